@@ -20,10 +20,14 @@ Run = dict[str, Any]
 
 
 async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
-    """Compare run b with run a, both with their `map`.
+    """Compare two finished runs, both with their `map`.
 
-    Maps of the same recording share a frame. Others are aligned by the distances between their stems, or
-    compared without alignment where those do not agree.
+    Maps of the same recording share a frame. Other maps are aligned by the distances between their stems; if
+    that fails, they are compared without alignment.
+
+    Args:
+        a, b: The runs.
+        same_source: Whether both are of the same recording.
 
     Returns:
         The tables of the page; positions of b are in the frame of a.
@@ -85,7 +89,8 @@ def _rows(points: list[list[float]]) -> Float:
 def _paired(
     a: list[dict[str, Any]], b: list[dict[str, Any]], place_a: Float, place_b: Float
 ) -> tuple[list[dict[str, Any]], list[int], list[int]]:
-    """The trees of both maps, the largest shift first, and the numbers of those in only one map."""
+    """Return the pairs of trees of both maps, the largest shift first, and the numbers of those in only one
+    map."""
     from pipeline.evaluation import match
 
     a_of = match(place_b, place_a, MATCH)
@@ -113,7 +118,7 @@ def _change(before: float | None, after: float | None) -> float | None:
 
 
 def _differences(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
-    """The parameters that differ."""
+    """Return name and both values of each parameter that differs."""
     names = dict.fromkeys([*a, *b])
     return [
         {"name": name, "a": _plain(a.get(name)), "b": _plain(b.get(name))}

@@ -71,9 +71,9 @@ class SavedRun:
         sources: The mapped sources, oldest first.
         preset, parameters: Name of the preset, and JSON of all parameters.
         seed: Random seed.
-        start_ns: Time of the first scan.
+        start_ns: Time of the first scan [ns].
         tally: Counts so far.
-        losses: Messages that were left out, by reason.
+        losses: Number of messages that were left out, by reason.
         map: State of the mapper.
     """
 
@@ -199,10 +199,18 @@ def continue_map(
     seed: int,
     warnings: list[str],
 ) -> RunStart:
-    """Load the saved map into a new mapper, and find where the robot starts in it.
+    """Load the saved map into a new mapper, and return how the run begins in it.
+
+    Args:
+        continued: The saved run, and where the robot starts.
+        source: Source of the new run.
+        mapper: A mapper before its first scan.
+        odometry: Choice of the odometry.
+        seed: Random seed.
+        warnings: Messages for the user are appended.
 
     Raises:
-        StemmapError: The start is to be found by the stems, and was not.
+        StemmapError: The start had to be found by the stems and was not.
     """
     saved, start = continued.saved, continued.start
     path = saved.map.stamp_ns
@@ -262,8 +270,15 @@ def _in_another_run(
 def localise(
     source: Source, parameters: Parameters, reference: Stems, odometry: OdometryChoice, seed: int
 ) -> Match:
-    """Find the first pose of a source in a map. The first scans are mapped separately until their stems
-    match.
+    """Return the pose of the first scan of a source in a map. The first scans are mapped separately until
+    their stems match.
+
+    Args:
+        source: The source.
+        parameters: Parameters of the mapper.
+        reference: Stems of the map.
+        odometry: Choice of the odometry.
+        seed: Random seed.
 
     Raises:
         StemmapError: No match was found; the message has the last reason.
@@ -293,7 +308,8 @@ def localise(
 
 
 def _truth_of(uri: str) -> Truth:
-    """The true trees of the first run, whose frame is that of the map; none where it cannot be opened."""
+    """Return the true trees of the first run, whose frame is that of the map; no trees if it cannot be
+    opened."""
     try:
         with closing(open_source(uri, SourceOptions())) as source:
             known = source.truth()

@@ -26,8 +26,8 @@ QUIET_S = 600.0  # a folder that was written to more recently may belong to a ru
 
 
 def finished_folders(settings: Settings) -> dict[str, Path]:
-    """Return the folders of finished runs by name; of two with the same name the first. Links that lead out
-    of the data folders are left out."""
+    """Return the folders of finished runs by name; of two with the same name the first. Links that point
+    outside of the data folders are left out."""
     found: dict[str, Path] = {}
     for folder in settings.data_folders:
         try:
@@ -40,7 +40,11 @@ def finished_folders(settings: Settings) -> dict[str, Path]:
 
 
 async def read_folder(name: str, settings: Settings) -> dict[str, Any]:
-    """Read a finished run, in a process of its own.
+    """Return a finished run, read in a child process.
+
+    Args:
+        name: Name in `finished_folders`.
+        settings: Settings of the deployment.
 
     Raises:
         UnknownError: There is no such folder.
@@ -79,7 +83,12 @@ class PartialOutput:
 
 
 def partial_outputs(settings: Settings, now_s: float | None = None) -> list[PartialOutput]:
-    """Return the partial outputs in the data folders, the newest first."""
+    """Return the partial outputs in the data folders, the newest first.
+
+    Args:
+        settings: Settings of the deployment.
+        now_s: Present time [s since 1970]; None for the system time.
+    """
     now_s = time.time() if now_s is None else now_s
     found = [_described(path, name, now_s) for name, path in _partial_folders(settings).items()]
     return sorted((each for each in found if each is not None), key=lambda each: -each.changed_s)
@@ -87,6 +96,11 @@ def partial_outputs(settings: Settings, now_s: float | None = None) -> list[Part
 
 def delete_partial_output(name: str, settings: Settings, now_s: float | None = None) -> None:
     """Delete a partial output.
+
+    Args:
+        name: Its path relative to the data folder.
+        settings: Settings of the deployment.
+        now_s: Present time [s since 1970]; None for the system time.
 
     Raises:
         UnknownError: There is none of this name.
@@ -142,7 +156,7 @@ def _folders(folder: Path) -> list[Path]:
 
 
 def _described(path: Path, name: str, now_s: float) -> PartialOutput | None:
-    """None where the folder has just been deleted."""
+    """Return the description of a partial output; None if it has just been deleted."""
     with contextlib.suppress(OSError):
         stats = [path.stat(), *(file.lstat() for file in path.iterdir())]
         changed = max(stat.st_mtime for stat in stats)

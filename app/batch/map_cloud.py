@@ -47,6 +47,16 @@ def map_plot_run(
 ) -> MappingResult:
     """Map a whole cloud and write its files.
 
+    Args:
+        cloud: The cloud.
+        preset: Name of the preset.
+        parameters: All parameters.
+        truth: True trees, or None.
+        folder: Folder for the files.
+
+    Returns:
+        The result for people.
+
     Raises:
         SourceError: The cloud cannot be read.
         OSError: The folder cannot be written; it is unchanged then.
@@ -98,7 +108,8 @@ _NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHIN
 
 
 def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
-    """Longitude and latitude (WGS84) of positions; None where their reference system is unknown."""
+    """Return longitude and latitude (WGS84) of positions; None if the reference system is unknown, with a
+    warning."""
     if not crs:
         return None
     import pyproj
@@ -153,8 +164,8 @@ def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
 
 
 def _terrain_rows(ground: TerrainRaster, offset: Float) -> Iterator[list[str]]:
-    """The centres of the cells with ground returns, from west to east, without interpolated cells. The number
-    of views and the uncertainty of the heights are unknown for a cloud."""
+    """Yield the centres of the cells with ground returns, from west to east, without interpolated cells. The
+    number of views and the uncertainty of the heights are unknown for a cloud."""
     columns, rows = np.nonzero(ground.seen)
     place = ground.low + (np.stack([columns, rows], axis=1) + 0.5) * ground.cell + offset[:2]
     height = ground.height[columns, rows] + offset[2]

@@ -56,10 +56,10 @@ class OfflineRun:
 
     Attributes:
         odometry: Source of the motion, see `app.sources.opening`.
-        stop_after: Largest number of scans.
+        stop_after: Maximum number of scans.
         revisions: Parameter changes: first scan and parameters.
-        on_frame: Told of each scan's results.
-        chosen: Topics and mounting that were asked for, see `SourceRequest.kept_choices`.
+        on_frame: Called with the results of each scan.
+        chosen: Topics and mounting that the user chose, see `SourceRequest.kept_choices`.
     """
 
     source: Source
@@ -96,13 +96,13 @@ class MappingResult:
 def map_run(
     plan: OfflineRun, folder: FilePath, progress: Progress, earlier: FilePath | None = None
 ) -> MappingResult:
-    """Map a run and write its files.
+    """Map a run, write its files, and return the result for people.
 
     Args:
         plan: The run.
         folder: Folder for the files.
         progress: Updated after each scan.
-        earlier: Folder of the run that is continued.
+        earlier: Folder of the run that is continued, or None.
 
     Raises:
         SourceError: The source cannot be read.
@@ -184,7 +184,7 @@ def _map_scans(
     progress: Progress,
     stopwatch: Stopwatch,
 ) -> tuple[Frame, int]:
-    """Map scan by scan. Returns the last frame and the time of the first scan [ns]."""
+    """Map all scans; return the last frame and the time of the first scan [ns]."""
     start_ns, frame = begun.start_ns, None
     for step in to_map:
         _use_revisions(plan, mapper, step.index)
@@ -204,7 +204,7 @@ def _map_scans(
 
 
 def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) -> None:
-    """The map is complete already; errors here become warnings."""
+    """Write the pictures of trees. The map is complete already, so errors become warnings."""
     try:
         kept, warning = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
     except (StemmapError, OSError) as error:
@@ -224,7 +224,7 @@ def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
 
 
 def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
-    """The changes of each revision, for run.json."""
+    """Return the parameter changes of each revision for run.json."""
     revisions: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
     before = plan.parameters.flat()
     for first, parameters in plan.revisions:

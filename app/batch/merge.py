@@ -133,7 +133,7 @@ def _path(merged: MergedMap) -> Path:
 
 
 def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
-    """Update the record of run a to that of the merged run."""
+    """Change the record of run a to that of the merged run, in place."""
     first, *others = saved.sources
     seconds, metres = driven(path, breaks_of(saved.sources))
     record["source"].update(uri=first.uri, sha256=first.digest)
@@ -163,15 +163,15 @@ def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, mat
 
 
 def _shown(trees: Trees) -> set[int]:
-    """Numbers of the confirmed trees, which the files contain."""
+    """Return the numbers of the confirmed trees, which the files contain."""
     return set(trees.number[trees.confirmed].tolist())
 
 
 def _correspondence(
     merged: MergedMap, b: SavedMap, shown: set[int], of_a: set[int], of_b: set[int]
 ) -> list[list[str]]:
-    """Rows of CORRESPONDENCE_COLUMNS for the confirmed trees of the merged map, by number. The cell of a run
-    in which the tree was not confirmed is empty."""
+    """Return rows of CORRESPONDENCE_COLUMNS for the confirmed trees of the merged map, by number. The cell of
+    a run in which the tree was not confirmed is empty."""
     rows = {n: [str(n), str(n) if n in of_a else "", "", ""] for n in sorted(shown)}
     merged_rows = zip(
         b.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True
@@ -186,7 +186,7 @@ def _correspondence(
 def _moved_rows(
     file: FilePath, T: Pose2, scans: int, shift: int, a: SavedRun, b: SavedRun
 ) -> list[list[str]]:
-    """The detections of run b with frame, scan numbers and times of run a."""
+    """Return the detections of run b with frame, scan numbers and times of run a."""
     seconds = (b.start_ns + shift - a.start_ns) * 1e-9
     try:
         with file.open(encoding="utf-8", newline="") as text:

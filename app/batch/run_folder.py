@@ -50,7 +50,7 @@ class FinishedRun:
 
 
 def read_run(folder: FilePath) -> FinishedRun:
-    """Read the folder of a run.
+    """Return the run in a folder that `stemmap map` wrote.
 
     Raises:
         SourceError: A file is missing or damaged.
@@ -72,12 +72,12 @@ def read_run(folder: FilePath) -> FinishedRun:
 
 
 def is_of_cloud(record: dict[str, Any]) -> bool:
-    """Whether run.json describes the map of a whole cloud."""
+    """Return whether a record (run.json) is that of the map of a whole cloud."""
     return isinstance(record.get("source"), dict) and "offset_m" in record["source"]
 
 
 def read_run_record(folder: FilePath) -> dict[str, Any]:
-    """Read run.json of a folder.
+    """Return run.json of a folder.
 
     Raises:
         SourceError: It is missing or damaged.
@@ -93,7 +93,12 @@ def read_run_record(folder: FilePath) -> dict[str, Any]:
 
 def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
     """Return the confirmed trees and the path with the precision of their files, so that scores after mapping
-    are the same as scores of the files later."""
+    equal scores of the files.
+
+    Args:
+        trees, path: The map.
+        start_ns: Time of the first scan [ns].
+    """
     columns = (
         _table(path_rows(path, start_ns), PATH_COLUMNS),
         _table(tree_rows(trees, start_ns), TREE_COLUMNS),
@@ -166,7 +171,7 @@ def _trees(c: dict[str, Float]) -> Trees:
 
 
 def _stamps(seconds: Float) -> Int:
-    """Nanoseconds; -1 where the time is unknown, as in the map of a whole cloud."""
+    """Convert seconds to nanoseconds; NaN, as in the map of a whole cloud, becomes -1."""
     stamps: Int = np.where(np.isfinite(seconds), np.round(np.nan_to_num(seconds) * 1e9), -1.0).astype(
         np.int64
     )

@@ -24,7 +24,7 @@ MOST_SPANS = 200  # written; the rest is counted
 
 @dataclass(slots=True)
 class _HealthSpan:
-    """Scans after one another in one state; the reason is that of the first."""
+    """Consecutive scans with one state of the pose quality; the reason is that of the first scan."""
 
     state: HealthState
     reason: str
@@ -36,7 +36,7 @@ class _HealthSpan:
 
 @dataclass(slots=True, eq=False)
 class RunHealth:
-    """Takes the health of each scan and sums it up."""
+    """Pose quality over a run: numbers of scans by state, worst values, and spans of weak or lost scans."""
 
     _scans: Counter[str] = field(default_factory=Counter)
     _spans: list[_HealthSpan] = field(default_factory=list)
@@ -46,7 +46,13 @@ class RunHealth:
 
     @classmethod
     def of_both(cls, first: RunHealth, second: RunHealth, scans: int, shift_ns: int) -> RunHealth:
-        """Of two runs after one another: the second comes after so many scans, later by `shift_ns`."""
+        """Return the pose quality of two consecutive runs.
+
+        Args:
+            first, second: Pose quality of the runs.
+            scans: Number of scans of the first run.
+            shift_ns: Offset that is added to the times of the second run [ns].
+        """
         moved = [
             replace(
                 span,
@@ -68,7 +74,7 @@ class RunHealth:
         return cls(first._scans + second._scans, spans[:MOST_SPANS], left_out, second._was, worst)
 
     def add(self, frame: Frame) -> None:
-        """Take the next scan."""
+        """Add the next scan."""
         health = frame.health
         self._scans[health.state] += 1
         self._remember_worst(health)
@@ -118,7 +124,7 @@ class RunHealth:
         }
 
     def summary(self) -> list[str]:
-        """A line for people when not all was good."""
+        """Return a line for people if any scan was weak or lost; else []."""
         weak, lost = self._scans["weak"], self._scans["lost"]
         if not weak and not lost:
             return []
@@ -154,9 +160,9 @@ class RunTotals:
     """Counts over a run.
 
     Attributes:
-        warned: Warnings with their numbers.
-        points: Points by the stage that removed them.
-        verdicts: Clusters by verdict.
+        warned: Number of times that each warning was given.
+        points: Number of points by the stage that removed them.
+        verdicts: Number of clusters by verdict.
         health: Quality of the poses.
     """
 
@@ -166,19 +172,24 @@ class RunTotals:
     health: RunHealth = field(default_factory=RunHealth)
 
     def add(self, frame: Frame) -> None:
-        """Count a scan."""
+        """Add the next scan."""
         self.health.add(frame)
         self.points.update(frame.counts)
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
 
     def warn_of_far_truth(self, evaluation: MapScores | None) -> None:
-        """Warn where no true tree is near the path."""
+        """Add a warning if no true tree is near the path."""
         if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
             self.warned[far_truth(evaluation.reach)] += 1
 
     def warn_of_unconfirmed(self, frame: Frame, hits: int) -> None:
-        """Warn of trees that were seen in too few scans."""
+        """Add a warning if trees were seen in too few scans.
+
+        Args:
+            frame: Results of the last scan.
+            hits: Number of scans that confirms a tree.
+        """
         tentative = int(np.count_nonzero(~frame.trees.confirmed))
         if tentative:
             them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
@@ -202,7 +213,7 @@ def far_truth(reach: float) -> str:
 
 
 def breaks_of(sources: Iterable[RunSource]) -> list[int]:
-    """Return the numbers of the scans with which another drive begins."""
+    """Return the indices of the scans with which another drive begins."""
     return [source.from_scan for source in sources if source.start not in _SAME_DRIVE]
 
 

@@ -90,6 +90,11 @@ def stem_corners(x: float, y: float, dbh: float) -> Float:
 def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) -> tuple[int, str]:
     """Write a picture of each tree to `folder`/pictures; pictures of an earlier run are deleted.
 
+    Args:
+        source: The source, with its camera.
+        trees, path: The map.
+        folder: Folder of the run.
+
     Returns:
         Number of pictures, and a warning; "" for none.
 

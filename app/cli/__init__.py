@@ -149,7 +149,7 @@ def _check_command(words: list[str]) -> None:
 
 @contextlib.contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Inside, SIGTERM acts as Ctrl-C: partial outputs are removed."""
+    """Treat SIGTERM as Ctrl-C inside the context, so that partial outputs are removed."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -161,7 +161,11 @@ def _sigterm_as_ctrl_c() -> Iterator[None]:
 
 
 def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser of the program, and the parser of each command."""
+    """Return the parser of the program, and the parser of each command by name.
+
+    Args:
+        wanted: Command whose arguments are added; the others have only their help text.
+    """
     parser = _Parser(
         prog="stemmap",
         description="Maps trees from a robot's LiDAR as it drives, and shows the reasons in the browser.",

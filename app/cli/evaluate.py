@@ -113,7 +113,7 @@ def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) ->
 
 
 def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]:
-    """The scores of a run, and whether it is a whole cloud."""
+    """Return the scores of a run, and whether it is a whole cloud."""
     import numpy as np
 
     from app.batch.run_folder import read_run
@@ -142,7 +142,7 @@ def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]
 
 
 def _given_truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
-    """The true trees that --truth gives for a run."""
+    """Return the true trees that --truth gives for a run, or None."""
     from pipeline.io.ground_truth import read_truth_trees
 
     if not arguments.truth:
@@ -179,7 +179,7 @@ def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) ->
 
 
 def add_grid_flags(parser: argparse.ArgumentParser) -> None:
-    """--param-grid and its flags."""
+    """Add --param-grid and its flags."""
     group = parser.add_argument_group("comparison of parameter sets")
     group.add_argument(
         "--param-grid",
@@ -238,13 +238,13 @@ def refuse_without_grid(arguments: argparse.Namespace) -> None:
 
 
 def distances(arguments: argparse.Namespace) -> list[str]:
-    """--match-distance and --reach as assignments."""
+    """Return --match-distance and --reach as assignments of parameters."""
     asked = (("match_distance", arguments.match_distance), ("reach", arguments.reach))
     return [f"evaluation.{name}={value}" for name, value in asked if value is not None]
 
 
 def run_grid(arguments: argparse.Namespace) -> int:
-    """Compare all sets on all runs."""
+    """Compare all sets on all runs; return the exit code."""
     from app.tuning.sweep.grid import combinations, read_axes
 
     sets = combinations(read_axes(arguments.param_grid))
@@ -270,7 +270,7 @@ def run_grid(arguments: argparse.Namespace) -> int:
 
 
 def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
-    """The runs that can be scored, and the number of the others, which are reported."""
+    """Return the runs that can be scored, and the number of the others, which are reported."""
     from app.sources.request import SourceRequest, mount_of_degrees
     from app.tuning.sweep.jobs import prepare_run
 
@@ -293,7 +293,7 @@ def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
 
 
 def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Value]) -> Parameters:
-    """The parameters that a set changes: the preset of the set or of the run, and the flags."""
+    """Return the parameters that a set changes: the preset of the set or of the run, and the flags."""
     from app.tuning.sweep.grid import PRESET
     from pipeline.config import preset
 

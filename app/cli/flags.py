@@ -38,7 +38,7 @@ def plain(text: str) -> str:
 
 
 def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
-    """--preset, --config and --set."""
+    """Add --preset, --config and --set."""
     parser.add_argument(
         "--preset",
         metavar="NAME",
@@ -51,28 +51,28 @@ def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_set_flag(parser: argparse.ArgumentParser, help_text: str) -> None:
-    """--set."""
+    """Add --set."""
     parser.add_argument(
         "--set", metavar="STAGE.NAME=VALUE", dest="assignments", action="append", default=[], help=help_text
     )
 
 
 def add_dbh_unit_flag(parser: argparse.ArgumentParser) -> None:
-    """--dbh-unit."""
+    """Add --dbh-unit."""
     parser.add_argument(
         "--dbh-unit", choices=("m", "cm", "mm"), help="unit of a diameter column without unit"
     )
 
 
 def add_force_flag(parser: argparse.ArgumentParser) -> None:
-    """--force."""
+    """Add --force."""
     parser.add_argument(
         "--force", action="store_true", help="overwrite the map of another source in the folder"
     )
 
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
-    """--seed and --odometry."""
+    """Add --seed and --odometry."""
     parser.add_argument("--seed", type=seed, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
         "--odometry",
@@ -86,7 +86,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_source_flags(parser: argparse.ArgumentParser) -> None:
-    """--topic and --mount."""
+    """Add --topic and --mount."""
     parser.add_argument(
         "--topic",
         metavar="ROLE=NAME",
@@ -106,7 +106,7 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_live_flags(parser: argparse.ArgumentParser) -> None:
-    """--record and --publish."""
+    """Add --record and --publish."""
     parser.add_argument(
         "--record",
         metavar="FILE.mcap",
@@ -123,6 +123,10 @@ def add_live_flags(parser: argparse.ArgumentParser) -> None:
 
 def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
     """Return the file of --record; "" without a recording.
+
+    Args:
+        arguments: Parsed arguments with the flags of `add_live_flags`.
+        sources: URIs of the sources, which must be live with --record.
 
     Raises:
         ParameterError: A source is not live.
@@ -201,7 +205,11 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
 
 
 def source(text: str) -> str:
-    """Check a source. An empty word is an error and not the current folder."""
+    """Return the word for a source; an empty word is an error and not the current folder.
+
+    Raises:
+        argparse.ArgumentTypeError: The word is empty.
+    """
     if not text.strip():
         raise argparse.ArgumentTypeError("the source is empty")
     return text
@@ -291,7 +299,7 @@ def chosen_parameters(
 
 @contextmanager
 def compilation_notice() -> Iterator[None]:
-    """Inside, the first kernel that must be compiled is reported on stderr, above a progress bar."""
+    """Report the first kernel that must be compiled inside the context on stderr, above a progress bar."""
     from tqdm import tqdm
 
     from pipeline.jit import on_compiling

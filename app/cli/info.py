@@ -147,7 +147,7 @@ def _sensor(sensor: Sensor) -> str:
 
 
 def _truth_counts(truth: Truth | None) -> tuple[int, int]:
-    """Numbers of true trees and of other known objects."""
+    """Return the numbers of true trees and of other known objects."""
     kinds = () if truth is None or truth.trees is None else truth.trees.kind
     trees = sum(kind == "tree" for kind in kinds)
     return trees, len(kinds) - trees
@@ -195,7 +195,7 @@ def _cloud_lines(d: CloudDescription) -> list[str]:
 
 
 def _extent(d: CloudDescription) -> tuple[np.ndarray, np.ndarray] | None:
-    """The corners; None where the file has no valid extent."""
+    """Return the corners of a cloud [m]; None if the file has no valid extent."""
     import numpy as np
 
     if d.low is None or d.high is None:
@@ -225,7 +225,7 @@ def _extent_rows(d: CloudDescription) -> list[tuple[str, str]]:
 
 
 def _crs_words(crs: str) -> str:
-    """The name of the reference system."""
+    """Return the name of a reference system, given as WKT or "EPSG:..."."""
     if not crs:
         return "none: positions have no longitude and latitude"
     import pyproj

@@ -95,7 +95,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Map the run."""
+    """Map the run; return the exit code."""
     if arguments.start is not None and arguments.continued is None:
         raise ParameterError("--start needs a continued map", remedy="Add --continue DIR")
     chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
@@ -111,7 +111,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_plot(arguments: argparse.Namespace) -> int:
-    """Map a whole cloud of a plot."""
+    """Map a whole cloud of a plot; return the exit code."""
     if arguments.continued is not None or arguments.stop_after is not None:
         raise ParameterError("a whole cloud has no scans", remedy="Remove --continue and --stop-after")
     from app.batch.map_cloud import map_plot_run
@@ -191,7 +191,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
 
 
 def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
-    """What the flags chose about the source, for run.json."""
+    """Return the topics and the mounting that the flags give, for run.json."""
     from app.sources.request import request_of_options
 
     kept = request_of_options(arguments.source, source_options(arguments)).kept_choices()
@@ -201,7 +201,7 @@ def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
 def _tell(
     summary: list[str], out: Path, warnings: list[str], losses: dict[str, int], *, replaces: bool
 ) -> int:
-    """Print the result; returns the exit code."""
+    """Print the result; return the exit code."""
     for line in summary:
         print(line)
     print(f"files in {out}" + (" (replaced)" if replaces else ""))
@@ -233,7 +233,7 @@ def _start(text: str) -> str | tuple[float, float, float]:
 
 
 class _MapProgress:
-    """A progress bar on a terminal; silent elsewhere."""
+    """A progress bar on a terminal; without a terminal it prints nothing."""
 
     def __init__(self, scans: int | None) -> None:
         from tqdm import tqdm
@@ -316,7 +316,8 @@ def _listening(
 
 @contextmanager
 def _notices(source: LiveSource) -> Iterator[None]:
-    """Inside, a thread prints every five seconds why no scans arrive, and whether a robot was lost."""
+    """Print every five seconds why no scans arrive, and whether a robot was lost, in a thread while the
+    context is active."""
     ended = threading.Event()
 
     def show(*lines: str) -> None:

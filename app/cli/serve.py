@@ -65,7 +65,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until Ctrl-C."""
+    """Serve until Ctrl-C; return the exit code."""
     from app.common.environment import from_environment
 
     settings = from_environment()
@@ -114,7 +114,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
-    """The router whose robots are all shown: one with robot=* in its address, or with several robots."""
+    """Return the router whose robots are all shown, if an address has robot=* or names several robots, and
+    how they are opened; else None."""
     from app.robot.address import ALL_ROBOTS, ZenohAddress, is_live, parse_address
 
     if len(sources) != 1 or not is_live(sources[0].uri):
@@ -143,7 +144,7 @@ def _report_partial_outputs(settings: Settings) -> None:
 
 
 def _check_source(uri: str) -> None:
-    """Report a missing file or scenario at once. The worker checks the contents of a file."""
+    """Check that a file or scenario exists. The worker checks the contents of a file."""
     if _exists(uri):
         return
     scheme, colon, _ = uri.partition(":")

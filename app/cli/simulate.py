@@ -37,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Write the recording and the table of trees beside it."""
+    """Write the recording and a table of its trees next to it; return the exit code."""
     from app.common.text import count
     from pipeline.io.readers.simulated import open_simulated
     from pipeline.io.recording import write_recording
@@ -73,7 +73,7 @@ def _mcap(text: str) -> Path:
 
 
 def _uri(arguments: argparse.Namespace) -> str:
-    """The URI of the scenario with the flags as options, which its parser checks."""
+    """Return the URI of the scenario with the flags as options."""
     uri: str = arguments.scenario if arguments.scenario.startswith("sim:") else f"sim:{arguments.scenario}"
     for key in ("seed", "duration"):
         value = getattr(arguments, key)

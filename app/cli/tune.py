@@ -101,7 +101,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Search and write the best set."""
+    """Search and write the best set; return the exit code."""
     from app.tuning.search import Search
     from app.worker.numba_warmup import compile_ahead
 
@@ -147,7 +147,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
 
 
 def _suggested(uri: str) -> str:
-    """The preset that suits the first run."""
+    """Return the preset that suits a run."""
     from contextlib import closing
 
     from pipeline.io.readers import open_source
@@ -228,7 +228,7 @@ def _storage(arguments: argparse.Namespace) -> str:
 
 
 def _search(search: Search, number: int) -> tuple[bool, int]:
-    """Make the trials. Returns whether the search stopped before the last one, and the number of lost
+    """Make the trials. Return whether the search stopped before the last one, and the number of lost
     processes."""
     import time
 
@@ -316,7 +316,7 @@ class _SearchProgress:
         self._bar.update(made)
 
     def show(self, search: Search) -> None:
-        """Update the bar."""
+        """Update the bar, and print a line for a new best set."""
         made, best = len(search.trials()), search.best()
         self._bar.update(made - self._bar.n if not self._bar.disable else 0)
         if best is None or best.loss is None or (self._best is not None and best.loss >= self._best):

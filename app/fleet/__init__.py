@@ -1,1 +1,2 @@
-"""Several robots or runs at once: a dashboard each, with a worker and a map of its own; one page of all."""
+"""Several robots or runs at once: each has a dashboard with a worker and a map; one page shows all of
+them."""

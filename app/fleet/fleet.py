@@ -1,4 +1,5 @@
-"""A fleet: a dashboard for each robot on a port of its own, and the states and maps that its page shows."""
+"""A fleet: a dashboard for each robot on a port of its own, and the states and maps that the common page
+shows."""
 
 from __future__ import annotations
 
@@ -41,11 +42,11 @@ Map = dict[str, Any]
 
 
 class Frames:
-    """Tries to lay each map upon the common one, one at a time.
+    """Poses of the maps of a fleet in one common frame; one map is aligned at a time.
 
-    The first map with trees enough is the common frame. Two replays of one recording share their frame, for
-    each begins where the recording does. All others are laid by their stems; what was laid stays until its
-    robot opens another source.
+    The first map with enough trees is the common frame. Two replays of one recording share their frame,
+    because each begins at the start of the recording. All other maps are aligned by their stems. A pose
+    remains valid until its robot opens another source.
     """
 
     def __init__(self) -> None:
@@ -57,19 +58,19 @@ class Frames:
         self._first: tuple[str, str] | None = None
 
     def pose(self, name: str) -> Pose2 | None:
-        """Pose of the frame of a map in the common frame; None where it is unknown."""
+        """Return the pose of the frame of a map in the common frame; None if it is unknown."""
         return self._pose.get(name)
 
     def how(self, name: str) -> str:
-        """How that is known, or why it is not, in words."""
+        """Return how the pose of a map was found, or why it is unknown, as text."""
         why = ": too few trees" if name in self._few else ""
         return self._how.get(name, f"its frame is not known yet{why}")
 
     async def try_one(self, maps: dict[str, tuple[str, Map]]) -> bool:
-        """Lay one more map if any is worth a try; whether one was tried.
+        """Try to align one more map; return whether an alignment was computed.
 
         Args:
-            maps: The run's digest and the map (a list of trees as the page has them) by name.
+            maps: By name: digest of the run, and the map with a list of trees as on the page.
         """
         self._forget(maps)
         self._few = {name for name, (_, shown) in maps.items() if len(shown["trees"]) < LEAST_TREES}
@@ -99,7 +100,7 @@ class Frames:
             self._pose[name] = pose
 
     def _forget(self, maps: dict[str, tuple[str, Map]]) -> None:
-        """What was known of runs that are left is known no more; without the first, nothing is."""
+        """Remove the poses of runs that were closed; if the common frame was closed, remove all."""
         if self._first is not None and maps.get(self._first[0], ("", {}))[0] != self._first[1]:
             self.__init__()  # type: ignore[misc]
             return
@@ -116,7 +117,12 @@ MOST_POINTS = 400
 
 
 def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
-    """State and key figures of a robot, as JSON values."""
+    """Return state and key figures of a robot as JSON values.
+
+    Args:
+        name: Name of the robot on the page.
+        dashboard: Its dashboard.
+    """
     status = dashboard.status
     clearance = None if dashboard.shown is None else dashboard.shown.frame.clearance
     return {
@@ -139,7 +145,8 @@ def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
 
 
 def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
-    """Trees, path and pose of a robot in the frame of its map, as JSON values; None before the first scan."""
+    """Return trees, path and pose of the robot of a dashboard in the frame of its map, as JSON values; None
+    before the first scan."""
     shown = dashboard.shown
     if shown is None:
         return None
@@ -154,8 +161,13 @@ def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
 
 
 def drawn(own: dict[str, Any], pose: Pose2 | None, how: str) -> dict[str, Any]:
-    """A map as the page draws it: [x, y, DBH in cm or None] of each tree, and the pose of its frame in the
-    common one."""
+    """Return a map as the page draws it: [x, y, DBH in cm or None] of each tree, and the pose of its frame in
+    the common one.
+
+    Args:
+        own: Result of `shown_map`.
+        pose, how: Results of `Frames.pose` and `Frames.how`.
+    """
     return {
         "trees": [[round(t["x"], 2), round(t["y"], 2), t["dbh_cm"]] for t in own["trees"]],
         "path": own["path"],
@@ -173,11 +185,11 @@ class Member:
     """The dashboard of one robot or run, with its server.
 
     Args:
-        name: Of the robot or run, as the page shows it.
+        name: Name of the robot or run on the page.
         source: The run that the dashboard opens.
-        listening: The socket of its port.
-        app: The application of the dashboard.
-        settings: Of the deployment.
+        listening: Listening socket of its port.
+        app: Application of the dashboard.
+        settings: Settings of the deployment.
     """
 
     def __init__(
@@ -196,17 +208,17 @@ class Member:
 
     @property
     def started(self) -> bool:
-        """Whether the server answers."""
+        """Whether the server accepts requests."""
         return self._server.started
 
     @property
     def ended(self) -> bool:
-        """Whether the server ended by itself, which is a fault."""
+        """Whether the server ended without a call of `close`, which is a fault."""
         return self._task is not None and self._task.done()
 
     @property
     def answers(self) -> bool:
-        """Whether the page can be opened now. The port accepts connections earlier and lets them wait."""
+        """Whether the page can be opened. The port accepts connections earlier and lets them wait."""
         return self.started and not self.ended
 
     async def close(self) -> None:
@@ -219,7 +231,7 @@ class Member:
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves the signals to that of the fleet."""
+    """A uvicorn server that handles no signals, because the server of the fleet does."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -228,7 +240,7 @@ class _Server(uvicorn.Server):
 
 
 def next_port(settings: Settings, after: int) -> socket.socket:
-    """A listening socket on the first free port after a given one.
+    """Return a listening socket on the first free port after port `after`.
 
     Raises:
         StemmapError: No port is free.
@@ -257,18 +269,18 @@ class Fleet:
     """The dashboards of all robots, by name, in the order in which they were added.
 
     Args:
-        settings: Of the deployment.
-        port: Of the fleet's page.
+        settings: Settings of the deployment.
+        port: Port of the page of the fleet.
         token: Access token of browsers, also for the dashboards.
-        make_parameters: Makes the initial parameters of a dashboard.
+        make_parameters: Returns the initial parameters of a dashboard.
         make_scene, make_worker: Replacements of viser and of the worker process, for tests.
-        warm: The dashboards start after it; None starts them at once.
+        warm: Task after which the dashboards start; None starts them at once.
 
     Attributes:
-        live: States and maps for the connected pages.
+        live: Broadcast of states and maps to the connected pages.
         members: Dashboard by name.
-        remote: Card and map by name, of robots that map by themselves.
-        notice: A message for the page, "" for none.
+        remote: Card and map by name, for robots that map by themselves.
+        notice: Message for the page, "" for none.
     """
 
     def __init__(
@@ -295,7 +307,8 @@ class Fleet:
         self._aligning: asyncio.Task[None] | None = None
 
     def add(self, name: str, source: Open) -> bool:
-        """Add a robot; False if there is no room for it, which the page reports."""
+        """Add a robot and start its dashboard; return False if there is no room for it, which the page
+        reports."""
         if name in self.members:
             return True
         if len(self.members) >= MOST_ROBOTS:
@@ -386,7 +399,7 @@ class Fleet:
         self.live.tell("maps", {"maps": maps})
 
     def _maps(self) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Digest and map of each robot that has a map."""
+        """Return digest and map of each robot that has a map, by name."""
         found = {name: (m.dashboard.digest, shown_map(m.dashboard)) for name, m in self.members.items()}
         maps = {name: (digest, own) for name, (digest, own) in found.items() if own is not None}
         return maps | {name: (f"remote:{name}", own) for name, (_, own) in self.remote.items()}

@@ -1,7 +1,7 @@
-"""Receives the maps that robots make and publish: `python -m app.fleet.hearing ADDRESS`, a child process.
+"""Receives the maps that robots compute and publish: `python -m app.fleet.hearing ADDRESS`, a child process.
 
-The process decodes messages of unknown senders, so it is apart from the server. Twice a second it sends a
-report in a line of JSON. It ends when its standard input does.
+It decodes messages of unknown senders, so it is separate from the server. Twice a second it sends a report as
+a line of JSON. It ends when its standard input does.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class RobotReport(msgspec.Struct, frozen=True):
     Attributes:
         silence_s: Age of the newest pose [s]; None before the first.
         unreadable: Number of messages that could not be read.
-        map: Trees, path and pose as `app.fleet.fleet.shown_map` gives them.
+        map: Trees, path and pose as `app.fleet.fleet.shown_map` returns them.
         alive: Whether its results are announced now.
     """
 
@@ -86,7 +86,13 @@ class Results:
         self._came_s: deque[float] = deque(maxlen=_RATE_OVER)
 
     def take(self, topic: str, payload: bytes, now_s: float) -> None:
-        """Read a message of one of TOPICS; count it if it cannot be read."""
+        """Read a message; if it cannot be read, count it in `losses`.
+
+        Args:
+            topic: One of TOPICS.
+            payload: The message in CDR.
+            now_s: Present time [s] from any origin.
+        """
         try:
             message = outputs.store().deserialize_cdr(payload, outputs.TYPES[topic])
             self._take(topic, message, now_s)
@@ -111,7 +117,11 @@ class Results:
                 self._zone = Zone(int(message.data)).label
 
     def report(self, now_s: float, *, alive: bool) -> RobotReport:
-        """State and map for the page.
+        """Return state and map for the page.
+
+        Args:
+            now_s: Present time [s] from the same origin as in `take`.
+            alive: Whether the results of the robot are announced now.
 
         Raises:
             msgspec.MsgspecError: A figure is not finite.
@@ -140,17 +150,17 @@ class Results:
 
 
 def _placed(pose: Any) -> tuple[float, float, float]:  # noqa: ANN401
-    """x, y and yaw of a geometry_msgs/Pose."""
+    """Return x, y [m] and yaw [rad] of a geometry_msgs/Pose."""
     q = pose.orientation
     yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
     return float(pose.position.x), float(pose.position.y), yaw
 
 
 def _finite(*values: float) -> list[float]:
-    """The values, rounded to millimetres.
+    """Return the values, rounded to millimetres.
 
     Raises:
-        ValueError: A value is not finite, or beyond 1e7.
+        ValueError: A value is not finite, or its magnitude is above 1e7.
     """
     if not all(math.isfinite(value) and abs(value) < 1e7 for value in values):
         raise ValueError("not a place")
@@ -158,7 +168,7 @@ def _finite(*values: float) -> list[float]:
 
 
 def _tree(detection: Any) -> dict[str, Any]:  # noqa: ANN401
-    """The tree of a vision_msgs/Detection3D, as JSON values for the page."""
+    """Return the tree of a vision_msgs/Detection3D as JSON values for the page."""
     centre, width = detection.bbox.center.position, float(detection.bbox.size.x)
     x, y = _finite(float(centre.x), float(centre.y))
     covariance = np.asarray(detection.results[0].pose.covariance, np.float64)
@@ -176,11 +186,11 @@ _BY_TYPE = {topic: outputs.TYPES[topic] for topic in TOPICS}
 
 
 class ResultReceiver:
-    """The results of all robots at a router.
+    """Receives the results of all robots at a router.
 
     Args:
         link: Connection to the router.
-        inbox: Of the link.
+        inbox: Inbox that the link fills.
     """
 
     def __init__(self, link: ZenohLink, inbox: Inbox) -> None:
@@ -208,19 +218,19 @@ class ResultReceiver:
             self._link.subscribe([Channel(number, publisher.topic, publisher.msgtype, "cdr", "", "", 0)])
 
     def take(self, now_s: float) -> None:
-        """Read all messages that arrived."""
+        """Read all messages that arrived; `now_s` is the present time [s] from any origin."""
         while (message := self._inbox.take()) is not None:
             robot, topic = self._topics[message.channel]
             self._robots[robot].take(topic, message.payload, now_s)
 
     def report(self, now_s: float) -> FleetReport:
-        """The present state of all robots."""
+        """Return the present state of all robots; `now_s` as in `take`."""
         alive = {found[0] for p in self._link.publishers() if (found := results_topic(p.topic)) is not None}
         robots = {name: self._report_of(name, name in alive, now_s) for name in self._robots}
         return FleetReport(self._link.problem, self._link.place, robots)
 
     def _report_of(self, name: str, alive: bool, now_s: float) -> RobotReport:
-        """Report of one robot. Results that cannot be reported are dropped and counted."""
+        """Return the report of one robot. Results that cannot be reported are dropped and counted."""
         try:
             return self._robots[name].report(now_s, alive=alive)
         except Exception:  # any error that a stranger's figures can cause
@@ -230,7 +240,7 @@ class ResultReceiver:
 
 
 def results_topic(topic: str) -> tuple[str, str] | None:
-    """The robot and the result that a topic belongs to; None for any other topic."""
+    """Return the namespace of the robot and the name of the result of a topic; None for any other topic."""
     head, _, last = topic.rpartition("/")
     if last not in TOPICS or not head.endswith("/stemmap"):
         return None
@@ -238,12 +248,12 @@ def results_topic(topic: str) -> tuple[str, str] | None:
 
 
 def main(uri: str, ending: threading.Event, parent: ParentConnection) -> None:
-    """Send reports until the parent closes the connection.
+    """Send reports until the parent closes the connection; the program of the child process.
 
     Args:
         uri: Address of the router.
-        ending: Set when the parent closes the connection.
-        parent: The server.
+        ending: Event that is set when the parent closes the connection.
+        parent: Connection to the server.
     """
     address = parse_address(uri)
     if not isinstance(address, ZenohAddress):

@@ -1,4 +1,4 @@
-"""Robots that map by themselves, on the page of a fleet: their results are received, their scans are not."""
+"""Robots that map by themselves, on the page of a fleet. Their results are received; their scans are not."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ SILENT_S = 3.0
 
 
 class RemoteRobots:
-    """Keeps the process that receives the maps running, and passes its reports to the fleet.
+    """Runs the process that receives the maps, and passes its reports to the fleet.
 
     Args:
-        fleet: Shows the robots.
+        fleet: The fleet that shows the robots.
         uri: Address of the router.
-        command: The process.
+        command: Program and arguments of the process.
     """
 
     def __init__(self, fleet: Fleet, uri: str, command: Sequence[str] = HEARING) -> None:
@@ -79,7 +79,7 @@ class RemoteRobots:
         self._show(receiving=True)
 
     def _show(self, *, receiving: bool) -> None:
-        """Pass cards and maps to the fleet; without the process, none of them is live."""
+        """Pass cards and maps to the fleet; without `receiving`, no robot counts as live."""
         now_s = time.monotonic()
         self._fleet.remote = {}
         for robot, known in self._known.items():
@@ -88,13 +88,20 @@ class RemoteRobots:
 
 
 def _aged(robot: RobotReport, reported_s: float, now_s: float) -> RobotReport:
-    """A report of an earlier time, with its silence up to now."""
+    """Return a report of an earlier time, with its silence extended to `now_s`."""
     silence_s = None if robot.silence_s is None else robot.silence_s + now_s - reported_s
     return msgspec.structs.replace(robot, silence_s=silence_s)
 
 
 def card_of(name: str, uri: str, robot: RobotReport, *, receiving: bool) -> dict[str, Any]:
-    """The card of a robot, as `app.fleet.fleet.card` makes it of a dashboard."""
+    """Return the card of a robot, in the form of `app.fleet.fleet.card`.
+
+    Args:
+        name: Name of the robot.
+        uri: Address of the router.
+        robot: Its newest report.
+        receiving: Whether the process that receives the reports runs.
+    """
     silent = not receiving or robot.silence_s is None or robot.silence_s > SILENT_S
     since = "" if robot.silence_s is None else f"Nothing heard for {robot.silence_s:.0f} s: "
     reason = "it is announced and silent" if robot.alive else "its mapping is gone"

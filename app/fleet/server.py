@@ -38,7 +38,10 @@ WARMING = python_module("app.worker.numba_warmup", "warm_up")
 
 
 async def warm_kernels(command: Sequence[str] = WARMING) -> None:
-    """Compile the kernels of the mapper in a child process, so that not every worker does.
+    """Compile the kernels of the mapper in a child process, so that the workers find them in the cache.
+
+    Args:
+        command: Program and arguments of the child process.
 
     Raises:
         StemmapError: The process cannot be started.
@@ -49,7 +52,7 @@ async def warm_kernels(command: Sequence[str] = WARMING) -> None:
 
 
 def named(sources: Sequence[Open]) -> dict[str, Open]:
-    """Sources by a short name: for a file its stem, with a number appended where two are equal."""
+    """Return the sources by short names: for a file its stem, with a number appended if two are equal."""
     found: dict[str, Open] = {}
     for source in sources:
         short = source.uri
@@ -69,10 +72,11 @@ def named(sources: Sequence[Open]) -> dict[str, Open]:
 
 
 def recorded_apart(source: Open, name: str, taken: Iterable[str]) -> Open:
-    """A source whose recording has the robot's name in its file name.
+    """Return a source whose recording has the name of the robot in its file name.
 
     Args:
-        source, name: The run that is opened, and the robot's name.
+        source: The run that is opened.
+        name: Name of the robot.
         taken: Recordings of the other robots. Names that give the same file (`a/b`, `a_b`) are numbered.
     """
     if not source.record:
@@ -88,7 +92,7 @@ def recorded_apart(source: Open, name: str, taken: Iterable[str]) -> Open:
 
 
 def address_of(address: ZenohAddress, robot: str) -> str:
-    """The address of one robot at a router; "" is the robot without a namespace."""
+    """Return the address of one robot at a router; an empty `robot` is the robot without a namespace."""
     options = {"robot": robot or ROOT, "domain": str(address.domain) if address.domain else ""}
     options |= address.topics | address.files
     query = urlencode({name: value for name, value in options.items() if value}, safe="/")
@@ -101,12 +105,12 @@ _DISCOVERY_S, _SETTLED_S = 3.0, 0.7
 
 
 class RobotWatch:
-    """Adds each robot that appears at a router to a fleet. It receives no messages of theirs.
+    """Adds each robot that appears at a router to a fleet. It does not subscribe to messages of the robots.
 
     Args:
-        fleet: Gets the robots.
-        address: Of the router.
-        source: Odometry, seed, recording and publishing for all of them.
+        fleet: The fleet.
+        address: Address of the router.
+        source: Odometry, seed, recording and publishing for all robots.
     """
 
     def __init__(self, fleet: Fleet, address: ZenohAddress, source: Open) -> None:
@@ -115,11 +119,11 @@ class RobotWatch:
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Start to look."""
+        """Start to watch the router."""
         self._task = asyncio.create_task(self._watch(), name="watch robots")
 
     async def close(self) -> None:
-        """Leave the router."""
+        """Disconnect from the router."""
         await cancel(self._task)
         await asyncio.to_thread(self._link.close)
 
@@ -145,7 +149,7 @@ class RobotWatch:
 
 
 def robots_at(address: ZenohAddress) -> list[str]:
-    """The namespaces of the robots at a router, asked before the server starts; [] if it does not answer."""
+    """Return the namespaces of the robots at a router; [] if the router does not answer."""
     link = ZenohLink(address, Inbox())
     end = time.monotonic() + _DISCOVERY_S
     connected_s = None
@@ -177,13 +181,14 @@ def build_fleet(
     fleet: Fleet,
     watching: RobotWatch | RemoteRobots | None = None,
 ) -> FastAPI:
-    """The application.
+    """Return the application of the page of the fleet.
 
     Args:
-        settings: Of the deployment.
-        port: On which it is served, for Host and Origin.
-        token: That browsers must show.
-        fleet: The robots; watching: what adds further ones.
+        settings: Settings of the deployment.
+        port: Port on which it is served, to check Host and Origin.
+        token: Access token of browsers.
+        fleet: The robots.
+        watching: What adds further robots; None for nothing.
     """
 
     @asynccontextmanager
@@ -208,7 +213,7 @@ def build_fleet(
 
 @router.get("/")
 def fleet_page(request: Request) -> Response:
-    """The page of all robots."""
+    """Return the page of all robots."""
     return page_answer(request, page_folder() / "fleet.html")
 
 
@@ -229,7 +234,7 @@ def robot_page(request: Request, name: str) -> Response:
 
 @router.websocket("/api/fleet")
 async def fleet_live(browser: WebSocket) -> None:
-    """States of all robots as they change; nothing is taken."""
+    """Send the states of all robots as they change. Messages of the browser are ignored."""
     fleet: Fleet = browser.app.state.fleet
     with fleet.pages.place(role_of(browser.scope)) as free:
         if not free:
@@ -250,18 +255,18 @@ def serve_fleet(
     open_browser: bool,
     viewer: bool = False,
 ) -> int:
-    """Serve until SIGINT or SIGTERM.
+    """Serve until SIGINT or SIGTERM; return the exit code.
 
     Args:
-        settings: Of the deployment.
-        sources: What is open from the start, by name.
-        make_parameters: The parameters that each dashboard begins with.
-        watched: A router whose robots are added as they come, and how they are opened.
-        open_browser: Whether to show the page.
+        settings: Settings of the deployment.
+        sources: Runs that are open from the start, by name.
+        make_parameters: Returns the initial parameters of a dashboard.
+        watched: A router whose robots are added when they appear, and how they are opened; None for none.
+        open_browser: Whether to open the page in the browser of this machine.
         viewer: Whether to print the view-only link.
 
     Raises:
-        StemmapError: The port is in use, or the address is not one of this machine.
+        StemmapError: The port is in use, or the address is not an address of this machine.
     """
     listening = bind(settings)
     port = listening.getsockname()[1]

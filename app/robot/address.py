@@ -94,12 +94,12 @@ class VelodyneAddress(Address):
 
 
 def is_live(uri: str) -> bool:
-    """Whether a source is a live one."""
+    """Return whether a URI is the address of a live source."""
     return uri.lower().startswith((SCHEME, VELODYNE, DDS))
 
 
 def parse_address(uri: str) -> Address:
-    """Read an address.
+    """Return the address that a URI describes.
 
     Raises:
         SourceError: The address is invalid or has an unknown option.
@@ -180,7 +180,16 @@ def _zenoh(uri: str) -> ZenohAddress:
 
 
 def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
-    """Parse the options of an address, which must be known."""
+    """Return the options of an address by name.
+
+    Args:
+        uri: The address, for errors.
+        query: Text of the options.
+        names: Permitted names.
+
+    Raises:
+        SourceError: An option is unknown.
+    """
     options = dict(parse_qsl(query, keep_blank_values=True))
     unknown = sorted(options.keys() - set(names))
     if unknown:
@@ -197,12 +206,16 @@ def _domain(uri: str, options: dict[str, str]) -> int:
 
 
 def _topics(options: dict[str, str]) -> dict[str, str]:
-    """Topic by role where the user names it."""
+    """Return the topics that the user named, by role."""
     return {role: options[role] for role in _TOPICS if options.get(role)}
 
 
 def _files(uri: str, endpoint: str, named: dict[str, str]) -> dict[str, str]:
-    """Return the absolute paths of the certificates by role."""
+    """Return the absolute paths of the certificates by role.
+
+    Raises:
+        SourceError: A file is missing, or the endpoint does not use certificates.
+    """
     if named and endpoint.startswith("tcp/"):
         raise SourceError(
             "certificates need an encrypted connection", where=uri, remedy="Write tls/ in place of tcp/"

@@ -23,7 +23,7 @@ _STRING = "string"
 
 @cache
 def idl_type(msgtype: str) -> Any:  # noqa: ANN401 - cyclonedds is an extra, and imported where it is used
-    """The IDL structure of a message, under the name that ROS 2 gives it on the network.
+    """Return the IDL structure of a message, under the name that ROS 2 gives it on the network.
 
     Args:
         msgtype: In the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
@@ -59,7 +59,7 @@ _PREFIX, _LONGEST = "rt/", 256
 
 @dataclass(frozen=True, slots=True)
 class Offer:
-    """A writer as it announces itself.
+    """What a writer announces about itself.
 
     Attributes:
         topic, msgtype: In the ROS 2 spelling.
@@ -74,7 +74,13 @@ class Offer:
 
     @classmethod
     def of(cls, topic: str, type_name: str, *, reliable: bool, latched: bool) -> Offer | None:
-        """Return the offer of a writer; None where its topic is not one of ROS."""
+        """Return the offer of a writer; None if its topic is not a topic of ROS.
+
+        Args:
+            topic: Name of the topic on the network.
+            type_name: Name of the type on the network.
+            reliable, latched: See `Offer`.
+        """
         if len(topic) > _LONGEST or len(type_name) > _LONGEST or not topic.startswith(_PREFIX):
             return None
         name, kind = topic[len(_PREFIX) - 1 :], TYPE.fullmatch(type_name)
@@ -95,7 +101,13 @@ class DdsGraph:
         self._alive: dict[str, Offer] = {}
 
     def add(self, key: str, offer: Offer | None, losses: dict[str, int]) -> bool:
-        """Add a writer that was announced; return whether that changes anything."""
+        """Add a writer that was announced; return whether the set of topics changed.
+
+        Args:
+            key: Identifier of the writer.
+            offer: Its offer; None if it is not a writer of ROS.
+            losses: Counts writers for which there is no room.
+        """
         if offer is None or self._alive.get(key) == offer:
             return False
         if len(self._alive) >= MAX_ENDPOINTS:
@@ -114,7 +126,7 @@ class DdsGraph:
         return [Publisher(*each) for each in sorted(found)]
 
     def common(self, topic: str, msgtype: str) -> Offer | None:
-        """Return what all writers of a topic offer, None where there is none."""
+        """Return what all writers of a topic offer, None if there is no writer."""
         there = [o for o in self._alive.values() if (o.topic, o.msgtype) == (topic, msgtype)]
         if not there:
             return None
@@ -156,8 +168,8 @@ class DdsLink(Link):
     """Participant in a DDS domain.
 
     Args:
-        address: Of the domain.
-        inbox: Gets the messages.
+        address: Address of the domain.
+        inbox: Receives the messages.
     """
 
     def __init__(self, address: DdsAddress, inbox: Inbox) -> None:
@@ -169,12 +181,12 @@ class DdsLink(Link):
 
     @property
     def place(self) -> str:
-        """Where it listens, as text for the user."""
+        """Description of the domain for the user."""
         return f"in DDS domain {self._address.domain} on {self._address.interface or 'this machine'}"
 
     @property
     def nothing(self) -> str:
-        """Why no scan topic is chosen, as text for the user."""
+        """Reason why no scan topic is chosen, as text for the user."""
         wanted = f" below /{self._address.robot}" if self._address.robot else ""
         others = sorted({p.topic for p in self.publishers()})[:10]
         there = f" (there are: {', '.join(others)})" if others else ""
@@ -182,20 +194,20 @@ class DdsLink(Link):
         return f"no scans{wanted} are announced{there}{elsewhere}"
 
     def publishers(self) -> list[Publisher]:
-        """All topics that are written now."""
+        """Return all topics that are written now."""
         with self.lock:
             return self._graph.publishers()
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these topics."""
+        """Receive the messages of these channels from now on."""
         self._channels = tuple(channels)
 
     def failure(self, error: Exception) -> str:
-        """Why it takes no part in the domain."""
+        """Return the reason why the domain cannot be joined."""
         return f"cannot take part in DDS domain {self._address.domain}: {first_line(error)}"
 
     def receive(self) -> None:
-        """Take part in the domain until `close`."""
+        """Join the domain and receive messages until `close`."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
         from cyclonedds.core import WaitSet
         from cyclonedds.domain import Domain, DomainParticipant
@@ -221,7 +233,7 @@ class DdsLink(Link):
         del waiting, announced, participant, domain  # in this order; that leaves the network
 
     def _note(self, announced: Any) -> None:  # noqa: ANN401
-        """Take the announcements and withdrawals since the last call."""
+        """Process the announcements and withdrawals of writers since the last call."""
         from cyclonedds.core import InstanceState
 
         for found in announced.take(100):

@@ -33,18 +33,18 @@ _Lane = deque[tuple[int, Message]]
 
 
 class ArrivalTimes:
-    """Times of arrival that only ever grow, even if the system clock is set meanwhile."""
+    """Times of arrival that always increase, even if the system clock is set back."""
 
     def __init__(self) -> None:
         self._wall_ns, self._start_ns = time.time_ns(), time.monotonic_ns()
         self._last_ns = 0
 
     def now_ns(self) -> int:
-        """The present time [ns since 1970]; never before an earlier one."""
+        """Return the present time [ns since 1970]; never less than an earlier result."""
         return self._wall_ns + time.monotonic_ns() - self._start_ns
 
     def next_ns(self) -> int:
-        """The present time [ns since 1970], later than every time that this method returned before."""
+        """Return the present time [ns since 1970], greater than every earlier result of this method."""
         self._last_ns = max(self.now_ns(), self._last_ns + 1)
         return self._last_ns
 
@@ -53,13 +53,14 @@ class Inbox:
     """Queue between the threads of a network library, which fill it, and the mapping loop, which empties it.
 
     Each message goes to the recorder first. When the queue is full, the oldest scans are skipped, because a
-    live map needs the newest; the recorder is told which. The publisher is never delayed, since it may be
-    the robot's own driver. Pictures have a queue of their own.
+    live map needs the newest; the recorder stores which were skipped. The publisher is never delayed, since
+    it may be the robot's own driver. Pictures have a queue of their own.
 
     Attributes:
-        losses: Number of messages that were skipped, by reason.
+        losses: Number of skipped messages, by reason.
         early_scans: Number of scans that were skipped before the first call of `take`.
-        pictures_arrived, pictures_accepted: Number of pictures that arrived, and that the rate limit let in.
+        pictures_arrived, pictures_accepted: Number of pictures that arrived, and that the rate limit
+            accepted.
     """
 
     def __init__(self) -> None:
@@ -93,7 +94,12 @@ class Inbox:
         self._recorder, self._fixed_channels = recorder, frozenset(fixed)
 
     def put(self, message: Message, *, is_scan: bool) -> None:
-        """Record and queue a message; the oldest ones are skipped where there is no room."""
+        """Record and queue a message; without room, the oldest messages are skipped.
+
+        Args:
+            message: The message.
+            is_scan: Whether it is a scan; other messages are skipped last.
+        """
         with self._lock:
             if self._recorder is not None:
                 self._recorder.add(message)
@@ -108,7 +114,12 @@ class Inbox:
                 self._bytes -= self._skip(self._others, OTHERS_SKIPPED)
 
     def wants_picture(self, arrival_ns: int, size: int) -> bool:
-        """Count a picture; return whether the rate limit lets it in. Called before its bytes are copied."""
+        """Count a picture; return whether the rate limit accepts it. Called before its bytes are copied.
+
+        Args:
+            arrival_ns: Time of arrival [ns].
+            size: Number of bytes.
+        """
         with self._lock:
             self.pictures_arrived += 1
             if size > LARGEST_PICTURE:
@@ -149,7 +160,7 @@ class Inbox:
             return message
 
     def end(self) -> None:
-        """Stop recording. The recorder is told that the messages still queued are not mapped."""
+        """Stop recording. Messages that are still queued are recorded as skipped."""
         with self._lock:
             recorder, self._recorder = self._recorder, None
             if recorder is not None:

@@ -23,20 +23,20 @@ _CLOSE_S = 5.0
 
 
 class Link(ABC):
-    """A connection, in a thread of its own that tries again until `close`.
+    """A connection to a robot, in a thread that connects again after an error until `close`.
 
     A subclass starts `thread` at the end of its constructor.
 
     Args:
-        inbox: Gets the messages.
+        inbox: Receives the messages.
         name: Name of the thread.
 
     Attributes:
-        problem: Why there is no connection, "" while there is one.
+        problem: Reason why there is no connection, "" while there is one.
         losses: Number of messages lost before the inbox, by reason.
         scans: Number of scans that arrived.
-        version: Grows with every change among the publishers.
-        session: Session on which results can be published, None where there is none.
+        version: Number of changes among the publishers so far.
+        session: Session on which results can be published, None if there is none.
     """
 
     session: Any = None
@@ -53,28 +53,29 @@ class Link(ABC):
     @property
     @abstractmethod
     def place(self) -> str:
-        """Where it listens, as text for the user."""
+        """Description of the connection for the user."""
 
     @property
     @abstractmethod
     def nothing(self) -> str:
-        """Why no scan topic is chosen, as text for the user."""
+        """Reason why no scan topic is chosen, as text for the user."""
 
     @abstractmethod
     def publishers(self) -> list[Publisher]:
-        """All topics that are published now, each once."""
+        """Return all topics that are published now, each once."""
 
     @abstractmethod
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these topics."""
+        """Receive the messages of these channels from now on."""
 
     @abstractmethod
     def receive(self) -> None:
-        """Connect and receive until `close`. Any error is reported as `problem`, and this is called again."""
+        """Connect and receive messages until `close`. After an exception, `problem` has its text and the
+        method is called again."""
 
     @abstractmethod
     def failure(self, error: Exception) -> str:
-        """The text of `problem` for an error."""
+        """Return the text of `problem` for an exception."""
 
     @property
     def silence_s(self) -> float | None:
@@ -91,7 +92,13 @@ class Link(ABC):
         self.thread.join(timeout=_CLOSE_S)
 
     def take(self, channel: Channel, payload: Any, size: int) -> None:  # noqa: ANN401 - bytes of a library
-        """Count a message and put it into the inbox; bytes are copied only of what the inbox accepts."""
+        """Count a message and put it into the inbox; bytes are copied only if the inbox accepts them.
+
+        Args:
+            channel: Channel of the message.
+            payload: Bytes, or an object of a library that holds them.
+            size: Number of bytes.
+        """
         is_scan = channel.msgtype in SCAN_TYPES
         with self.lock:
             if is_scan:
@@ -116,6 +123,6 @@ class Link(ABC):
 
 
 def first_line(error: Exception) -> str:
-    """The first line of a library's error, without places in its source code."""
+    """Return the first line of the text of an exception, without positions in source code."""
     first = str(error).partition("\n")[0].partition(" at ")[0].rstrip("!; ")
     return first[:200] or type(error).__name__

@@ -53,7 +53,11 @@ class PictureStore:
         self.losses: dict[str, int] = {}
 
     def is_due(self, path: Path) -> bool:
-        """Whether the robot has moved far enough since the last stored picture."""
+        """Return whether the robot has moved far enough since the last stored picture.
+
+        Args:
+            path: Path up to the present pose.
+        """
         if not len(path.x):
             return False
         here = float(path.x[-1]), float(path.y[-1]), float(path.yaw[-1])
@@ -64,7 +68,12 @@ class PictureStore:
         return math.hypot(here[0] - x, here[1] - y) >= STEP_M or turned >= TURN_RAD
 
     def add(self, picture: Picture, path: Path) -> None:
-        """Store a picture that was taken at the end of a path."""
+        """Store a picture.
+
+        Args:
+            picture: The picture.
+            path: Path up to the pose at which it was taken.
+        """
         self._last = float(path.x[-1]), float(path.y[-1]), float(path.yaw[-1])
         if picture.stamp_ns in self._kept:
             return

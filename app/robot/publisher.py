@@ -20,9 +20,9 @@ class RosPublisher:
     """Publishes pose, path and trees below `/<robot>/stemmap/`.
 
     Args:
-        session: Of zenoh, to the robot's router.
+        session: Session of zenoh with the router of the robot.
         domain: ROS_DOMAIN_ID.
-        robot: The robot's namespace, "" for none.
+        robot: Namespace of the robot, "" for none.
     """
 
     def __init__(self, session: Any, domain: int, robot: str) -> None:  # noqa: ANN401
@@ -43,7 +43,7 @@ class RosPublisher:
             self._publishers[topic] = _Topic(session, key, token, latched=topic in outputs.LATCHED)
 
     def name(self, topic: str) -> str:
-        """The full name of a topic."""
+        """Return the full name of a topic."""
         return f"{self._prefix}/{topic}"
 
     def publish(self, messages_by_topic: Mapping[str, bytes]) -> None:
@@ -56,7 +56,8 @@ class RosPublisher:
 
 
 class _Topic:
-    """One topic; its messages have a number, a time and a publisher id, as those of rmw_zenoh."""
+    """A published topic. Its messages have a sequence number, a time and a publisher id, as those of
+    rmw_zenoh."""
 
     def __init__(self, session: Any, key: str, token: str, *, latched: bool) -> None:  # noqa: ANN401
         import zenoh

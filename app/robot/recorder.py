@@ -33,15 +33,15 @@ _Work = Callable[[LiveWriter], None]
 
 
 class Recorder:
-    """Writes one file in a thread of its own. Every method may be called from any thread and returns at once,
+    """Writes one file in a separate thread. Every method may be called from any thread and returns at once,
     except `close`.
 
     Args:
-        path: Of the file. If it exists, a number is appended to the name.
+        path: The file. If it exists, a number is appended to the name.
 
     Attributes:
-        path: Of the file that is written.
-        problem: Why the recording ended before the run; "" while it works.
+        path: The file that is written.
+        problem: Reason why the recording ended before the run; "" otherwise.
         losses: Number of messages that were not recorded, by reason.
 
     Raises:
@@ -68,7 +68,7 @@ class Recorder:
 
     @property
     def status(self) -> str:
-        """One line for the user: the file and its size, or why the recording ended."""
+        """The file and its size, or the reason why the recording ended, as one line."""
         if self.problem:
             return f"not recording: {self.problem}"
         lost = sum(self.losses.values())
@@ -76,10 +76,10 @@ class Recorder:
         return f"recording {self.path.name}, {self._file.tell() / 1e6:.0f} MB{missing}"
 
     def begin(self, channels: Sequence[Channel], header: Mapping[str, Any], robot: str) -> None:
-        """Write the head of the file and start the thread.
+        """Write the beginning of the file and start the thread.
 
         Args:
-            channels: Of the robot's topics; messages refer to their numbers.
+            channels: Channels of the robot, whose numbers messages refer to.
             header: Address and topics of the run, as JSON values.
             robot: Namespace of the robot, "" for none.
         """
@@ -100,7 +100,7 @@ class Recorder:
         self._put(len(message.payload), lambda writer: writer.add(message))
 
     def skip(self, message: Message) -> None:
-        """Note that the mapping does not use a message that was recorded."""
+        """Record that the mapping did not use a message that was recorded."""
         with self._lock:
             self._skipped.setdefault(message.channel, []).append(message.log_ns)
 
@@ -110,11 +110,17 @@ class Recorder:
         self._put(size, lambda writer: writer.add_outputs(messages_by_topic))
 
     def add_parameters(self, revision: int, from_scan: int, values: Mapping[str, Any]) -> None:
-        """Record parameters that apply from a mapped scan onwards."""
+        """Record parameters that apply from a mapped scan onwards.
+
+        Args:
+            revision: Number of the revision.
+            from_scan: Index of the first scan that is mapped with them.
+            values: Values by stage and name.
+        """
         self._put(0, lambda writer: writer.add_parameters(revision, from_scan, values))
 
     def close(self) -> None:
-        """Write what is queued and the index, and close the file; delete it if nothing was heard."""
+        """Write the queued messages and the index, and close the file. A file without messages is deleted."""
         self._closing.set()
         with self._lock:
             thread = self._thread

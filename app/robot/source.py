@@ -1,4 +1,4 @@
-"""A live robot as a source of records. Reading never waits for a message unless that is asked for."""
+"""A live robot as a source of records. Reading waits for a message only in `records` and `wait`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ MakeLink = Callable[[Any, Inbox], Link]
 
 
 def link_for(address: Address) -> tuple[MakeLink, str]:
-    """Return the class of the connection for an address, and the kind of such a source for the user."""
+    """Return the class of the connection for an address, and a name of such sources for the user."""
     if isinstance(address, VelodyneAddress):
         return VelodyneLink, VELODYNE_KIND
     return (DdsLink, DDS_KIND) if isinstance(address, DdsAddress) else (ZenohLink, KIND)
@@ -50,16 +50,17 @@ _MAP_PAUSE_S = 1.0
 
 
 class LiveSource:
-    """Records of the messages that a robot sends from now on. They cannot be read again; a recording can.
+    """Records of the messages that a robot sends from now on. They cannot be read again, but a recording of
+    them can.
 
     A thread of the source watches the robot: it chooses the topics, starts the recorder and subscribes,
-    whatever the mapping does meanwhile.
+    independently of the mapping.
 
     Args:
-        address: Of the robot.
+        address: Address of the robot.
         options: Topics and mounting that the user chose.
-        make_link: Makes the connection from the address and the inbox.
-        kind: Of the source, for the user.
+        make_link: Returns the connection for the address and the inbox.
+        kind: Name of such sources for the user.
     """
 
     def __init__(
@@ -93,10 +94,10 @@ class LiveSource:
         self._watch: threading.Thread | None = None
 
     def start(self, recorder: Recorder | None = None, *, publish: bool = False) -> None:
-        """Begin to listen.
+        """Start to receive messages.
 
         Args:
-            recorder: Takes every message that arrives; the source closes it.
+            recorder: Records every message that arrives; the source closes it.
             publish: Whether results are published on the robot's network.
         """
         self._recorder, self._publishes = recorder, publish
@@ -107,10 +108,10 @@ class LiveSource:
 
     @property
     def description(self) -> SourceDescription:
-        """The description of the source; see `ready`.
+        """Description of the source; see `ready`.
 
         Raises:
-            SourceError: Nothing was heard yet.
+            SourceError: No scan has arrived yet.
         """
         known = None if self._reader is None else self._reader.description
         if known is None or self._choice is None:
@@ -131,10 +132,13 @@ class LiveSource:
         return {**self._link.losses, **self._inbox.losses, **recorder, **read, **kept}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records as they come, until `stop`; waits for them.
+        """Yield records when they arrive, until `stop`.
+
+        Args:
+            start_ns: Must be None, because a live run cannot be read again.
 
         Raises:
-            SourceError: A message cannot be read, or the run is to be read again.
+            SourceError: A message cannot be read, or `start_ns` is given.
         """
         if start_ns is not None:
             raise SourceError("a live run cannot be read again", where=self.uri, remedy="Open its recording.")
@@ -148,7 +152,7 @@ class LiveSource:
             yield from self._reader.finish()
 
     def truth(self) -> Truth | None:
-        """A live run has no ground truth."""
+        """Return None: a live run has no ground truth."""
         return None
 
     def close(self) -> None:
@@ -162,7 +166,7 @@ class LiveSource:
             self._kept.close()
 
     def end_recording(self) -> None:
-        """Finish the file of the recording; may be called from any thread, while another one maps."""
+        """Finish the recording; may be called from any thread while another one maps."""
         self._inbox.end()
         if self._recorder is not None:
             self._recorder.close()
@@ -174,7 +178,7 @@ class LiveSource:
         return (None, "") if self._camera is None else self._camera.camera(self._base)
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the recent picture nearest to a time, None where it differs by more than `within_ns`."""
+        """Return the recent picture nearest to a time [ns], None if none is within `within_ns` of it."""
         return None if self._camera is None else self._camera.near(stamp_ns, self._offset_ns, within_ns)
 
     def picture_stamps(self) -> list[int]:
@@ -187,7 +191,7 @@ class LiveSource:
 
     @property
     def picture_counts(self) -> str:
-        """Numbers of pictures that arrived and were accepted, as text; "" where there is no camera."""
+        """Numbers of pictures that arrived and were accepted, as text; "" without a camera."""
         if self._camera is None:
             return ""
         lost = sum(self._inbox.losses.get(reason, 0) for reason in (PICTURES_SKIPPED, PICTURES_TOO_LARGE))
@@ -197,10 +201,13 @@ class LiveSource:
         )
 
     def keep_pictures(self, folder: FilePath) -> None:
-        """Store pictures on the disk of a folder, for the pictures of trees at the end of the run.
+        """Store pictures during the run, for the pictures of trees at its end.
+
+        Args:
+            folder: Folder on whose disk they are stored.
 
         Raises:
-            OSError: The file for them cannot be created.
+            OSError: The file cannot be created.
         """
         self._kept = PictureStore(folder)
 
@@ -213,16 +220,16 @@ class LiveSource:
 
     @property
     def robot(self) -> str:
-        """Namespace of the robot, "" for none, or before it is known."""
+        """Namespace of the robot, "" for none or before it is known."""
         return "" if self._choice is None else self._choice.robot
 
     @property
     def robots(self) -> list[str]:
-        """The namespaces of all robots that publish scans now."""
+        """Namespaces of all robots that publish scans now."""
         return self._link.robots()
 
     def publishers(self) -> list[Publisher]:
-        """All topics that are published on the network of the robot, each once."""
+        """Return all topics that are published on the network of the robot, each once."""
         return self._link.publishers()
 
     @property
@@ -232,11 +239,16 @@ class LiveSource:
 
     @property
     def recording(self) -> str:
-        """The state of the recording in one line, "" where there is none."""
+        """State of the recording in one line, "" without one."""
         return "" if self._recorder is None else self._recorder.status
 
     def mapped(self, frame: Frame, path: Path) -> None:
-        """Publish and record the results of a scan, and keep its picture where one is due."""
+        """Publish and record the results of a scan, and store its picture if one is due.
+
+        Args:
+            frame: Results of the scan.
+            path: Path up to the scan.
+        """
         if self._camera is not None and self._kept is not None and self._kept.is_due(path):
             picture = self.picture_near(frame.stamp_ns)
             if picture is not None:
@@ -254,16 +266,22 @@ class LiveSource:
             self._recorder.add_outputs(messages)
 
     def use_parameters(self, revision: int, from_scan: int, parameters: Parameters) -> None:
-        """Record parameters that apply from a mapped scan onwards."""
+        """Record parameters that apply from a mapped scan onwards.
+
+        Args:
+            revision: Number of the revision.
+            from_scan: Index of the first scan that is mapped with them.
+            parameters: The parameters.
+        """
         if self._recorder is not None:
             self._recorder.add_parameters(revision, from_scan, parameters.model_dump())
 
     def stop(self) -> None:
-        """End `records`; may be called in a signal handler."""
+        """End the iteration of `records`; may be called in a signal handler."""
         self._ending.set()
 
     def listen(self) -> bool:
-        """Take the messages that arrived before the description was known; return whether it is known now.
+        """Process the messages that arrived before the description was known; return whether it is known now.
 
         Raises:
             SourceError: A message cannot be read.
@@ -278,7 +296,7 @@ class LiveSource:
         return self.ready
 
     def wait(self) -> bool:
-        """Listen until the description is known or `stop` is called; return whether it is known.
+        """Process messages until the description is known or `stop` is called; return whether it is known.
 
         Raises:
             SourceError: A message cannot be read.
@@ -288,7 +306,7 @@ class LiveSource:
         return self.ready
 
     def take(self) -> list[Record]:
-        """Return the records of the next message that has any; [] when none waits.
+        """Return the records of the next message that has any; [] if no message is queued.
 
         Raises:
             SourceError: A message cannot be read.
@@ -309,12 +327,12 @@ class LiveSource:
         return []
 
     def notices(self) -> list[str]:
-        """Return notices since the last call, such as a lost robot."""
+        """Return the messages for the user since the last call, for example about a lost robot."""
         notices, self._notices = self._notices, []
         return notices
 
     def waiting_for(self) -> str:
-        """Why no scans arrive, as text; "" while they arrive."""
+        """Return why no scans arrive, as text; "" while they arrive."""
         silence_s = self._link.silence_s
         if self._choice is not None and silence_s is not None and silence_s < SILENT_S:
             return ""
@@ -357,7 +375,7 @@ class LiveSource:
             )
 
     def _note_presence(self, choice: Choice) -> None:
-        """Note whether the scans of the robot are still announced."""
+        """Update whether the scans of the robot are still announced."""
         self._version = self._link.version
         publishers = self._link.publishers()
         scan = choice.channels[0].topic
@@ -397,10 +415,14 @@ class LiveSource:
 
 
 def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
-    """Begin to listen; returns at once.
+    """Connect to a live source and return it at once; `LiveSource.start` begins to read its topics.
+
+    Args:
+        uri: Address of the robot.
+        options: Topics and mounting that the user chose.
 
     Raises:
-        SourceError: The address is invalid.
+        SourceError: The address is invalid, or names robots that cannot be mapped here.
     """
     address, chosen = parse_address(uri), options or SourceOptions()
     make_link, kind = link_for(address)

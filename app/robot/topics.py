@@ -35,8 +35,8 @@ class Publisher:
     """A published topic.
 
     Attributes:
-        robot: The publisher's namespace without slashes at its ends, "" for none.
-        topic: With its leading slash.
+        robot: Namespace of the publisher without slashes at its ends, "" for none.
+        topic: Name with its leading slash.
         msgtype: In the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
     """
 
@@ -60,11 +60,10 @@ class Choice:
     """The topics of a robot that are read.
 
     Attributes:
-        robot: Its namespace, "" for none.
-        channels: To subscribe to; their numbers count from 1.
+        robot: Namespace of the robot, "" for none.
+        channels: Channels of the topics, numbered from 1.
         warnings: Other topics and robots that could have been chosen.
-        camera: The channels of the pictures and of their CameraInfo where they exist, numbered after the
-            others.
+        camera: Channels of the pictures and of their CameraInfo if there are any, numbered after the others.
     """
 
     robot: str
@@ -74,19 +73,16 @@ class Choice:
 
 
 def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], where: str) -> Choice | None:
-    """Choose the topics of one robot.
+    """Return the topics of one robot that are read; None while no such robot publishes scans.
 
     Args:
-        publishers: Alive now.
-        robot: Namespace that is wanted, ROOT for none, "" for the first one by name that sends scans.
+        publishers: Present publishers.
+        robot: Namespace of the robot, ROOT for none, "" for the first one by name that publishes scans.
         topics: Topic by role where the user named it.
         where: The address, for errors.
 
-    Returns:
-        None while there is no scan of such a robot.
-
     Raises:
-        SourceError: A topic that the user named is of another type.
+        SourceError: A topic that the user named has another type.
     """
     there = [p for p in publishers if OWN not in p.topic.split("/")[:-1]]
     named = topics.get("scan")
@@ -164,7 +160,7 @@ def _refuse_wrong_type(
 
 
 def _derived(publisher: Publisher) -> bool:
-    """Whether the name suggests that a cloud is not a raw sweep of a LiDAR."""
+    """Return whether the name of a topic suggests that its clouds are not raw sweeps of a LiDAR."""
     return _has_word(publisher, _DERIVED)
 
 
@@ -173,7 +169,8 @@ def _has_word(publisher: Publisher, words: tuple[str, ...]) -> bool:
 
 
 def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
-    """A planar laser comes last, because it is a safety sensor where there is a LiDAR too."""
+    """Return the sort key of a scan topic. A planar laser comes last, because with a LiDAR it is a safety
+    sensor."""
     kind = publisher.msgtype
     return kind == LASER_SCAN, _derived(publisher), kind == VELODYNE_SCAN, publisher.robot, publisher.topic
 
@@ -188,7 +185,8 @@ def _imu_rank(publisher: Publisher) -> tuple[object, ...]:
 
 
 def _picture_rank(publisher: Publisher) -> tuple[object, ...]:
-    """Compressed pictures come first; they have a tenth of the size."""
+    """Return the sort key of a picture topic. Compressed pictures come first; they have a tenth of the
+    size."""
     return publisher.msgtype != COMPRESSED_IMAGE, publisher.topic
 
 
@@ -210,8 +208,13 @@ def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | 
 
 
 def countable(publishers: Sequence[Publisher], most: int) -> list[Channel]:
-    """Return a channel for each readable topic, numbered as its publisher. The others may be of any size and
-    are not received."""
+    """Return a channel for each topic whose type is read, numbered by its position in `publishers`. Other
+    topics may have messages of any size and are not received.
+
+    Args:
+        publishers: Present publishers.
+        most: Maximum number of publishers that are considered.
+    """
     return [
         Channel(k, each.topic, each.msgtype, "cdr", "", "", 0)
         for k, each in enumerate(publishers[:most])

@@ -26,7 +26,7 @@ _TURN, _HALF = 36_000, 18_000
 
 
 class Sweeps:
-    """Joins packets of one sensor to sweeps of one turn. A sweep has the time of its last packet."""
+    """Joins the packets of one sensor to sweeps of one turn. A sweep has the time of its last packet."""
 
     def __init__(self) -> None:
         self._packets: list[tuple[int, bytes]] = []
@@ -51,7 +51,8 @@ class Sweeps:
         return ended
 
     def is_stale(self, now_ns: int) -> bool:
-        """Whether the pause since the last packet ends the sweep."""
+        """Return whether the time since the last packet is so long that the sweep is complete; `now_ns` is
+        the present time [ns]."""
         return bool(self._packets) and now_ns - self._packets[-1][0] > GAP_NS
 
     def end(self) -> bytes | None:
@@ -93,11 +94,11 @@ OTHER_SENSOR = "packets of other sensors"
 
 
 class VelodyneLink(Link):
-    """Receiver of a sensor's packets. It looks like a robot with one topic.
+    """Receiver of the packets of a sensor, with the interface of a robot with one topic.
 
     Args:
-        address: Where to listen, and to which sender.
-        inbox: Gets the sweeps.
+        address: Address on which it listens, and address of the sender.
+        inbox: Receives the sweeps.
     """
 
     def __init__(self, address: VelodyneAddress, inbox: Inbox) -> None:
@@ -111,19 +112,19 @@ class VelodyneLink(Link):
 
     @property
     def place(self) -> str:
-        """The connection in words, for the user."""
+        """Description of the connection for the user."""
         sender = self._address.sender or "this machine"
         return f"listening on {self._address.host}:{self._address.port} to {sender}"
 
     @property
     def nothing(self) -> str:
-        """Why there are no scans, in words."""
+        """Reason why there are no scans, as text for the user."""
         refused = self.losses.get(OTHERS, 0)
         others = f"; {refused} packets of other senders were refused" if refused else ""
         return f"no data packet of a known sensor came{others}"
 
     def publishers(self) -> list[Publisher]:
-        """The sensor, while it sends."""
+        """Return the topic of the sensor; [] while it does not send."""
         return [Publisher("", TOPIC, VELODYNE_SCAN)] if self._there else []
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
@@ -131,7 +132,7 @@ class VelodyneLink(Link):
         self._number = channels[0].number
 
     def failure(self, error: Exception) -> str:
-        """Why it cannot listen."""
+        """Return the reason why the port cannot be used."""
         reason = (error.strerror if isinstance(error, OSError) else "") or repr(error)
         return f"cannot listen on {self._address.host}:{self._address.port}: {reason}"
 
@@ -159,7 +160,7 @@ class VelodyneLink(Link):
         return listening
 
     def _pause(self) -> None:
-        """Handle a silence: a short one ends the sweep, after a long one the sensor counts as gone."""
+        """Handle a pause: a short one completes the sweep, after a long one the sensor counts as absent."""
         if self._sweeps.is_stale(self.times.now_ns()):
             self._hand_over(self._sweeps.end())
         silence_s = self.silence_s

@@ -21,10 +21,10 @@ _LONGEST_TOKEN = 1000
 
 
 def publisher_of(token: str) -> Publisher | None:
-    """Parse a token; None if it is not that of a publisher.
+    """Return the publisher of a liveliness token; None for other tokens.
 
-    Its form is `@ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>`, and for an
-    endpoint `/<topic>/<type>/<hash>/<qos>` after it. A slash inside of a part is written `%`.
+    A token is `@ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>`, followed for
+    an endpoint by `/<topic>/<type>/<hash>/<qos>`. A slash inside of a part is written `%`.
     """
     parts = token.split("/")
     if len(token) > _LONGEST_TOKEN or len(parts) != 13 or parts[0] != ADMIN or parts[5] != PUBLISHER:
@@ -38,19 +38,27 @@ def publisher_of(token: str) -> Publisher | None:
 
 
 def data_key(domain: int, topic: str, msgtype: str, type_hash: str = "*") -> str:
-    """The key of a topic's messages; any hash of the type unless one is given."""
+    """Return the key of the messages of a topic.
+
+    Args:
+        domain: ROS_DOMAIN_ID.
+        topic: Name of the topic.
+        msgtype: In the ROS 2 spelling.
+        type_hash: Hash of the type; "*" for any.
+    """
     package, _, name = msgtype.split("/")
     return f"{domain}/{topic.lstrip('/')}/{package}::msg::dds_::{name}_/{type_hash}"
 
 
 class RosGraph:
-    """The publishers that are alive now, by liveliness token."""
+    """The present publishers, by liveliness token."""
 
     def __init__(self) -> None:
         self._alive: dict[str, Publisher] = {}
 
     def add(self, token: str) -> bool:
-        """Add a token. Returns False if there is no room; a token that is not a publisher's needs none."""
+        """Add a token; return False if there is no room. Tokens of other entities than publishers are
+        ignored."""
         publisher = publisher_of(token)
         if publisher is None or token in self._alive:
             return True
@@ -64,7 +72,7 @@ class RosGraph:
         self._alive.pop(token, None)
 
     def publishers(self) -> list[Publisher]:
-        """All publishers, each once, sorted by robot and topic."""
+        """Return all publishers, each once, sorted by robot and topic."""
         return sorted(set(self._alive.values()), key=lambda p: (p.robot, p.topic, p.msgtype))
 
 
@@ -77,10 +85,11 @@ _TLS = {"ca": "root_ca_certificate", "cert": "connect_certificate", "key": "conn
 
 
 def configuration(endpoint: str, files: Mapping[str, str] | None = None) -> str:
-    """The session's configuration as JSON: a client of one router that neither listens nor scouts.
+    """Return the configuration of the session as JSON: a client of one router that neither listens nor
+    scouts.
 
     Args:
-        endpoint: Of the router.
+        endpoint: Endpoint of the router.
         files: Paths of certificates by role, see `ZenohAddress`.
     """
     tls: dict[str, Any] = {_TLS[name]: path for name, path in (files or {}).items()}
@@ -105,8 +114,8 @@ class ZenohLink(Link):
     """Connection to a router.
 
     Args:
-        address: Of the router.
-        inbox: Gets the messages.
+        address: Address of the router.
+        inbox: Receives the messages.
     """
 
     def __init__(self, address: ZenohAddress, inbox: Inbox) -> None:
@@ -120,12 +129,12 @@ class ZenohLink(Link):
 
     @property
     def place(self) -> str:
-        """The connection in words, for the user."""
+        """Description of the connection for the user."""
         return f"connected to {self._address.endpoint}"
 
     @property
     def nothing(self) -> str:
-        """Why no scan topic is chosen, in words."""
+        """Reason why no scan topic is chosen, as text for the user."""
         if self.robots() and not self._address.robot and not self._address.topics:
             return "a robot was found, its topics are being chosen"
         robot = self._address.robot
@@ -135,12 +144,13 @@ class ZenohLink(Link):
         return f"no scans of {wanted} are announced in ROS domain {self._address.domain}{there}"
 
     def publishers(self) -> list[Publisher]:
-        """All publishers that are alive."""
+        """Return all present publishers."""
         with self.lock:
             return self._graph.publishers()
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of further topics; publishers of fixed transforms repeat their last ones."""
+        """Receive the messages of further channels; publishers of fixed transforms repeat their last
+        messages."""
         self._channels = (*self._channels, *channels)
         if self.session is not None:
             self._subscriptions += [self._subscribe_to(channel) for channel in channels]
@@ -165,7 +175,7 @@ class ZenohLink(Link):
             self._disconnect()
 
     def failure(self, error: Exception) -> str:
-        """Why there is no connection."""
+        """Return the reason why there is no connection."""
         return f"no connection to {self._address.endpoint}: {first_line(error)}"
 
     def _connect(self) -> None:
@@ -185,7 +195,7 @@ class ZenohLink(Link):
         ]
 
     def _watch(self) -> None:
-        """Report whether the router is there, until `close`; zenoh reconnects by itself."""
+        """Update until `close` whether the router is connected; zenoh reconnects by itself."""
         while not self.closing.is_set():
             is_connected = bool(self.session.info.routers_zid())
             self.problem = "" if is_connected else f"no connection to {self._address.endpoint}"
@@ -216,7 +226,14 @@ class ZenohLink(Link):
         self.take(channel, sample.payload, len(sample.payload))
 
     def _count_gap(self, number: int, attachment: bytes, reason: str) -> None:
-        """Count lost messages: rmw_zenoh numbers the messages of a publisher, so a gap is a loss."""
+        """Count lost messages. rmw_zenoh numbers the messages of a publisher, so a gap in the numbers is a
+        loss.
+
+        Args:
+            number: Number of the channel.
+            attachment: Attachment of a message with its number.
+            reason: Reason under which losses are counted.
+        """
         if len(attachment) < _ATTACHMENT.size:
             return
         sequence, _stamp, _length = _ATTACHMENT.unpack_from(attachment)

@@ -1,4 +1,4 @@
-"""The 3D scene with its sliders. Nothing outside of this package knows viser."""
+"""The 3D scene with its sliders. Only this package uses viser."""
 
 from app.scene.panel import SceneCommands
 from app.scene.scene import Scene

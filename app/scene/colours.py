@@ -67,19 +67,23 @@ _RAMP = np.array(
 
 
 def by_verdict(verdicts: NDArray[np.integer]) -> Colours:
-    """Return the colour of each verdict, shape (K, 3)."""
+    """Return the colour of each verdict, uint8, shape (K, 3).
+
+    Args:
+        verdicts: Values of `Verdict`, shape (K,).
+    """
     chosen: Colours = _BY_VERDICT[np.clip(verdicts, 0, len(_BY_VERDICT) - 1)]
     return chosen
 
 
 def by_category(numbers: NDArray[np.integer]) -> Colours:
-    """Return a hue for each number, shape (K, 3); equal numbers have equal hues."""
+    """Return a colour for each number, uint8, shape (K, 3); equal numbers have equal colours."""
     chosen: Colours = _CATEGORIES[np.asarray(numbers) % len(_CATEGORIES)]
     return chosen
 
 
 def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
-    """Return colours from violet (`low`) to yellow (`high`), shape (K, 3); NaN counts as `high`."""
+    """Return colours from violet (`low`) to yellow (`high`), uint8, shape (K, 3); NaN counts as `high`."""
     t = (np.nan_to_num(values, nan=high, posinf=high, neginf=low) - low) / max(high - low, 1e-9)
     place = np.clip(t, 0.0, 1.0) * (len(_RAMP) - 1)
     rgb = np.stack([np.interp(place, np.arange(len(_RAMP)), _RAMP[:, c]) for c in range(3)], axis=-1)
@@ -87,7 +91,13 @@ def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
 
 
 def of_points(cluster_colours: Colours, labels: NDArray[np.integer], noise: Rgb) -> Colours:
-    """Return the colour of the cluster of each point, `noise` for label -1, shape (M, 3)."""
+    """Return the colour of each point, uint8, shape (M, 3).
+
+    Args:
+        cluster_colours: Colour of each cluster, shape (K, 3).
+        labels: Cluster of each point, -1 for none, shape (M,).
+        noise: Colour of points without a cluster.
+    """
     table = np.vstack([cluster_colours.reshape(-1, 3), np.array([noise], dtype=np.uint8)])
     chosen: Colours = table[labels]
     return chosen
@@ -99,9 +109,9 @@ def choose(first: NDArray[np.bool_], one: Rgb, other: Rgb) -> Colours:
 
 
 def of_lines(each: NDArray[np.uint8]) -> Colours:
-    """Return the colours that viser needs to draw lines in these colours.
+    """Return the colours with which viser draws lines in the colours `each`, uint8, of the same shape.
 
-    Its client treats the colours of lines as linear light and converts them to sRGB once more.
+    Its client treats the colours of lines as linear light and converts them to sRGB again.
     """
     c = each / 255.0
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)

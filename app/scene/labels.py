@@ -22,7 +22,7 @@ NUMBER_WIDTH, WORDS_WIDTH = 0.05, 0.11
 
 @dataclass(frozen=True, slots=True)
 class Label:
-    """A text at a place in the frame of the map [m]; `key` identifies the labelled object."""
+    """A text at a position in the frame of the map [m]; `key` identifies the labelled object."""
 
     key: int
     text: str
@@ -30,7 +30,7 @@ class Label:
 
 
 class LabelNodes:
-    """A pool of label nodes. A node stays with its key, so that an unchanged text is not sent again."""
+    """A pool of label nodes. A node keeps its object, so that an unchanged text is not sent again."""
 
     def __init__(self, scene: viser.SceneApi, name: str, scale: float = 0.9) -> None:
         self._scene, self._name, self._scale = scene, name, scale
@@ -139,7 +139,7 @@ def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def short(value: float) -> str:
-    """Return a number with two digits below 100 and one above, so that the text rarely changes."""
+    """Return a number as text: two decimals below 100, one above, so that the text rarely changes."""
     if not np.isfinite(value):
         return "∞"
     if value >= 100.0:

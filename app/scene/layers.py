@@ -16,9 +16,9 @@ class Layer(NamedTuple):
     """A layer of the scene.
 
     Attributes:
-        title: Its name on the page.
-        colour: Its colour while the scene is coloured by verdict; None for many colours.
-        on: Whether it is visible at first. Layers that are slow or cover others are not.
+        title: Name on the page.
+        colour: Colour while the scene is coloured by verdict; None for several colours.
+        on: Whether it is visible at the start. Layers that are slow or cover others are not.
     """
 
     title: str
@@ -59,10 +59,14 @@ class ViewSettings:
     )
 
     def choose(self, name: str, value: str | bool) -> None:
-        """Switch a layer or following, or choose the colouring or the labels.
+        """Set one choice of the view.
+
+        Args:
+            name: Name of a layer, "follow", "colour_by" or "label_by".
+            value: Visibility or following as bool; for colours and labels the name of the choice.
 
         Raises:
-            ParameterError: There is no such choice, or it has no such value.
+            ParameterError: There is no such choice, or the value is not one of it.
         """
         if name in CHOICES:
             if value not in CHOICES[name]:

@@ -25,11 +25,11 @@ NUMBERS = 20  # nearest trees that carry their number
 
 
 class MapNodes:
-    """Trees and ground truth.
+    """Nodes of trees and ground truth.
 
     Args:
-        scene: Where the nodes are added.
-        on_tree: Called in viser's thread with the number of a tree that was clicked.
+        scene: Scene of viser to which the nodes are added.
+        on_tree: Called in the thread of viser with the number of a clicked tree.
     """
 
     def __init__(self, scene: viser.SceneApi, on_tree: Callable[[int], None]) -> None:
@@ -49,7 +49,14 @@ class MapNodes:
                 on_tree(numbers[event.instance_index])
 
     def show(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
-        """Show the map after a scan; what moved by less than a centimetre stays where it is."""
+        """Show the map after a scan. Trees that moved by less than a centimetre are not sent again.
+
+        Args:
+            frame: Results of the scan.
+            selected: Number of the selected tree, or None.
+            ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
+            view: Visible layers.
+        """
         if self.ground.show(frame.ground):
             self.show_truth(self._truth_trees)
         trees = confirmed(frame.trees)
@@ -63,8 +70,7 @@ class MapNodes:
         self.repaint(frame, selected, ring, view)
 
     def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
-        """Show the same map after a choice of layers, of a tree, or of a cluster that stands at `ring`: x, y
-        and radius [m] in the frame of the map."""
+        """Show the same map after a change of the view or the selection; arguments as in `show`."""
         self.ground.visible = view.layers["ground"]
         self._trees.visible = view.layers["trees"]
         self._truth.visible = view.layers["truth"]
@@ -94,7 +100,7 @@ class MapNodes:
 
     @property
     def texts(self) -> list[str]:
-        """The labels that are to be read now."""
+        """The visible labels."""
         return self._labels.texts
 
     def _show_trees(self, place: NDArray[np.float64], measured: NDArray[np.bool_]) -> None:
@@ -117,7 +123,7 @@ class MapNodes:
 
 
 def confirmed(trees: Trees) -> Trees:
-    """Return the confirmed trees only."""
+    """Return the confirmed trees of a table."""
     known = {name: column for name in Trees.__slots__ if (column := getattr(trees, name)) is not None}
     return Trees(**{name: column[trees.confirmed] for name, column in known.items()})
 
@@ -180,7 +186,15 @@ class ErrorNode(Segments):
     def show_errors(
         self, trees: Trees, truth: TruthTrees | None, path: Float, wanted: Evaluation, ground: GroundNode
     ) -> None:
-        """Show the errors against the ground truth within reach of the path, shape (N, 2) [m]."""
+        """Show the errors of the map against the ground truth.
+
+        Args:
+            trees: The map.
+            truth: Ground truth; None hides the errors.
+            path: Positions of the robot, shape (N, 2) [m]; the ground truth within reach of them counts.
+            wanted: Distances of a match and of the ground truth from the path.
+            ground: Ground with its heights.
+        """
         if truth is None or len(path) == 0:
             self.hide()
             return
@@ -198,10 +212,15 @@ class ErrorNode(Segments):
 
 
 def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> tuple[Float, Float, Float]:
-    """Return pairs of true and mapped position of matched trees, missed trees, and false trees.
+    """Return the errors of a map: pairs of true and mapped position of matched trees, shape (M, 2, 2), missed
+    trees, shape (K, 2), and false trees, shape (F, 2), all in metres.
 
-    Shapes (M, 2, 2), (K, 2) and (F, 2), all in metres. Only trees within reach of the path count as missed or
-    false.
+    Args:
+        trees: The map; confirmed trees count.
+        truth: Ground truth.
+        path: Positions of the robot, shape (N, 2) [m]. Only trees within reach of it count as missed or
+            false.
+        wanted: Distances of a match and of the ground truth from the path.
     """
     from scipy.spatial import cKDTree
 
@@ -294,7 +313,7 @@ class MapCloud:
     """The accumulated points in the scene, in blocks; only changed blocks are sent.
 
     Args:
-        scene: Scene of the nodes.
+        scene: Scene of viser to which the nodes are added.
         gathered: Accumulated points; they outlive the nodes when viser restarts.
     """
 
@@ -310,7 +329,7 @@ class MapCloud:
         return len(self._gathered.points)
 
     def show(self, frame: Frame, visible: bool) -> None:
-        """Add a scan; hidden points are accumulated too."""
+        """Add the points of a scan, and show them if `visible`."""
         self._gathered.take(frame)
         self.repaint(visible)
 
@@ -336,7 +355,7 @@ class MapCloud:
 
 
 def _keys(points: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the key of the cell of each point, shape (N,)."""
+    """Return the key of the cell of each point, shape (N,), for points of shape (N, 3) [m]."""
     cell = (
         np.clip(np.floor(np.asarray(points, np.float64) / SIDE), -_HALF, _HALF - 1).astype(np.int64) + _HALF
     )

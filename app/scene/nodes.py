@@ -76,8 +76,8 @@ def polyline(points: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 class LayerNode(Generic[N]):
-    """A node of a layer. It is visible while the layer is on and there is something to show; viser's client
-    logs an error for an empty node."""
+    """A node of a layer. It is visible while the layer is on and has content, because viser's client logs an
+    error for an empty node."""
 
     def __init__(self, node: N) -> None:
         self.node = node
@@ -100,7 +100,14 @@ class LayerNode(Generic[N]):
 
 
 class Batch(LayerNode[viser.BatchedMeshHandle]):
-    """Upright copies of one mesh as one node: viser is slow with a thousand nodes."""
+    """Upright copies of one mesh as one node, because viser is slow with a thousand nodes.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the node.
+        mesh: Vertices and faces.
+        look: Further arguments of `add_batched_meshes_simple`.
+    """
 
     def __init__(self, scene: viser.SceneApi, name: str, mesh: Mesh, **look: Any) -> None:  # noqa: ANN401
         node = scene.add_batched_meshes_simple(
@@ -123,8 +130,9 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
         """Replace the copies.
 
         Args:
-            positions, scales: shape (N, 3) [m].
-            colours: shape (N, 3).
+            positions: Positions of the copies, shape (N, 3) [m].
+            scales: Their sizes along x, y, z in units of the mesh, shape (N, 3).
+            colours: Their colours, uint8, shape (N, 3).
         """
         if not len(positions) == len(scales) == len(colours):
             raise ValueError("positions, scales and colours must have the same length")
@@ -143,7 +151,14 @@ def _upright(count: int) -> NDArray[np.float32]:
 
 
 class CloudNode(LayerNode[viser.PointCloudHandle]):
-    """One point cloud. While it is hidden nothing is sent; the newest points are sent when it is shown."""
+    """One point cloud. While it is hidden nothing is sent; when it is shown, the newest points are sent.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the node.
+        size: Diameter of a point [m].
+        precision: Precision of the coordinates that are sent.
+    """
 
     def __init__(
         self, scene: viser.SceneApi, name: str, size: float, *, precision: Precision = "float16"
@@ -184,7 +199,13 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
 
 
 class Segments(LayerNode[viser.LineSegmentsHandle]):
-    """Line segments as one node, which keep their colour; meshes are shaded."""
+    """Line segments as one node. Unlike meshes they are not shaded, so they keep their colour.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the node.
+        thickness: Width of the lines [pixels].
+    """
 
     def __init__(self, scene: viser.SceneApi, name: str, thickness: float) -> None:
         node = scene.add_line_segments(
@@ -206,15 +227,28 @@ class Segments(LayerNode[viser.LineSegmentsHandle]):
 
 
 class Circles(Segments):
-    """Circles at a height above the ground [m]."""
+    """Circles at a height above the ground.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the node.
+        height: Height above the ground [m].
+        thickness: Width of the lines [pixels].
+    """
 
     def __init__(self, scene: viser.SceneApi, name: str, height: float, thickness: float) -> None:
         super().__init__(scene, name, thickness)
         self._height = height
 
     def show_at(self, centres: Float, radii: Float, each: Colours, ground: Float) -> None:
-        """Show circles at centres (N, 2) [m] with radii (N,) [m] in N colours, above the ground at heights
-        (N,) [m]."""
+        """Replace the circles.
+
+        Args:
+            centres: x, y, shape (N, 2) [m].
+            radii: shape (N,) [m].
+            each: Colours, uint8, shape (N, 3).
+            ground: Heights of the ground, shape (N,) [m].
+        """
         self.show(circles(centres, radii, self._height + ground), np.repeat(each, SIDES, axis=0))
 
 
@@ -222,7 +256,14 @@ CHUNK = 200  # segments per node, so that a long path is not sent again with eac
 
 
 class LineNode:
-    """A growing line in chunks; only the chunks that changed are sent."""
+    """A growing line in chunks; only the chunks that changed are sent.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the nodes.
+        colour: Colour of the line.
+        height: Height above the ground [m].
+    """
 
     def __init__(self, scene: viser.SceneApi, name: str, colour: Rgb, height: float) -> None:
         self._scene, self._name, self._height = scene, name, height
@@ -321,7 +362,12 @@ class GroundNode(LayerNode[viser.MeshHandle]):
         return True
 
     def heights(self, places: NDArray[np.floating], otherwise: float) -> Float:
-        """Return the height of the ground at places (N, 2) [m]; `otherwise` where it is unknown."""
+        """Return the heights of the ground, shape (N,) [m].
+
+        Args:
+            places: Positions, shape (N, 2) [m].
+            otherwise: Height where the ground is unknown [m].
+        """
         cell = np.floor((np.asarray(places, np.float64).reshape(-1, 2) - self._low) / self._cell)
         inside = np.all((cell >= 0) & (cell < self._raster.shape), axis=1)
         i, j = np.where(inside[:, None], cell, 0).astype(np.int64).T
@@ -330,10 +376,11 @@ class GroundNode(LayerNode[viser.MeshHandle]):
 
 
 def raster(ground: HeightMap) -> tuple[Float, Float, float]:
-    """Return the heights of a grid around all known cells, its lower corner, and the side of a cell.
+    """Return the heights of a grid around all known cells of a height map, its lower corner, and the side of
+    a cell.
 
-    Heights have shape (I, J) [m] and are NaN where unknown; the corner has shape (2,) [m]. A map with more
-    than `MOST_CELLS` cells gets larger cells.
+    Heights have shape (I, J) [m] and are NaN where unknown; the corner has shape (2,) [m]. For a map with
+    more than `MOST_CELLS` cells, four cells each are averaged until there are fewer.
     """
     place, height, cell = ground.place.astype(np.int64), ground.height.astype(np.float64), ground.cell
     if len(place) == 0:
@@ -349,9 +396,13 @@ def raster(ground: HeightMap) -> tuple[Float, Float, float]:
 
 
 def surface(grid: Float, low: Float, cell: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return a mesh through the centres of the known cells: vertices (V, 3) [m] and faces (F, 3).
+    """Return a mesh through the centres of the known cells: vertices, shape (V, 3) [m], and faces, shape (F,
+    3).
 
     Four neighbouring known centres become two triangles.
+
+    Args:
+        grid, low, cell: Result of `raster`.
     """
     known = np.isfinite(grid)
     square = known[:-1, :-1] & known[1:, :-1] & known[:-1, 1:] & known[1:, 1:]

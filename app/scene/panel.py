@@ -66,11 +66,11 @@ class TunePanel:
         self.show(parameters, preset_name, frozenset())
 
     def show(self, parameters: Parameters, preset_name: str, moving: frozenset[str]) -> None:
-        """Set the sliders from code, and mark what differs from the preset.
+        """Set the sliders, and flag the values that differ from the preset.
 
         Args:
-            parameters, preset_name: What holds now.
-            moving: Parameters a person is moving right now; their sliders are left alone.
+            parameters, preset_name: Present values and their preset.
+            moving: Parameters that a person is moving; their sliders are not set.
         """
         changed = parameters.changes_from(preset(preset_name))
         values = parameters.flat()
@@ -86,7 +86,7 @@ class TunePanel:
         self._summary.content = _summary(len(changed), preset_name)
 
     def widget(self, name: str) -> viser.GuiInputHandle[Any]:
-        """The widget of a parameter, by its dotted name."""
+        """Return the widget of a parameter, by its dotted name."""
         return self._widgets[name]
 
     def _add_stage(
@@ -118,7 +118,13 @@ class TunePanel:
 
 
 def make_widget(gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiInputHandle[Any]:
-    """A slider with a number box, a list or a switch, as the parameter's kind asks."""
+    """Return a new widget for a parameter: a slider with a number box, a list or a switch.
+
+    Args:
+        gui: Panel of viser.
+        spec: Declaration of the parameter.
+        value: Initial value.
+    """
     label = _label(spec, changed=False)
     if spec.kind == "bool":
         return gui.add_checkbox(label, bool(value), hint=spec.doc)
@@ -200,7 +206,7 @@ class _Origin:
 
 
 class PanelCommands:
-    """Sends changes of the panel to the server, one at a time, on the loop of the server.
+    """Sends changes of the panel to the server, one at a time, on the event loop of the server.
 
     Args:
         commands: Commands to the server.
@@ -215,18 +221,24 @@ class PanelCommands:
 
     @property
     def moving(self) -> frozenset[str]:
-        """Parameters whose newest value has not been sent yet."""
+        """Parameters whose newest value is not sent yet."""
         return frozenset(self._waiting)
 
     def change(self, name: str, value: Value, client: viser.ClientHandle | None) -> None:
-        """Send a value; while the server is busy, only the newest value of each parameter waits."""
+        """Send a value; while the server is busy, only the newest value of each parameter waits.
+
+        Args:
+            name: Dotted name of the parameter.
+            value: New value.
+            client: Browser that made the change; None if unknown.
+        """
         self._waiting[name] = (value, _Origin(current_user.get(), client))
         if not self._busy:
             self._busy = True
             self._start(self._send_waiting())
 
     def ask(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
-        """Run another command; a refusal is shown in the browser of the client."""
+        """Run another command; a refusal is shown in the browser of `client`."""
         self._start(self._told(command, client))
 
     def stop(self) -> None:

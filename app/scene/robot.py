@@ -20,7 +20,11 @@ STEP = 0.05  # m
 
 
 class RobotNodes:
-    """The mesh and frame of the robot, the particles, the path, and the path by odometry only."""
+    """The mesh and frame of the robot, the particles, the path, and the path by odometry only.
+
+    Args:
+        scene: Scene of viser to which the nodes are added.
+    """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         self._frame = add_posed(scene, ROBOT)
@@ -64,7 +68,8 @@ class RobotNodes:
             self._odometry.show(places, self._stepped(places))
 
     def _stepped(self, places: Float) -> Float:
-        """Return heights of the ground in steps, so that a line is not sent again for a centimetre."""
+        """Return heights of the ground at places (N, 2) [m], rounded, so that small changes do not send a
+        line again."""
         if self._ground is None:
             return np.zeros(len(places))
         return np.round(self._ground.heights(places, 0.0) / STEP) * STEP
@@ -120,7 +125,13 @@ class WayNode(Segments):
         self._drawn: tuple[object, ...] | None = None
 
     def show_ahead(self, clearance: Clearance | None, parameters: Obstacles, visible: bool) -> None:
-        """Show the path ahead of a scan; hide it if there is none or the layer is off."""
+        """Show the path ahead of the robot.
+
+        Args:
+            clearance: Path ahead and obstacles at the scan; None hides the node.
+            parameters: Widths and lengths of the zones.
+            visible: Whether the layer is on.
+        """
         self.visible = visible and clearance is not None
         if clearance is None or not visible:
             return
@@ -142,10 +153,14 @@ class WayNode(Segments):
 
 
 def way_lines(curvature: float, backward: bool, begins: float, parameters: Obstacles) -> NDArray[np.float32]:
-    """Return both sides of the path ahead and a bar at the end of each zone, in the level base frame.
+    """Return both sides of the path ahead and a line at the end of each zone, in the level base frame, as
+    segments of shape (S, 2, 3) [m].
 
-    Returns:
-        Line segments, shape (S, 2, 3) [m].
+    Args:
+        curvature: Curvature of the path [1/m], positive to the left.
+        backward: Whether the robot drives backward.
+        begins: Distance of the beginning of the path from the base [m].
+        parameters: Widths and lengths of the zones.
     """
     half = 0.5 * parameters.width
     s = np.linspace(begins, begins + parameters.slow_distance, PIECES + 1)
@@ -158,7 +173,8 @@ def way_lines(curvature: float, backward: bool, begins: float, parameters: Obsta
 
 
 def _on_way(s: Float, left: float | Float, curvature: float, backward: bool) -> Float:
-    """Return places at arc lengths `s` from the base and at distances `left` of the arc, shape (N, 3) [m]."""
+    """Return the points at arc lengths `s` [m] from the base and at a lateral distance `left` [m] from the
+    path, shape (N, 3) [m]."""
     if abs(curvature) < 1e-6:
         x, y = s, np.zeros_like(s) + left
     else:

@@ -114,7 +114,7 @@ class ScanNodes:
         )
 
     def _show_markers(self, frame: Frame) -> None:
-        """Show a cylinder around each cluster, because point clouds take no clicks.
+        """Show a cylinder around each cluster that receives clicks, because point clouds do not.
 
         Its radius is limited, so that a wide cluster does not cover its neighbours.
         """
@@ -266,7 +266,12 @@ def meant(
 
 
 def distances(origin: Float, direction: Float, low: Float, high: Float) -> Float:
-    """Return the distances between a ray and the segments from `low` to `high`, shape (K,) [m]."""
+    """Return the distances between a ray and vertical or inclined segments, shape (K,) [m].
+
+    Args:
+        origin, direction: Ray, shape (3,) each; the direction may have any length.
+        low, high: Ends of the segments, shape (K, 3) [m].
+    """
     d = direction / max(float(np.linalg.norm(direction)), 1e-12)
     axis, away = high - low, low - origin
     # Closest points of two lines: s along the segment within 0..1, t along the ray not behind its origin.

@@ -32,12 +32,12 @@ RENEW_AFTER = 2_000_000
 class Scene:
     """Shows frames in viser and passes the actions of people there to the server.
 
-    All methods are called on `loop`. Callbacks from the thread of viser are passed to `loop` first, so that
+    All methods are called on `loop`. Callbacks of the thread of viser are passed to `loop` first, so that
     only one thread changes the nodes.
 
     Args:
         commands: Commands of the scene to the server.
-        loop: The server's loop.
+        loop: Event loop of the server.
     """
 
     def __init__(self, commands: SceneCommands, loop: asyncio.AbstractEventLoop) -> None:
@@ -56,12 +56,12 @@ class Scene:
 
     @property
     def port(self) -> int:
-        """Port of viser on 127.0.0.1. It changes when the scene restarts viser: read it each time."""
+        """Port of viser on 127.0.0.1. It changes when viser is restarted, so it must be read each time."""
         return self._server.get_port()
 
     @property
     def messages(self) -> int:
-        """Number of messages that viser has numbered since it started."""
+        """Number of messages that viser has numbered since it was started."""
         return messages_sent(self._server)
 
     def show(self, frame: Frame, path: Float) -> None:
@@ -90,9 +90,11 @@ class Scene:
             self._map.show_truth(trees)
 
     def select(self, tree: int | None, ring: Ring = None) -> None:
-        """Mark a tree by its number, and a cluster by a ring: x, y and radius [m] in the frame of the map.
+        """Highlight the selection.
 
-        None removes the mark.
+        Args:
+            tree: Number of the selected tree, or None.
+            ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
         """
         self._selected, self._ring = tree, ring
         if self._frame is not None:  # the scan itself does not change
@@ -115,7 +117,7 @@ class Scene:
         }
 
     def choose(self, name: str, value: str | bool) -> None:
-        """Show or hide a layer, follow the robot or not, or choose colouring and labels.
+        """Set one choice of the view, see `ViewSettings.choose`.
 
         Raises:
             ParameterError: There is no such choice.
@@ -124,7 +126,7 @@ class Scene:
         self._repaint()
 
     def clear(self) -> None:
-        """Remove the run: the scene is empty, the panel stays."""
+        """Remove the run from the scene; the panel stays."""
         self._frame, self._path = None, np.zeros((0, 2))
         self._truth = self._selected = self._ring = None
         self._accumulated = Accumulated()
@@ -277,7 +279,7 @@ ABOVE = (0.0, -0.01, 28.0)
 class Follower:
     """Keeps the robot at the origin of the viewer by moving the world instead of the cameras.
 
-    The pose of a camera arrives from the browser some frames late, so that moving it from here would
+    The pose of a camera arrives from the browser some frames late, so that moving the camera from here would
     interfere with the person who turns it. The pose of the world is sent in one group with the points. When
     following ends, the world keeps its pose.
 
@@ -292,7 +294,13 @@ class Follower:
         server.initial_camera.look_at = (0.0, 0.0, 0.5)
 
     def show(self, pose: Pose2, z: float, follow: bool) -> None:
-        """Move the robot at this pose and height [m] to the origin, if `follow`."""
+        """Move the robot to the origin.
+
+        Args:
+            pose: Pose of the robot in the map.
+            z: Height of the robot [m].
+            follow: Whether following is on; otherwise nothing moves.
+        """
         if follow:
             self._world.position = (-pose.x, -pose.y, -z)
 
@@ -302,7 +310,14 @@ class Follower:
         return np.array(self._world.position, dtype=np.float64)
 
     def look(self, client: viser.ClientHandle, pose: Pose2, z: float, *, from_above: bool) -> None:
-        """Turn one browser's camera to the robot at this pose and height [m]."""
+        """Turn the camera of one browser to the robot.
+
+        Args:
+            client: The browser.
+            pose: Pose of the robot in the map.
+            z: Height of the robot [m].
+            from_above: Whether the camera is above the robot; otherwise behind it.
+        """
         target = np.array([pose.x, pose.y, z]) + self._world.position
         with client.atomic():
             client.camera.up_direction = np.array([0.0, 0.0, 1.0])
@@ -314,10 +329,10 @@ OnCamera = Callable[[str, viser.ClientHandle], None]
 
 
 def add_hotkeys(gui: viser.GuiApi, on_camera: OnCamera, on_follow: Callable[[], None]) -> None:
-    """Add commands with keys, which work while the scene has the focus; the page forwards the keys.
+    """Add commands with keys. They work while the scene has the focus; otherwise the page forwards the keys.
 
     Args:
-        gui: viser's panel.
+        gui: Panel of viser.
         on_camera: Called in the thread of viser with "top" or "behind" and the client.
         on_follow: Called in the thread of viser to start or stop following.
     """

@@ -31,10 +31,10 @@ _starting = threading.Lock()
 
 
 def start_server(secret: str) -> viser.ViserServer:
-    """A viser server on 127.0.0.1 and a free port that refuses every request without the secret.
+    """Return a viser server on 127.0.0.1 and a free port that refuses every request without the secret.
 
     Args:
-        secret: What the header `X-Stemmap-Secret` must hold.
+        secret: Required value of the header `X-Stemmap-Secret`.
     """
     with _guarded_handshakes(secret), silenced():
         server = viser.ViserServer(host="127.0.0.1", port=0, label="stemmap", verbose=False)
@@ -45,7 +45,7 @@ def start_server(secret: str) -> viser.ViserServer:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Suppress viser's messages on standard output, which belongs to the command line."""
+    """Suppress viser's messages on standard output inside the context, because the command line uses it."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield
 
@@ -124,5 +124,5 @@ def add_posed(scene: viser.SceneApi, name: str) -> viser.FrameHandle:
 
 
 def set_value(widget: Any, value: float | int | bool | str) -> None:  # noqa: ANN401
-    """Set the value of a widget from code. (mypy does not see the setter of viser's generic property.)"""
+    """Set the value of a widget from code."""
     widget.value = value

@@ -40,7 +40,7 @@ class AsyncStore:
         self._waiting = 0
 
     async def ask(self, function: Callable[[Store], T]) -> T:
-        """Run a function of the store in the store's thread and return its result.
+        """Return the result of a function, which is called with the store in the thread of the store.
 
         Raises:
             StoreBusyError: Too many requests wait.

@@ -62,7 +62,15 @@ class RunFigures:
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A change of parameters by a person; `changes` maps each name to [before, after]."""
+    """A change of parameters by a person.
+
+    Attributes:
+        revision: Revision after the change.
+        time_s: Time of the current scan [s since the first scan].
+        who: Name of the person.
+        preset: Name of the preset.
+        changes: [before, after] by parameter name.
+    """
 
     revision: int
     time_s: float
@@ -84,7 +92,7 @@ class RunRecords:
         self._clock = clock
 
     def begin(self, run: NewRun, figures: RunFigures) -> int:
-        """Create the record of a new run and return its number."""
+        """Store the record of a new run and return its number."""
         now = self._clock()
         with self._engine.begin() as connection:
             _forget_deleted(connection, now - _KEPT_NS)
@@ -122,7 +130,7 @@ class RunRecords:
                 _revise(connection, record, change, now)
 
     def listed(self) -> list[dict[str, Any]]:
-        """Return the runs without their maps, newest first."""
+        """Return the runs without their maps, newest first, at most MOST_LISTED."""
         query = (
             _with_source()
             .where(_records.c.deleted_ns.is_(None))
@@ -171,7 +179,7 @@ class RunRecords:
         """Undo the deletion of a run.
 
         Raises:
-            UnknownError: The run no longer exists.
+            UnknownError: The run does not exist any more.
         """
         with self._engine.begin() as connection:
             found = connection.execute(
@@ -213,7 +221,7 @@ def _with_source() -> Select[Any]:
 
 
 def _figures(figures: RunFigures) -> dict[str, Any]:
-    """The columns of `run_records` that change while a run plays."""
+    """Return the columns of `run_records` that change while a run plays."""
     return {each.name: getattr(figures, each.name) for each in fields(figures) if each.name != "map"}
 
 

@@ -76,6 +76,11 @@ class Sets:
     def save(self, name: str, toml: str, who: str) -> None:
         """Save a set under a name; it replaces a set of the same name.
 
+        Args:
+            name: Name of the set.
+            toml: Contents of its file.
+            who: Name of the person.
+
         Raises:
             StemmapError: The maximum number of sets is reached.
         """
@@ -130,7 +135,8 @@ class Store:
         self._engine.dispose()
 
     def open_run(self, source: str, uri: str, name: str) -> int:
-        """Return the number of a source; it does not depend on the path of the recording.
+        """Return the number of a source, which is stored if it is new. It does not depend on the path of the
+        recording.
 
         Args:
             source: Digest of the recording, or its URI if it has no digest.
@@ -146,7 +152,8 @@ class Store:
             return int(known)
 
     def annotations(self, run: int) -> list[Annotation]:
-        """Return the annotations that are not deleted, in the order of their creation."""
+        """Return the annotations of the source with this number that are not deleted, in the order of their
+        creation."""
         query = select(_annotations).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
         with self._engine.begin() as connection:
             rows = connection.execute(query.order_by(_annotations.c.id)).all()
@@ -170,6 +177,11 @@ class Store:
     def add(self, run: int, author: Author, contents: Sequence[Content]) -> list[int]:
         """Add annotations in one step and return their ids.
 
+        Args:
+            run: Number of the source, see `open_run`.
+            author: Author of the edit.
+            contents: Contents of the annotations.
+
         Raises:
             StemmapError: The maximum number of annotations is reached.
         """
@@ -185,6 +197,13 @@ class Store:
     def change(self, run: int, author: Author, id_: int, version: int, content: Content) -> None:
         """Change the content of an annotation.
 
+        Args:
+            run: Number of the source, see `open_run`.
+            author: Author of the edit.
+            id_: Identifier of the annotation.
+            version: Version that the author has seen.
+            content: New content.
+
         Raises:
             UnknownError: The run has no annotation with this id.
             StaleError: The annotation has another version; the message names author and time of the last
@@ -193,11 +212,15 @@ class Store:
         self._edit(run, author, id_, version, content)
 
     def delete(self, run: int, author: Author, id_: int, version: int) -> None:
-        """Delete an annotation; raises the same errors as `change`."""
+        """Delete an annotation; arguments and errors as in `change`."""
         self._edit(run, author, id_, version, None)
 
     def undo(self, run: int, author: Author) -> None:
         """Undo the last step of a browser.
+
+        Args:
+            run: Number of the source, see `open_run`.
+            author: Author, with the browser.
 
         Raises:
             StemmapError: There is no step to undo.
@@ -206,11 +229,16 @@ class Store:
         self._turn(run, author, "undone")
 
     def redo(self, run: int, author: Author) -> None:
-        """Redo the step that a browser undid last; raises the same errors as `undo`."""
+        """Redo the step that a browser undid last; arguments and errors as in `undo`."""
         self._turn(run, author, "done")
 
     def steps(self, run: int, browser: str) -> tuple[int, int]:
-        """Return the number of steps that a browser can undo and redo."""
+        """Return the numbers of steps that a browser can undo and redo.
+
+        Args:
+            run: Number of the source, see `open_run`.
+            browser: Identifier of the browser.
+        """
         query = select(_steps.c.state, func.count()).where(
             _steps.c.run == run, _steps.c.browser == browser, _steps.c.state != "left"
         )
@@ -293,8 +321,8 @@ class Store:
 
 
 def _request_of(connection: Connection, run: Row[Any]) -> SourceRequest:
-    """How a source was mapped last, with the path at which it was opened last; the defaults where it was
-    never mapped."""
+    """Return the request with which a source was mapped last, with the path at which it was opened last; the
+    defaults if it was never mapped."""
     newest = connection.execute(
         select(_records)
         .where(_records.c.run == run.id, _records.c.deleted_ns.is_(None), _records.c.scans > 0)

@@ -80,16 +80,27 @@ def role_of(scope: Scope) -> Role:
 
 
 def session_value(token: str, port: int, expires_s: int) -> str:
-    """Return the value of a session cookie that expires at a time [Unix seconds].
+    """Return the value of a session cookie.
 
     It is signed with the token and does not reveal it, because browsers send cookies to every port of this
     machine. It stays valid after a restart with the same token, so that an open page finds its server again.
+
+    Args:
+        token: Token of the link.
+        port: Port of the dashboard.
+        expires_s: Time at which it expires [s since 1970].
     """
     return f"{expires_s}.{_signature(token, f'stemmap cookie {port} {expires_s}')}"
 
 
 def ticket(token: str, port: int, role: Role) -> str:
-    """Return a code that opens the dashboard on a port once, within TICKET_S seconds, with a role."""
+    """Return a code that opens a dashboard once, within TICKET_S seconds.
+
+    Args:
+        token: Token of the owner.
+        port: Port of the dashboard.
+        role: Role that the code gives.
+    """
     expires_s = int(time.time()) + TICKET_S
     nonce = secrets.token_urlsafe(12)
     signed = f"{role}.{expires_s}.{nonce}"
@@ -101,9 +112,10 @@ def _signature(token: str, text: str) -> str:
 
 
 def is_local(headers: Headers) -> bool:
-    """Whether a request was sent to a loopback name and not forwarded by a proxy that says so.
+    """Return whether a request was sent to a loopback name, and no header shows that a proxy has forwarded
+    it.
 
-    A proxy that hides itself cannot be detected: behind one, set STEMMAP_FILES=folders.
+    A proxy that adds no header cannot be detected: behind one, set STEMMAP_FILES=folders.
     """
     if any(name in headers for name in _FORWARDING):
         return False
@@ -115,7 +127,12 @@ def is_local(headers: Headers) -> bool:
 
 
 def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozenset[str]:
-    """Return the accepted values of the Host header."""
+    """Return the accepted values of the Host header.
+
+    Args:
+        host, port: Address on which the server listens.
+        further: Further host names.
+    """
     names = {*_LOOPBACK_NAMES, f"[{host}]" if ":" in host else host.lower(), *further}
     if host in _ANY_ADDRESS:
         names.add(socket.gethostname().lower())
@@ -123,15 +140,15 @@ def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozense
 
 
 class Guard:
-    """ASGI middleware that refuses requests and websockets without the right to them.
+    """ASGI middleware that refuses requests and websockets without permission.
 
     Args:
         app: The guarded application.
         token: Token of the owner.
         host, port: Address on which the server listens.
         further_hosts: Further accepted host names.
-        body_limit: Largest body of a request [bytes].
-        upload_limit: Largest body of an upload [bytes].
+        body_limit: Maximum size of the body of a request [bytes].
+        upload_limit: Maximum size of the body of an upload [bytes].
     """
 
     def __init__(
@@ -195,7 +212,8 @@ class Guard:
         return bool(ends) and max(end or 0 for end in ends) < time.time() + SESSION_S / 2
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """The response to a wrong Host or Origin, or to a body that is too large; None if all are right."""
+        """Return the response to a wrong Host or Origin, or to a body that is too large; None if all are
+        valid."""
         if not self._knows_host(headers):
             return error_reply(
                 403, "this server has another host name", remedy="Open the link that stemmap printed"
@@ -210,7 +228,8 @@ class Guard:
         return None
 
     def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
-        """The response to a viewer who tries to change something; None otherwise. Stores the role."""
+        """Return the response to a viewer who tries to change something; None otherwise. Stores the role of
+        the request."""
         role = self._role(headers)
         scope.setdefault("state", {})["role"] = role
         if role == "owner" or scope["type"] == "websocket" or scope["method"] in _SAFE_METHODS:
@@ -224,12 +243,13 @@ class Guard:
         )
 
     def _limit_of(self, scope: Scope) -> int:
-        """Largest body of a request [bytes]."""
+        """Return the maximum size of the body of a request [bytes]."""
         is_upload = scope.get("path") == UPLOADS and scope.get("method") == "POST"
         return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
-        """The response to a link with a token or ticket, or to a request without a session, else None."""
+        """Return the response to a link with a token or ticket, or to a request without a session, else
+        None."""
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             given = dict(query)
@@ -247,10 +267,15 @@ class Guard:
         return error_reply(401, "the token is missing or wrong", remedy="Open the link that stemmap printed")
 
     def _welcome(self, role: Role, query: list[tuple[str, str]], *, from_elsewhere: bool) -> Response:
-        """Set the session cookie and redirect to the page without the token.
+        """Return a redirect to the page without the token, which sets the session cookie.
 
-        A browser does not send a strict cookie along a redirect that began in a file or on another site. From
-        there, a page of this server leads on instead.
+        A browser does not send a strict cookie along a redirect that began in a file or on another site; in
+        that case the response is a page of this server that loads the dashboard.
+
+        Args:
+            role: Role of the session.
+            query: Parameters of the link.
+            from_elsewhere: Whether the request began in a file or on another site.
         """
         target = "/" + (f"?{urlencode(query)}" if query else "")
         reply: Response = RedirectResponse(target, 303)
@@ -273,7 +298,8 @@ class Guard:
         return host in self._hosts or (self._any_address and self._is_own_address(host))
 
     def _is_own_address(self, host: str) -> bool:
-        """Whether a Host is a bare address with our port: only names can be rebound to this machine."""
+        """Return whether a Host is a bare address with our port. Only names can be rebound to this
+        machine."""
         try:
             parts = urlsplit(f"//{host}")
             ipaddress.ip_address(parts.hostname or "")
@@ -296,7 +322,7 @@ class Guard:
         return "owner" if "owner" in roles else "viewer" if "viewer" in roles else None
 
     def _cookies(self, headers: Headers) -> list[str]:
-        """All session cookies of the request: one of another path must not hide ours."""
+        """Return all session cookies of the request, because a cookie of another path could hide ours."""
         return [
             value
             for line in headers.getlist("cookie")
@@ -312,7 +338,7 @@ class Guard:
         return next((role for role, session in sessions if _same(value, session)), None)
 
     def _role_by_ticket(self, value: str) -> Role | None:
-        """The role of a ticket that is valid and was not used before."""
+        """Return the role of a ticket that is valid and was not used before, else None."""
         signed, _, signature = value.rpartition(".")
         parts = signed.split(".")
         expires_s = _seconds(parts[1]) if len(parts) == 3 else None

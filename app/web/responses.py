@@ -49,7 +49,13 @@ def json_reply(content: object, status: int = 200) -> Response:
 def error_reply(
     status: int, what: str, *, where: str = "", remedy: str = "", retry_after_s: int | None = None
 ) -> Response:
-    """Return an error as the page shows it; `retry_after_s` says when the same request may succeed."""
+    """Return an error as JSON for the page.
+
+    Args:
+        status: HTTP status.
+        what, where, remedy: Text of the error, see `StemmapError`.
+        retry_after_s: Time after which the same request may succeed [s]; None if it will not.
+    """
     reply = json_reply({"error": {"what": what, "where": where, "remedy": remedy}}, status)
     if retry_after_s is not None:
         reply.headers["Retry-After"] = str(retry_after_s)
@@ -57,7 +63,7 @@ def error_reply(
 
 
 def failure_reply(status: int, error: StemmapError, retry_after_s: int | None = None) -> Response:
-    """Return an exception as the page shows it."""
+    """Return an exception as JSON for the page; arguments as in `error_reply`."""
     return error_reply(
         status, error.what, where=error.where, remedy=error.remedy, retry_after_s=retry_after_s
     )

@@ -33,8 +33,8 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="refe
 
 @contextlib.contextmanager
 def page_that_leads_to(link: str) -> Iterator[Path]:
-    """Create a file, readable only by its owner, that redirects a browser to a link, and remove it at the
-    end.
+    """Create a file that redirects a browser to a link, readable only by its owner; remove it at the end of
+    the context.
 
     Command-line arguments are visible to all users of a machine, so the link with its token is not passed to
     the browser.
@@ -73,7 +73,14 @@ def serve(
     open_browser: bool,
     viewer: bool = False,
 ) -> int:
-    """Serve the dashboard until SIGINT or SIGTERM; `viewer` also prints the view-only link.
+    """Serve the dashboard until SIGINT or SIGTERM; return the exit code.
+
+    Args:
+        settings: Settings of the deployment.
+        source: Source that is opened at the start.
+        parameter_state: Parameters at the start.
+        open_browser: Whether to open the page in the browser of this machine.
+        viewer: Whether to print the view-only link.
 
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.

@@ -45,7 +45,7 @@ class Uploads:
     """Stores uploads in a folder.
 
     Args:
-        folder: Created with the first upload; None refuses uploads.
+        folder: The folder, created with the first upload; None refuses uploads.
         limit: Maximum size of a file [bytes].
         store: Access to the store, which records the original names.
     """
@@ -64,7 +64,12 @@ class Uploads:
         return max(0, min(self.limit, self._free() - self._awaited))
 
     async def take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Receive a file of the announced size and return its path and description.
+        """Receive a file and return its path and description.
+
+        Args:
+            name: Original name of the file.
+            size: Announced size [bytes].
+            stream: Yields the bytes.
 
         Raises:
             UploadError: The file is too large, incomplete, or cannot be read.
@@ -184,7 +189,11 @@ async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 
 async def _look_at(part: Path, name: str) -> str:
-    """Return a description of the file, found by a child process."""
+    """Return the format of the file, detected in a child process.
+
+    Raises:
+        UploadError: The file cannot be read.
+    """
     try:
         found = await inspection.ask({"ask": "recording", "path": str(part)})
     except inspection.TookTooLongError:
@@ -211,7 +220,8 @@ router = APIRouter()
 
 @router.get(UPLOADS)
 async def room(request: Request) -> Response:
-    """Return how large an upload may be now [bytes], so that a browser does not send one that is refused."""
+    """Return the maximum size of an upload at present [bytes], so that a browser does not send one that is
+    refused."""
     uploads: Uploads = request.app.state.uploads
     try:
         return json_reply({"room": await asyncio.to_thread(uploads.room), "limit": uploads.limit})

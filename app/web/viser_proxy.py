@@ -1,8 +1,7 @@
 """Proxy to viser: its client page, and a bridge between the websocket of a browser and that of viser.
 
 viser has no authentication. It listens on loopback only, requires a secret that only the bridge knows, and
-receives only
-permitted messages: without the filter, any browser could open a public tunnel or upload files.
+receives only permitted messages. Without the filter, any browser could open a public tunnel or upload files.
 """
 
 from __future__ import annotations
@@ -84,7 +83,12 @@ _viewers_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Camera
 
 
 def is_allowed(message: bytes, *, looks_only: bool = False) -> bool:
-    """Return whether a browser, or a view-only browser, may send a message to viser."""
+    """Return whether a browser may send a message to viser.
+
+    Args:
+        message: The message, as msgpack.
+        looks_only: Whether the browser has a view-only link.
+    """
     if len(message) > LARGEST:
         return False
     try:
@@ -182,7 +186,7 @@ async def _connect(viser: ViserServer, user: str, protocols: list[Subprotocol]) 
 
 
 async def _carry(browser: WebSocket, upstream: ClientConnection, looks_only: bool) -> None:
-    """Forward both directions; the first one that ends also ends the other."""
+    """Forward messages in both directions until either side disconnects."""
     directions = {
         asyncio.create_task(_to_browser(browser, upstream)),
         asyncio.create_task(_to_viser(browser, upstream, looks_only)),

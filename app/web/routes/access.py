@@ -50,8 +50,8 @@ class RequestQueue:
     """Runs requests one after the other with a pause in between, and refuses those beyond a short queue.
 
     Args:
-        pause_s: Pause between two requests.
-        most_waiting: Longest queue.
+        pause_s: Pause between two requests [s].
+        most_waiting: Maximum length of the queue.
     """
 
     def __init__(self, pause_s: float = _PAUSE_S, most_waiting: int = _MOST_WAITING) -> None:
@@ -112,7 +112,8 @@ def _role(connection: HTTPConnection) -> Role:
 
 
 def _may_open_any_file(connection: HTTPConnection) -> bool:
-    """Whether the request may name any file of this machine, or only recordings of the data folders."""
+    """Return whether the request may name any file of this machine, or only recordings in the data
+    folders."""
     settings = _settings(connection)
     if role_of(connection.scope) != "owner" or settings.files == "folders":
         return False
@@ -120,7 +121,7 @@ def _may_open_any_file(connection: HTTPConnection) -> bool:
 
 
 async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
-    """Make viewers wait for their turn, because the request costs work."""
+    """Wait for a turn if the request is that of a viewer, because the request costs work."""
     viewer = role_of(connection.scope) == "viewer"
     async with _limits(connection).viewers.turn() if viewer else nullcontext():
         yield

@@ -191,7 +191,7 @@ def _when(row: dict[str, Any]) -> str:
 
 
 def _key(content: Content) -> tuple[float, float, str]:
-    """Two rows with the same key are the same: kind, and position to the millimetre."""
+    """Return the key of a row; rows with the same key (kind, and position to the millimetre) are the same."""
     return round(content.x, 3), round(content.y, 3), content.kind
 
 

@@ -90,8 +90,8 @@ def viser_page(request: Request) -> Response:
 
 
 def lead_on(request: Request, port: int) -> Response:
-    """Redirect to another port of this host, with a ticket that opens it once for the same role: a redirect
-    is kept in histories and logs, so it must not carry the token."""
+    """Redirect to another port of this host with a ticket that opens it once for the same role. Redirects are
+    kept in histories and logs, so they must not contain the token."""
     once = ticket(request.app.state.token, port, role_of(request.scope))
     asked = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
     host = f"[{asked}]" if ":" in asked else asked

@@ -197,7 +197,7 @@ class NotPermittedError(StemmapError):
 
 
 def not_permitted(uri: str) -> NotPermittedError:
-    """The error for a source that the request may not open."""
+    """Return the error for a source that the request may not open."""
     return NotPermittedError(
         "only scenarios and the recordings of the data folder can be opened here",
         where=uri,
@@ -207,6 +207,11 @@ def not_permitted(uri: str) -> NotPermittedError:
 
 def permitted_request(request: SourceRequest, settings: Settings, any_file: bool) -> SourceRequest:
     """Return the request with paths that may be opened.
+
+    Args:
+        request: The request of the browser.
+        settings: Settings of the deployment.
+        any_file: See `permitted_uri`.
 
     Raises:
         NotPermittedError: A file may not be opened.
@@ -230,12 +235,14 @@ def permitted_request(request: SourceRequest, settings: Settings, any_file: bool
 
 
 def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
-    """Return the source that is opened for a URI, or None where it may not be opened.
+    """Return the source that is opened for a URI, or None if it may not be opened.
 
     Args:
-        any_file: Whether the request may open any file of this machine; else only simulated sources and
-            files of the data folders. For those the result is an absolute path without links, so that the
-            file that was checked is the file that is opened.
+        uri: URI of the request.
+        settings: Settings of the deployment, with the data folders.
+        any_file: Whether the request may open any file of this machine; else only simulated sources and files
+            in the data folders. For those the result is an absolute path without links, so that the file that
+            was checked is the file that is opened.
     """
     if any_file:
         return uri

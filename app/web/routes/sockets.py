@@ -45,7 +45,7 @@ _decoder: msgspec.json.Decoder[_Select | _SelectCluster] = msgspec.json.Decoder(
 
 @router.websocket("/api/live")
 async def live(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
-    """Send states as they change, the newest of each kind; receive selections."""
+    """Send states as they change, the newest of each kind, and receive selections."""
     with bounds.pages.place(role) as free:
         if not free:
             await browser.close(_TRY_AGAIN_LATER)
@@ -83,7 +83,12 @@ async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: Calle
 
 @contextlib.asynccontextmanager
 async def telling(browser: WebSocket, live: Broadcast) -> AsyncIterator[None]:
-    """Send all state changes to a browser while the context is active."""
+    """Send all state changes to a browser while the context is active.
+
+    Args:
+        browser: Websocket of the browser.
+        live: Broadcast of the dashboard.
+    """
     with live.listener() as listener:
         sending = asyncio.create_task(_send(browser, listener))
         try:
