@@ -253,26 +253,23 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
 
     def thinned(self) -> KeyframeGraph:
-        """Return the graph without every second keyframe and its detections; motions are compounded."""
-        kept: list[Keyframe] = [self.keyframes[0]]
-        for i in range(2, len(self.keyframes), 2):
-            between, after = self.keyframes[i - 1], self.keyframes[i]
-            x, y, yaw = after.motion
-            motion, covariance = compounded(between.motion, between.covariance, x, y, yaw, after.covariance)
-            if not (np.isfinite(between.covariance).all() and np.isfinite(after.covariance).all()):
+        """Return the graph without every second keyframe and its detections; motions are compounded. The ends
+        of loops and the newest keyframe stay."""
+        ends = {scan for loop in self.loops for scan in loop.scans} | {self.newest_scan}
+        rows, kept = list[int](), list[Keyframe]()
+        motion, covariance = np.zeros(3), np.zeros((3, 3))
+        for row, keyframe in enumerate(self.keyframes):
+            x, y, yaw = keyframe.motion
+            unknown = not (np.isfinite(covariance).all() and np.isfinite(keyframe.covariance).all())
+            motion, covariance = compounded(motion, covariance, x, y, yaw, keyframe.covariance)
+            if unknown:
                 covariance = np.full((3, 3), np.inf)
-            kept.append(replace(after, motion=motion, covariance=covariance))
-        rows = np.arange(0, len(self.keyframes), 2)
-        if len(self.keyframes) % 2 == 0:  # the newest keyframe stays
-            kept.append(self.keyframes[-1])
-            rows = np.append(rows, len(self.keyframes) - 1)
-        scans = np.array([k.scan for k in kept], np.int64)
-        loops = tuple(
-            replace(e, scans=(_nearest(scans, e.scans[0]), _nearest(scans, e.scans[1]))) for e in self.loops
-        )
-        return replace(
-            self, keyframes=tuple(kept), pose=self.pose[rows], loops=loops, solved=self.solved // 2
-        )
+            if row % 2 == 0 or keyframe.scan in ends:
+                rows.append(row)
+                kept.append(replace(keyframe, motion=motion, covariance=covariance))
+                motion, covariance = np.zeros(3), np.zeros((3, 3))
+        solved = int(np.searchsorted(rows, self.solved))
+        return replace(self, keyframes=tuple(kept), pose=self.pose[rows], solved=solved)
 
     def solve(self, *, new_loop: bool = False) -> Solution | None:
         """Return the minimum; None without convergence.
@@ -306,13 +303,6 @@ class KeyframeGraph:
         old = keyframe.birth[keyframe.birth < first_birth]
         seen = np.concatenate(recent) if recent else old[:0]
         return int(np.count_nonzero(~np.isin(old, seen))) >= 2
-
-
-def _nearest(scans: Int, scan: int) -> int:
-    """Return the element of ascending scan numbers that is nearest to a scan."""
-    row = int(np.searchsorted(scans, scan))
-    rows = [r for r in (row - 1, row) if 0 <= r < len(scans)]
-    return int(scans[min(rows, key=lambda r: abs(int(scans[r]) - scan))])
 
 
 class _Problem:

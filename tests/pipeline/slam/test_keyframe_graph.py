@@ -204,6 +204,22 @@ def test_the_graph_stays_bounded_and_keeps_its_motion():
     assert abs(wrap_angle(chain[2] - total[2])) < 1e-9
 
 
+def test_loops_stay_at_their_scans_when_the_graph_is_thinned():
+    true = arc(42)
+    graph = graph_of(true[:40], np.random.default_rng(3), STEMS[:0])
+    graph = graph.with_loop(5, Pose2(*true[39]), 1e-6 * np.eye(3))
+    for k in (40, 41):
+        motion = composed(inverse(true[k - 1 : k]), true[k : k + 1])[0]
+        none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
+        graph = graph.with_keyframe(Keyframe(k, 0, float(k), motion, Q, *none), true[k])
+    thin = graph.thinned()
+    assert len(thin.keyframes) == 24
+    assert thin.loops[0].scans == (5, 39)
+    one, other = graph.solve(new_loop=True), thin.solve(new_loop=True)
+    # The noise of the dropped keyframes is the same, but spread over fewer motions.
+    np.testing.assert_allclose(other.pose, one.pose[np.searchsorted(graph.scans, thin.scans)], atol=0.02)
+
+
 def test_a_solution_is_due_when_trees_are_seen_again_after_long():
     def keyframe(k, birth, way):
         n = len(birth)
