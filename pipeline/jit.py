@@ -1,11 +1,11 @@
-"""The one place that knows how our own loops are compiled.
+"""Compilation of kernels by Numba, and the cache of their machine code.
 
-Kernels are compiled at their first call and kept on disk beside the source, so that only the first
-start on a machine waits for them. `fastmath` stays off: the same input must give the same bytes. Only
-where a kernel does nothing but add up over an array, its terms may be added in another order.
+A kernel is compiled at its first call and cached next to its source, so that only the first start on a
+machine compiles. `fastmath` is off, because the same input must give the same bytes; only `compiled_sums`
+may change the order of the terms of a sum.
 
-A kernel takes in what it calls, and constants too, from other files. Numba looks at the kernel's own
-file alone when it asks whether what is kept is still good; here all files of ours that it imports count.
+A kernel includes functions and constants of other modules. Numba checks only the time of the file of a
+kernel; here the cache is valid for a digest of all modules of this project that the file imports.
 """
 
 from __future__ import annotations
@@ -34,25 +34,24 @@ _DOTTED = re.compile(r"[\w.]+")
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a loop over arrays to machine code; it holds no interpreter lock while it runs."""
-    # A kernel that does not say whether it counts would do as the one that calls it.
+    """Compile a function to machine code; it releases the interpreter lock while it runs."""
+    # Without _nrt a kernel would inherit the setting of its caller.
     kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=True)(function)
     _keep_by_all_sources(kernel, function.__module__)
     return kernel
 
 
 def compiled_borrowing(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile an inner loop that makes no array and keeps none: it only borrows those that it is handed, so
-    it need not count who holds them. Counting is an atomic operation wherever an array is named in a tuple
-    of arrays, which costs more than the arithmetic of a loop over few landmarks."""
+    """Compile a function that neither creates nor keeps an array, without reference counting. The atomic
+    operations of reference counting cost more than the arithmetic of a loop over few landmarks."""
     kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function)
     _keep_by_all_sources(kernel, function.__module__)
     return kernel
 
 
 def compiled_within(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile an inner loop, as above, into each kernel that calls it: a call hands over every array of a
-    tuple of arrays by eight numbers, which costs more than a short loop itself."""
+    """Compile a function like `compiled_borrowing`, inlined in each kernel that calls it: a call passes each
+    array as eight numbers, which costs more than a short loop."""
     kernel: Callable[P, R] = numba.njit(
         cache=True, nogil=True, error_model="numpy", _nrt=False, inline="always"
     )(function)
@@ -61,9 +60,9 @@ def compiled_within(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a loop that adds up over arrays so that vector registers are used, which is several times
-    faster. The order of the terms is set when it is compiled: runs on one kind of processor agree in
-    every byte, two kinds may differ in the last bit, as with the library's products of matrices."""
+    """Compile sums over arrays with vector registers, which is several times faster. The order of the terms
+    is fixed at compilation: runs on one kind of processor give the same bytes, and two kinds may differ in
+    the last bit, like the matrix products of NumPy."""
     kernel: Callable[P, R] = numba.njit(
         cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"}, _nrt=True
     )(function)
@@ -71,62 +70,64 @@ def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     return kernel
 
 
-_heard: list[Callable[[], None]] = []
+_callbacks: list[Callable[[], None]] = []
 
 
-class _Compiling(event.Listener):  # type: ignore[misc]
-    """Hears of every kernel that is compiled; one that is loaded from what is kept is none."""
+class _CompilationListener(event.Listener):  # type: ignore[misc]
+    """Calls a function when Numba begins to compile a kernel; loading from the cache is no compilation."""
 
-    def __init__(self, begun: Callable[[], None]) -> None:
-        self._begun = begun
+    def __init__(self, callback: Callable[[], None]) -> None:
+        self._callback = callback
 
     def on_start(self, event: event.Event) -> None:
-        """A kernel begins to be compiled."""
+        """Call the function."""
         del event
-        self._begun()
+        self._callback()
 
     def on_end(self, event: event.Event) -> None:
-        """It is compiled."""
+        """Do nothing."""
 
 
 @contextmanager
-def on_compiling(tell: Callable[[], None]) -> Iterator[None]:
-    """Inside, `tell` is called before each kernel that this machine has to compile, in the thread that
-    waits for it, and when somebody else compiles for it (see `others_compile`). Kernels that are kept on disk
-    need no compiling and are not told."""
-    _heard.append(tell)
+def on_compiling(callback: Callable[[], None]) -> Iterator[None]:
+    """Call a function before each kernel that is compiled within the context, in the thread that waits for
+    it, and when other processes compile for it (see `others_compile`)."""
+    _callbacks.append(callback)
     try:
-        with event.install_listener("numba:compile", _Compiling(tell)):
+        with event.install_listener("numba:compile", _CompilationListener(callback)):
             yield
     finally:
-        _heard.remove(tell)
+        _callbacks.remove(callback)
 
 
 def others_compile() -> None:
-    """Tell those who listen that this thread waits for kernels which other processes compile."""
-    for tell in tuple(_heard):
-        tell()
+    """Call the functions of `on_compiling`, because this thread waits for kernels that other processes
+    compile."""
+    for callback in tuple(_callbacks):
+        callback()
 
 
 def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
-    """Let what is kept of a kernel be good only while no source that it may have taken in has changed."""
-    file = kernel._cache._cache_file  # numba has no public place for this
-    file._source_stamp = sources_digest(module)  # not the file's time: a copy of the sources shares the cache
-    # Numba numbers files anew after a change of the sources, and writes its index first: who dies in between,
-    # or reads meanwhile, would run machine code of the sources before. No two sources share a name here.
+    """Make the cache of a kernel valid for one digest of all sources that it may include."""
+    file = kernel._cache._cache_file  # Numba has no public interface for this
+    file._source_stamp = sources_digest(
+        module
+    )  # not the time of the file: copies of the sources share a cache
+    # Numba numbers its files from zero after a change of the sources, and writes the index first. A process
+    # that ends in between, or reads meanwhile, would run old machine code. No two sources share a file name.
     digest = hashlib.sha256(repr(file._source_stamp).encode()).hexdigest()[:12]
-    # Of other sources nothing but this is read: what they left may name classes that are no more.
+    # Entries of other sources are not read, because they may refer to classes that no longer exist.
     file._version = f"{file._version} {digest}"
     base = file._index_name.removesuffix(".nbi")
-    # Nor do two types: who has read an index, while sources change to and fro, finds its own code or none.
+    # Two types share no file name either: an index that was read before a change leads to no other code.
     file._data_name = lambda _number: f"{base}.{digest}.{uuid.uuid4().hex[:16]}.nbc"
     file.save = _saved_by_one(file, base)
 
 
 def _saved_by_one(file: Any, base: str) -> Callable[[Any, Any], None]:  # noqa: ANN401
-    """Let one process at a time write what is kept of a kernel: two that compile it for other types at once
-    would give both the same file, and the index would lead one of them to the other's machine code. What
-    no index names goes."""
+    """Return a replacement of Numba's `save` that lets one process at a time write the cache of a kernel, and
+    deletes files that no index refers to. Two processes that compile it for different types at once would
+    otherwise use the same file."""
     save: Callable[[Any, Any, Any], None] = type(file).save
 
     def save_alone(key: Any, data: Any) -> None:  # noqa: ANN401
@@ -141,24 +142,25 @@ def _saved_by_one(file: Any, base: str) -> Callable[[Any, Any], None]:  # noqa: 
 
 
 @contextmanager
-def locked(beside: Path) -> Iterator[None]:
-    """Inside, no other process holds the lock of a file's folder; where there can be no lock, all goes on."""
+def locked(file: Path) -> Iterator[None]:
+    """Hold the lock of the folder of a file; without effect where the file system has no locks."""
     with ExitStack() as stack:
         with suppress(ImportError, OSError):
             import fcntl
 
-            lock = stack.enter_context((beside.parent / ".lock").open("a"))
-            fcntl.flock(lock, fcntl.LOCK_EX)  # let go with the file
+            lock = stack.enter_context((file.parent / ".lock").open("a"))
+            fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed
         yield
 
 
 def is_kept(kernel: Callable[..., Any]) -> bool:
-    """Whether machine code of a kernel is kept, for any types, that was made from the sources as they are."""
+    """Return whether the cache has machine code of a kernel, for any types, of the present sources."""
     return bool(kernel._cache._cache_file._load_index())  # type: ignore[attr-defined]
 
 
 def sources_digest(module: str) -> str:
-    """SHA-256 (hex) of a module's source and of those of its package that it imports, however far."""
+    """Return the SHA-256 (hex) of the source of a module and of all modules of its package that it imports,
+    directly or indirectly."""
     package = module.partition(".")[0] + "."
     seen = {module}
     waiting = [module]
@@ -174,7 +176,7 @@ def sources_digest(module: str) -> str:
 
 @cache
 def _imported(module: str) -> frozenset[str]:
-    """The modules that are loaded and named in the imports of this one."""
+    """Return the loaded modules that the imports of a module name."""
     names: set[str] = set()
     text = _source(module).decode()
     for origin, what in _FROM.findall(text):

@@ -1,4 +1,4 @@
-"""How far the way is free, as people, programs and robots are told."""
+"""Free distance on the path of the robot, for the page, programs and robots."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from enum import IntEnum
 
 
 class Zone(IntEnum):
-    """What a robot should do about what is on its way."""
+    """What a robot should do because of obstacles on its path."""
 
     CLEAR = 0
     SLOW = 1
@@ -17,26 +17,26 @@ class Zone(IntEnum):
 
     @property
     def label(self) -> str:
-        """The zone in one word."""
+        """The zone as text."""
         return self.name.lower()
 
 
 @dataclass(frozen=True, slots=True)
 class Clearance:
-    """What one scan shows of the way that the robot drives, an arc of constant curvature.
+    """Obstacles of one scan on the path of the robot, an arc of constant curvature.
 
     Attributes:
-        zone: UNKNOWN where nothing is seen in the way and the sensor does not look along it, or where it is
-            not known how high what it sees stands: that is not free, it is not seen.
-        ahead: Distance along the way from the robot's end to the nearest obstacle [m], 0 at the robot's
-            side; infinite where the slow zone is free.
-        beside: Least distance between the robot's sides and what stands beside the way [m], 0 for what
-            stands in it; infinite where nothing is near.
-        x, y: Where the nearest obstacle stands in the level base frame [m]; NaN where there is none.
-        curvature: Of the way [1/m], positive to the left.
+        zone: UNKNOWN if no obstacle is observed but the sensor does not observe the path, or the height of
+            returns is unknown.
+        ahead: Distance along the path from the end of the robot to the nearest obstacle [m], 0 at its side;
+            infinite if the slow zone is free.
+        beside: Least distance between the sides of the robot and obstacles next to the path [m], 0 for one on
+            the path; infinite without one.
+        x, y: Position of the nearest obstacle in the level base frame [m]; NaN without one.
+        curvature: Curvature of the path [1/m], positive to the left.
         backward: Whether the robot drives backwards.
-        within: How far along the way was looked [m].
-        begins: How far along the way from the base the robot ends and `ahead` begins [m].
+        within: Length of the path that is checked [m].
+        begins: Distance along the path from the base to the end of the robot, where `ahead` begins [m].
     """
 
     zone: Zone

@@ -1,4 +1,4 @@
-"""How far a pose can be trusted, as people and programs are told."""
+"""Quality of a pose, for the page and for programs."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ HealthState = Literal["good", "weak", "lost"]
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """How far the pose can be trusted after a scan.
+    """Quality of the pose after a scan.
 
     Attributes:
-        state: "good"; "weak": the map may suffer; "lost": the pose means nothing.
-        reason: Why, in words for people; empty when good.
+        state: "good"; "weak": the map may be wrong; "lost": the pose is not usable.
+        reason: Message with the reason; empty if good.
         n_eff: Effective number of particles.
-        ancestors: How many particles of 50 to 100 scans ago are ancestors of those of today.
-        detections: Detections in the scan; recognised: those of them that are well known landmarks
-            (mean over the particles); ambiguous: those with two likely landmarks (likewise).
-        innovation: Normalised innovation squared a degree of freedom, mean over the scan: 1 where the
-            errors are as large as their covariances say; NaN where no known landmark was recognised.
-        sigma_xy: Standard deviation of the position [m]; sigma_yaw: of the heading [rad].
-        odometry: How far the scan moved the pose away from what the odometry said [sigma].
-        doubt: Why the odometry is not believed, for people; it may be good nevertheless, by the trees.
+        ancestors: Number of particles of 50 to 100 scans ago that have descendants.
+        detections: Number of detections in the scan.
+        recognised: Number of detections of well known landmarks, mean over the particles.
+        ambiguous: Number of detections with two likely landmarks, mean over the particles.
+        innovation: Normalised innovation squared per degree of freedom, mean over the scan: 1 if the errors
+            agree with their covariances; NaN without a known landmark.
+        sigma_xy: Standard deviation of the position [m].
+        sigma_yaw: Standard deviation of the heading [rad].
+        odometry: Difference between the pose and the prediction by odometry [sigma].
+        doubt: Message why the odometry may be wrong; the pose may be good nevertheless.
     """
 
     state: HealthState = "good"
@@ -39,6 +41,6 @@ class Health:
     odometry: float = 0.0
     doubt: str = ""
 
-    def warnings(self, said: str) -> tuple[str, ...]:
-        """Of what people are warned: of an odometry that is not believed, where that was not `said` yet."""
-        return (self.doubt,) if self.doubt not in ("", said) else ()
+    def warnings(self, reported: str) -> tuple[str, ...]:
+        """Return the doubt about the odometry as a warning, unless it is the one `reported` already."""
+        return (self.doubt,) if self.doubt not in ("", reported) else ()

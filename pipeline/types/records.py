@@ -1,5 +1,5 @@
-"""What flows through the pipeline: immutable records. Times are integer nanoseconds, lengths metres,
-angles radians. Tables are kept as columns of equal length, never as lists of objects.
+"""Immutable records that pass between packages. Times are integer nanoseconds, lengths metres, angles
+radians. Tables are columns of equal length, not lists of objects.
 """
 
 from __future__ import annotations
@@ -34,28 +34,26 @@ from pipeline.types.sensor_data import TruthTrees as TruthTrees
 from pipeline.types.sensor_data import Turn as Turn
 from pipeline.types.sensor_data import UInt16 as UInt16
 
-# --- what the stages hand on ---------------------------------------------------------------------
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """All that the mapper needs for one scan: the scan and the motion at its time.
+    """Input of the mapper: a scan, and the motion and tilt at its time.
 
     Attributes:
         index: Number of the scan in the run, from 0.
-        scan: The sweep.
-        T_odom_base: Pose of the base at the scan's time in the odometry's frame, None when the
-            source has none.
-        roll, pitch: Tilt of the base against gravity [rad], 0 when not known.
+        scan: The scan.
+        T_odom_base: Pose of the base in the frame of the odometry at the time of the scan; None without
+            odometry.
+        roll, pitch: Tilt of the base against gravity [rad]; 0 if unknown.
         tilt_known: Whether roll and pitch were measured.
-        twist: Velocity of the base at the scan: forward, left [m/s], turn [rad/s]; zero when unknown.
-        warnings: What the synchroniser noticed on the way to this scan.
-        doubt: Why the motion to this scan may be wrong, for people; empty when nothing says so.
-        slack: What that adds to its standard deviations: position [m] and heading [rad].
-        measured: The pose by another source at this scan, None where there is none.
-        turn: By a gyroscope since the scan before, None where there is none.
-        turn_rate: By a gyroscope at the scan [rad/s].
-        learnt: What the readings so far have taught of the gyroscope.
+        twist: Velocity of the base at the scan: forward, left [m/s], turn [rad/s]; zero if unknown.
+        warnings: Messages of the synchroniser since the previous scan.
+        doubt: Message why the motion to this scan may be wrong; empty if there is no doubt.
+        slack: Standard deviations that the doubt adds to the motion: position [m] and heading [rad].
+        measured: Pose measurement of another source at this scan, or None.
+        turn: Rotation by the gyroscope since the previous scan, or None.
+        turn_rate: Rate of turn by the gyroscope at the scan [rad/s], or None.
+        learnt: Calibration of the gyroscope so far.
     """
 
     index: int
@@ -76,13 +74,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labels:
-    """Which cluster each point belongs to.
+    """Clusters of the points of one scan.
 
     Attributes:
-        label: int32, shape (N,): 0..clusters-1 in the order of their first point, -1 for noise. What was
-            joined to a trunk and taken off (see `cluster_splitting`) comes after all others.
+        label: int32, shape (N,): cluster of each point, 0..clusters-1 in the order of their first points, -1
+            for noise. Parts that were split off trunks (see `cluster_splitting`) follow all other clusters.
         clusters: Number of clusters.
-        hidden: shape (clusters,): whether something nearer hides an edge of the cluster.
+        hidden: shape (clusters,): whether a nearer object hides an edge of the cluster.
     """
 
     label: Int32
@@ -91,7 +89,7 @@ class Labels:
 
 
 class Verdict(IntEnum):
-    """What a cluster is, or why it is not a tree."""
+    """Class of a cluster, or the reason why it is not a tree."""
 
     TREE = 0
     POLE = 1
@@ -113,13 +111,13 @@ class Verdict(IntEnum):
 
     @property
     def label(self) -> str:
-        """The verdict in words, for people and files."""
+        """The verdict as text for the page and for files."""
         return self.name.lower().replace("_", " ")
 
 
-#: What columns are voted to be, in the order of their shares (see Columns).
+#: Classes of columns, in the order of their shares of votes (see Columns).
 CLASSES = (Verdict.TREE, Verdict.POLE, Verdict.PERSON, Verdict.BUSH, Verdict.WALL, Verdict.OTHER)
-#: What the votes count where circles show something round: so seldom is it anything else (docs/trunks.md).
+#: Weights of the votes for an object that is round by its circle fits (docs/trunks.md).
 AT_ROUND = tuple(1.0 if k in (Verdict.TREE, Verdict.POLE, Verdict.PERSON) else 0.1 for k in CLASSES)
 
 
@@ -130,16 +128,16 @@ class Clusters:
     Attributes:
         size: int64, number of points.
         centroid: shape (K, 3) [m].
-        eigenvalues: shape (K, 3) [m^2], descending; the third is 0 when the plane is 2D.
+        eigenvalues: shape (K, 3) [m^2], descending; the third is 0 in two dimensions.
         eccentricity: lambda1 / lambda2 >= 1 (Eq. 4); inf for points on a line.
         centre: shape (K, 2) [m], the estimate of the trunk's axis.
         covariance: shape (K, 2, 2) [m^2], of `centre`.
-        radius, radius_sigma: [m], of the fitted circle; NaN where none was fitted.
+        radius, radius_sigma: [m], of the fitted circle; NaN without a fit.
         radial_std: [m], standard deviation of the distances to the axis (the cylinder check).
         arc: Visible part of the circle [rad].
         extent: shape (K, 3) [m], size of the bounding box along the ray, across it and up.
         hidden: Whether something nearer hides an edge of the cluster.
-        cut: Whether it goes on where nobody looked (see `pipeline.detection.truncation`).
+        cut: Whether it may continue beyond the observed space (see `pipeline.detection.truncation`).
         verdict: int32, see Verdict.
     """
 
@@ -161,7 +159,7 @@ class Clusters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Detections:
-    """The clusters that SLAM sees as trees, in the base frame; columns of length D.
+    """Candidates for trees, the observations of SLAM, in the base frame; columns of length D.
 
     Attributes:
         cluster: int64, row in Clusters.
@@ -182,7 +180,7 @@ class Detections:
 
 
 def no_detections() -> Detections:
-    """A table without rows."""
+    """Return a table without rows."""
     return Detections(
         np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 2, 2)), *(np.zeros(0) for _ in range(4))
     )
@@ -193,20 +191,19 @@ class Trees:
     """The tree map (Table 2) as columns of length T, in the frame of the map.
 
     Attributes:
-        number: int64, from 1; a tree keeps its number for ever.
+        number: int64, from 1; a tree never changes its number.
         position: shape (T, 2) [m].
         covariance: shape (T, 2, 2) [m^2].
         velocity: shape (T, 2) [m/s], of the Kalman filter's state (Eq. 10).
-        dbh: Diameter at breast height [m], NaN where no arc carried one.
-        dbh_sigma: [m], NaN likewise.
+        dbh: Diameter at breast height [m], NaN if no arc was wide enough.
+        dbh_sigma: Its standard deviation [m], or NaN.
         eccentricity: Mean over the observations.
-        observations: int64, number of scans it was seen in; where pieces of it were trees of their own before
-            they came to be one, the scans in which each was seen count for each.
-        coverage: Part of its circumference that was seen [rad].
+        observations: int64, number of scans with a detection of it. The counts of merged trees are added.
+        coverage: Part of its circumference that was observed [rad].
         first_seen_ns, last_seen_ns: int64.
-        confirmed: Whether it was seen often enough to be shown and exported.
-        sides: int64: bit k is set when the k-th of 36 sectors around the trunk was seen, counted from x
-            to y of the map; None where only the coverage is known.
+        confirmed: Whether it was observed often enough to be shown and exported.
+        sides: int64: bit k is set if the k-th of 36 sectors around the trunk was observed, counted from x to
+            y of the map; None if only the coverage is known.
     """
 
     number: Int
@@ -226,16 +223,17 @@ class Trees:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
-    """What stands upright in what all scans gathered; columns of length K, frame of the map.
+    """Vertical columns of voxels over all scans; columns of length K, frame of the map.
 
     Attributes:
-        tile: int64, shape (K, 2): where in the memory the foot stands.
+        tile: int64, shape (K, 2): tile of the voxel map that contains the foot.
         axis: shape (K, 5): x, y at 1.3 m [m], shift of x and y per metre of height, strength.
-        viewed: How high above the ground any scan looked there [m].
-        present, absent: In how many scans something, or nothing, stood there in free view.
+        viewed: Greatest height above the ground that a scan observed there [m].
+        present, absent: Number of scans with free view of the place in which an object was there, or not.
         met, passed: int32, shape (K, slices of height): rays that ended at it, or passed its axis.
-        figures: shape (K, figures): what it is judged by, see `pipeline.classification.features.NAMES`.
-        share: shape (K, 6): votes for tree, pole, person, bush, wall, other; verdict: int32, see Verdict.
+        figures: shape (K, figures): features, see `pipeline.classification.features.NAMES`.
+        share: shape (K, 6): votes for tree, pole, person, bush, wall, other.
+        verdict: int32, see Verdict.
     """
 
     tile: Int
@@ -252,14 +250,14 @@ class Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HeightMap:
-    """The ground as all scans saw it; columns of length K, one a known cell, in the frame of the map.
+    """Terrain map; columns of length K, one row per observed cell, frame of the map.
 
     Attributes:
         cell: Side of the square cells [m].
         place: int32, shape (K, 2): the cell spans from place * cell to (place + 1) * cell [m].
-        height: float32 [m], above the ground where the run began.
-        sigma: float32 [m], how far one view's height lies from it.
-        views: int32, how many scans saw it.
+        height: float32 [m], above the ground at the start of the run.
+        sigma: float32 [m], standard deviation of the height of one view.
+        views: int32, number of scans that observed it.
     """
 
     cell: float
@@ -277,7 +275,7 @@ class Landmarks:
         birth: int64, serial number of the detection that began the landmark: its identity.
         position: shape (L, 2) [m].
         covariance: xx, xy, yy, shape (L, 3) [m^2], given the path.
-        score: Hits less misses in free view, of the last hits; below 0 it was missed more often than seen.
+        score: Weighted hits minus misses in free view; negative if it was missed more often than detected.
         gate, distance_max: Limits of the data association [sigma], [m].
     """
 
@@ -291,7 +289,7 @@ class Landmarks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
-    """What SLAM believes after a scan.
+    """Estimate of SLAM after a scan.
 
     Attributes:
         T_map_base: The pose.
@@ -301,10 +299,9 @@ class PoseEstimate:
         n_eff: Effective number of particles, 1 / sum of squared weights.
         landmarks: shape (L, 2) [m], the landmarks of the best particle.
         resampled: Whether the particles were resampled at this scan.
-        health: How far it can be trusted.
-        relative: Covariance with respect to the landmarks around, shape (3, 3); None: `covariance`.
-        landmark_of: Birth of the landmark that SLAM associates with each detection, int64, shape (D,); -1 for
-            a detection without landmark.
+        health: Quality of the pose.
+        relative: Covariance with respect to the nearby landmarks, shape (3, 3); None if it is `covariance`.
+        landmark_of: Birth number of the landmark of each detection, int64, shape (D,); -1 without one.
     """
 
     T_map_base: Pose2
@@ -321,7 +318,7 @@ class PoseEstimate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
-    """Where the robot was at each scan (Eq. 11), in the frame of the map; columns of length N.
+    """Path of the robot (Eq. 11), one row per scan, in the frame of the map; columns of length N.
 
     Attributes:
         stamp_ns: int64.
@@ -339,26 +336,25 @@ class Path:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """All that came of one scan: the picture, and what the map knows now.
+    """Result of one scan: its points and clusters, and the present map.
 
     Attributes:
         index, stamp_ns: Of the scan.
         raw: float32, shape (N, 3) [m]: the scan in the level sensor frame.
-        filtered: float32, shape (M, 3) [m]: what passed the filters, same frame.
+        filtered: float32, shape (M, 3) [m]: the points that passed the filters, same frame.
         labels: int32, shape (M,): row in `clusters` of each filtered point, -1 for noise.
         clusters, detections: Of this scan.
         estimate: The pose.
-        T_odom_base: The pose by odometry alone.
-        sensor_offset: shape (3,) [m]: where the sensor stands in the base frame; add it to points
-            of `raw` and `filtered` to have them in the level base frame.
+        T_odom_base: The pose by odometry only.
+        sensor_offset: shape (3,) [m]: position of the sensor in the base frame; `raw` plus this offset is in
+            the level base frame.
         trees: The map.
-        counts: How many points each stage let pass and how many it refused, by name.
-        warnings: For people.
-        columns: What was gathered over the scans, None where nothing is.
-        ground: The height map, made anew every some scans; None where no ground is looked for, or where it
-            is the same as in the picture before.
-        base_z: Height of the base in the height map [m].
-        clearance: Of the way that the robot drives; None where nobody looks for obstacles.
+        counts: Number of points that each stage passed and rejected, by name.
+        warnings: Messages for the user.
+        columns: Voxel columns; None without this classifier.
+        ground: Terrain map, updated every few scans; None without ground segmentation, or if it is unchanged.
+        base_z: Height of the base in the terrain map [m].
+        clearance: Free distance on the path of the robot; None without obstacle detection.
     """
 
     index: int
@@ -381,5 +377,5 @@ class Frame:
 
     @property
     def health(self) -> Health:
-        """How far the pose can be trusted."""
+        """Quality of the pose."""
         return self.estimate.health

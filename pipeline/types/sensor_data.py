@@ -1,5 +1,5 @@
-"""What sources give: scans, motion, and what is known for certain. Times are integer nanoseconds, lengths
-metres, angles radians.
+"""Records of sources: scans, motion, and ground truth. Times are integer nanoseconds, lengths metres, angles
+radians.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ Bool = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stems:
-    """Stems that another program found in a sweep, one row a point of its scan.
+    """Stems that another program detected in a scan, one row per point of the scan.
 
     Attributes:
-        axis: Unit vectors along the stems, upwards, sensor frame, shape (N, 3); NaN where not known.
-        dbh: Diameter at breast height [m], NaN where none was fitted, shape (N,).
+        axis: Unit vectors along the stems, upwards, sensor frame, shape (N, 3); NaN if unknown.
+        dbh: Diameter at breast height [m], shape (N,); NaN without a fit.
     """
 
     axis: Float
@@ -35,16 +35,16 @@ class Stems:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """One sweep of the LiDAR (Eq. 1), in the sensor's own frame (`lidar`).
+    """One scan of the LiDAR (Eq. 1), in the frame of the sensor (`lidar`).
 
     Attributes:
-        stamp_ns: Time of the sweep.
+        stamp_ns: Time of the scan.
         points: float32, shape (N, 3) [m], all finite, no returns at the origin.
-        reflectance: float32, shape (N,), in the sensor's own scale, or None.
-        ring: int32, shape (N,), the laser that saw the point (0 = lowest), or None.
+        reflectance: float32, shape (N,), in the scale of the sensor, or None.
+        ring: int32, shape (N,), the laser that measured the point (0 = lowest), or None.
         offset_ns: int32, shape (N,), time of each point relative to `stamp_ns`, or None.
-        dropped: How many returns the reader left out because they were not finite or empty.
-        stems: Where the source gives stems instead of returns; then `points` are their places.
+        dropped: Number of returns that the reader rejected because they were not finite or empty.
+        stems: Stems, if the source provides stems instead of returns; `points` are their positions then.
     """
 
     stamp_ns: int
@@ -58,37 +58,37 @@ class Scan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Odometry:
-    """Where the wheels (or another source) say the base is.
+    """Pose of the base by wheels or another odometry.
 
     Attributes:
         stamp_ns: Time of the pose.
-        T_odom_base: The pose of the base in the odometry's own frame.
+        T_odom_base: Pose of the base in the frame of the odometry.
     """
 
     stamp_ns: int
     T_odom_base: Pose3
 
 
-SHARED = 4  # errors that all poses of a source have alike, at the most: two of a shift, two of turns
-SOURCES = 2  # of measured poses, each with errors of its own: GNSS, another SLAM
+SHARED = 4  # most errors that all poses of a source share: two of a shift, two of rotations
+SOURCES = 2  # sources of measured poses, each with its own shared errors: GNSS, another SLAM
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseMeasurement:
-    """Where another source (GNSS, another SLAM) says the base is, in the frame of the map.
+    """Pose of the base in the frame of the map, measured by another source (GNSS, another SLAM).
 
-    What its frame lies off errs all its poses alike: z = x + shared e + v with e ~ N(0, I) the same for all
-    poses of the source, and v of this one alone.
+    z = x + shared e + v, where the error e ~ N(0, I) is the same for all poses of the source, for example the
+    offset of its frame, and v is independent between poses.
 
     Attributes:
         stamp_ns: Time of the pose.
         T_map_base: The pose.
-        covariance: shape (3, 3) of x, y [m], yaw [rad]; a large variance says nothing of the heading.
-        gate: It is left out where the square of its distance from what is known, in sigmas, is larger: a
-            source may jump.
-        shared: How x, y [m], yaw [rad] err by one sigma of each of the errors that all poses of the source
-            have alike, shape (3, SHARED); they are in the covariance too. None: each errs alone.
-        source: Whose errors those are, less than SOURCES.
+        covariance: shape (3, 3) of x, y [m], yaw [rad], with the shared errors; the variance of
+            an unknown heading is large.
+        gate: Largest squared Mahalanobis distance from the estimate at which it is used.
+        shared: Effect on x, y [m], yaw [rad] of one sigma of each shared error, shape (3, SHARED); None
+            without shared errors.
+        source: Number of the source, less than SOURCES.
     """
 
     stamp_ns: int
@@ -100,7 +100,7 @@ class PoseMeasurement:
 
     @property
     def own(self) -> Float:
-        """Covariance of what this pose errs by alone, shape (3, 3)."""
+        """Covariance of the independent error v, shape (3, 3)."""
         return self.covariance if self.shared is None else self.covariance - self.shared @ self.shared.T
 
     def is_sound(self) -> bool:
@@ -117,12 +117,12 @@ class PoseMeasurement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imu:
-    """One reading of the inertial unit, turned into the base frame.
+    """One reading of the inertial measurement unit, in the base frame.
 
     Attributes:
         stamp_ns: Time of the reading.
         angular_velocity: shape (3,) [rad/s].
-        linear_acceleration: shape (3,) [m/s^2], +9.81 along z when it stands still and level.
+        linear_acceleration: shape (3,) [m/s^2], +9.81 along z at rest and level.
         orientation: Quaternion w, x, y, z of the base in a level frame, shape (4,), or None.
     """
 
@@ -134,7 +134,7 @@ class Imu:
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """How far a gyroscope says that the base turned about the vertical since the scan before: angle and its
+    """Rotation of the base about the vertical since the previous scan by the gyroscope: angle and its
     standard deviation [rad]."""
 
     angle: float
@@ -143,18 +143,20 @@ class Turn:
 
 @dataclass(frozen=True, slots=True)
 class Learnt:
-    """What the readings up to a step have taught of the gyroscope: who reads on from there needs it.
+    """Calibration of the gyroscope by the readings up to a step; reading can continue from it.
 
     Attributes:
-        stamp_ns: Of the step.
-        bias: Of the turn rate; scatter: of the readings around it [rad/s]; blocks: how many it is the mean
-            of; block: the readings of the next.
-        same: How many readings in a row were the same.
-        turned: Sums over the steps, of the wheels' turns [rad], of their squares, and of their products with
-            those of the gyroscope [rad^2].
-        proven: Whether it was seen to turn as the wheels do.
-        stands: Since when the robot stands, and where by odometry; None before the first odometry.
-        tilt: When it was last taken [ns], roll and pitch [rad].
+        stamp_ns: Time of the step.
+        bias: Bias of the turn rate [rad/s].
+        scatter: Standard deviation of the readings around the bias [rad/s].
+        blocks: Number of blocks of readings in the bias.
+        block: Readings of the unfinished block [rad/s].
+        same: Number of equal readings in a row.
+        turned: Sums over the steps of the turns by wheels [rad], of their squares, and of their products with
+            the turns by gyroscope [rad^2].
+        proven: Whether the gyroscope was observed to turn with the wheels.
+        stands: Time and odometry pose since which the robot is at rest; None before the first odometry.
+        tilt: Time of the last tilt [ns], roll and pitch [rad].
     """
 
     stamp_ns: int = 0
@@ -171,11 +173,11 @@ class Learnt:
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """What a source noticed on the way, for people: it becomes a warning of the next step.
+    """A message of a source for the user, which becomes a warning of the next step.
 
     Attributes:
-        stamp_ns: When.
-        text: In words.
+        stamp_ns: Time.
+        text: The message.
     """
 
     stamp_ns: int
@@ -187,15 +189,15 @@ Record = Scan | Odometry | Imu | PoseMeasurement | Notice
 
 @dataclass(frozen=True, slots=True)
 class Sensor:
-    """What is known of the LiDAR. It decides how far apart neighbouring returns lie.
+    """Properties of the LiDAR; they determine the distance between neighbouring returns.
 
     Attributes:
-        name: For people, e.g. "VLP-16".
-        rings: Number of lasers; 1 for a planar laser; 0 when unknown or not a spinning sensor.
-        ring_step: Angle between neighbouring lasers [rad]; 0 when unknown.
+        name: Displayed name, e.g. "VLP-16".
+        rings: Number of lasers; 1 for a planar laser; 0 if unknown or not a spinning sensor.
+        ring_step: Angle between neighbouring lasers [rad]; 0 if unknown.
         azimuth_step: Angle between neighbouring shots [rad].
         range_sigma: Standard deviation of a range [m].
-        range_max: Longest range that it reports [m].
+        range_max: Largest range that it reports [m].
     """
 
     name: str = "LiDAR"
@@ -208,12 +210,12 @@ class Sensor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthTrees:
-    """What really stands in the plot (trees and others), in the frame of the map.
+    """Ground truth of trees and other objects, in the frame of the map.
 
     Attributes:
         x, y: shape (N,) [m].
-        dbh: Diameter at breast height [m], NaN where it is not known, shape (N,).
-        kind: One of "tree", "pole", "person", "bush", "other" each.
+        dbh: Diameter at breast height [m], shape (N,); NaN if unknown.
+        kind: Class of each: "tree", "pole", "person", "bush" or "other".
     """
 
     x: Float
@@ -224,13 +226,13 @@ class TruthTrees:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthPath:
-    """Where the robot really was.
+    """Ground truth of the path.
 
     Attributes:
         stamp_ns: int64, shape (N,), ascending.
         x, y: shape (N,) [m].
-        yaw: shape (N,) [rad], NaN where only the position is known (GNSS).
-        same_frame: Whether x and y are in the frame of the map; if not, it is aligned before it is
+        yaw: shape (N,) [rad]; NaN if only the position is known (GNSS).
+        same_frame: Whether x and y are in the frame of the map; if not, the path is aligned before it is
             compared.
     """
 
@@ -243,7 +245,7 @@ class TruthPath:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What is known for certain about a run; either part may be missing."""
+    """Ground truth of a run; either part may be missing."""
 
     trees: TruthTrees | None = None
     path: TruthPath | None = None

@@ -1,4 +1,4 @@
-"""Relocalisation: where a constellation of stems stands in a map, without any guess of the pose."""
+"""Global matching of a constellation of stems with a map, without an initial pose."""
 
 from pipeline.loop_closure.stem_matching.constellation import Match, Refusal, find_constellation
 from pipeline.loop_closure.stem_matching.stem_constellation import Stems

@@ -1,9 +1,9 @@
-"""Find a constellation of stems in a map: the pose and its covariance, or why there is none.
+"""Find a constellation of stems in a map: its pose and covariance, or the reason of a refusal.
 
-A wrong loop ruins a map, a missed one costs little. So a pose is told only where (1) enough stems agree,
-(2) so many would not agree by chance, by the number of false alarms of the a contrario method (Desolneux,
-Moisan, Morel 2000), (3) no other pose explains nearly as many, which is what a plantation offers, and
-(4) the stems that agree fix the pose well.
+A wrong loop ruins a map, a missed one costs little. A pose is accepted only if (1) enough stems agree, (2) so
+many would not agree by chance, by the number of false alarms of the a contrario method (Desolneux, Moisan,
+Morel 2000), (3) no other pose explains nearly as many, as in the regular grid of a plantation, and (4) the
+stems that agree determine the pose well.
 """
 
 from __future__ import annotations
@@ -23,33 +23,34 @@ from pipeline.types.records import Int, Int32
 Refusal = Literal[
     "too few stems", "no agreement", "could be chance", "ambiguous", "most stems disagree", "weakly fixed"
 ]
-SHORTEST, LONGEST = 2.0, 20.0  # m, of pairs; shorter ones leave the heading open, longer ones bend
-MOST_PAIRS = 2_000_000  # of the map
-BASE_PAIRS = 150  # of the constellation
-GOLDEN = 0.6180339887498949  # its multiples, modulo 1, spread evenly however many are taken
-LEAST = 4  # stems in agreement, of a hypothesis that is looked at
-REACH = 1.0  # m, at most, between two stems that agree
-ROUNDS = 8
-WIDE, WIDE_ROUNDS = 3.0, 2  # times the slack in the first rounds, when the pose is that of one pair
-WINDOW = 8.0  # m, in which the density of the map is taken
-FALSE_ALARMS = 1e-4  # expected number of agreements as good by chance
-SECOND_BEST = 0.7  # of the stems that agree in the best pose may agree in the second best, and
-LEAD = 3  # so many fewer at least
-AGREEING = 0.4  # of the local stems that come to lie among the map's
-SIGMA_XY, SIGMA_YAW = 0.5, 0.05  # m, rad
+# m; distance of pairs of stems: shorter pairs determine the heading poorly, longer ones suffer from drift.
+SHORTEST, LONGEST = 2.0, 20.0
+MOST_PAIRS = 2_000_000  # pairs of the map
+BASE_PAIRS = 150  # pairs of the constellation
+GOLDEN = 0.6180339887498949  # golden ratio; its multiples modulo 1 are a low-discrepancy sequence
+LEAST = 4  # stems in agreement; hypotheses with fewer are dropped
+REACH = 1.0  # m; largest distance of two stems that agree
+ROUNDS = 8  # iterations of pairing and alignment
+WIDE, WIDE_ROUNDS = 3.0, 2  # factor of the slack in the first iterations, which start from a single pair
+WINDOW = 8.0  # m; radius in which the density of the map is measured
+FALSE_ALARMS = 1e-4  # expected number of equally good agreements by chance
+SECOND_BEST = 0.7  # largest ratio of the agreements of the second best pose and the best one
+LEAD = 3  # least difference of their numbers
+AGREEING = 0.4  # least share of agreeing stems among those inside the map
+SIGMA_XY, SIGMA_YAW = 0.5, 0.05  # m, rad; largest standard deviations of the pose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Match:
-    """What came of a search.
+    """Result of a search.
 
     Attributes:
-        pose: T_reference_local, None where it was refused.
-        covariance: Of x, y [m], yaw [rad], shape (3, 3); zeros where refused.
-        reason: Why there is no pose; None where there is one.
+        pose: T_reference_local; None if it was refused.
+        covariance: Covariance of x, y [m], yaw [rad], shape (3, 3); zeros if refused.
+        reason: Reason of the refusal, or None.
         local, reference: Rows of the stems that agree in the best pose, int64, shape (K,).
-        second: How many agree in the best other pose.
-        false_alarms: Expected number of agreements as good by chance, as a decimal logarithm.
+        second: Number of stems that agree in the second best pose.
+        false_alarms: Decimal logarithm of the expected number of equally good agreements by chance.
     """
 
     pose: Pose2 | None
@@ -64,13 +65,13 @@ class Match:
 def find_constellation(
     local: Stems, reference: Stems, parameters: Relocalisation, *, hypotheses: int = 300_000
 ) -> Match:
-    """Find where local stems stand in a reference map; no guess is needed.
+    """Return the pose of local stems in a reference map, without an initial pose.
 
     Args:
-        local: In their own frame, e.g. what was mapped since the robot was lost.
-        reference: In the frame of the map.
-        parameters: Of this stage.
-        hypotheses: About how many are looked at before the search ends.
+        local: Stems in their own frame, for example of the map since the robot was lost.
+        reference: Stems in the frame of the map.
+        parameters: Parameters of this stage.
+        hypotheses: Number of hypotheses after which no further pair of local stems is tried.
     """
     rows, map_rows = np.flatnonzero(local.usable()), np.flatnonzero(reference.usable())
     search_ = _Search(local.take(rows), reference.take(map_rows), parameters, hypotheses)
@@ -78,7 +79,7 @@ def find_constellation(
     if best is None:
         none = np.zeros(0, np.int64)
         return Match(None, np.zeros((3, 3)), search_.reason, none, none, 0, 0.0)
-    pose, covariance, chance, reason = search_.judged(best, 0 if second is None else second.found)
+    pose, covariance, chance, reason = search_.checked(best, 0 if second is None else second.found)
     at = np.flatnonzero(best.of >= 0)
     return Match(
         pose=pose if reason is None else None,
@@ -93,19 +94,19 @@ def find_constellation(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A refined pose x, y, yaw; the row of the map of each local stem, -1 for none; how many there are."""
+    """A refined pose x, y, yaw; the row of the map for each local stem, or -1; the number of pairs."""
 
     pose: Float
     of: Int
     found: int
 
     def is_same(self, other: _Candidate) -> bool:
-        """Whether it pairs the stems as another one does, by more than half."""
+        """Return whether more than half of the pairs are those of another candidate."""
         return 2 * int(np.count_nonzero((self.of >= 0) & (self.of == other.of))) > self.found
 
 
 class _Search:
-    """One search; local stems are kept about their mean, so that a turn moves them least."""
+    """One search. The local stems are centred at their mean, which decouples rotation and translation."""
 
     def __init__(self, local: Stems, reference: Stems, parameters: Relocalisation, most: int) -> None:
         self.reason: Refusal = "too few stems"
@@ -116,7 +117,7 @@ class _Search:
         self._most, self._looked = most, 0
 
     def best_two(self) -> tuple[_Candidate | None, _Candidate | None]:
-        """The pose in which most stems agree, and the best one that pairs them differently."""
+        """Return the pose in which most stems agree, and the best pose with other pairs."""
         local, reference, p = self._local, self._reference, self._p
         if min(len(local), len(reference)) < p.stems_min:
             return None, None
@@ -136,8 +137,8 @@ class _Search:
         best = refined[0]
         return best, next((c for c in refined[1:] if not c.is_same(best)), None)
 
-    def judged(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
-        """The pose with covariance, the logarithm of the false alarms, and why it is refused if it is."""
+    def checked(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
+        """Return the pose, its covariance, the logarithm of the false alarms, and the reason of a refusal."""
         local, reference = self._local, self._reference
         at = np.flatnonzero(best.of >= 0)
         about_mean = Pose2(*(float(v) for v in best.pose))
@@ -170,7 +171,7 @@ class _Search:
         return None
 
     def _refined(self, pose: Float) -> _Candidate:
-        """Pair and align in turns until the pairs stay."""
+        """Return a pose after pairing and alignment in turns until the pairs do not change."""
         local, reference = self._local, self._reference
         pose = pose.copy()
         of, before = np.full(len(local), -1, np.int64), np.full(len(local), -2, np.int64)
@@ -195,13 +196,13 @@ class _Search:
 
 
 def _evenly(base: Int32) -> Int32:
-    """At most BASE_PAIRS of the pairs, in an order of which every beginning is even over their lengths."""
+    """Return at most BASE_PAIRS pairs, in an order in which each first part covers all lengths evenly."""
     rows = np.linspace(0, len(base) - 1, min(len(base), BASE_PAIRS)).astype(np.int64)
     return base[rows[np.argsort(np.arange(len(rows)) * GOLDEN % 1.0, kind="stable")]]
 
 
 def _log10_false_alarms(tests: int, trials: int, hits: int, p: float) -> float:
-    """log10 of tests * P(Binomial(trials, p) >= hits)."""
+    """Return log10 of tests * P(Binomial(trials, p) >= hits)."""
     from scipy.stats import binom
 
     tail = float(binom.logsf(hits - 1, max(trials, 1), p)) / np.log(10.0)

@@ -1,8 +1,7 @@
-"""Hypotheses of a pose: every pair of local stems laid upon every pair of the map that is as long.
+"""Hypotheses of a pose: each pair of local stems aligned with each pair of the map of equal length.
 
-The pairs of the map are sorted by their length, which is the hash that finds them. Each hypothesis is
-verified by how many other stems find a partner; the search looks at all of them, so that the second
-best is known as well as the best.
+The pairs of the map are sorted by length. Each hypothesis is verified by the number of other stems that find
+a partner. The search is exhaustive, so that the second best pose is known as well.
 """
 
 from __future__ import annotations
@@ -13,17 +12,16 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Int, Int32
 
-KEPT = 48  # candidates that are refined
+KEPT = 48  # hypotheses that are refined
 MOST_CELLS = 1_000_000
-BINS = 256  # of the lengths of pairs, by which the longest are left out where there are too many
-DBH_SLACK = 0.05  # m; a diameter of another height, season or tool
+BINS = 256  # bins of the lengths of pairs, by which the longest are omitted if there are too many
+DBH_SLACK = 0.05  # m; difference of diameters by another height, season or instrument
 
 
 @compiled
 def pairs_within(position: Float, shortest: float, longest: float, most: int) -> tuple[Int32, Float]:
-    """Pairs of stems whose distance is in bounds, sorted by it: rows (K, 2) and lengths (K,) [m].
-
-    Where there are more than `most`, the longest ones are left out.
+    """Return the pairs of stems with a distance between two bounds, sorted by distance: rows (K, 2) and
+    lengths (K,) [m]. Of more than `most` pairs the longest are omitted.
     """
     order = np.argsort(position[:, 0], kind="mergesort")
     bins = np.zeros(BINS, np.int64)
@@ -45,8 +43,8 @@ def _walk_pairs(
     position: Float, order: Int, shortest: float, longest: float,
     bins: Int, taken: int, row: Int32, length: Float,
 ) -> None:  # fmt: skip
-    """Count the pairs by their length in bins, and write those of the first `taken` bins where there is
-    room for them."""
+    """Count the pairs by bins of their length, and write those of the first `taken` bins as far as there is
+    room."""
     n = 0
     for a in range(order.shape[0]):
         i = order[a]
@@ -67,8 +65,8 @@ def _walk_pairs(
 
 @compiled
 def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
-    """A grid over the stems: its low corner and cell size, the first stem of each cell, and the next one
-    of the same cell; -1 for none."""
+    """Return a grid over the stems: its low corner and cell size, the first stem of each cell, and the next
+    stem in the same cell of each stem; -1 without one."""
     grid = np.empty(3)
     grid[0], grid[1], grid[2] = position[:, 0].min(), position[:, 1].min(), cell
     width = np.floor((position[:, 0].max() - grid[0]) / grid[2]) + 1.0
@@ -91,7 +89,7 @@ def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
 def nearest(
     x: float, y: float, reach: float, position: Float, grid: Float, first: Int32, following: Int32
 ) -> tuple[int, float]:
-    """The nearest stem within reach, which is at most a cell: row and squared distance; -1 for none."""
+    """Return row and squared distance of the nearest stem within reach, at most one cell; else row -1."""
     best, best2 = -1, reach * reach
     fa, fb = np.floor((x - grid[0]) / grid[2]), np.floor((y - grid[1]) / grid[2])
     if not (-2.0 < fa < first.shape[0] + 1.0 and -2.0 < fb < first.shape[1] + 1.0):
@@ -110,7 +108,7 @@ def nearest(
 
 @compiled
 def alike(dbh: float, sigma: float, other: float, other_sigma: float) -> bool:
-    """Whether two diameters may be of one stem; one that is not known may be any."""
+    """Return whether two diameters may be of the same stem; an unknown diameter fits any other."""
     if not (dbh > 0.0 and other > 0.0):
         return True
     slack = DBH_SLACK * DBH_SLACK + (sigma * sigma if sigma > 0.0 else 0.0)
@@ -125,19 +123,21 @@ def search(
     grid: Float, first: Int32, following: Int32,
     slack: float, reach: float, least: int, most: int,
 ) -> tuple[Float, Int, int]:  # fmt: skip
-    """Lay every base pair upon all pairs as long and count the stems that agree.
+    """Align each base pair with all pairs of the map of equal length, and count the stems that agree.
 
     Args:
-        local: Stems, shape (L, 2) [m], about their mean; base: pairs of their rows, shape (B, 2).
-        reference: Stems of the map, shape (N, 2) [m]; pair, length: see `pairs_within`.
-        slack: By how much a map may be bent over a constellation [m].
-        reach: No stem agrees over more than this [m], at most a cell of the grid.
+        local: Local stems, shape (L, 2) [m], relative to their mean.
+        base: Pairs of their rows, shape (B, 2).
+        reference: Stems of the map, shape (N, 2) [m].
+        pair, length: Pairs of the map, see `pairs_within`.
+        slack: Standard deviation of the deformation of a map within a constellation [m].
+        reach: Largest distance of two stems that agree [m], at most one cell of the grid.
         least: Hypotheses with fewer stems in agreement are dropped.
-        most: After so many hypotheses no further base pair is begun.
+        most: Number of hypotheses after which no further base pair is tried.
 
     Returns:
-        The best distinct poses x, y, yaw, shape (K, 3), how many stems agree in each, (K,), and how many
-        hypotheses were looked at.
+        The best distinct poses x, y, yaw, shape (K, 3), the number of stems that agree in each, (K,), and the
+        number of hypotheses.
     """
     pose = np.empty((KEPT, 3))
     agree = np.zeros(KEPT, np.int64)
@@ -187,7 +187,7 @@ def search(
                         found += 1
                 if found >= floor:
                     kept = _keep(pose, agree, kept, x, y, yaw, found, reach)
-                    # One with fewer than half could not even be the second best that matters.
+                    # A hypothesis with fewer than half cannot make the best one ambiguous.
                     floor = max(floor, found // 2 + 1)
                     if kept == KEPT:
                         floor = max(floor, int(agree.min()) + 1)
@@ -198,7 +198,7 @@ def search(
 def _keep(
     pose: Float, agree: Int, kept: int, x: float, y: float, yaw: float, found: int, reach: float
 ) -> int:
-    """Keep a hypothesis unless a better one stands at its place; returns how many are kept."""
+    """Store a hypothesis unless a better one has the same pose; returns the number of stored ones."""
     worst = 0
     for k in range(kept):
         dx, dy = pose[k, 0] - x, pose[k, 1] - y
@@ -228,8 +228,8 @@ def partners(
     grid: Float, first: Int32, following: Int32,
     slack: float, reach: float, of: Int,
 ) -> int:  # fmt: skip
-    """The stem of the map that each local stem meets within three sigma, one to one; fills `of` with rows,
-    -1 for none, and returns how many there are."""
+    """Fill `of` with the row of the map for each local stem within three sigma, one to one, -1 without one;
+    returns the number of pairs."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     distance2 = np.full(local.shape[0], np.inf)
     owner = np.full(reference.shape[0], -1, np.int64)
@@ -256,8 +256,8 @@ def partners(
 
 @compiled
 def crowding(pose: Float, local: Float, reference: Float, window: float) -> tuple[float, int]:
-    """Stems of the map per m^2 around where the local ones come to lie, in the mean over them, and how
-    many of them have one within the window."""
+    """Return the mean density of the map around the aligned local stems [1/m^2], and the number of local
+    stems with a stem of the map within the window."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     total, inside = 0, 0
     for m in range(local.shape[0]):

@@ -1,4 +1,4 @@
-"""Stems of a map as a constellation sees them."""
+"""Stems as the matching of constellations uses them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ class Stems:
     Attributes:
         position: shape (N, 2) [m].
         sigma: Standard deviation of a position in its worst direction, shape (N,) [m].
-        dbh: Diameter at breast height, NaN where unknown, shape (N,) [m]; dbh_sigma: of it, shape (N,).
+        dbh: Diameter at breast height, shape (N,) [m]; NaN if unknown.
+        dbh_sigma: Its standard deviation, shape (N,) [m]; NaN if unknown.
     """
 
     position: Float
@@ -30,14 +31,14 @@ class Stems:
 
     @classmethod
     def at(cls, position: Float, sigma: float = 0.05) -> Stems:
-        """Stems of which the place alone is known, positions of shape (N, 2) [m]."""
+        """Return stems of unknown diameter at positions of shape (N, 2) [m]."""
         n = len(position)
         unknown = np.full(n, np.nan)
         return cls(np.asarray(position, np.float64).reshape(n, 2), np.full(n, sigma), unknown, unknown)
 
     @classmethod
     def of_trees(cls, trees: Trees) -> Stems:
-        """The confirmed trees of a map."""
+        """Return the confirmed trees of a map."""
         kept = trees.confirmed
         unknown = np.isnan(trees.dbh[kept])
         return cls(
@@ -48,17 +49,17 @@ class Stems:
         )
 
     def usable(self) -> Bool:
-        """Which of them stand at a finite place that is known to some extent, shape (N,)."""
+        """Return which stems have a finite position and sigma, shape (N,)."""
         finite: Bool = np.isfinite(self.position).all(axis=1) & np.isfinite(self.sigma) & (self.sigma >= 0.0)
         return finite
 
     def take(self, rows: Int | Bool) -> Stems:
-        """Some of them."""
+        """Return the stems of some rows."""
         return Stems(self.position[rows], self.sigma[rows], self.dbh[rows], self.dbh_sigma[rows])
 
 
 def worst_sigma(covariance: Float) -> Float:
-    """Square root of the larger eigenvalue of covariances xx, xy, yy, shape (N, 3) -> (N,) [m]."""
+    """Return the larger standard deviation of covariances xx, xy, yy, shape (N, 3) -> (N,) [m]."""
     xx, xy, yy = covariance[:, 0], covariance[:, 1], covariance[:, 2]
     largest: Float = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
     return np.sqrt(np.maximum(largest, 0.0))
