@@ -165,7 +165,7 @@ def _seen_with(
     level = np.tile(np.eye(3), (lidar.columns, 1, 1)), np.zeros((lidar.columns, 3))
     sweep = sweep_scene(lidar, solids, _NO_GROUND, *level, 0, rng)
     new, solid = sweep.scan.points, sweep.solid
-    hit = (solid >= 0) & lidar.sees(new)
+    hit = solid >= 0
     new, kind = new[hit], classes[solids.owner[solid[hit]]]
     to_real, towards = _directions(points)
     key = int(rng.integers(0, 2**62))

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.config.stages import Evaluation
 from pipeline.evaluation.matching import match
 from pipeline.geometry.poses import Float
-from pipeline.types.records import Bool, Trees, TruthTrees
+from pipeline.types.records import HIDDEN, Bool, Trees, TruthTrees
 
 # A ground truth is doubtful if less than this share of at least so many trees matches.
 _DOUBTFUL_SHARE, _DOUBTFUL_TREES = 0.25, 4
@@ -79,7 +79,8 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
 
     Args:
         trees: The map.
-        truth: Trees and other objects of the ground truth, in the frame of the map.
+        truth: Trees and other objects of the ground truth, in the frame of the map. Objects of kind HIDDEN
+            count neither way: a tree of the map at one of them is neither right nor wrong.
         parameters: Maximum distance of a match, and maximum distance of the ground truth from the path.
         path: Positions of the robot, shape (N, 2) [m]; None scores the whole ground truth.
     """
@@ -87,7 +88,9 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
     found = trees.position[confirmed]
     position = np.stack([truth.x, truth.y], axis=1)
     is_tree = np.array([kind == "tree" for kind in truth.kind], np.bool_)
-    in_reach = _within(position, path, parameters.reach)
+    in_reach = _within(position, path, parameters.reach) & np.array(
+        [k != HIDDEN for k in truth.kind], np.bool_
+    )
     truth_of = match(found, position, parameters.match_distance)
     matched = truth_of >= 0
     hit = np.zeros(len(position), np.bool_)

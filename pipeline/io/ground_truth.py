@@ -17,9 +17,9 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
 from pipeline.io.readers.base import COORDINATE_LIMIT
-from pipeline.types.records import Sensor, Truth, TruthPath, TruthTrees
+from pipeline.types.records import HIDDEN, Sensor, Truth, TruthPath, TruthTrees
 
-KINDS = ("tree", "pole", "person", "bush", "other")
+KINDS = ("tree", "pole", "person", "bush", "other", HIDDEN)
 LARGEST_FILE = 64 << 20
 _X = ("x_m", "x", "treelocationx", "easting", "easting_m", "east", "utm_x")
 _Y = ("y_m", "y", "treelocationy", "northing", "northing_m", "north", "utm_y")
@@ -205,7 +205,7 @@ class _Trees(msgspec.Struct, frozen=True):
     y: Rows
     dbh: Annotated[list[float | None], msgspec.Meta(max_length=2_000_000)]
     kind: Annotated[
-        list[Literal["tree", "pole", "person", "bush", "other"]], msgspec.Meta(max_length=2_000_000)
+        list[Literal["tree", "pole", "person", "bush", "other", "hidden"]], msgspec.Meta(max_length=2_000_000)
     ]
 
 

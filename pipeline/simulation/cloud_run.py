@@ -78,7 +78,8 @@ class CloudRun(SimulatedRun):
         reported[~((reported >= lidar.range_min) & (reported <= lidar.range_max))] = 0.0
         reflectance, no_solid = np.full(ranges.shape, REFLECTANCE), np.full(ranges.shape, -1, np.int32)
         stamp_ns = simulated.START_NS + k * lidar.period_ns
-        return scan_of_returns(lidar, stamp_ns, reported, reflectance, no_solid)
+        echoes = reported[:, :, None], reflectance[:, :, None], no_solid[:, :, None]
+        return scan_of_returns(lidar, stamp_ns, *echoes)
 
     def digest(self) -> str:
         """Return the SHA-256 (hex) of everything that decides the bytes of the run."""

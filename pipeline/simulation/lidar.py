@@ -8,7 +8,7 @@ are in the sensor frame at their own time, as a driver gives them, so motion dis
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -34,12 +34,12 @@ GROUND_REFLECTIVITY = 0.25
 
 @compiled
 def count_echoes(
-    kind: int, shape: Float, o: Float, d: Float, d_next: Float, divergence: float
+    kind: int, shape: Float, surface: Float, o: Float, d: Float, d_next: Float, divergence: float
 ) -> tuple[int, float]:
     """Divide a beam into eight rays; return how many meet a shape, and the sum of their ranges.
 
     Args:
-        kind, shape, o, d: As in `meet_solid`.
+        kind, shape, surface, o, d: As in `meet_solid`.
         d_next: Direction of the ray in the next column.
         divergence: Full width of the beam [rad] times the number of columns.
     """
@@ -49,7 +49,7 @@ def count_echoes(
         share = divergence * ((m + 0.5) / 8.0 - 0.5) / (2.0 * np.pi)
         for i in range(3):
             ray[i] = d[i] + share * (d_next[i] - d[i])
-        met = meet_solid(kind, shape, o, ray, 0.5)
+        met = meet_solid(kind, shape, surface, o, ray, 0.5)
         if met < np.inf:
             count += 1
             total += met
@@ -66,11 +66,13 @@ def echo(
     o: Float,
     directions: Float,
     optics: Optics,
+    last: bool,
 ) -> tuple[float, int]:
     """Return range and shape that the receiver reports for beam k of column c.
 
     At the edge of a shape a part of the beam passes and meets the shape behind. Echoes nearer to one another
-    than `Optics.pulse` are reported as one range in between; else the stronger one is reported.
+    than `Optics.pulse` are reported as one range in between; else the stronger one is reported, or
+    the last one if `last`.
     """
     columns = ranges.shape[0]
     before, after = max(c - 1, 0), min(c + 1, columns - 1)
@@ -95,7 +97,13 @@ def echo(
         return t, n
     neighbour = after if after != c else before
     count, total = count_echoes(
-        kind[edge], shape[edge], o[c], directions[c, k], directions[neighbour, k], optics.divergence * columns
+        kind[edge],
+        shape[edge],
+        surface[edge],
+        o[c],
+        directions[c, k],
+        directions[neighbour, k],
+        optics.divergence * columns,
     )
     if count == 0 or count == 8:
         return t, n
@@ -110,7 +118,7 @@ def echo(
         )
     if behind - near < optics.pulse:
         return (strong * near + weak * behind) / (strong + weak), edge
-    if strong >= weak:
+    if weak == 0.0 or (strong >= weak and not last):
         return near, edge
     return behind, behind_hit
 
@@ -126,6 +134,7 @@ def measure(
     optics: Optics,
     noise: Float,
     key: int,
+    last: bool,
 ) -> tuple[Float, Float, Int32]:
     """Return what the receiver reports: range [m] (0 without a return), reflectance 0..255 and shape, (C, K)
     each.
@@ -134,6 +143,7 @@ def measure(
         ranges, hit: Result of `first_returns`.
         solids, terrain, o, directions, optics, key: See `first_returns`.
         noise: Error of each range [m], shape (C, K).
+        last: Whether the last of two separate echoes is reported, not the stronger one.
     """
     kind, shape, surface = solids.kind, solids.shape, solids.surface
     columns, rings = ranges.shape
@@ -142,7 +152,7 @@ def measure(
     source = np.full((columns, rings), NOTHING, dtype=np.int32)
     for c in range(columns):
         for k in range(rings):
-            t, n = echo(c, k, ranges, hit, solids, o, directions, optics)
+            t, n = echo(c, k, ranges, hit, solids, o, directions, optics, last)
             if n == NOTHING or t > optics.range_max:
                 continue
             if n == GROUND:
@@ -151,7 +161,7 @@ def measure(
             else:
                 reflectivity = surface[n, 0]
                 incidence = 0.7
-                if shape[n, 8] == 0.0 or kind[n] == 0:
+                if shape[n, 8] == 0.0 or kind[n] != 1:
                     incidence = solid_incidence(kind[n], shape[n], o[c], directions[c, k], t)
                     incidence = max(incidence, 0.05)
                 if surface[n, 1] > 0.0:
@@ -178,18 +188,21 @@ def scan_of_returns(
     Args:
         lidar: The sensor.
         stamp_ns: Start of the sweep.
-        reported: Range of each beam [m], 0 without a return; reflectance, source: See `measure`; (C, K) each.
+        reported: Range of each echo of each beam [m], 0 without a return, shape (C, K, echoes); reflectance,
+            source: See `measure`; of the same shape.
     """
-    column, ring = np.nonzero(reported > 0.0)
-    points = lidar.beams()[column, ring] * reported[column, ring, None]
+    column, ring, echo_number = np.nonzero(reported > 0.0)
+    points = lidar.beams()[column, ring] * reported[column, ring, echo_number, None]
+    in_view = lidar.sees(points.astype(np.float32))
+    column, ring, echo_number, points = column[in_view], ring[in_view], echo_number[in_view], points[in_view]
     scan = Scan(
         stamp_ns,
         points.astype(np.float32),
-        reflectance[column, ring].astype(np.float32),
+        reflectance[column, ring, echo_number].astype(np.float32),
         ring.astype(np.int32),
         lidar.column_offsets_ns()[column],
     )
-    return Sweep(scan, source[column, ring])
+    return Sweep(scan, source[column, ring, echo_number])
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,6 +221,9 @@ class SpinningLidar:
         pulse: Echoes nearer to one another than this are reported as one [m].
         strength: Range at which a perpendicular surface of reflectivity 1 gives a return in 63 % of the shots
             [m].
+        field: Half the width of the field of view in azimuth [rad].
+        dual: Whether the last echo of a beam is reported too, where it is separate from the strongest one.
+        name: Name of the sensor.
     """
 
     columns: int = 1800
@@ -221,12 +237,15 @@ class SpinningLidar:
     divergence: float = 0.003
     pulse: float = 0.6
     strength: float = 110.0
+    field: float = np.pi
+    dual: bool = False
+    name: str = "VLP-16"
 
     @property
     def sensor(self) -> Sensor:
         """The sensor as the pipeline describes it."""
         return Sensor(
-            name="VLP-16 (simulated)",
+            name=f"{self.name} (simulated)",
             rings=self.rings,
             ring_step=self.ring_step,
             azimuth_step=2.0 * np.pi / self.columns,
@@ -248,6 +267,10 @@ class SpinningLidar:
     def beams(self) -> Float:
         """Return the unit directions of all rays in the sensor frame, shape (C, K, 3)."""
         return _beams(self)
+
+    def at_scan(self, k: int) -> SpinningLidar:  # noqa: ARG002 - all turns are alike
+        """Return the sensor with the pattern of scan k."""
+        return self
 
     def sees(self, points: Float32) -> Bool:
         """Return which points (N, 3) are in the field of view, shape (N,)."""
@@ -284,12 +307,18 @@ class SolidStateLidar(SpinningLidar):
     lowest: float = -CONE
     ring_step: float = 2.0 * CONE / 199
     divergence: float = 0.004
+    field: float = CONE
+    name: str = "solid state"
     pattern: int = 0
 
     @property
     def sensor(self) -> Sensor:
         """The sensor as the pipeline describes it, without rings."""
-        return Sensor("solid state (simulated)", azimuth_step=0.0035, range_sigma=self.range_sigma)
+        return Sensor(f"{self.name} (simulated)", azimuth_step=0.0035, range_sigma=self.range_sigma)
+
+    def at_scan(self, k: int) -> SolidStateLidar:
+        """Return the sensor with the pattern of scan k."""
+        return replace(self, pattern=self.pattern + k)
 
     def sees(self, points: Float32) -> Bool:
         """Return which points (N, 3) are in the cone, shape (N,)."""
@@ -344,5 +373,13 @@ def sweep_scene(
     away = np.hypot(*(solids.capsule[:, :2] - o[lidar.columns // 2, :2]).T)
     optics, order = lidar.optics, np.argsort(away, kind="stable")
     ranges, hit = first_returns(solids, terrain.packed, R, o, directions, optics, key, order)
-    returns = measure(ranges, hit, solids, terrain.packed, o, directions, optics, noise, key)
-    return scan_of_returns(lidar, stamp_ns, *returns)
+    returns = [
+        measure(ranges, hit, solids, terrain.packed, o, directions, optics, noise, key, last)
+        for last in ((False, True) if lidar.dual else (False,))
+    ]
+    if lidar.dual:
+        strongest, last_range = returns[0][0], returns[1][0]
+        last_range[np.abs(last_range - strongest) < lidar.pulse] = 0.0
+    return scan_of_returns(
+        lidar, stamp_ns, *(np.stack(columns, axis=2) for columns in zip(*returns, strict=True))
+    )

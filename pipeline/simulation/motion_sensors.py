@@ -16,6 +16,7 @@ from pipeline.simulation.scenarios import WheelQuality
 from pipeline.types.records import Float
 
 ODOMETRY_HZ = 50
+SPIN, SPIN_TURN = (0.02, 0.15), np.radians(1.0)  # m and rad that spinning wheels measure too much
 
 
 def wheel_odometry(motion: TrueMotion, quality: WheelQuality, rng: np.random.Generator) -> Float:
@@ -37,6 +38,12 @@ def wheel_odometry(motion: TrueMotion, quality: WheelQuality, rng: np.random.Gen
     measured += quality.distance_noise * root * rng.standard_normal(distance.size)
     turned = turn * (1.0 + signs[1] * quality.turn_scale) + signs[2] * quality.turn_bias * distance
     turned += quality.turn_noise * root * rng.standard_normal(distance.size)
+    if quality.spins > 0.0:
+        first = np.flatnonzero(rng.random(distance.size) < quality.spins * distance)
+        for begin in first:
+            during = slice(begin, begin + ODOMETRY_HZ // 2)  # half a second
+            measured[during] += rng.uniform(*SPIN) / (ODOMETRY_HZ // 2)
+            turned[during] += rng.normal(0.0, SPIN_TURN) / (ODOMETRY_HZ // 2)
     heading = np.concatenate([[0.0], np.cumsum(turned)])
     middle = 0.5 * (heading[1:] + heading[:-1])
     return np.stack(

@@ -1,11 +1,13 @@
 """Shapes of which the objects of a scene are built, as columns.
 
-There are tapered cylinders (trunks, branches, poles, limbs), ellipsoids that are solid (head, torso) or
-porous (foliage), and upright boxes. Each row also has a capsule that encloses the shape.
+There are tapered cylinders (trunks, branches, poles, limbs), stems with a section that is not round and bark
+with furrows, ellipsoids that are solid (head, torso) or porous (foliage), and upright boxes. Each row
+also has a capsule that encloses the shape.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,19 +15,60 @@ from numpy.typing import ArrayLike
 
 from pipeline.types.records import Float, Int32
 
-CONE, ELLIPSOID, BOX = 0, 1, 2
+CONE, ELLIPSOID, BOX, STEM = 0, 1, 2, 3
+SURFACE = 9  # columns of `Solids.surface`
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Section of a stem. At the angle a around the axis the bark has the radius
+
+        r (1 + oval cos(2 (a - oval_phase)) + fluted cos(3 (a - fluted_phase))) - depth f,
+
+    where f is 0 on the ridges and 1 in the furrows of the bark. The section without furrows is convex, so
+    that a tape touches the ridges only.
+
+    Attributes:
+        oval, fluted: Relative amplitudes of two and of three lobes.
+        oval_phase, fluted_phase: Their directions [rad].
+        bark: Depth of the furrows at the start of the stem [m]; it is proportional to the radius.
+        furrows: Number of furrows around the stem.
+        furrow_phase: [rad].
+    """
+
+    oval: float = 0.0
+    oval_phase: float = 0.0
+    fluted: float = 0.0
+    fluted_phase: float = 0.0
+    bark: float = 0.0
+    furrows: int = 0
+    furrow_phase: float = 0.0
+
+    @property
+    def widest(self) -> float:
+        """Factor between r and a radius that encloses the section."""
+        return 1.0 + self.oval + self.fluted
+
+    def perimeter_factor(self) -> float:
+        """Return the length of a tape around the section divided by 2 pi r."""
+        a = np.arange(3600) * (2.0 * np.pi / 3600)
+        two, three = 2.0 * (a - self.oval_phase), 3.0 * (a - self.fluted_phase)
+        r = 1.0 + self.oval * np.cos(two) + self.fluted * np.cos(three)
+        slope = -2.0 * self.oval * np.sin(two) - 3.0 * self.fluted * np.sin(three)
+        return float(np.sqrt(r * r + slope * slope).mean())
 
 
 class Solids(NamedTuple):
     """N shapes as columns.
 
     Attributes:
-        kind: int32, CONE, ELLIPSOID or BOX.
-        shape: float64, shape (N, 9). CONE: start (3), unit axis (3), length, radius at the start,
+        kind: int32, CONE, ELLIPSOID, BOX or STEM.
+        shape: float64, shape (N, 9). CONE and STEM: start (3), unit axis (3), length, radius at the start,
             change of radius per metre. ELLIPSOID and BOX: centre (3), half sizes (3), cosine and sine
             of the yaw, and for the ellipsoid the mean free path of light in it [m], 0 if solid.
         capsule: float64, shape (N, 7): two ends (3 + 3) and the radius of the enclosing capsule.
-        surface: float64, shape (N, 2): reflectivity 0..1, roughness of the surface [m].
+        surface: float64, shape (N, SURFACE): reflectivity 0..1, roughness of the surface [m], and of a STEM
+            the seven figures of its `Section`.
         owner: int32: number of the object in the scene.
     """
 
@@ -51,7 +94,7 @@ class Solids(NamedTuple):
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         shape, capsule = self.shape.copy(), self.capsule.copy()
         shape[:, :3] = shape[:, :3] @ R.T + offset
-        cone = self.kind == CONE
+        cone = (self.kind == CONE) | (self.kind == STEM)
         shape[cone, 3:6] = shape[cone, 3:6] @ R.T
         cos, sin = shape[~cone, 6], shape[~cone, 7]
         shape[~cone, 6], shape[~cone, 7] = c * cos - s * sin, s * cos + c * sin
@@ -80,7 +123,27 @@ class SolidsBuilder:
         a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
         length = float(np.linalg.norm(b - a))
         shape = [*a, *((b - a) / length), length, radii[0], (radii[1] - radii[0]) / length]
-        self._rows.append((CONE, shape, [*a, *b, max(radii)], [reflectivity, roughness], owner))
+        self._rows.append((CONE, shape, [*a, *b, max(radii)], _surface(reflectivity, roughness), owner))
+
+    def stem(
+        self,
+        owner: int,
+        start: ArrayLike,
+        end: ArrayLike,
+        radii: tuple[float, float],
+        section: Section,
+        *,
+        reflectivity: float = 0.35,
+    ) -> None:
+        """Add a stem: a tapered cylinder as in `cone` with a section that is not round."""
+        self.cone(owner, start, end, radii, reflectivity=reflectivity)
+        _, shape, capsule, surface, _ = self._rows.pop()
+        figures = (
+            section.oval, section.oval_phase, section.fluted, section.fluted_phase, section.bark,
+            float(section.furrows), section.furrow_phase,
+        )  # fmt: skip
+        capsule[6] *= section.widest
+        self._rows.append((STEM, shape, capsule, [*surface[:2], *figures], owner))
 
     def ellipsoid(
         self,
@@ -95,7 +158,7 @@ class SolidsBuilder:
         """Add an ellipsoid with half sizes (3,) [m], turned by `yaw` about z; porous if `free_path` > 0."""
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)
         shape = [*c, *h, np.cos(yaw), np.sin(yaw), free_path]
-        self._rows.append((ELLIPSOID, shape, [*c, *c, float(h.max())], [reflectivity, 0.0], owner))
+        self._rows.append((ELLIPSOID, shape, [*c, *c, float(h.max())], _surface(reflectivity), owner))
 
     def box(
         self, owner: int, centre: ArrayLike, half: ArrayLike, *, yaw: float = 0.0, reflectivity: float = 0.5
@@ -103,7 +166,7 @@ class SolidsBuilder:
         """Add an upright box with half sizes (3,) [m], turned by `yaw` about z."""
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)
         shape = [*c, *h, np.cos(yaw), np.sin(yaw), 0.0]
-        self._rows.append((BOX, shape, [*c, *c, float(np.linalg.norm(h))], [reflectivity, 0.0], owner))
+        self._rows.append((BOX, shape, [*c, *c, float(np.linalg.norm(h))], _surface(reflectivity), owner))
 
     def extend(self, solids: Solids) -> None:
         """Add all shapes of a table."""
@@ -116,6 +179,10 @@ class SolidsBuilder:
             np.array(kind, dtype=np.int32),
             np.array(shape, dtype=np.float64).reshape(-1, 9),
             np.array(capsule, dtype=np.float64).reshape(-1, 7),
-            np.array(surface, dtype=np.float64).reshape(-1, 2),
+            np.array(surface, dtype=np.float64).reshape(-1, SURFACE),
             np.array(owner, dtype=np.int32),
         )
+
+
+def _surface(reflectivity: float, roughness: float = 0.0) -> list[float]:
+    return [reflectivity, roughness, *[0.0] * (SURFACE - 2)]

@@ -28,6 +28,7 @@ class Optics(NamedTuple):
         pulse: Echoes nearer to one another than this are reported as one [m].
         strength: Range at which a perpendicular surface of reflectivity 1 gives a return in 63 % of the shots
             [m].
+        field: Half the width of the field of view in azimuth [rad].
     """
 
     lowest: float
@@ -37,17 +38,25 @@ class Optics(NamedTuple):
     divergence: float
     pulse: float
     strength: float
+    field: float
 
 
 @compiled
 def meet_cone(shape: Float, o: Float, d: Float) -> float:
     """Return the range at which a ray (origin o, unit direction d) enters the mantle of a tapered
     cylinder."""
+    return _meet_mantle(shape, 1.0, o, d)
+
+
+@compiled
+def _meet_mantle(shape: Float, widest: float, o: Float, d: Float) -> float:
+    """Return the same with radii that are multiplied by `widest`."""
     wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
     along = wx * shape[3] + wy * shape[4] + wz * shape[5]
     rate = d[0] * shape[3] + d[1] * shape[4] + d[2] * shape[5]
-    k = shape[8]
-    radius = shape[7] + k * along
+    k = widest * shape[8]
+    first = widest * shape[7]
+    radius = first + k * along
     a = d[0] * d[0] + d[1] * d[1] + d[2] * d[2] - rate * rate * (1.0 + k * k)
     b = wx * d[0] + wy * d[1] + wz * d[2] - along * rate - k * rate * radius
     c = wx * wx + wy * wy + wz * wz - along * along - radius * radius
@@ -56,9 +65,67 @@ def meet_cone(shape: Float, o: Float, d: Float) -> float:
         return MISS
     t: float = (-b - np.sqrt(discriminant)) / a
     h = along + t * rate
-    if t <= 0.0 or h < 0.0 or h > shape[6] or shape[7] + k * h <= 0.0:
+    if t <= 0.0 or h < 0.0 or h > shape[6] or first + k * h <= 0.0:
         return MISS
     return t
+
+
+FURROW_WAVE = 0.5  # m of height in which a furrow swings to and fro
+_MARCH, _TOUCH = 0.4, 5e-4  # share of the gap to the bark that is safe to advance; precision [m]
+
+
+@compiled
+def bark_radius(surface: Float, radius: float, depth: float, angle: float, height: float) -> float:
+    """Return the radius of a stem in a direction [m], see `primitives.Section`.
+
+    Args:
+        surface: Row of `Solids.surface`.
+        radius: r at this height [m].
+        depth: Depth of the furrows at this height [m].
+        angle: Angle around the axis [rad].
+        height: Distance along the axis [m].
+    """
+    lobes = surface[2] * np.cos(2.0 * (angle - surface[3])) + surface[4] * np.cos(3.0 * (angle - surface[5]))
+    swing = sine_of_turns(height / FURROW_WAVE)
+    furrow = 0.5 - 0.5 * np.cos(surface[7] * angle + surface[8] + swing)
+    bark: float = radius * (1.0 + lobes) - depth * furrow * furrow
+    return bark
+
+
+@compiled
+def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
+    """Return the range at which a ray enters the bark of a stem. From the mantle that encloses the stem
+    the ray advances by a share of the gap, which is small enough for furrows with a slope of 2."""
+    widest = 1.0 + surface[2] + surface[4]
+    t = _meet_mantle(shape, widest, o, d)
+    if t == MISS:
+        return MISS
+    ux, uy, uz = shape[3], shape[4], shape[5]
+    # Two directions perpendicular to the axis: the x axis without its part along the axis, and their product.
+    ax, ay, az = 1.0 - ux * ux, -ux * uy, -ux * uz
+    norm = np.sqrt(ax * ax + ay * ay + az * az)
+    if norm < 1e-6:
+        ax, ay, az, norm = 0.0, 1.0, 0.0, 1.0
+    ax, ay, az = ax / norm, ay / norm, az / norm
+    bx, by, bz = uy * az - uz * ay, uz * ax - ux * az, ux * ay - uy * ax
+    before = MISS
+    for _ in range(400):
+        x, y, z = o[0] + t * d[0] - shape[0], o[1] + t * d[1] - shape[1], o[2] + t * d[2] - shape[2]
+        h = x * ux + y * uy + z * uz
+        if h < 0.0 or h > shape[6]:
+            return MISS
+        a, b = x * ax + y * ay + z * az, x * bx + y * by + z * bz
+        rho = np.sqrt(a * a + b * b)
+        radius = shape[7] + shape[8] * h
+        depth = surface[6] * radius / shape[7]
+        gap = rho - bark_radius(surface, radius, depth, np.arctan2(b, a), h)
+        if gap < _TOUCH:
+            return t
+        if rho > widest * radius + _TOUCH and rho > before:
+            return MISS
+        before = rho
+        t += max(_MARCH * gap, _TOUCH)
+    return MISS
 
 
 @compiled
@@ -179,7 +246,7 @@ def ground_incidence(terrain: Float, o: Float, d: Float, t: float) -> float:
 def solid_incidence(kind: int, shape: Float, o: Float, d: Float, t: float) -> float:
     """Return the cosine of the angle between a ray and the normal of the shape that it meets at range t."""
     x, y, z = o[0] + t * d[0] - shape[0], o[1] + t * d[1] - shape[1], o[2] + t * d[2] - shape[2]
-    if kind == 0:
+    if kind == 0 or kind == 3:
         h = x * shape[3] + y * shape[4] + z * shape[5]
         nx, ny, nz = x - h * shape[3], y - h * shape[4], z - h * shape[5]
     else:
@@ -333,8 +400,10 @@ def ray_directions(R: Float, beams: Float) -> Float:
 
 
 @compiled
-def meet_solid(kind: int, shape: Float, o: Float, d: Float, chance: float) -> float:
+def meet_solid(kind: int, shape: Float, surface: Float, o: Float, d: Float, chance: float) -> float:
     """Return the range of the first return from a shape; in foliage it is at a random depth."""
+    if kind == 3:
+        return meet_stem(shape, surface, o, d)
     if kind == 0:
         return meet_cone(shape, o, d)
     if kind == 2:
@@ -365,7 +434,8 @@ def first_returns(
 
     Column c looks along the azimuth pi - c 2 pi / C from the pose R[c], o[c].
     """
-    kind, shape, capsule, farthest = solids.kind, solids.shape, solids.capsule, optics.range_max
+    kind, shape, surface = solids.kind, solids.shape, solids.surface
+    capsule, farthest = solids.capsule, optics.range_max
     columns, rings = directions.shape[0], directions.shape[1]
     ranges = np.full((columns, rings), np.inf)
     owner = np.full((columns, rings), NOTHING, dtype=np.int32)
@@ -377,18 +447,22 @@ def first_returns(
             continue
         for column in range(first, last + 1):
             c = column % columns
+            if abs(np.pi - c * (2.0 * np.pi / columns)) > optics.field:
+                continue
             for k in range(ring_first, ring_last + 1):
                 if ranges[c, k] <= nearest - 0.2:
                     continue
                 chance = 0.5
                 if kind[n] == 1 and shape[n, 8] > 0.0:
                     chance = random_unit(key, c * rings + k, n)
-                t = meet_solid(kind[n], shape[n], o[c], directions[c, k], chance)
+                t = meet_solid(kind[n], shape[n], surface[n], o[c], directions[c, k], chance)
                 if t < ranges[c, k]:
                     ranges[c, k] = t
                     owner[c, k] = n
     waves, space = np.empty((terrain.shape[0], 3)), np.empty(terrain.shape[0])
     for c in range(columns):
+        if abs(np.pi - c * (2.0 * np.pi / columns)) > optics.field:
+            continue
         waves_at(terrain, o[c], waves)
         for k in range(rings):
             t = meet_ground(terrain, waves, directions[c, k], min(ranges[c, k], farthest), space)
@@ -408,7 +482,7 @@ def first_along(solids: Solids, directions: Float, key: int) -> Float:
         directions: Unit vectors, shape (N, 3).
         key: Seed of the depths at which foliage stops light.
     """
-    kind, shape, capsule = solids.kind, solids.shape, solids.capsule
+    kind, shape, surface, capsule = solids.kind, solids.shape, solids.surface, solids.capsule
     ranges = np.full(directions.shape[0], np.inf)
     middle = np.zeros(3)
     origin = np.zeros(3)
@@ -430,5 +504,5 @@ def first_along(solids: Solids, directions: Float, key: int) -> Float:
             chance = 0.5
             if kind[n] == 1 and shape[n, 8] > 0.0:
                 chance = random_unit(key, k, n)
-            ranges[k] = min(ranges[k], meet_solid(kind[n], shape[n], origin, d, chance))
+            ranges[k] = min(ranges[k], meet_solid(kind[n], shape[n], surface[n], origin, d, chance))
     return ranges

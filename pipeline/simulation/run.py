@@ -18,10 +18,19 @@ from pipeline.simulation.motion_sensors import (
     wheel_odometry,
 )
 from pipeline.simulation.obstacle_aware_driver import obstacle_aware_drive
-from pipeline.simulation.robot_motion import RATE_HZ, TrueMotion, drive_course, lay_course, lay_on_terrain
-from pipeline.simulation.scenarios import EXACT, QUALITIES, RunRequest
+from pipeline.simulation.robot_motion import (
+    RATE_HZ,
+    TerrainModel,
+    TrueMotion,
+    drive_course,
+    lay_course,
+    lay_on_terrain,
+)
+from pipeline.simulation.scenarios import EXACT, QUALITIES, WILD, RunRequest
 from pipeline.simulation.scene import SimulatedScene, build_scene
-from pipeline.types.records import Float, Imu, Int, Odometry, TruthPath
+from pipeline.simulation.terrain import WheelContact
+from pipeline.simulation.wild_scenes import build_wild_scene, truth_in_view
+from pipeline.types.records import Float, Imu, Int, Odometry, TruthPath, TruthTrees
 
 # Raise it with every change that changes the bytes of a run.
 VERSION = 1
@@ -68,7 +77,7 @@ class SimulatedRun:
         times, R, o = self.sensor_poses(k)
         rng, stamp_ns = random_stream(SCAN, self.request, k), START_NS + k * self.lidar.period_ns
         solids = self.scene.solids_at(times, R, o)
-        return sweep_scene(self.lidar, solids, self.scene.terrain, R, o, stamp_ns, rng)
+        return sweep_scene(self.lidar.at_scan(k), solids, self.scene.terrain, R, o, stamp_ns, rng)
 
     def odometry_record(self, n: int) -> Odometry:
         """Return reading n of the odometry."""
@@ -84,6 +93,13 @@ class SimulatedRun:
         stamp = START_NS + n * (1_000_000_000 // IMU_HZ)
         unit = self.inertial
         return Imu(stamp, unit.angular_velocity[n], unit.linear_acceleration[n], unit.orientation(n))
+
+    def true_trees(self) -> TruthTrees:
+        """Return the objects of the ground truth; in `sim:wild`, trees out of view are HIDDEN."""
+        if self.request.name != WILD:
+            return self.scene.truth
+        poses = (self.sensor_poses(k) for k in range(0, self.scans, 1_000_000_000 // self.lidar.period_ns))
+        return truth_in_view(self.lidar, self.scene, poses)
 
     def true_path(self) -> TruthPath:
         """Return the true pose of the base at the stamp of each scan, in the frame of the map."""
@@ -115,14 +131,20 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     scenario = request.scenario
     lidar = SpinningLidar(range_sigma=request.sigma)
     course = lay_course(np.array(scenario.waypoints), scenario.closed)
-    scene = build_scene(scenario, course, random_stream(SCENE, request))
+    ground: TerrainModel
+    if request.name == WILD:
+        lidar, scene = build_wild_scene(scenario, course, request.sigma, random_stream(SCENE, request))
+        ground = WheelContact(scene.terrain)
+    else:
+        scene = build_scene(scenario, course, random_stream(SCENE, request))
+        ground = scene.terrain
     mounting = MOUNTING if T_base_lidar is None else T_base_lidar
     if scenario.obeys:
         seed = int(random_stream(SENSE, request).integers(2**31))
         drive, _ = obstacle_aware_drive(course, scenario.speed, scene, mounting, seed, request.duration_s)
     else:
         drive = drive_course(course, scenario.speed, request.duration_s)
-    motion = lay_on_terrain(drive, scene.terrain, random_stream(SHAKE, request))
+    motion = lay_on_terrain(drive, ground, random_stream(SHAKE, request))
     return SimulatedRun(
         request=request,
         T_base_lidar=mounting,

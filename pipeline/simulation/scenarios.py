@@ -51,6 +51,7 @@ class Scenario:
         placed: Objects at given positions in the frame of the map.
         crossings: Persons who walk to and fro: from x, y to x, y [m], and their speed [m/s].
         obeys: Whether the robot slows down and stops for obstacles in its path.
+        odometry: Default quality of the wheels.
     """
 
     line: str
@@ -77,6 +78,7 @@ class Scenario:
     placed: tuple[Placed, ...] = ()
     crossings: tuple[tuple[float, float, float, float, float], ...] = field(default=(), repr=False)
     obeys: bool = field(default=False, repr=False)
+    odometry: str = field(default="normal", repr=False)
 
 
 def _ring(radius: float, wobble: float, lobes: int, points: int) -> Waypoints:
@@ -101,6 +103,7 @@ _PAPER_PLOT = (
     Placed("bush", 13.4, 4.4, 1.20),
 )
 
+WILD = "wild"
 SCENARIOS: dict[str, Scenario] = {
     "stand": Scenario(
         line="A natural stand of 40 x 40 m with poles, bushes, persons and a box; one loop of 75 s",
@@ -193,6 +196,16 @@ SCENARIOS: dict[str, Scenario] = {
         crossings=((8.0, -5.0, 8.0, 4.0, 0.5), (13.5, 8.5, 13.5, -3.0, 0.5)),
         obeys=True,
     ),
+    WILD: Scenario(
+        line="Rough stems, undergrowth, ditches, logs and street furniture, seen by one of four sensors",
+        waypoints=_ring(7.0, 1.2, 3, 18),
+        closed=True,
+        speed=1.5,
+        duration_s=38.0,
+        half_side=15.0,
+        trees=60,
+        odometry="slipping",
+    ),
 }
 
 
@@ -212,6 +225,7 @@ class WheelQuality:
         turn_bias: False turn per metre [rad/m]; its sign is drawn.
         distance_noise: Standard deviation of the distance [m] per square root of metre.
         turn_noise: Standard deviation of the heading [rad] per square root of metre.
+        spins: How often the wheels spin on soft ground [1/m].
     """
 
     scale: float
@@ -220,12 +234,14 @@ class WheelQuality:
     turn_bias: float
     distance_noise: float
     turn_noise: float
+    spins: float = 0.0
 
 
 QUALITIES = {
     "good": WheelQuality(0.003, 0.01, 0.002, 2e-4, 0.005, 0.002),
     "normal": WheelQuality(0.01, 0.04, 0.006, 6e-4, 0.01, 0.004),
     "poor": WheelQuality(0.03, 0.10, 0.006, 2.8e-3, 0.03, 0.006),
+    "slipping": WheelQuality(0.01, 0.04, 0.006, 6e-4, 0.01, 0.004, spins=0.1),
 }
 
 
@@ -312,7 +328,7 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
         raise UsageError(
             "the cloud to be driven through is not named", where=uri, remedy="sim:cloud?file=plot.laz"
         )
-    odometry = values.get("odometry", "normal")
+    odometry = values.get("odometry", "normal" if name == CLOUD else SCENARIOS[name].odometry)
     if odometry not in (*QUALITIES, EXACT):
         raise _refusal(uri, "odometry", odometry)
     scenario = None if name == CLOUD else SCENARIOS[name]

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from pipeline.errors import SourceError
-from pipeline.simulation.primitives import Solids
+from pipeline.simulation.primitives import ELLIPSOID, Solids
 from pipeline.simulation.robot_motion import Course
 from pipeline.simulation.scenarios import Placed, Scenario
 from pipeline.simulation.scene_objects import (
@@ -25,6 +25,7 @@ from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Float, TruthTrees
 
 _STEP_HZ, _STRIDE = 0.9, 0.42  # of a walking person; [rad]
+_SWAY_HZ = 0.4  # of branches in the wind; natural frequencies of trees are 0.1 to 1 Hz
 # Positions are drawn in small batches while there is room, and in large ones when the plot becomes full.
 _BATCHES = (8, 16, 32, 64, 128, *[256] * 36)
 
@@ -79,6 +80,8 @@ class SimulatedScene:
         truth: Trees (x, y of the axis at 1.3 m above the ground), poles, bushes, boxes ("other") and
             standing persons. Walking persons have no position, and undergrowth counts as ground.
         kinds: Kind of each object by its number (`Solids.owner`), with "walker" and "undergrowth".
+        owners: Number of each object of the ground truth.
+        wind: How far the wind moves leaves that are 10 m above the ground, to each side [m].
     """
 
     terrain: SimulatedTerrain
@@ -86,6 +89,8 @@ class SimulatedScene:
     persons: tuple[Person, ...]
     truth: TruthTrees
     kinds: tuple[str, ...]
+    owners: tuple[int, ...] = ()
+    wind: float = 0.0
 
     def solids_at(self, times: Float, R: Float, o: Float) -> Solids:
         """Return all solids, each person at the time when the beam of a sweep passes them.
@@ -94,8 +99,8 @@ class SimulatedScene:
             times: Times of the columns of the sweep, shape (C,) [s].
             R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
         """
-        solids = self.still
         middle = times.size // 2
+        solids = self.still if self.wind == 0.0 else self._blown(float(times[middle]))
         for each in self.persons:
             at, _ = each.place(float(times[middle]))
             away = R[middle].T @ (np.array([at[0], at[1], o[middle, 2]]) - o[middle])
@@ -103,6 +108,21 @@ class SimulatedScene:
             column = min(int(turned * times.size), times.size - 1)
             solids = solids.join(each.solids(float(times[column]), self.terrain))
         return solids
+
+    def _blown(self, t: float) -> Solids:
+        """Return the solids at time t [s] with the leaves moved by the wind: each volume of leaves swings
+        with a phase of its own, in proportion to its height."""
+        solids = self.still
+        leaves = np.flatnonzero((solids.kind == ELLIPSOID) & (solids.shape[:, 8] > 0.0))
+        x, y, z = solids.shape[leaves, :3].T
+        height = np.maximum(z - self.terrain.height(x, y), 0.0)
+        turns = _SWAY_HZ * t + 0.618 * np.arange(len(leaves))
+        shift = self.wind * height / 10.0 * np.sin(2.0 * np.pi * turns)
+        shape, capsule = solids.shape.copy(), solids.capsule.copy()
+        shape[leaves, 0] += shift
+        capsule[leaves, 0] += shift
+        capsule[leaves, 3] += shift
+        return solids._replace(shape=shape, capsule=capsule)
 
 
 class Plot:
@@ -138,7 +158,14 @@ class Plot:
         self._taken = np.vstack([self._taken, [x, y, radius]])
 
     def find(
-        self, radius: float, gap: float, near: float, far: float, rng: np.random.Generator, what: str
+        self,
+        radius: float,
+        gap: float,
+        near: float,
+        far: float,
+        rng: np.random.Generator,
+        what: str,
+        edge: float = np.inf,
     ) -> tuple[float, float]:
         """Find a free position and mark it as occupied.
 
@@ -148,6 +175,7 @@ class Plot:
             near, far: Least and greatest distance of its surface from the course [m].
             rng: Draws the positions.
             what: Name of the object, for the error.
+            edge: Greatest distance from the edge of the plot [m].
 
         Raises:
             SourceError: The plot is full.
@@ -156,6 +184,7 @@ class Plot:
             places = self.centre + self.half_side * rng.uniform(-1.0, 1.0, (count, 2))
             off = self.from_course(places) - radius
             good = (off >= near) & (off <= far)
+            good &= np.abs(places - self.centre).max(axis=1) >= self.half_side - edge
             good[good] = self.from_objects(places[good]) - radius >= gap
             if good.any():
                 x, y = (float(value) for value in places[int(np.argmax(good))])
@@ -250,6 +279,7 @@ class _Planter:
             persons=tuple(self._persons),
             truth=TruthTrees(np.array(x), np.array(y), np.array(dbh), tuple(kind)),
             kinds=tuple(self._scene.kinds),
+            owners=tuple(self._scene.owners),
         )
 
     def _add_tree(self, x: float, y: float, dbh: float) -> None:

@@ -34,6 +34,7 @@ class SceneBuilder:
         solids: Solids of all objects so far.
         kinds: Kind of each object or part of an object by its number (`Solids.owner`).
         truth: x, y [m], DBH [m] (NaN if not a tree) and kind of the objects of the ground truth.
+        owners: Numbers of the objects of the ground truth.
         trunks: Number, x and y [m] of each trunk.
     """
 
@@ -42,6 +43,7 @@ class SceneBuilder:
         self.solids = SolidsBuilder()
         self.kinds: list[str] = []
         self.truth: list[tuple[float, float, float, str]] = []
+        self.owners: list[int] = []
         self.trunks: list[tuple[int, float, float]] = []
 
     def owner(self, kind: str) -> int:
@@ -52,7 +54,8 @@ class SceneBuilder:
     def true_object(self, kind: str, x: float, y: float, dbh: float = np.nan) -> int:
         """Return the number of a new object that belongs to the ground truth."""
         self.truth.append((x, y, dbh, kind))
-        return self.owner(kind)
+        self.owners.append(self.owner(kind))
+        return self.owners[-1]
 
     def foot(self, x: float, y: float) -> Float:
         """Return the point on the ground at x, y [m], shape (3,)."""
@@ -486,6 +489,36 @@ def _post(scene: SceneBuilder, owner: int, x: float, y: float, radius: float, he
     scene.solids.cone(owner, foot - _up(0.3), top, (radius, 0.8 * radius), reflectivity=0.6)
 
 
+def add_bench(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a bench with a back."""
+    owner, foot, yaw = scene.owner("vehicle"), scene.foot(x, y), scene.uniform(0.0, np.pi)
+    half = scene.uniform(0.6, 1.0)
+    scene.solids.box(owner, foot + _up(0.45), [half, 0.22, 0.03], yaw=yaw)
+    scene.solids.box(owner, foot + 0.2 * _ahead(yaw + 0.5 * np.pi) + _up(0.7), [half, 0.03, 0.15], yaw=yaw)
+    for side in (-0.8, 0.8):
+        scene.solids.box(owner, foot + side * half * _ahead(yaw) + _up(0.22), [0.04, 0.2, 0.22], yaw=yaw)
+
+
+def add_stump(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add the stump of a felled tree."""
+    owner, foot = scene.owner("trunk"), scene.foot(x, y)
+    radius, top = scene.uniform(0.1, 0.3), foot + _up(scene.uniform(0.15, 0.6))
+    scene.solids.cone(owner, foot - _up(0.2), top, (1.3 * radius, radius), roughness=0.01)
+    scene.solids.ellipsoid(owner, top, [radius, radius, 0.03], reflectivity=0.5)
+
+
+def add_log(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a log on the ground with stubs of branches."""
+    owner, way = scene.owner("trunk"), _ahead(scene.uniform(0.0, 2.0 * np.pi))
+    radius, length = scene.uniform(0.08, 0.25), scene.uniform(1.5, 6.0)
+    ends = [scene.foot(x + side * way[0], y + side * way[1]) + _up(radius) for side in (0.0, length)]
+    scene.solids.cone(owner, ends[0], ends[1], (radius, 0.7 * radius), roughness=0.01)
+    for part in scene.rng.uniform(0.1, 0.9, int(scene.rng.integers(0, 6))):
+        start = ends[0] + part * (ends[1] - ends[0])
+        stub = scene.uniform(0.2, 0.9) * _ahead(scene.uniform(0.0, 2.0 * np.pi), scene.uniform(0.2, 2.0))
+        scene.solids.cone(owner, start, start + stub, (scene.uniform(0.008, 0.025), 0.005))
+
+
 def _free_hedge(scene: SceneBuilder, x: float, y: float) -> None:
     start = np.array([x, y])
     add_hedge(scene, start, start + scene.uniform(2.0, 10.0) * _ahead(scene.uniform(0.0, np.pi))[:2])
@@ -507,4 +540,7 @@ KINDS: dict[str, Callable[[SceneBuilder, float, float], None]] = {
     "bin": add_bin,
     "drum": add_drum,
     "person": add_person,
+    "bench": add_bench,
+    "stump": add_stump,
+    "log": add_log,
 }

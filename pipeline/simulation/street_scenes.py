@@ -106,8 +106,7 @@ def _scanned(scene: SceneBuilder, lidar: SpinningLidar, height: float, poses: li
         R, o = T_map_lidar.R, T_map_lidar.t + np.array([0.0, 0.0, height])
         still = (np.tile(R, (lidar.columns, 1, 1)), np.tile(o, (lidar.columns, 1)))
         sweep = sweep_scene(lidar, solids, terrain, *still, k * PERIOD_NS, scene.rng)
-        in_view = lidar.sees(sweep.scan.points)
-        points, solid = sweep.scan.points[in_view], sweep.solid[in_view]
+        points, solid = sweep.scan.points, sweep.solid
         steps.append(Step(k, Scan(k * PERIOD_NS, points), pose))
         clouds.append(points @ R.T + o)
         owners.append(np.where(solid >= 0, solids.owner[solid], -1))

@@ -89,6 +89,31 @@ class SimulatedTerrain:
         packed[0, 2] = -height_at(packed, 0.0, 0.0)
         return cls(packed)
 
+    def with_ditches(
+        self, depth: float, width: float, spacing: float, direction: float, phase: float
+    ) -> SimulatedTerrain:
+        """Return this terrain with parallel drainage ditches; the origin keeps the height 0.
+
+        Args:
+            depth: Depth of a ditch [m].
+            width: Its width at 60 % of the depth [m]; the profile is a Gaussian bell.
+            spacing: Distance between two ditches [m].
+            direction: Direction across the ditches [rad].
+            phase: Position of the first ditch as a share of the spacing.
+        """
+        # Fourier series of a periodic bell, as far as an amplitude is larger than a centimetre.
+        sigma = 0.5 * width
+        n = np.arange(1, int(spacing / sigma) + 1)
+        share = np.sqrt(2.0 * np.pi) * sigma / spacing
+        amplitude = 2.0 * depth * share * np.exp(-0.5 * (2.0 * np.pi * n * sigma / spacing) ** 2)
+        n, amplitude = n[amplitude > 0.01], amplitude[amplitude > 0.01]
+        # Amplitudes are positive for the bounds of `meet_ground`: -cos(a) is the sine of a + 3/4 of a turn.
+        waves = (np.cos(direction) / spacing, np.sin(direction) / spacing)
+        rows = np.stack([amplitude, n * waves[0], n * waves[1], 0.75 - n * phase], axis=1)
+        packed = np.vstack([self.packed, rows])
+        packed[0, 2] -= height_at(packed, 0.0, 0.0)
+        return SimulatedTerrain(packed)
+
     def height(self, x: Float, y: Float) -> Float:
         """Return heights [m] at positions of shape (N,) [m]."""
         return self.evaluate(x, y)[:, 0]
@@ -97,3 +122,23 @@ class SimulatedTerrain:
         """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
         result: Float = _evaluate(self.packed, np.ascontiguousarray(x), np.ascontiguousarray(y))
         return result
+
+
+WHEELBASE = 0.8  # m; distance between the axles of a small forestry robot
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WheelContact:
+    """The ground as wheels average it: height and slope over a square with the side of the wheelbase."""
+
+    terrain: SimulatedTerrain
+
+    def evaluate(self, x: Float, y: Float) -> Float:
+        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
+        half = 0.5 * WHEELBASE
+        west, east, south, north = (
+            self.terrain.height(x + dx, y + dy)
+            for dx, dy in ((-half, 0.0), (half, 0.0), (0.0, -half), (0.0, half))
+        )
+        mean = 0.25 * (west + east + south + north)
+        return np.stack([mean, (east - west) / WHEELBASE, (north - south) / WHEELBASE], axis=1)

@@ -14,6 +14,7 @@ from pipeline.geometry.poses import Pose2
 from pipeline.types.clearance import Clearance as Clearance
 from pipeline.types.clearance import Zone as Zone
 from pipeline.types.pose_health import Health
+from pipeline.types.sensor_data import HIDDEN as HIDDEN
 from pipeline.types.sensor_data import Bool as Bool
 from pipeline.types.sensor_data import Float as Float
 from pipeline.types.sensor_data import Float32 as Float32

@@ -208,6 +208,9 @@ class Sensor:
     range_max: float = 100.0
 
 
+HIDDEN = "hidden"  # a tree that the sensor could not see
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthTrees:
     """Ground truth of trees and other objects, in the frame of the map.
@@ -215,7 +218,7 @@ class TruthTrees:
     Attributes:
         x, y: shape (N,) [m].
         dbh: Diameter at breast height [m], shape (N,); NaN if unknown.
-        kind: Class of each: "tree", "pole", "person", "bush" or "other".
+        kind: Class of each: "tree", "pole", "person", "bush", "other" or HIDDEN.
     """
 
     x: Float

@@ -70,7 +70,7 @@ class SimulatedSource:
 
     def truth(self) -> Truth:
         """Return the trees and other objects, and the true path."""
-        trees = self.run.scene.truth if self._knows_trees else None
+        trees = self.run.true_trees() if self._knows_trees else None
         return Truth(trees=trees, path=self.run.true_path())
 
     def close(self) -> None:

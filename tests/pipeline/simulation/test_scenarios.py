@@ -44,7 +44,7 @@ def test_every_option_is_taken_and_the_seed_of_the_uri_wins():
         ("sim:stand?duration=1_0", "duration"),
         ("sim:stand?duration=٣٠", "duration"),
         ("sim:stand?duration=%2030", "duration"),
-        ("sim:stand?odometry=perfect", "good, normal, poor, exact"),
+        ("sim:stand?odometry=perfect", "good, normal, poor, slipping, exact"),
         ("sim:stand?duration=0", "duration"),
         ("sim:stand?duration=1e9", "1 to 3600"),
         ("sim:stand?trees=-3", "trees"),
