@@ -5,29 +5,28 @@ The seeds 0 to 19 are for scoring only. Training and development use seeds from 
 
 from __future__ import annotations
 
-import os
 import sys
 from collections import Counter
 from contextlib import closing
 from typing import TYPE_CHECKING
 
+from tests.benchmarks.seeds import chosen_seeds
 from tests.benchmarks.table import Cell, Table
 
 if TYPE_CHECKING:
-    from pipeline.evaluation import Evaluation
+    from pipeline.evaluation import MapScores
     from pipeline.types.records import Float, Trees, TruthTrees
 
 NAME = "wild"
 LINE = "Trees of sim:wild, seeds 0 to 19: completeness, correctness, position, DBH"
-SEEDS = os.environ.get("STEMMAP_WILD_SEEDS", "0-19")
+SEEDS = range(20)
 BESIDE = 1.0  # m; a false tree this near to a tree is a second one of it
 
 
 def run() -> list[Table]:
     """Twenty stands."""
-    first, _, last = SEEDS.partition("-")
-    rows, scores, on = list[tuple[Cell, ...]](), list["Evaluation"](), Counter[str]()
-    for seed in range(int(first), int(last or first) + 1):
+    rows, scores, on = list[tuple[Cell, ...]](), list["MapScores"](), Counter[str]()
+    for seed in chosen_seeds(SEEDS):
         row, score, false = _mapped(seed)
         rows.append(row)
         scores.append(score)
@@ -50,7 +49,7 @@ def run() -> list[Table]:
     return [Table(LINE, columns, tuple(rows), (f"False trees are at: {kinds}.",))]
 
 
-def _mapped(seed: int) -> tuple[tuple[Cell, ...], Evaluation, Counter[str]]:
+def _mapped(seed: int) -> tuple[tuple[Cell, ...], MapScores, Counter[str]]:
     """One stand: its row, its scores, and what is nearest to its false trees."""
     import numpy as np
 
