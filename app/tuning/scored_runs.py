@@ -30,8 +30,7 @@ from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import ScanCache, ScanCaches
 from pipeline.types.records import Frame, Path, Step, Trees, TruthTrees
 
-#: Points of the scans that are held in memory [bytes]; a longer run is read again when the front end runs
-# again.
+#: Points of the scans that are held in memory [bytes]; a longer run is read again when the front end runs.
 _STEPS_LIMIT = 512 << 20
 # The temporary folder of the system may be in memory. The file has no name.
 _CACHE_FOLDER = FilePath("/var/tmp")  # noqa: S108

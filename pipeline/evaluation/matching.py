@@ -39,8 +39,8 @@ def match(found: Float, truth: Float, distance_max: float) -> Int:
 
 
 def _near(found: Float, truth: Float, distance_max: float) -> tuple[Int, Int]:
-    """Return rows of `found` and `truth` of all pairs within `distance_max`. A position that is not finite
-    has no pair."""
+    """Return rows of `found` and of `truth` for all pairs within `distance_max` [m]. A position that is not
+    finite has no pair."""
     from scipy.spatial import cKDTree
 
     mine, others = (np.flatnonzero(np.isfinite(each).all(axis=1)) for each in (found, truth))
@@ -54,7 +54,14 @@ def _near(found: Float, truth: Float, distance_max: float) -> tuple[Int, Int]:
 
 
 def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: Int, truth_of: Int) -> None:
-    """Solve the assignment of one group, given its allowed pairs, and write it into `truth_of`."""
+    """Assign one group of positions, and write the rows of `truth` into `truth_of`.
+
+    Args:
+        found, truth: All positions, shape (N, 2) and (M, 2) [m].
+        distance_max: Maximum distance of a pair [m].
+        rows, columns: Allowed pairs of the group: rows of `found` and of `truth`.
+        truth_of: Result, shape (N,), modified in place.
+    """
     from scipy.optimize import linear_sum_assignment
 
     if len(rows) == 1:
@@ -70,7 +77,14 @@ def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: 
 
 
 def matched_rows(trees: Trees, truth: TruthTrees, distance_max: float) -> tuple[Int, Int]:
-    """Return the rows of the confirmed mapped trees, and of the real trees that they are assigned to."""
+    """Return the rows of the matched mapped trees in `trees`, and of the real trees in `truth` that they are
+    assigned to.
+
+    Args:
+        trees: The map; confirmed trees are matched.
+        truth: Ground truth in the frame of the map.
+        distance_max: Maximum distance of a pair [m].
+    """
     confirmed = np.flatnonzero(trees.confirmed)
     is_tree = np.array([kind == "tree" for kind in truth.kind], np.bool_)
     position = np.stack([truth.x, truth.y], axis=1)

@@ -18,14 +18,14 @@ _DOUBTFUL_SHARE, _DOUBTFUL_TREES = 0.25, 4
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """A count and the whole of which it is a part."""
+    """A count and the total of which it is a part."""
 
     count: int
     of: int
 
     @property
     def rate(self) -> float | None:
-        """count / of, or None if the whole is empty."""
+        """count / of; None if the total is 0."""
         return self.count / self.of if self.of else None
 
 
@@ -172,7 +172,13 @@ def pair_errors(found: Float, truth: Float) -> PairErrors:
 
 
 def _within(position: Float, path: Float | None, reach: float) -> Bool:
-    """Whether each position, shape (N, 2) [m], is at most `reach` [m] from the path; True without a path."""
+    """Return which positions are at most `reach` from the path, shape (N,); all are without a path.
+
+    Args:
+        position: shape (N, 2) [m].
+        path: Positions of the robot, shape (M, 2) [m], or None.
+        reach: Maximum distance [m].
+    """
     if path is None or len(position) == 0:
         return np.ones(len(position), np.bool_)
     if len(path) == 0:

@@ -60,8 +60,12 @@ def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> Pa
 
 
 def fit_rigid(a: Float, b: Float) -> Pose2:
-    """Return the T_b_a that minimises sum |b - T_b_a a|^2 for N pairs of points, both of shape (N, 2) [m]
-    (Umeyama 1991, without scale)."""
+    """Return the pose T_b_a that minimises sum |b - T_b_a a|^2 over N pairs of points (Umeyama 1991, without
+    scale).
+
+    Args:
+        a, b: Points in the two frames, shape (N, 2) [m] each.
+    """
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     M = (a - mean_a).T @ (b - mean_b)
     yaw = float(np.arctan2(M[0, 1] - M[1, 0], M[0, 0] + M[1, 1]))

@@ -102,7 +102,12 @@ class PlotMap:
 
 
 def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
-    """Map the stems of a whole cloud.
+    """Return the map of the stems of a whole cloud.
+
+    Args:
+        cloud: The cloud, which is read three times.
+        parameters: All parameters.
+        forests: Returns the random forest by its name.
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or is larger than a plot.
@@ -180,7 +185,14 @@ def find_ground(
 
 
 def _reject_other_objects(figures: Float, verdict: Int32, places: Float, share: Float) -> None:
-    """Change the verdict of stems that the forest classifies as poles, persons or walls, in place."""
+    """Change the verdict of stems that the forest classifies as poles, persons or walls, in place.
+
+    Args:
+        figures: Models of the stems, shape (K, COLUMNS).
+        verdict: Verdicts of the stems, shape (K,), modified.
+        places: Positions of upright columns, shape (C, 2) [m].
+        share: Class shares of the columns, shape (C, 6).
+    """
     from scipy.spatial import cKDTree
 
     tree = np.flatnonzero(verdict == Verdict.TREE)
@@ -217,7 +229,8 @@ def _trees(stems: Float, arc_min: float) -> Trees:
 
 
 def _candidates(figures: Float, verdict: Int32, places: Float, share: Float) -> Candidates:
-    """Return the stems, and the upright columns that are not stems."""
+    """Return the stems, and the upright columns that are not stems, as candidates; arguments as in
+    `_reject_other_objects`."""
     others = _away_from(places, figures[:, [X, Y]]) > SAME_OBJECT
     places, share = places[others], share[others]
     kind = np.array(CLASSES, np.int32)[share.argmax(axis=1)] if len(share) else np.zeros(0, np.int32)

@@ -83,7 +83,11 @@ class Extent:
 
 
 def find_extent(parts: Iterable[Float32], where: str) -> Extent:
-    """Return the extent of a cloud that comes in parts of shape (N, 3) [m].
+    """Return the extent of a cloud.
+
+    Args:
+        parts: Points in parts, shape (N, 3) [m] each.
+        where: Name of the cloud in errors.
 
     Raises:
         SourceError: There are no points, or they are in too many squares.
@@ -131,12 +135,13 @@ _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 
 
 class Thinned:
-    """Thins points: the points of a cube become their mean.
+    """Thins points: all points in one cube are replaced by their mean.
 
-    When there are more than `most` cubes, the cubes become larger and the means so far are thinned again.
+    When there are more than `most` cubes, the side of the cubes is enlarged and the means so far are thinned
+    again.
 
     Args:
-        most: Largest number of cubes, a power of two.
+        most: Maximum number of cubes, a power of two.
         side: Side of a cube at the beginning [m].
     """
 
@@ -193,7 +198,18 @@ def _add(
     slot: Int32,
     used: int,
 ) -> tuple[int, int]:
-    """Return the first point without room (the number of points when all fit) and the cubes in use."""
+    """Add points to the cubes until no cube is free; return the index of the first point that was not added
+    (the number of points if all were), and the number of cubes in use.
+
+    Args:
+        points: shape (N, 4).
+        weight: Number of points that each point represents, shape (N,).
+        begin: First point to add.
+        side: Side of a cube [m].
+        keys, mean, count: Key, mean and number of points of each cube, modified in place.
+        slot: Hash table of the cubes, modified in place.
+        used: Number of cubes in use.
+    """
     mask = slot.shape[0] - 1
     shift = np.uint64(64 - int(np.log2(slot.shape[0]) + 0.5))
     for i in range(begin, points.shape[0]):

@@ -28,20 +28,17 @@ BESIDE, BESIDE_OF_RADIUS = 0.1, 0.5  # m, and share of the radius; width of the 
 
 @compiled
 def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Float) -> float:
-    """Find the circle through three of the points with the most other points on it.
+    """Find the circle through three of the points that has the most other points on it. Return the number of
+    points on it minus the number inside; 0 without a circle.
 
-    Points inside count against a circle as much as points on it count for it: the cross-section of a trunk is
-        hollow,
-    that of a bush is not.
+    Points inside count against a circle, because the cross-section of a trunk is hollow and that of a bush is
+    not.
 
     Args:
         xy: Points, shape (N, 2) [m].
-        tolerance: Largest distance of a point on the circle [m].
-        r_min, r_max: Smallest and largest radius [m].
-        out: Filled with x, y, r.
-
-    Returns:
-        Points on it minus points inside, 0 without a circle.
+        tolerance: Maximum distance of a point on the circle [m].
+        r_min, r_max: Minimum and maximum radius [m].
+        out: Filled with x, y and radius of the circle [m].
     """
     n = xy.shape[0]
     best = 0.0
@@ -81,16 +78,13 @@ def _through_three(a: Float, b: Float, c: Float) -> tuple[float, float, float]:
 
 @compiled
 def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) -> bool:
-    """Fit a circle geometrically from x, y, r in `out[:3]`, and fill `out`, shape (FIGURES,).
+    """Fit a circle geometrically. Return whether there is a circle with at least five points on it.
 
     Args:
         xy: Points, shape (N, 2) [m].
         reach: Points farther from the circle are ignored [m].
-        r_min, r_max: Smallest and largest radius [m].
-        out: Start and result.
-
-    Returns:
-        Whether there is a circle with at least five points on it.
+        r_min, r_max: Minimum and maximum radius [m].
+        out: Initial x, y and radius in `out[:3]`; filled with the result, shape (FIGURES,).
     """
     n = xy.shape[0]
     x, y, r = out[0], out[1], out[2]
@@ -143,9 +137,13 @@ def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) 
 
 
 def without_scatter(radius: Float, scatter: Float) -> Float:
-    """Return radii [m] without the bias by the scatter of the points [m].
+    """Return radii without the bias that the scatter of the points causes [m], shape (N,).
 
-    Points with an error of s in both directions are s^2 / 2 r farther from the centre in the mean (Rice).
+    Points with an error of s in both directions are on average s^2 / 2 r farther from the centre (Rice).
+
+    Args:
+        radius: Fitted radii, shape (N,) [m].
+        scatter: Standard deviations of the points from the circles, shape (N,) [m].
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.maximum(radius - 0.5 * scatter * scatter / radius, 0.5 * radius)
@@ -153,7 +151,13 @@ def without_scatter(radius: Float, scatter: Float) -> Float:
 
 @compiled
 def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tuple[float, float]:
-    """Return the angle of the circle that points on it fill [rad], and their number."""
+    """Return the angle of a circle that points on it cover [rad], and the number of these points.
+
+    Args:
+        xy: Points, shape (N, 2) [m].
+        x, y, r: Centre and radius of the circle [m].
+        tolerance: Maximum distance of a point on the circle [m].
+    """
     filled = np.zeros(SECTORS, np.bool_)
     on = 0.0
     for i in range(xy.shape[0]):
@@ -171,8 +175,12 @@ def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tupl
 
 @compiled
 def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered: float, on: float) -> float:
-    """Return the ratio of the densities of points on the visible part of a circle and in the ring around
-    it."""
+    """Return the ratio of the densities of points on the visible part of a circle and in the ring around it.
+
+    Args:
+        xy, x, y, r, tolerance: As in `_coverage`.
+        covered, on: Result of `_coverage`.
+    """
     near, far = r + tolerance, r + tolerance + max(BESIDE, BESIDE_OF_RADIUS * r)
     in_ring = 0.0
     for i in range(xy.shape[0]):
@@ -184,7 +192,12 @@ def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered
 
 @compiled
 def share_inside(xy: Float, x: float, y: float, r: float) -> float:
-    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r."""
+    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r.
+
+    Args:
+        xy: Points, shape (N, 2) [m].
+        x, y, r: Centre and radius of the circle [m].
+    """
     inside, all_of_it = 0, 0
     for i in range(xy.shape[0]):
         d = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2)
@@ -195,7 +208,7 @@ def share_inside(xy: Float, x: float, y: float, r: float) -> float:
 
 @compiled
 def on_circle(xy: Float, x: float, y: float, r: float, tolerance: float) -> Bool:
-    """Return which points are on or in a circle, shape (N,)."""
+    """Return which points are on or inside a circle, shape (N,); arguments as in `_coverage`."""
     on = np.empty(xy.shape[0], np.bool_)
     for i in range(xy.shape[0]):
         on[i] = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) < r + tolerance
@@ -231,7 +244,7 @@ class Slices:
     spacing: float
 
     def slab(self, k: int) -> Float:
-        """Return the points of slice k, shape (M, 3)."""
+        """Return the points of slice k: x, y, height above the ground, shape (M, 3) [m]."""
         return self.points[self.bounds[k] : self.bounds[min(k + THICK, len(self.bounds) - 1)]]
 
     @property
@@ -241,12 +254,17 @@ class Slices:
 
     @staticmethod
     def middle(k: Float | Int) -> Float:
-        """Return the height of the middle of slices above the ground [m]."""
+        """Return the height above the ground of the middle of slice `k` [m], for one number or an array of
+        them."""
         return LOWEST + STEP * (np.asarray(k, np.float64) + 0.5 * THICK)
 
 
 def cut(points: Float32) -> Slices:
-    """Cut points of shape (N, 4) (x, y, z, height above the ground) into slices."""
+    """Return the points sorted into slices.
+
+    Args:
+        points: x, y, z, height above the ground [m], shape (N, 4).
+    """
     steps = round((HIGHEST - LOWEST) / STEP)
     step = np.floor((points[:, 3] - LOWEST) / STEP).astype(np.int64)
     inside = (step >= 0) & (step < steps)
@@ -317,8 +335,14 @@ def _circles(xy: Float, bounds: Int, tolerance: float, r_min: float, r_max: floa
 
 @compiled
 def _in_windows(xy: Float, x0: float, y0: float, wide: float) -> tuple[Int, Int, int]:
-    """Return the order of points by square cells of WINDOW, the first row of each cell, and the cells per
-    side."""
+    """Return the order of points by square cells with sides of WINDOW, the first row of each cell in this
+    order, and the number of cells per side of the grid.
+
+    Args:
+        xy: Points, shape (N, 2) [m].
+        x0, y0: Corner of the grid [m].
+        wide: Side of the grid [m].
+    """
     across = int(wide / WINDOW) + 1
     cell = np.empty(xy.shape[0], np.int64)
     cells = np.zeros(across * across + 1, np.int64)
@@ -335,7 +359,13 @@ def _in_windows(xy: Float, x0: float, y0: float, wide: float) -> tuple[Int, Int,
 
 @compiled
 def _window(xy: Float, order: Int, cells: Int, across: int, a: int, b: int) -> Float:
-    """Return the points of a cell and of the next ones along x and y."""
+    """Return the points of cell (a, b) and of the next cells along x and y, shape (M, 2) [m].
+
+    Args:
+        xy: Points, shape (N, 2) [m].
+        order, cells, across: Results of `_in_windows`.
+        a, b: Column and row of the cell.
+    """
     n = 0
     for i in range(a, min(a + 2, across)):
         n += cells[i * across + min(b + 2, across)] - cells[i * across + b]
@@ -352,7 +382,17 @@ def _window(xy: Float, order: Int, cells: Int, across: int, a: int, b: int) -> F
 def _peel(
     xy: Float, tolerance: float, r_min: float, r_max: float, k: float, n: int, out: Float
 ) -> tuple[int, Float]:
-    """Find the circles of a cluster in turn; the points of a circle are removed before the next."""
+    """Find the circles of a cluster one after the other; the points of a circle are removed before the next
+    is sought. Return the number of circles in `out`, and `out`, which may have been enlarged.
+
+    Args:
+        xy: Points of the cluster, shape (N, 2) [m].
+        tolerance: Maximum distance of a point on the circle [m].
+        r_min, r_max: Minimum and maximum radius [m].
+        k: Number of the slice.
+        n: Number of circles in `out`.
+        out: Circles so far, shape (M, FIGURES + 2).
+    """
     rest = xy
     row = np.zeros(FIGURES + 2)
     for _ in range(CIRCLES):

@@ -75,7 +75,14 @@ def describe_stems(slices: Float, height: Float) -> Float:
 
 @compiled
 def _evenness(rows: Float, h: Float, out: Float) -> None:
-    """Fill in the median distances of the centres from a straight axis and of the radii from a cone [m]."""
+    """Write into `out` the median distances of the centres from a straight axis and of the radii from a cone
+    [m], and the change of the radius per metre of height.
+
+    Args:
+        rows: Circles of a stem, shape (M, FIGURES).
+        h: Their heights, shape (M,) [m].
+        out: Model of the stem, shape (COLUMNS,), modified in place.
+    """
     even = np.ones(h.shape[0])
     off_x = rows[:, 0].copy()
     off_y, off_r = rows[:, 1].copy(), rows[:, 2].copy()
@@ -88,7 +95,12 @@ def _evenness(rows: Float, h: Float, out: Float) -> None:
 
 
 def classify_stems(stems: Float, r_min: float, r_max: float) -> Int32:
-    """Return the verdict of each stem by its model."""
+    """Return the verdict of each stem, shape (K,).
+
+    Args:
+        stems: Result of `describe_stems`.
+        r_min, r_max: Minimum and maximum radius of a tree [m].
+    """
     verdict = np.full(len(stems), Verdict.TREE, np.int32)
     r, slices = stems[:, RADIUS], stems[:, SLICES]
     span = stems[:, LAST] - stems[:, FIRST]
@@ -133,7 +145,12 @@ def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
 
 
 def is_repeated(stems: Float, verdict: Int32) -> Bool:
-    """Return which stems repeat an earlier one, or a tree."""
+    """Return which stems repeat an earlier stem or a tree, shape (K,).
+
+    Args:
+        stems: Result of `describe_stems`.
+        verdict: Result of `classify_stems`.
+    """
     if len(stems) == 0:
         return np.zeros(0, np.bool_)
     order = np.lexsort((np.arange(len(stems)), -stems[:, SLICES], verdict != Verdict.TREE))
@@ -162,5 +179,5 @@ def _again(stems: Float, tree: Bool) -> Bool:
 
 
 def middles(slices: Slices) -> Float:
-    """Return the heights of the middles of all slices [m]."""
+    """Return the heights above the ground of the middles of all slices, shape (S,) [m]."""
     return Slices.middle(np.arange(slices.count))

@@ -39,7 +39,7 @@ TUKEY = 4.7
 
 
 def chain(circles: Float) -> tuple[Int, int]:
-    """Return the number of the stem of each circle, -1 for none, and the number of stems.
+    """Return the number of the stem of each circle, -1 for none, shape (K,), and the number of stems.
 
     Args:
         circles: Result of `find_circles`, in the order of slices.
@@ -89,7 +89,14 @@ def _root(parent: Int, c: int) -> int:
 
 
 def follow(slices: Slices, circles: Float, number: Int, stems: int, r_min: float, r_max: float) -> Float:
-    """Trace each stem from its best circle upwards and downwards, with the points around the next circle.
+    """Trace each stem from its best circle upwards and downwards; the next circle is fitted to the points
+    around the predicted one.
+
+    Args:
+        slices: Slices of the plot.
+        circles: Result of `find_circles`.
+        number, stems: Result of `chain`.
+        r_min, r_max: Minimum and maximum radius [m].
 
     Returns:
         Values of `fit_circle`, NaN in slices without a circle, shape (stems, slices, FIGURES).
@@ -131,7 +138,14 @@ class _Buckets:
 def _around(
     xy: Float, start: Int, low: Float, across: Int, k: int, x: float, y: float, reach: float
 ) -> Float:
-    """Return the points of slice k within `reach` of a position, shape (M, 2)."""
+    """Return the points of slice k within `reach` [m] of x, y [m], shape (M, 2).
+
+    Args:
+        xy, start, low, across: Points of all slices in buckets, see `_Buckets`.
+        k: Number of the slice.
+        x, y: The position [m].
+        reach: Radius [m].
+    """
     a0, a1 = int((x - reach - low[0]) / BUCKET), int((x + reach - low[0]) / BUCKET)
     b0, b1 = int((y - reach - low[1]) / BUCKET), int((y + reach - low[1]) / BUCKET)
     a0, a1, b0, b1 = max(a0, 0), min(a1, across[0] - 1), max(b0, 0), min(b1, across[1] - 1)
@@ -200,7 +214,14 @@ def _worth(circle: Float) -> float:
 
 @compiled
 def _fits(near: Float, row: Float, r_min: float, r_max: float, missed: int) -> bool:
-    """Fit a circle from the predicted one, and return whether it can be the next one of the stem."""
+    """Fit a circle from the predicted one; return whether it can be the next circle of the stem.
+
+    Args:
+        near: Points around the predicted circle, shape (N, 2) [m].
+        row: Predicted circle; filled with the result, shape (FIGURES,).
+        r_min, r_max: Minimum and maximum radius [m].
+        missed: Number of slices without a circle since the last one.
+    """
     x, y, r = row[0], row[1], row[2]
     if near.shape[0] < LEAST or not fit_circle(near, max(0.04, 0.4 * r), r_min, r_max, row):
         return False
@@ -219,8 +240,13 @@ def _fits(near: Float, row: Float, r_min: float, r_max: float, missed: int) -> b
 
 @compiled
 def lines(height: Float, value: Float, weight: Float) -> tuple[float, float, float, float]:
-    """Fit a line through values over height robustly; return the value at breast height, its change per
-    metre, and their standard deviations. A weak prior keeps the slope near 0."""
+    """Fit a line through values over height robustly. Return the value at breast height, its change per
+    metre, and the standard deviations of both. A weak prior keeps the slope near 0.
+
+    Args:
+        height: shape (N,) [m].
+        value, weight: Values and their weights, shape (N,).
+    """
     n = height.shape[0]
     a, b, scale = np.median(value), 0.0, 1.0
     saa, sab, sbb = 1.0, 0.0, 1.0
@@ -252,9 +278,8 @@ MOST_VOXELS = 1 << 20
 def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
     """Return upright columns of voxels and the votes of a forest on them.
 
-    A whole cloud counts as seen by a robot from everywhere: each position was visible up to the height in
-        which stems
-    are traced, and no column was ever absent.
+    A whole cloud is treated as if a robot had seen it from everywhere: each position was visible up to the
+    height in which stems are traced, and no column was ever absent.
 
     Args:
         points: x, y, z, height above the ground [m], shape (N, 4).
@@ -284,7 +309,8 @@ def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
 
 
 def _apart(places: Float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which positions have no earlier one within TWICE."""
+    """Return which positions have no earlier one within TWICE, shape (K,), for positions of shape (K, 2)
+    [m]."""
     from scipy.spatial import cKDTree
 
     kept = np.ones(len(places), np.bool_)

@@ -69,7 +69,7 @@ class LowestReturns:
 
     @staticmethod
     def room(low: Float, high: Float) -> int:
-        """Return the bytes of a raster between two corners."""
+        """Return the memory that a raster between two corners [m] needs [bytes]."""
         columns, rows = (max(int(np.ceil(v / CELL)), 1) for v in (high - low).tolist())
         return columns * rows * (12 * KEPT + 4 + 8)
 
@@ -128,16 +128,25 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
 
 @compiled
 def _height_bit(z: float, bins_above: int) -> np.uint64:
-    """Return the bit of the height bin of z, or of a bin above it; bins are half of PIT high."""
+    """Return a mask with the bit of one height bin; bins are half of PIT high.
+
+    Args:
+        z: Height [m].
+        bins_above: Number of bins above the bin of z.
+    """
     return np.uint64(1) << np.uint64((int(np.floor(z / (0.5 * PIT))) + bins_above) & 63)
 
 
 @compiled
 def _supported(lowest: Float32, count: Int32) -> Float:
-    """Return the lowest return of each cell that has two more returns close above it.
+    """Return the lowest return of each cell that has two more returns close above it, shape (columns, rows,
+    3) [m].
 
-    Cells with fewer than three returns give their lowest return. Shape (columns, rows, 3) [m]; an empty cell
-    has infinite z.
+    Cells with fewer than three returns give their lowest return. An empty cell has infinite z.
+
+    Args:
+        lowest: Lowest returns of each cell.
+        count: Number of returns of each cell, shape (columns, rows).
     """
     columns, rows = count.shape
     ground = np.full((columns, rows, 3), np.inf)
@@ -161,8 +170,12 @@ def _supported(lowest: Float32, count: Int32) -> Float:
 
 
 def _trend(ground: Float) -> Float:
-    """Return the plane z = a x + b y + c through the lowest cells of squares of 4 m, fitted robustly, shape
-    (3,)."""
+    """Return a, b, c of the plane z = a x + b y + c through the lowest cells of squares of 4 m, fitted
+    robustly, shape (3,).
+
+    Args:
+        ground: Lowest returns, shape (columns, rows, 3) [m].
+    """
     squares = 8
     columns, rows = (-(-n // squares) * squares for n in ground.shape[:2])
     padded = np.full((columns, rows, 3), np.inf)
@@ -220,7 +233,12 @@ def _remove_pits(ground: Float, continuous: Bool) -> None:
 @compiled
 def _continues_upwards(ground: Float, occupied: UInt64) -> Bool:
     """Return whether the height bins above the lowest return of each cell are occupied for the depth of a
-    pit."""
+    pit, shape (columns, rows).
+
+    Args:
+        ground: Lowest returns, shape (columns, rows, 3) [m].
+        occupied: Bits of the occupied height bins of each cell, see `_height_bit`.
+    """
     columns, rows = occupied.shape
     continuous = np.zeros((columns, rows), np.bool_)
     for a in range(columns):
@@ -234,10 +252,14 @@ def _continues_upwards(ground: Float, occupied: UInt64) -> Bool:
 
 @compiled
 def _remove_overhanging(ground: Float, slope: float) -> None:
-    """Remove cells that are steeper than `slope` above a lower cell.
+    """Remove cells that are steeper above a lower cell than the terrain can be, in place.
 
     The cone of the maximum slope of each cell is propagated over the raster by two passes in each direction
     (a chamfer distance).
+
+    Args:
+        ground: Lowest returns, shape (columns, rows, 3) [m]; removed cells get infinite z.
+        slope: Maximum slope (rise over run).
     """
     columns, rows = ground.shape[0], ground.shape[1]
     cone = ground[:, :, 2].copy()
@@ -268,7 +290,12 @@ def _remove_overhanging(ground: Float, slope: float) -> None:
 @compiled
 def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
     """Return the height at the centre of each cell with ground, by a plane through the lowest returns around
-    it, NaN elsewhere; and which cells have ground."""
+    it, NaN elsewhere, and which cells have ground; shape (columns, rows) each.
+
+    Args:
+        ground: Lowest returns, shape (columns, rows, 3) [m].
+        low: Corner of the raster, shape (2,) [m].
+    """
     columns, rows = ground.shape[0], ground.shape[1]
     height = np.full((columns, rows), np.nan)
     seen = np.zeros((columns, rows), np.bool_)
@@ -305,7 +332,8 @@ def _add_row(H: Float, g: Float, dx: float, dy: float, z: float, w: float) -> No
 
 
 def _fill(height: Float) -> None:
-    """Replace NaN by interpolated means of coarser and coarser cells (a pyramid), in place."""
+    """Replace NaN in heights, shape (columns, rows), by interpolated means of coarser and coarser cells (a
+    pyramid), in place."""
     if not np.isfinite(height).any():
         height[:] = 0.0
         return
@@ -335,8 +363,15 @@ def _evaluate(height: Float, low: Float, cell: float, x: Float, y: Float) -> Flo
 
 @compiled
 def ground_at(height: Float, low: Float, cell: float, x: float, y: float) -> tuple[float, float, float]:
-    """Return the height [m] of the raster at a position and its slope along x and y; outside those at the
-    border."""
+    """Return the height [m] of the raster at a position and its slopes along x and y. Outside of the raster,
+    the values at its border are returned.
+
+    Args:
+        height: Heights at the centres of the cells, shape (columns, rows) [m].
+        low: Corner of the raster, shape (2,) [m].
+        cell: Side of a cell [m].
+        x, y: The position [m].
+    """
     columns, rows = height.shape
     u = min(max((x - low[0]) / cell - 0.5, 0.0), columns - 1.0)
     v = min(max((y - low[1]) / cell - 0.5, 0.0), rows - 1.0)

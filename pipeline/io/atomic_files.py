@@ -48,7 +48,8 @@ def write_beside(path: Path) -> Iterator[Path]:
 
 
 def hold(file: IO[Any]) -> None:
-    """Lock an open file until it is closed or the process ends."""
+    """Lock an open file until it is closed or the process ends. Other processes see the lock with
+    `is_held`."""
     if sys.platform != "win32":  # Windows locks open files
         fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
 
@@ -65,7 +66,8 @@ def is_held(path: Path) -> bool:
 
 
 def _to_disk(path: Path) -> None:
-    """Wait until a file or folder is on the disk, so that a power cut leaves the old or the new file."""
+    """Wait until a file or folder is written to the disk, so that after a power cut either the old or the new
+    file exists."""
     if path.is_dir() and os.name == "nt":
         return  # Windows cannot open folders
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)

@@ -162,7 +162,8 @@ def _diameters(table: _Table, dbh_unit: str | None) -> Float:
 
 
 def _measured(diameter: Float) -> Float:
-    """Return diameters with NaN for 0 and negative numbers, which other tools write for unmeasured ones."""
+    """Return diameters [m] with NaN for 0 and negative numbers, which other programs write for unmeasured
+    ones."""
     return np.where(diameter > 0.0, diameter, np.nan)
 
 
@@ -226,7 +227,11 @@ class _TruthFile(msgspec.Struct, frozen=True):
 
 
 def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
-    """Decode the attachment into the ground truth, in the map frame, and the sensor (None if not named).
+    """Return the ground truth in the map frame, and the sensor (None if it is not named), of an attachment.
+
+    Args:
+        content: JSON of `truth_json`.
+        where: Name of the recording in errors.
 
     Raises:
         SourceError: It is not JSON of this form, a number is beyond 1e8, or columns differ in length.
@@ -257,9 +262,13 @@ def _path(columns: _Path) -> TruthPath:
 
 
 def truth_json(sensor: Sensor, truth: Truth | None) -> bytes:
-    """Return the attachment with sensor, trees (dbh null where unknown) and path, as columns.
+    """Return the attachment with sensor, trees (dbh null where unknown) and path, as columns of JSON.
 
     A path in another frame than that of the map, or without yaw, is left out, because readers expect both.
+
+    Args:
+        sensor: The LiDAR.
+        truth: Ground truth, or None.
     """
     content: dict[str, Any] = {"version": 1, "sensor": asdict(sensor)}
     if truth is not None and truth.trees is not None:

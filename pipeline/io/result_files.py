@@ -75,7 +75,7 @@ def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
 
 
 def path_rows(path: Path, start_ns: int) -> list[list[str]]:
-    """Return the path as rows of PATH_COLUMNS, one per scan."""
+    """Return the path as rows of PATH_COLUMNS, one per scan; seconds count from `start_ns`."""
     return [
         [
             _number(_seconds(stamp, start_ns), 3),
@@ -107,7 +107,12 @@ def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
 
 def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
     """Return the clusters of a scan with their verdicts, in the frame of the map, as rows of
-    DETECTION_COLUMNS."""
+    DETECTION_COLUMNS.
+
+    Args:
+        frame: Results of the scan.
+        start_ns: Time from which the seconds count [ns].
+    """
     c = frame.clusters
     centre = frame.estimate.T_map_base.apply(c.centre + frame.sensor_offset[:2])
     fitted = np.isfinite(c.radius)
@@ -272,7 +277,8 @@ def _seconds(stamp_ns: int, start_ns: int) -> float:
 
 
 def _number(value: float, digits: int) -> str:
-    """Return a decimal text without exponent and without minus zero; empty for values that are not finite."""
+    """Return a decimal text with `digits` decimals, without exponent and without minus zero; empty for values
+    that are not finite."""
     if not math.isfinite(value):
         return ""
     text = f"{value:.{digits}f}"

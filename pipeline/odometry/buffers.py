@@ -88,19 +88,20 @@ class OdometryBuffer:
         self.stands = (reading.stamp_ns, reading.pose)
 
     def forget(self, needed_ns: int) -> None:
-        """Drop readings that no scan from a time on needs."""
+        """Drop readings that no scan from time `needed_ns` on needs."""
         while len(self._readings) > 2 and self._readings[1].stamp_ns < needed_ns - KEEP_NS:
             self._readings.popleft()
 
     def pose_at(self, stamp_ns: int) -> Pose2:
-        """Return T_odom_base at a time, interpolated or that of the nearest reading; needs a reading."""
+        """Return T_odom_base at a time [ns]: interpolated, or that of the nearest reading outside of their
+        range. There must be a reading."""
         before, after = self._around(stamp_ns)
         span = after.stamp_ns - before.stamp_ns
         fraction = (stamp_ns - before.stamp_ns) / span if span > 0 else 1.0
         return interpolate(before.pose, after.pose, min(max(fraction, 0.0), 1.0))
 
     def motion_at(self, stamp_ns: int) -> Moving:
-        """Return the motion of the base at a time; needs a reading."""
+        """Return the motion of the base at a time [ns]. There must be a reading."""
         before, after = self._around(stamp_ns)
         span = (after.stamp_ns - before.stamp_ns) * 1e-9
         if span <= 0.0:
@@ -185,7 +186,13 @@ class PoseBuffer:
 
 
 def _carried(pose: PoseMeasurement, step: Pose2, stamp_ns: int) -> PoseMeasurement:
-    """Predict a pose measurement to a later time by a step of the odometry: P' = F P F^T + Q."""
+    """Return a pose measurement predicted to a later time: P' = F P F^T + Q.
+
+    Args:
+        pose: The measurement.
+        step: Step of the odometry from its time to `stamp_ns`.
+        stamp_ns: The later time [ns].
+    """
     error = CARRIED * float(np.hypot(step.x, step.y))
     at = pose.T_map_base @ step
     dx, dy = at.x - pose.T_map_base.x, at.y - pose.T_map_base.y

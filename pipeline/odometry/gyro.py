@@ -85,24 +85,29 @@ class Gyro:
             self._scatter += (sigma - self._scatter) / self._blocks
 
     def learnt(self, stamp_ns: int) -> Learnt:
-        """Return the state of the estimates at a time."""
+        """Return the state of the estimates at a time [ns]."""
         block = tuple(self._block)
         of_bias = stamp_ns, self._bias, self._scatter, self._blocks, block
         return Learnt(*of_bias, self._same, self._turned, self._proven)
 
     def go_on_from(self, learnt: Learnt) -> None:
-        """Restore the state of the estimates; readings are kept."""
+        """Restore the state of the estimates; the readings stay."""
         self._bias, self._scatter = learnt.bias, learnt.scatter
         self._blocks, self._block = learnt.blocks, list(learnt.block)
         self._same, self._turned, self._proven = learnt.same, learnt.turned, learnt.proven
 
     @property
     def proven(self) -> bool:
-        """Whether the turns of the gyroscope agree with those of the wheels."""
+        """Whether the turns of the gyroscope have agreed with those of the wheels."""
         return self._proven
 
     def compare(self, by_wheels: float, turn: Turn) -> None:
-        """Compare the turns of a step by wheels and gyroscope [rad]: fit the slope over all steps."""
+        """Update the comparison of wheels and gyroscope (the slope of a line over all steps) with one step.
+
+        Args:
+            by_wheels: Turn of the step by the wheels [rad].
+            turn: Turn of the same step by the gyroscope.
+        """
         way, square, product = self._turned
         way, square = way + abs(by_wheels), square + by_wheels**2
         self._turned = (way, square, product + by_wheels * turn.angle)
@@ -115,7 +120,7 @@ class Gyro:
         return self._bias
 
     def turn(self, from_ns: int, to_ns: int) -> Turn | None:
-        """Return the turn between two times, None when readings are missing."""
+        """Return the turn between two times [ns]; None if readings are missing."""
         angle = self._integral(from_ns, to_ns)
         if angle is None:
             return None

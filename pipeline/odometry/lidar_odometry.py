@@ -115,7 +115,13 @@ class LidarOdometry:
         return points[keep], offset
 
     def _expected(self, velocity: Float, span_ns: int) -> Float:
-        """Predict the step since the last scan in the sensor frame: by the wheels, else the last step."""
+        """Return the predicted step since the last scan in the sensor frame, shape (4, 4): by the wheels,
+        else the last step, or no motion after a pause.
+
+        Args:
+            velocity: Last step in the sensor frame, shape (4, 4).
+            span_ns: Time since the last scan [ns].
+        """
         now, before = self._wheels, self._wheels_before
         if (
             now is not None

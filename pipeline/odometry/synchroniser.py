@@ -248,7 +248,13 @@ class Synchroniser:
         return step
 
     def _turn_to(self, stamp_ns: int, pose: Pose2 | None) -> Turn | None:
-        """Return the turn since the last step by the gyroscope; compare it with trusted odometry."""
+        """Return the turn since the last step by the gyroscope, and compare it with the odometry if that is
+        reliable.
+
+        Args:
+            stamp_ns: Time of the scan [ns].
+            pose: Pose by the odometry at that time, or None.
+        """
         turn = None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, stamp_ns)
         if turn is None or pose is None or self._stepped is None or self._doubt or self._after is not None:
             return turn
@@ -256,7 +262,8 @@ class Synchroniser:
         return turn
 
     def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:
-        """Return pose, velocity in the base frame, and tilt by the odometry."""
+        """Return pose, velocity in the base frame (x, y [m/s], yaw [rad/s]), and tilt by the odometry at a
+        time [ns]."""
         newest = self._odometry.newest
         if newest is None:
             if self._use_odometry:
@@ -268,7 +275,7 @@ class Synchroniser:
         return self._odometry.motion_at(stamp_ns)
 
     def _report_pause(self, stamp_ns: int) -> None:
-        """Warn of a long time without a scan, and mark the odometry as doubtful."""
+        """Add a warning after a long time without a scan, and flag the odometry as unreliable."""
         seconds = 0.0 if self._stepped_ns is None else (stamp_ns - self._stepped_ns) * 1e-9
         if seconds * 1e9 > PAUSE_NS:
             self._warn(f"no scan for {seconds:.0f} s: the pose is known only by the odometry")

@@ -32,7 +32,7 @@ _hints = cache(typing.get_type_hints)
 
 @cache
 def _saved(kind: type) -> tuple[str, ...]:
-    """The names of the fields of a record that are saved."""
+    """Return the names of the fields of a record type that are saved."""
     return tuple(f.name for f in fields(kind) if not f.metadata.get(NOT_SAVED))
 
 
@@ -63,11 +63,12 @@ class _Blob:
 
 
 def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: ANN401 - any record
-    """Return a record of arrays, numbers, texts, tuples and other records as JSON and the bytes of its
-    arrays.
+    """Return a record as JSON and the bytes of its arrays.
 
-    With `planes` the first bytes of all numbers of an array come first, then the second ones, and so on,
-    because these compress better.
+    Args:
+        record: A record of arrays, numbers, texts, tuples and other records.
+        planes: Whether the first bytes of all numbers of an array come first, then the second ones, and so
+            on, which compresses better.
     """
     blob = _Blob(planes)
     tree = _encoded(record, blob)
@@ -93,7 +94,12 @@ def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
 
 
 def decode(kind: type[R], tree: Any, blob: bytes, *, planes: bool = False) -> R:  # noqa: ANN401
-    """Return the record of a type that was encoded, see `encode`.
+    """Return the record that `encode` encoded.
+
+    Args:
+        kind: Type of the record.
+        tree, blob: Result of `encode`.
+        planes: As in `encode`.
 
     Raises:
         ValueError: A field is missing or unknown, or has another type, or an array is not inside of the
@@ -229,10 +235,14 @@ def write_archive(tree: Any, blob: bytes) -> bytes:  # noqa: ANN401 - any JSON
 
 
 def read_archive(data: bytes, where: str) -> tuple[Any, bytes]:
-    """Return the tree and the arrays of a file; sizes are checked before memory is allocated.
+    """Return the JSON and the arrays of an archive; sizes are checked before memory is allocated.
+
+    Args:
+        data: Bytes of the archive, see `write_archive`.
+        where: Name of the file in errors.
 
     Raises:
-        StemmapError: It is damaged, is another file, or declares too large sizes.
+        StemmapError: It is damaged, is another file, or declares sizes that are too large.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -245,7 +255,12 @@ def read_archive(data: bytes, where: str) -> tuple[Any, bytes]:
 
 
 def damaged(where: str, why: str) -> StemmapError:
-    """Return the error for a saved state that cannot be used."""
+    """Return the error for a saved state that cannot be used.
+
+    Args:
+        where: Name of the file.
+        why: Reason.
+    """
     return StemmapError(f"the saved state is damaged: {why}", where=where, remedy="Map the run again")
 
 

@@ -126,7 +126,16 @@ def _moved_path(b: SavedMap, T: Pose2) -> Float:
 
 
 def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, reach: float) -> SlamState:
-    """Return particles with the best maps of both, at the end of the second run."""
+    """Return the state of SLAM of the merged map: particles with the best maps of both runs, at the end of
+    the second run.
+
+    Args:
+        a, b: States of SLAM of the two maps.
+        T: Pose of the frame of b in that of a.
+        covariance: Covariance of T, shape (3, 3).
+        path: Path of the merged map.
+        reach: Distance within which landmarks of both maps are the same [m].
+    """
     P = len(a.pose)
     known, other = a.map_of(a.best), b.map_of(b.best)
     C = T.rotation()
@@ -170,7 +179,15 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemo
 
 
 def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int) -> PackedVoxelMap:
-    """Return the voxels of a with the means of those of b, each as often as it was seen, up to a limit."""
+    """Return the voxels of a with the means of those of b, each added as often as it was seen in b, up to
+    MOST_RETURNS.
+
+    Args:
+        a, b: Voxel maps.
+        T: Pose of the frame of b in that of a.
+        scan: Index of the scan at which the means of b are added.
+        most: Maximum number of voxels.
+    """
     memory = a.unpacked()
     points = b.mean.copy()
     points[:, :2] = T.apply(b.mean[:, :2].astype(np.float64))

@@ -114,7 +114,7 @@ class SavedMap:
         return RelocaliserState(local=local, driven=driven, since=since)
 
     def trees(self, parameters: Parameters) -> Trees:
-        """Return the trees of the map by some parameters."""
+        """Return the trees of the map, with the confirmation and diameters that the parameters give."""
         tracker = Tracker(parameters.tracking)
         tracker.tracks, tracker.next_number = self.tracks, self.next_number
         return tracker.trees()
@@ -188,7 +188,11 @@ def _check_graph(slam: SlamState, scans: int) -> None:
 
 
 def _check_finite(*columns: Float) -> None:
-    """Check numbers that compiled code converts to rows of tables."""
+    """Check that all numbers are finite, because compiled code converts them to rows of tables.
+
+    Raises:
+        ValueError: A number is not finite.
+    """
     if not all(np.isfinite(column).all() for column in columns):
         raise ValueError("a place or a covariance is not finite")
 
@@ -198,7 +202,12 @@ def _within(rows: Int, size: int) -> bool:
 
 
 def _check_rows(table: TrackTable | Columns, empty: TrackTable | Columns) -> None:
-    """Check that all columns have the length of the first, and the shapes of an empty table."""
+    """Check that all columns of a table have the length of the first one, and the shapes of those of an empty
+    table.
+
+    Raises:
+        ValueError: A column has another shape.
+    """
     n = None
     for f in fields(table):
         column, wanted = getattr(table, f.name), getattr(empty, f.name)

@@ -162,7 +162,7 @@ class FileSource:
         return None
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: no file is open."""
 
 
 def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:

@@ -41,7 +41,11 @@ class Camera:
     T_base_camera: Pose3
 
     def project(self, points: Float) -> tuple[Float, Float]:
-        """Project points in the base frame, (N, 3) [m]; return pixels, (N, 2), and depths [m], (N,)."""
+        """Return the pixels, shape (N, 2), and the depths, shape (N,) [m], of points.
+
+        Args:
+            points: Points in the base frame, shape (N, 3) [m].
+        """
         seen = self.T_base_camera.inverse().apply(points)
         depth = seen[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -111,7 +115,7 @@ def find_camera(
 
 
 def shared_parts(first: str, second: str) -> int:
-    """Return the number of leading parts that two topic names share."""
+    """Return the number of leading parts between slashes that two topic names share."""
     parts = zip(first.split("/"), second.split("/"), strict=False)
     return next((k for k, (a, b) in enumerate(parts) if a != b), 99)
 
@@ -119,7 +123,14 @@ def shared_parts(first: str, second: str) -> int:
 def picture_of(
     message: Message, channels: Mapping[int, Channel], decoder: MessageDecoder, stamp_ns: int
 ) -> Picture | None:
-    """Decode a picture, None when its sizes contradict each other or are too large."""
+    """Return the picture in a message; None if its sizes contradict each other or are too large.
+
+    Args:
+        message: Image or CompressedImage.
+        channels: Channels by number.
+        decoder: Decoder of the messages.
+        stamp_ns: Time of the picture [ns].
+    """
     if len(message.payload) > BYTES_LIMIT:
         return None
     channel = channels[message.channel]
@@ -144,7 +155,12 @@ SHOWN_NS = 1_000_000_000
 
 
 def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:
-    """Return the nearest of `stamps` (ascending, N >= 1) to each time, and whether it is near enough."""
+    """Return the nearest stamp for each time [ns], and whether it is within `SAME_TIME_NS`, shape (M,) each.
+
+    Args:
+        stamps: Stamps, ascending [ns], shape (N,), N >= 1.
+        wanted_ns: Times [ns], shape (M,).
+    """
     after = np.clip(np.searchsorted(stamps, wanted_ns), 0, len(stamps) - 1)
     before = np.maximum(after - 1, 0)
     near = np.where(np.abs(stamps[before] - wanted_ns) <= np.abs(stamps[after] - wanted_ns), before, after)
@@ -225,7 +241,7 @@ class RecordedPictures:
                     yield picture
 
     def near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time, None when it is farther than `within_ns`."""
+        """Return the picture nearest to a time [ns]; None if none is within `within_ns` of it."""
         # First only a short interval is read: pictures of a fast camera can be a megabyte each.
         best = self._nearest(stamp_ns, min(within_ns, SAME_TIME_NS)) or self._nearest(stamp_ns, within_ns)
         return None if best is None else picture_of(best[1], self._channels, self._decoder, best[0])

@@ -74,7 +74,12 @@ class Container(Protocol):
         """All channels."""
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return a time shortly before the last message of some channels."""
+        """Return a time [ns] from which a few messages of some channels are left to read, the last ones of
+        the recording.
+
+        Args:
+            numbers: Numbers of the channels.
+        """
 
     @property
     def damage(self) -> dict[str, int]:
@@ -83,9 +88,12 @@ class Container(Protocol):
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield the messages of some channels in the order of recording, from `start_ns` on.
+        """Yield messages in the order of recording. Parts that cannot be read are left out.
 
-        Parts that cannot be read are left out and counted in `losses`.
+        Args:
+            numbers: Numbers of the channels that are read.
+            start_ns: Time of the first message [ns]; None for all.
+            losses: Counts the parts that are left out, by reason.
         """
 
     def attachment(self, name: str, limit: int) -> bytes | None:
@@ -106,7 +114,12 @@ def ros2_type_name(name: str) -> str:
 
 
 def damaged(what: str, path: object) -> SourceError:
-    """Return the error for a file of which nothing can be read."""
+    """Return the error for a file that cannot be read at all.
+
+    Args:
+        what: What is wrong with it.
+        path: The file.
+    """
     return SourceError(what, where=str(path), remedy="Copy the file again, or record it again.")
 
 
@@ -137,7 +150,8 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
 
 
 def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
-    """Unpack at most `limit` + 1 bytes of a block."""
+    """Return the first `limit` + 1 unpacked bytes of a block, or all if there are fewer; arguments as in
+    `unpack`."""
     try:
         match compression:
             case "" | "none":
@@ -156,7 +170,7 @@ def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
 
 
 def plain_message(payload: bytes) -> bytes:
-    """Decompress a message that a recorder compressed by itself; empty when it is damaged."""
+    """Return the bytes of a message that a recorder may have compressed; b"" if they are damaged."""
     if payload[:4] != _ZSTD_MAGIC:
         return payload
     try:
@@ -225,14 +239,15 @@ class ChunkedFile:
             raise
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """See Container."""
+        """Return the time of the first message of the last chunk with these channels [ns]."""
         last = max(self._needed(frozenset(numbers), None), key=attrgetter("end_ns"), default=None)
         return 0 if last is None else last.start_ns
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """See Container. Chunks may overlap in time; each is unpacked when its first message is due."""
+        """Yield messages, see `Container.messages`. Chunks may overlap in time; each is unpacked when its
+        first message is due."""
         wanted = frozenset(numbers)
         heap: list[tuple[int, int, Message]] = []
         serial = held = 0
@@ -324,7 +339,8 @@ class ChunkedFile:
             raise BrokenChunkError from error
 
     def _survey(self, chunk: Chunk) -> Chunk:
-        """Return a chunk with the number and times of its messages, and keep the channels that it defines."""
+        """Return a chunk with the number and times of its messages, which are counted by unpacking it.
+        Channels that it defines are added."""
         counts: dict[int, int] = {}
         first_ns, last_ns = 2**64, -1
         try:
@@ -338,7 +354,8 @@ class ChunkedFile:
         return replace(chunk, counts=counts)
 
     def _survey_chunks(self) -> None:
-        """Survey the chunks without an index, and those with channels that are not defined elsewhere."""
+        """Count the messages of the chunks without an index, and of those with channels that are not defined
+        elsewhere."""
         for index, chunk in enumerate(self._chunks):
             if chunk.counts is None or not set(chunk.counts) <= set(self._known_channels()):
                 self._chunks[index] = self._survey(chunk)

@@ -13,7 +13,8 @@ Opener = Callable[[str, Path, SourceOptions], Source]
 
 
 def _opener(module: str, function: str) -> Opener:
-    """Return an opener of a module of this package, which is imported when a file is opened."""
+    """Return a function that imports `module` of this package and calls its `function` when a file is
+    opened."""
 
     def opened(uri: str, path: Path, options: SourceOptions) -> Source:
         found: Opener = getattr(import_module(f"pipeline.io.readers.{module}"), function)
@@ -90,7 +91,12 @@ READABLE = ", ".join(
 
 
 def file_format(path: Path, head: bytes) -> Format | None:
-    """Return the format of a file by its first bytes, or by its name for formats without magic bytes."""
+    """Return the format of a file, None if it is unknown.
+
+    Args:
+        path: The file; its name decides for formats without magic bytes.
+        head: Its first bytes.
+    """
     if path.suffix.lower() == ".npz":  # a .zip by its contents
         return expected_format(path)
     for kind in FILES:
@@ -111,7 +117,7 @@ def recordings_in(folder: Path) -> list[str]:
 
 
 def named(names: list[str]) -> str:
-    """List the first few names for a message."""
+    """Return the first few names as text for a message."""
     more = len(names) - _MOST_NAMED
     return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 

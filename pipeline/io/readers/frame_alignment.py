@@ -102,7 +102,7 @@ class FrameAlignment:
         self.refused = ""
 
     def add(self, stamped: Stamped[Message | Odometry]) -> Any:  # noqa: ANN401 - GnssFrame or OtherFrame
-        """Take the next message or odometry; return the frame once it is known, else None."""
+        """Process the next message or odometry. Return the frame once it is known, else None."""
         content = stamped.content
         if isinstance(content, Odometry):
             self._add_odometry(content)
@@ -196,7 +196,8 @@ class FrameAlignments:
                 (_Kind("gnss", "gnss", "GNSS", "GNSS fixes", "fixes", "the direction of north", decoder.fix,
                        align_fixes, *FIX_STRETCH, early=False), topics.gnss),
                 (_Kind("pose", "other_slam", "other SLAM", "Poses of another SLAM", "poses",
-                       "the pose of their frame", decoder.other_pose, align_poses,
+                       "the pose of their frame", decoder.other_pose,
+                       lambda poses, stamps, path, _lever: align_poses(poses, stamps, path),
                        *POSE_STRETCH, early=True), topics.pose),
             )
             if topic is not None
@@ -206,7 +207,13 @@ class FrameAlignments:
         self.notices: list[str] = []
 
     def begin(self, description: SourceDescription, *, live: bool) -> SourceDescription:
-        """Align the frames of a recording, or prepare it for a live run; return the completed description."""
+        """Align the frames of a recording, or prepare the alignment for a live run. Return the description
+        with how the readings are used.
+
+        Args:
+            description: Description of the source.
+            live: Whether the run is live.
+        """
         for kind, numbers in self._kinds:
             found, why, text = None, "", ""
             alignment = FrameAlignment(
@@ -237,7 +244,7 @@ class FrameAlignments:
         return description
 
     def add(self, stamped: Stamped[Message | Odometry]) -> None:
-        """Take the next message or odometry of a live run, before a record is made of it."""
+        """Process the next message or odometry of a live run, before it is decoded to a record."""
         for alignment in tuple(self._open):
             kind, found = alignment.kind, alignment.add(stamped)
             if found is not None:

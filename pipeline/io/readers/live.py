@@ -61,13 +61,13 @@ class MessageList:
         self.channels = [replace(channel, count=counts[channel.number]) for channel in channels]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """See Container."""
+        """Return the time of the last message [ns], see `Container.tail_ns`."""
         return max((m.log_ns for m in self._messages if m.channel in numbers), default=0)
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """See Container."""
+        """Yield the messages, see `Container.messages`."""
         del losses
         for message in self._messages:
             if message.channel in numbers and (start_ns is None or message.log_ns >= start_ns):
@@ -79,7 +79,7 @@ class MessageList:
         return None
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: no file is open."""
 
 
 class ArrivalReader:
@@ -126,7 +126,7 @@ class ArrivalReader:
         return "" if self._source is None else self._source.base
 
     def add(self, message: Message) -> list[Record]:
-        """Take the next message; return the records that it completes.
+        """Process the next message; return the records that it completes.
 
         Raises:
             SourceError: There are scans, and none can be read.
@@ -228,7 +228,7 @@ class LiveCamera:
         self._found: tuple[str, Camera | None, str] | None = None
 
     def add(self, message: Message) -> bool:
-        """Take a message of any channel; return whether only the camera uses it."""
+        """Process a message of any channel; return whether only the camera uses it."""
         number = message.channel
         if number not in self._numbers:
             if number in self._channels and len(self._fixed) < _MOST_FIXED:
@@ -328,7 +328,11 @@ class LiveRunHeader(msgspec.Struct, frozen=True):
 
 
 def read_live_header(container: McapFile, where: str) -> LiveRunHeader | None:
-    """Read the settings of a live run; None when the file is not the recording of a live run.
+    """Return the settings of a live run; None if the file is not the recording of a live run.
+
+    Args:
+        container: The file.
+        where: Its name in errors.
 
     Raises:
         SourceError: They are damaged or of a newer version.
@@ -474,14 +478,15 @@ class LiveRecording:
         )
 
     def _messages(self, numbers: Collection[int], losses: dict[str, int]) -> Iterator[Message]:
-        """The robot's messages in order of arrival; as the live run mapped them, if that is asked for."""
+        """Yield the messages of the robot in the order of arrival; with `as_live`, only those that the live
+        run mapped."""
         for message in self._container.messages(numbers, None, losses):
             skipped = self._skipped.get(message.channel) if self._options.as_live else None
             if skipped is None or message.log_ns not in skipped:
                 yield message
 
     def _revisions(self) -> Iterator[Revision]:
-        """The parameters of the live run, in order."""
+        """Yield the parameters of the live run, in order."""
         for text in self._notes(PARAMETERS):
             try:
                 yield msgspec.json.decode(text, type=Revision)
@@ -489,7 +494,7 @@ class LiveRecording:
                 count_loss(self._losses, "revisions of the parameters that cannot be read")
 
     def _read_skipped(self) -> dict[int, set[int]]:
-        """Log times of the messages that the live run did not map, by channel."""
+        """Return the log times of the messages that the live run did not map, by channel."""
         skipped: dict[int, set[int]] = {c.number: set() for c in self._channels}
         numbers = {c.topic: c.number for c in self._channels}
         total = 0
@@ -508,7 +513,7 @@ class LiveRecording:
         return {number: times for number, times in skipped.items() if times}
 
     def _notes(self, topic: str) -> Iterator[str]:
-        """The JSON texts of a channel of the recorder; damaged ones are counted."""
+        """Yield the JSON texts of a channel of the recorder; damaged ones are counted."""
         numbers = [c.number for c in self._container.channels if c.topic == topic]
         types: Any = standard_types("cdr")
         for count, message in enumerate(self._container.messages(numbers, None, {})):
@@ -521,7 +526,7 @@ class LiveRecording:
 
 
 def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
-    """Describe the topics of the camera of a live run."""
+    """Return the description of the topics of the camera of a live run."""
     return tuple(RecordedTopic(c.topic, c.msgtype, c.count, "camera", "") for c in channels)
 
 

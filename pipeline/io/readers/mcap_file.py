@@ -55,7 +55,7 @@ class McapFile(ChunkedFile):
         return channels
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """See Container."""
+        """Return the bytes of an attachment, see `Container.attachment`."""
         for offset, length in self._attachments:
             head = self._read(offset + 16, min(length - 16, 4096))
             try:
@@ -135,7 +135,13 @@ class McapFile(ChunkedFile):
         return chunks[0].chunk_start_offset if chunks else 0
 
     def _take(self, opcode: int, body: int, length: int) -> bool:
-        """Keep the contents of a record; return False when it is damaged or of an unknown kind."""
+        """Store the contents of a record; return False if it is damaged or of an unknown kind.
+
+        Args:
+            opcode: Kind of the record.
+            body: Position of its contents in the file.
+            length: Length of its contents [bytes].
+        """
         try:
             if opcode in (SCHEMA, CHANNEL):
                 self._define(opcode, self._read(body, min(length, DEFINITION_LIMIT)))
@@ -171,11 +177,11 @@ class McapFile(ChunkedFile):
         self._chunks.append(Chunk(body + at + 8, packed, start_ns, end_ns, compression, size, crc, None))
 
     def _add_run(self, start: int, end: int) -> None:
-        """Add messages outside of chunks as an uncompressed chunk."""
+        """Add the messages between two positions outside of chunks as an uncompressed chunk."""
         self._chunks.append(self._survey(Chunk(start, end - start, 0, 0, "", end - start, 0, None)))
 
     def _count(self, body: int, length: int) -> None:
-        """Take the number of messages of a channel from an index record behind its chunk."""
+        """Store the number of messages of a channel in the chunk before, from an index record."""
         number, size = struct.unpack_from("<HI", self._read(body, 6))
         if self._chunks and size + 6 <= length:
             chunk = self._chunks[-1]
@@ -200,7 +206,12 @@ class McapFile(ChunkedFile):
 
 
 def _text(record: bytes, at: int) -> tuple[str, int]:
-    """Return a string with its length before it, and the position of the next field."""
+    """Return a string that begins with its length, and the position after it.
+
+    Args:
+        record: Bytes of a record.
+        at: Position of the length.
+    """
     (size,) = struct.unpack_from("<I", record, at)
     if at + 4 + size > len(record):
         raise ValueError("the text is longer than its record")

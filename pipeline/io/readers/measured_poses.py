@@ -46,16 +46,14 @@ class RigidFit:
     rate_hz: float
 
     def shared(self, x: float, y: float, sigma: float, yaw_sigma: float, heading_sigma: float = 0.0) -> Float:
-        """Return the factor of the error shared by all positions, at a place in the map; see PoseMeasurement.
+        """Return the factor L of the covariance L L^T of (x, y, yaw) that all positions share, shape (3, 4);
+        see PoseMeasurement.
 
         Args:
-            x, y: The place [m].
+            x, y: Position in the map [m].
             sigma: Standard deviation of the shift of the frame [m].
             yaw_sigma: Standard deviation of its rotation about `centre` [rad].
             heading_sigma: Standard deviation of the difference of the headings [rad].
-
-        Returns:
-            L with covariance L L^T of (x, y, yaw), shape (3, 4).
         """
         dx, dy = x - self.centre[0], y - self.centre[1]
         return np.array(
@@ -68,7 +66,14 @@ class RigidFit:
 
 
 def interpolated(at_ns: Int, stamp_ns: Sequence[int], path: Float) -> Float:
-    """Interpolate each column of a path at other times; its end values apply outside of its time span."""
+    """Return the columns of a path, linearly interpolated at other times, shape (K, C). Outside of the path
+    its end values apply.
+
+    Args:
+        at_ns: Times [ns], shape (K,).
+        stamp_ns: Times of the path, ascending [ns], length N.
+        path: shape (N, C).
+    """
     times = (np.asarray(stamp_ns, dtype=np.int64) - int(stamp_ns[0])).astype(np.float64)
     at = (at_ns - int(stamp_ns[0])).astype(np.float64)
     columns: Float = np.stack([np.interp(at, times, column) for column in path.T], axis=1)
@@ -160,9 +165,14 @@ class Fix:
     def of(
         cls, stamp_ns: int, latitude: float, longitude: float, covariance: Sequence[float], kind: int
     ) -> Fix:
-        """Make a fix of the fields of its message.
+        """Return a fix from the fields of its message.
 
-        The covariance is unknown when `kind` is 0, or when its variances are zero, as many drivers send it.
+        Args:
+            stamp_ns: Time [ns].
+            latitude, longitude: WGS84 [deg].
+            covariance: Covariance of east, north, up [m^2], nine numbers.
+            kind: Field `position_covariance_type`. The covariance is unknown if it is 0, or if the variances
+                are zero, as many drivers send it.
 
         Raises:
             ValueError: The position is not on Earth, or the covariance is invalid.
@@ -219,7 +229,7 @@ class GnssFrame:
 
     @property
     def summary(self) -> str:
-        """Summary for the user."""
+        """How the fixes are used, as text for the user."""
         return (
             f"fixes are used; over {self.fit.length:.0f} m of the drive their distance from the path by "
             f"odometry is {self.fit.residual:.2f} m (RMS), and north is known to "
@@ -227,7 +237,8 @@ class GnssFrame:
         )
 
     def measurement(self, fix: Fix) -> PoseMeasurement:
-        """Return the position of the base in the map, with the errors of the fix and of the plane."""
+        """Return a fix as measurement of the position of the base in the map, with the errors of the fix and
+        of the plane."""
         T = self.fit.T_map_other
         c, s = math.cos(T.yaw), math.sin(T.yaw)
         east, north = self.plane.place(fix)
@@ -268,7 +279,7 @@ def align_fixes(
 
 
 #: Shortest and longest stretch for poses of another SLAM [m]; short, because odometry drifts and these poses
-# are much #: better than GNSS fixes.
+#: are much better than GNSS fixes.
 POSE_STRETCH = 5.0, 20.0
 #: Standard deviations that are added to those of the other SLAM [m, rad].
 BEST = (0.02, 0.005)
@@ -310,7 +321,13 @@ class OtherPose:
         covariance: Sequence[float],
         T_child_base: Pose3 | None = None,
     ) -> OtherPose:
-        """Make a pose of the fields of its message; `covariance` has 36 numbers.
+        """Return a pose from the fields of its message.
+
+        Args:
+            stamp_ns: Time [ns].
+            T_other_child: Pose in the message.
+            covariance: Covariance of x, y, z [m], roll, pitch, yaw [rad], 36 numbers.
+            T_child_base: Pose of the base in the frame of the message; None for the base itself.
 
         Raises:
             NoPoseError: The covariance in the plane is not finite or not positive definite.
@@ -347,7 +364,7 @@ class OtherFrame:
 
     @property
     def summary(self) -> str:
-        """Summary for the user."""
+        """How the poses are used, as text for the user."""
         heading = (
             "" if self.turn is not None else "; their headings are not those of this robot and are not used"
         )
@@ -377,7 +394,7 @@ class OtherFrame:
 
 
 def align_poses(
-    poses: Sequence[OtherPose], stamp_ns: Sequence[int], path: Float, lever: float = 0.0
+    poses: Sequence[OtherPose], stamp_ns: Sequence[int], path: Float
 ) -> tuple[OtherFrame | None, str]:
     """Fit the pose of the other frame in the map.
 
@@ -385,12 +402,10 @@ def align_poses(
         poses: In the order of time.
         stamp_ns: Times of the odometry, ascending, shape (N,).
         path: Poses of the base by odometry in the map frame: x, y [m], yaw [rad], shape (N, 3).
-        lever: Not used: the poses are those of the base.
 
     Returns:
         The frame, or None and the reason why there is none.
     """
-    del lever
     at_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
     other = np.array([pose.T_other_base.as_array() for pose in poses]).reshape(-1, 3)
     sigma = np.array([math.sqrt(0.5 * (p.covariance[0, 0] + p.covariance[1, 1])) for p in poses])

@@ -151,7 +151,12 @@ class Stamped(Generic[T]):
 
 
 def by_stamp(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -> Iterator[Stamped[T]]:
-    """Sort a stream by time; what arrives more than WINDOW_NS late is left out and counted."""
+    """Yield contents sorted by time. Contents that arrive more than WINDOW_NS late are left out.
+
+    Args:
+        arrivals: Contents in the order of arrival.
+        losses: Counts contents that are left out.
+    """
     heap: list[tuple[int, int, int, Stamped[T]]] = []
     newest = last = -(2**63)
     for serial, arrival in enumerate(arrivals):

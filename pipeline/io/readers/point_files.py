@@ -113,7 +113,8 @@ def read_columns(path: Path, losses: dict[str, int], *, limit: int = POINT_LIMIT
 
 
 def _column_names(fields: list[str]) -> list[str]:
-    """Return names in lower case without the prefix of CloudCompare; unusable ones begin with "*"."""
+    """Return the names of columns in lower case without the prefix of CloudCompare. Empty and repeated names
+    become "*" and their number; such columns are not used."""
     names: list[str] = []
     for k, field in enumerate(fields):
         name = field.lower().removeprefix("scalar_")
@@ -137,7 +138,7 @@ def _check_size(points: int, step: int, *, whole: bool = False) -> None:
     """Check the number of points and the bytes of one point.
 
     Args:
-        points, step: As the header says.
+        points, step: Number of points and bytes per point in the header.
         whole: Whether all points are read at once.
 
     Raises:
@@ -149,7 +150,13 @@ def _check_size(points: int, step: int, *, whole: bool = False) -> None:
 
 
 def _read_records(file: IO[bytes], dtype: np.dtype[Any], points: int) -> Iterator[NDArray[Any]]:
-    """Yield records of fixed length from the position of the file, without the last one if it is cut."""
+    """Yield arrays of records from the position of the file; an incomplete last record is left out.
+
+    Args:
+        file: Open file.
+        dtype: Type of a record.
+        points: Number of records.
+    """
     rows = max(1, min(PART, (16 << 20) // dtype.itemsize))
     while points > 0:
         block = file.read(min(rows, points) * dtype.itemsize)
@@ -273,7 +280,7 @@ def _pcd_ascii(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
 
 
 def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
-    """Convert numbers of a text to the type of the header; integers are clipped to its range."""
+    """Return numbers of a text file in the type of the header; integers are clipped to its range."""
     if dtype.kind == "f":
         with np.errstate(over="ignore"):
             return numbers.astype(dtype)
@@ -283,7 +290,8 @@ def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.g
 
 
 def _pcd_compressed(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
-    """Compressed data holds one field after the other, each with all its points."""
+    """Yield the points of compressed data as one part. The data has one field after the other, each with all
+    its points."""
     body = file.read(WHOLE_LIMIT)
     if len(body) < 8:
         raise ScanFileError("its packed data is missing")
@@ -301,7 +309,7 @@ def _pcd_compressed(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
 
 
 def lzf_decompress(block: bytes | memoryview, size: int) -> NDArray[np.uint8]:
-    """Decompress an LZF block to exactly `size` bytes; uint8 of shape (size,).
+    """Return the `size` decompressed bytes of an LZF block, uint8, shape (size,).
 
     Raises:
         ScanFileError: The block is damaged or has another size.
@@ -316,7 +324,8 @@ def lzf_decompress(block: bytes | memoryview, size: int) -> NDArray[np.uint8]:
 
 @compiled
 def _unpack_lzf(block: NDArray[np.uint8], unpacked: NDArray[np.uint8]) -> int:
-    """Return the number of bytes written, -1 when the block points outside of either array."""
+    """Decompress an LZF block into `unpacked`. Return the number of bytes written, -1 if the block refers to
+    bytes outside of either array."""
     at, out = 0, 0
     while at < len(block):
         control = int(block[at])
@@ -373,7 +382,7 @@ class _PlyElement:
     fields: list[tuple[str, str]]
 
     def dtype(self, order: str) -> np.dtype[np.void]:
-        """Return the record of one element."""
+        """Return the type of one element; `order` is the byte order, "" for text."""
         names = _column_names([name for name, _ in self.fields])
         return np.dtype(
             [(name, (order or "<") + kind) for name, (_, kind) in zip(names, self.fields, strict=True)]
@@ -609,7 +618,12 @@ def _numpy_table(path: Path, kind: str, arrays: dict[_NumpyArray, np.dtype[Any]]
 
 
 def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
-    """Parse the header of an array.
+    """Return the description of an array from its header.
+
+    Args:
+        file: File at the beginning of the array.
+        member: Name of the array in an .npz, None for an .npy.
+        size: Bytes of the file or of the unpacked member.
 
     Raises:
         ScanFileError: It is damaged, or the array holds Python objects (pickles) or is too large.

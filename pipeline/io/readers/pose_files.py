@@ -76,7 +76,12 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
 
 
 def exact_ns(path: Path) -> Int:
-    """Parse the first column, decimal seconds, as integer nanoseconds; a float has too few digits."""
+    """Return the times in the first column of a text file, decimal seconds, as integer nanoseconds, shape
+    (rows,). A float has too few digits for them.
+
+    Raises:
+        TextError: A word is not a number.
+    """
     words = [line.split()[0] for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
     try:
         return np.array([seconds_ns(word) for word in words], dtype=np.int64)
@@ -85,10 +90,10 @@ def exact_ns(path: Path) -> Int:
 
 
 def seconds_ns(text: str) -> int:
-    """Parse decimal seconds as integer nanoseconds, exactly.
+    """Return decimal seconds as integer nanoseconds, exactly.
 
     Raises:
-        ValueError: It is not a number, or too large.
+        ValueError: The text is not a number, or the number is too large.
     """
     whole, dot, fraction = text.partition(".")
     plain = whole.isascii() and whole.isdigit() and (not dot or (fraction.isascii() and fraction.isdigit()))
@@ -235,7 +240,8 @@ _LINE_LIMIT = 1 << 16  # bytes; a longer line is cut, and its parts are damaged 
 
 
 def parse_numbers(text: bytes) -> Float:
-    """Parse numbers between blanks or line ends up to the first word that is not a number; shape (N,)."""
+    """Return the numbers between blanks or line ends, up to the first word that is not a number, shape
+    (N,)."""
     parts, at = [np.zeros(0)], 0
     while at < len(text):
         gap = _GAP.search(text, at + _BLOCK)

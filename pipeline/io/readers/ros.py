@@ -108,7 +108,13 @@ class RosSource:
     def records_of(
         self, message: Message, losses: dict[str, int], from_ns: int | None = None
     ) -> Iterator[Record]:
-        """Yield the records of one message from `from_ns` on; what cannot be used is counted in `losses`."""
+        """Yield the records of one message.
+
+        Args:
+            message: The message.
+            losses: Counts contents that cannot be used.
+            from_ns: Time of the first record [ns]; None for all.
+        """
         if message.channel in self._wanted or message.channel in self._alignments.numbers:
             for stamped in self._times_of(message, losses):
                 self._alignments.add(stamped)
@@ -210,7 +216,7 @@ class RosSource:
                     yield Stamped(time_ns, 0, Odometry(time_ns, pose))
 
     def _upright(self, scan: Scan) -> Scan:
-        """Number the rings from below, as defined for Scan."""
+        """Return a scan whose rings are numbered from below, as defined for `Scan`."""
         if self._top_ring is None or scan.ring is None:
             return scan
         return replace(scan, ring=np.maximum(self._top_ring - scan.ring, 0).astype(np.int32))

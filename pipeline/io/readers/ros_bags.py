@@ -63,14 +63,14 @@ class Db3File:
             raise
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """See Container."""
+        """Return the time of the last message of some channels [ns]; 0 without one."""
         found = np.flatnonzero(np.isin(self._topic, list(numbers)))
         return int(self._stamp[found[-1]]) if len(found) else 0
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """See Container."""
+        """Yield messages, see `Container.messages`."""
         first = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
         chosen = first + np.flatnonzero(np.isin(self._topic[first:], list(numbers)))
         for index in chosen:
@@ -176,7 +176,7 @@ def bag_files(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[int, str]:
-    """Sort key by the number of the part: recorders write ..._0, ..._1, ..., ..._10."""
+    """Return the sort key of a part of a recording: recorders write ..._0, ..._1, ..., ..._10."""
     tail = path.stem.rpartition("_")[2]
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
 
@@ -222,13 +222,13 @@ class BagFolder:
         ]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """See Container."""
+        """Return a time shortly before the end of the last file [ns], see `Container.tail_ns`."""
         return max(part.tail_ns(_own(numbers, index)) for index, part in enumerate(self._parts))
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """See Container."""
+        """Yield messages of all files, see `Container.messages`."""
         streams = [
             _renumbered(part.messages(_own(numbers, index), start_ns, losses), index)
             for index, part in enumerate(self._parts)
@@ -236,7 +236,7 @@ class BagFolder:
         return heapq.merge(*streams, key=attrgetter("log_ns"))
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """See Container."""
+        """Return the bytes of an attachment of any file, see `Container.attachment`."""
         found = (part.attachment(name, limit) for part in self._parts)
         return next((content for content in found if content is not None), None)
 
@@ -338,7 +338,12 @@ class BagFile(ChunkedFile):
         self._connections[number] = (topic, msgtype, fields.get(b"message_definition", b"").decode())
 
     def _count(self, number: int, table: bytes) -> None:
-        """Take times and number of messages of a connection from an index record behind its chunk."""
+        """Store times and number of messages of a connection in the chunk before, from an index record.
+
+        Args:
+            number: Number of the connection.
+            table: Entries of the index record.
+        """
         times = np.frombuffer(table[: len(table) // 12 * 12], "<u4").reshape(-1, 3).astype(np.int64)
         if not len(times):
             return

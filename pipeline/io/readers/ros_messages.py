@@ -131,7 +131,12 @@ def _parse(channel: Channel) -> dict[str, Fields]:
 
 
 def _closed(found: dict[str, Fields], root: str, standard: Typestore) -> dict[str, Fields]:
-    """Return a type with all types of its fields; those missing in the file are the standard ones.
+    """Return a type with the types of all its fields, by name.
+
+    Args:
+        found: Types in the file.
+        root: Name of the type.
+        standard: Standard types, which are used where the file has none.
 
     Raises:
         ValueError: A type is not defined, or is too large.

@@ -158,7 +158,13 @@ class RecordDecoder:
         self.poses = frozenset[int]()
 
     def record(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
-        """Decode a message into a record; None when it cannot be used, which is counted in `losses`."""
+        """Return the record in a message; None if it cannot be used.
+
+        Args:
+            message: The message.
+            stamp_ns: Its time [ns].
+            losses: Counts messages that cannot be used.
+        """
         channel = self._channels[message.channel]
         try:
             # Damaged numbers may be of any size; the records are checked afterwards.
@@ -184,7 +190,12 @@ class RecordDecoder:
         return None
 
     def scan(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> tuple[Scan, str, int]:
-        """Decode a scan; return it, the name of its frame, and the product number of the sensor (0: unknown).
+        """Return a scan, the name of its frame, and the product number of the sensor (0 if unknown).
+
+        Args:
+            message: Cloud, laser scan or packets.
+            stamp_ns: Time of the scan [ns].
+            losses: Counts scans and points that cannot be used.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.

@@ -26,10 +26,15 @@ def clean_scan(
     offset_ns: NDArray[np.generic] | None = None,
     dropped: int = 0,
 ) -> Scan:
-    """Make a Scan of points of shape (N, 3) [m] and their columns of shape (N,).
+    """Return a scan without invalid returns: rows that are not finite, beyond 10 km, or at the origin.
 
-    Rows that are not finite, beyond 10 km, or at the origin are no returns: they are left out and added to
-    `dropped`.
+    Args:
+        stamp_ns: Time of the scan [ns].
+        points: shape (N, 3) [m].
+        reflectance: shape (N,), or None.
+        ring: Ring numbers, shape (N,), or None.
+        offset_ns: Times of the points after the stamp, shape (N,), or None.
+        dropped: Number of returns that were left out before; the rows left out here are added.
     """
     with np.errstate(invalid="ignore", over="ignore"):
         xyz = np.ascontiguousarray(points, dtype=np.float32)
@@ -124,7 +129,12 @@ def _unit(largest: float) -> float | None:
 
 
 def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
-    """Make a Scan of the columns of a table by their usual names; x, y and z [m] are among them."""
+    """Return a scan of the columns of a table, which are found by their usual names.
+
+    Args:
+        stamp_ns: Time of the scan [ns].
+        columns: Columns of shape (N,) by name; x, y and z [m] are among them.
+    """
     kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
     with np.errstate(invalid="ignore", over="ignore"):
         points = np.stack([columns[axis].astype(kind) for axis in "xyz"], axis=1)

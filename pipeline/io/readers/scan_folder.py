@@ -188,7 +188,13 @@ class ScanFolder(FileSource):
         return [poses[row] for row in rows.tolist()]
 
     def _rows(self, name: str, count: int, numbers: Int) -> Int | None:
-        """Return the row of each scan in a text file with `count` rows, None when they do not fit."""
+        """Return the row of each scan in a text file, None (with a warning) if the rows do not fit.
+
+        Args:
+            name: Name of the file.
+            count: Number of its rows.
+            numbers: Number in the name of each scan file.
+        """
         if count > int(numbers[-1]):
             return numbers
         if count == len(numbers):
@@ -221,7 +227,7 @@ def _times_in_names(files: list[Path]) -> Int | None:
 
 
 def _name_ns(stem: str) -> int:
-    """Parse a name that is a time since 1970 in seconds with decimals, microseconds or nanoseconds; in ns."""
+    """Return the time in a file name [ns]: seconds with decimals, microseconds or nanoseconds since 1970."""
     match = _TIME_NAME.fullmatch(stem)
     word = match.group(1) if match else "0"
     if "." in word or "_" in word:

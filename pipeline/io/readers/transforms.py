@@ -116,7 +116,13 @@ class Extrinsics:
         return next((name for name in usual if self.tree.knows(name)), "")
 
     def _links(self, topics: Iterable[Topic], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
-        """Return the transforms of the first messages; with `steady` only those that do not change."""
+        """Return the transforms of the first messages by parent and child.
+
+        Args:
+            topics: Topics with transforms.
+            limit: Number of messages that are read.
+            steady: Whether transforms that change are left out.
+        """
         numbers = frozenset[int]().union(*(topic.numbers for topic in topics))
         seen: dict[tuple[str, str], Pose3] = {}
         moved: set[tuple[str, str]] = set()

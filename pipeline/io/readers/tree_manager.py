@@ -286,8 +286,12 @@ def _header(file: Path) -> list[str]:
 def _columns(names: list[str], file: Path, uri: str) -> dict[str, int]:
     """Return the index of each column.
 
+    Args:
+        names: Names in the header.
+        file, uri: File and source, for errors.
+
     Raises:
-        SourceError: The place is missing.
+        SourceError: A column of the position is missing.
     """
     at = {name: k for k, name in enumerate(names)}
     missing = [name for name in PLACE if name not in at]
@@ -327,7 +331,13 @@ def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
 
 
 def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:
-    """Return the row of each file in a trajectory of `count` rows, and warnings."""
+    """Return the row of the trajectory for each file, and warnings.
+
+    Args:
+        number: Frame number of each file, ascending.
+        count: Number of rows of the trajectory.
+        uri: The source, for errors.
+    """
     files = len(number)
     if int(number[-1]) < count and len(np.unique(number)) == files:
         unseen = count - files

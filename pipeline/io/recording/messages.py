@@ -45,7 +45,7 @@ def store() -> Typestore:
 
 
 def make(name: str, /, **fields: Any) -> Message:  # noqa: ANN401
-    """Return a message of a type, e.g. "std_msgs/Header"."""
+    """Return a message of a type, e.g. "std_msgs/Header", with its fields."""
     package, short = name.split("/")
     return store().types[f"{package}/msg/{short}"](**fields)
 
@@ -97,7 +97,14 @@ def pose(t: NDArray[np.float64], wxyz: NDArray[np.float64]) -> Message:
 
 
 def odometry_of(head: Message, child: str, at: Message, covariance: NDArray[np.float64]) -> Message:
-    """Return a nav_msgs/Odometry of a pose with its covariance (36,); the twist is unknown and zero."""
+    """Return a nav_msgs/Odometry; its twist is unknown and zero.
+
+    Args:
+        head: Header with the parent frame.
+        child: Name of the child frame.
+        at: geometry_msgs/Pose of the child.
+        covariance: Covariance of the pose, 36 numbers.
+    """
     twist = make("geometry_msgs/Twist", linear=vector(), angular=vector())
     return make(
         "nav_msgs/Odometry",
@@ -195,7 +202,7 @@ def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) 
 
 
 def text(content: str) -> bytes:
-    """Return a std_msgs/String in CDR."""
+    """Return a std_msgs/String with this content in CDR."""
     return encode(make("std_msgs/String", data=content))
 
 

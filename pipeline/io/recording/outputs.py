@@ -89,7 +89,12 @@ def map_messages(frame: Frame, path: Path) -> dict[str, bytes]:
 
 
 def tree_messages(trees: Trees, head: Any) -> dict[str, bytes]:  # noqa: ANN401
-    """Return the confirmed trees by topic, in CDR."""
+    """Return the confirmed trees by topic, in CDR: markers and detections.
+
+    Args:
+        trees: The map.
+        head: Header of the messages.
+    """
     rows = np.flatnonzero(trees.confirmed)
     clear = _marker(head, 0, _CYLINDER, 0.0, 0.0, 0.0, (0.0, 0.0, 0.0), _GREEN, action=_DELETE_ALL)
     markers = [clear, *(marker for row in rows for marker in _markers(trees, int(row), head))]

@@ -37,7 +37,8 @@ class Mended:
 
 
 def mend(path: Path, out: Path) -> Mended:
-    """Write all complete messages of a recording to a new file, which appears when it is complete.
+    """Write all complete messages of a recording to a new file, which appears when it is complete; return
+    what was written and lost.
 
     Args:
         path: The recording, which does not change.
