@@ -239,8 +239,8 @@ def refuse_without_grid(arguments: argparse.Namespace) -> None:
 
 def distances(arguments: argparse.Namespace) -> list[str]:
     """Return --match-distance and --reach as assignments of parameters."""
-    asked = (("match_distance", arguments.match_distance), ("reach", arguments.reach))
-    return [f"evaluation.{name}={value}" for name, value in asked if value is not None]
+    values = (("match_distance", arguments.match_distance), ("reach", arguments.reach))
+    return [f"evaluation.{name}={value}" for name, value in values if value is not None]
 
 
 def run_grid(arguments: argparse.Namespace) -> int:

@@ -135,10 +135,10 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
 
     from app.robot.address import is_live, parse_address
 
-    asked = arguments.record is not None or arguments.publish
-    if asked and not all(is_live(uri) for uri in sources):
+    is_requested = arguments.record is not None or arguments.publish
+    if is_requested and not all(is_live(uri) for uri in sources):
         raise ParameterError("--record and --publish need a live robot", remedy="Remove them")
-    if asked and any(getattr(parse_address(uri), "mapped_there", False) for uri in sources):
+    if is_requested and any(getattr(parse_address(uri), "mapped_there", False) for uri in sources):
         raise ParameterError(
             "a robot that maps itself also records and publishes itself",
             remedy="Remove --record and --publish here, or give them to `stemmap map` on the robot",

@@ -200,7 +200,7 @@ class AnnotationEditor:
             if generation != self._generation:  # another run was opened meanwhile
                 return
             self.run, self.rows = run, rows
-            # Somebody may have chosen meanwhile.
+            # The choice may have changed meanwhile.
             self.truth = truth if self.against == "both" else truth_of(own, self.rows, self.against)
             self.problem = ""
         except StemmapError as error:

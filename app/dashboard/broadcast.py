@@ -47,7 +47,7 @@ class Broadcast:
                 `value`.
         """
         plain = msgspec.to_builtins(content) if content is not None else None
-        # A message without content says so; the page shows the empty state.
+        # Without content, the page shows the empty state.
         message = {"type": kind, **plain} if isinstance(plain, dict) else {"type": kind, "value": plain}
         encoded = _encode(message)
         if kind in self._messages and self._messages[kind][1] == encoded:

@@ -171,7 +171,7 @@ def _box(camera: Camera, points: Float) -> dict[str, float] | None:
 
 
 #: Beyond the ends of a path the robot goes on as it did so long before [ns]: corrections of single poses
-#: would be taken for speed over a shorter time.
+#: would look like speed over a shorter time.
 _STEADY_NS = 500_000_000
 
 

@@ -216,7 +216,7 @@ class Dashboard:
         self._opens += 1
         number = self._opens
         async with self._opening:
-            if number == self._opens:  # else another source was asked for meanwhile
+            if number == self._opens:  # else another source was requested meanwhile
                 await self._leave_for(source)
                 await self.command(command)
 
@@ -339,7 +339,10 @@ class Dashboard:
         match message:
             case Report(status=status):
                 self._set_status(status)
-            case Opened() if message.asked in ("", self.source.uri):  # else it was left before it was open
+            case Opened() if message.requested in (
+                "",
+                self.source.uri,
+            ):  # else it was left before it was open
                 await self._begin(message)
             case Shown():
                 await self._show(message)
@@ -373,7 +376,7 @@ class Dashboard:
         self._run, self.digest = opened.run, opened.digest or opened.uri
         number = self._opens
         await self.annotation_editor.begin(opened.digest or opened.uri, opened.uri, opened.truth)
-        if number != self._opens:  # another source was asked for meanwhile
+        if number != self._opens:  # another source was requested meanwhile
             return
         await self._forget()
         if self.parameters.suit(opened.preset):
@@ -434,7 +437,7 @@ class Dashboard:
         path_xy = self.path_xy
         distance = self.parameters.parameters.evaluation.match_distance
         payload, counted = await asyncio.to_thread(_map_and_counts, shown, self.truth, distance)
-        if number != self._opens:  # another source was asked for meanwhile
+        if number != self._opens:  # another source was requested meanwhile
             return
         counts = self._before_after.shown(counted)
         payload["layers"] |= self.scene.counts

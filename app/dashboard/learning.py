@@ -89,7 +89,7 @@ class Learning:
         if self._folder is None:
             raise StemmapError("there is no data folder for the decision trees")
         sources = await self._store.ask(lambda store: store.annotated_sources())
-        if self._task is not None:  # somebody else asked meanwhile
+        if self._task is not None:  # another training began meanwhile
             raise StemmapError(_UNDER_WAY)
         self._task = asyncio.create_task(self._learn(sources, parameters, self._folder), name="learning")
         self._become("working", "Beginning")

@@ -194,10 +194,10 @@ class RunRecorder:
                 return
 
             def work(store: Store) -> int:
-                standing = _figures_of(state, page.all_scans)
+                figures = _figures_of(state, page.all_scans)
                 if page.record is None:
-                    return store.book.begin(page.beginning, standing)
-                store.book.update(page.record, standing)
+                    return store.book.begin(page.beginning, figures)
+                store.book.update(page.record, figures)
                 return page.record
 
             try:

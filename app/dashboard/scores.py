@@ -41,7 +41,7 @@ class Scores:
     def __init__(self, tell: Callable[[dict[str, Any] | None], None]) -> None:
         self.latest: dict[str, Any] | None = None
         self._tell = tell
-        self._asked: tuple[Trees, TruthTrees, Evaluation, Float] | None = None
+        self._requested: tuple[Trees, TruthTrees, Evaluation, Float] | None = None
         self._task: asyncio.Task[None] | None = None
         self._runs = 0
 
@@ -54,13 +54,13 @@ class Scores:
             parameters: Distances of a match and of the ground truth from the path.
             path_xy: Path, shape (N, 2) [m].
         """
-        self._asked = (trees, truth, parameters, path_xy)
+        self._requested = (trees, truth, parameters, path_xy)
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._work(), name="scores")
 
     def forget(self) -> None:
         """Remove the score, because there is no map any more."""
-        self._asked = self.latest = None
+        self._requested = self.latest = None
         self._runs += 1
         self._tell(None)
 
@@ -70,11 +70,11 @@ class Scores:
             self._task.cancel()
 
     async def _work(self) -> None:
-        while self._asked is not None:
-            asked, self._asked = self._asked, None
+        while self._requested is not None:
+            requested, self._requested = self._requested, None
             run = self._runs
             try:
-                score = await asyncio.to_thread(score_map, *asked)
+                score = await asyncio.to_thread(score_map, *requested)
             except Exception:  # a score that fails must not end those that follow
                 _log.exception("the map could not be scored")
             else:

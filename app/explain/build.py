@@ -214,7 +214,7 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sen
 
 
 def _decided_by(share: Float, tree_share: float) -> tuple[Verdict, ...]:
-    """Return the verdicts that the votes alone give.
+    """Return the verdicts that the votes give without a rule.
 
     Args:
         share: Share of votes by class, in the order of CLASSES.

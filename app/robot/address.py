@@ -166,8 +166,8 @@ def _zenoh(uri: str) -> ZenohAddress:
         remedy = "Use mapped=robot for robots that map themselves, or mapped=here."
         raise SourceError(f"mapped={mapped!r} is unknown", where=uri, remedy=remedy)
     files = _files(uri, endpoint, {name: options[name] for name in _FILES if options.get(name)})
-    asked = options.get("robot", "")
-    robot = asked.strip("/") or (ROOT if asked else "")
+    named = options.get("robot", "")
+    robot = named.strip("/") or (ROOT if named else "")
     return ZenohAddress(
         uri=uri,
         domain=_domain(uri, options),

@@ -249,14 +249,14 @@ class DdsLink(Link):
         """Keep a reader for each channel that requests no more than all writers of its topic offer."""
         for channel in self._channels:
             with self.lock:
-                asked = self._graph.common(channel.topic, channel.msgtype)
+                offer = self._graph.common(channel.topic, channel.msgtype)
             known = readers.get(channel.number)
-            if asked is None or (known is not None and known.asked == asked):
+            if offer is None or (known is not None and known.offer == offer):
                 continue
             if known is not None:
                 waiting.detach(known.ready)
                 self._take(known)
-            readers[channel.number] = _Reader(participant, channel, asked, self._note_lost)
+            readers[channel.number] = _Reader(participant, channel, offer, self._note_lost)
             waiting.attach(readers[channel.number].ready)
 
     def _note_lost(self, channel: Channel, number: int) -> None:
@@ -303,7 +303,7 @@ class _Sample:
 class _Reader:
     """A DataReader of one channel; it requests earlier messages where the writers keep them (/tf_static)."""
 
-    def __init__(self, participant: Any, channel: Channel, asked: Offer, lost: Any) -> None:  # noqa: ANN401
+    def __init__(self, participant: Any, channel: Channel, offer: Offer, lost: Any) -> None:  # noqa: ANN401
         from cyclonedds.core import (
             InstanceState,
             Listener,
@@ -317,15 +317,15 @@ class _Reader:
         from cyclonedds.topic import Topic
         from cyclonedds.util import duration
 
-        self.channel, self.asked = channel, asked
+        self.channel, self.offer = channel, offer
         self.depth = _DEPTH
         if channel.msgtype in (*SCAN_TYPES, *PICTURE_TYPES):
             self.depth = _SCAN_DEPTH if channel.msgtype in SCAN_TYPES else _PICTURE_DEPTH
         policies = [
             Policy.Reliability.Reliable(duration(milliseconds=100))
-            if asked.reliable
+            if offer.reliable
             else Policy.Reliability.BestEffort,
-            Policy.Durability.TransientLocal if asked.latched else Policy.Durability.Volatile,
+            Policy.Durability.TransientLocal if offer.latched else Policy.Durability.Volatile,
             Policy.History.KeepLast(self.depth),
             Policy.TypeConsistency.AllowTypeCoercion(),
         ]

@@ -186,10 +186,8 @@ class Store:
             StemmapError: The maximum number of annotations is reached.
         """
         with self._engine.begin() as connection:
-            standing = select(func.count()).where(
-                _annotations.c.run == run, _annotations.c.deleted.is_(False)
-            )
-            if connection.execute(standing).scalar_one() + len(contents) > MOST_ANNOTATIONS:
+            counted = select(func.count()).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
+            if connection.execute(counted).scalar_one() + len(contents) > MOST_ANNOTATIONS:
                 raise StemmapError(f"a run may have {MOST_ANNOTATIONS} annotations")
             step = self._step(connection, run, author)
             return [self._add(connection, run, step, author, content) for content in contents]

@@ -354,23 +354,23 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
 
 def _choice(spec: FieldSpec, words: str) -> SearchAxis:
     known = {value_text(choice): choice for choice in _all_choices(spec)}
-    asked = [word.strip() for word in words.split(",")]
-    unknown = [word for word in asked if word not in known]
-    if unknown or len(set(asked)) < 2:
+    given = [word.strip() for word in words.split(",")]
+    unknown = [word for word in given if word not in known]
+    if unknown or len(set(given)) < 2:
         what = f"{unknown[0]!r} is not one of its values" if unknown else "at least two values are needed"
         raise ParameterError(f"{spec.name}={words}: {what}", remedy=f"Choose from {', '.join(known)}")
-    return SearchAxis(spec.name, "choice", choices=tuple(known[word] for word in dict.fromkeys(asked)))
+    return SearchAxis(spec.name, "choice", choices=tuple(known[word] for word in dict.fromkeys(given)))
 
 
 def _names(spec: FieldSpec, words: str) -> SearchAxis:
-    asked = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
-    if len(asked) < 2:
+    given = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
+    if len(given) < 2:
         raise ParameterError(
             f"{spec.name} is a name and has no bounds", remedy=f"Give at least two names: {spec.name}=A,B"
         )
-    for word in asked:
-        Parameters().replace({spec.name: word})  # raises an error that says how a name is written
-    return SearchAxis(spec.name, "choice", choices=asked)
+    for word in given:
+        Parameters().replace({spec.name: word})  # raises an error with the syntax of a name
+    return SearchAxis(spec.name, "choice", choices=given)
 
 
 def _all_choices(spec: FieldSpec) -> tuple[str | bool, ...]:

@@ -62,7 +62,7 @@ def result_of(search: Search) -> Result:
     """Return the result of the trials so far.
 
     Raises:
-        StoppedError: The search was asked to stop while a held-out run was scored.
+        StoppedError: The search was stopped while a held-out run was scored.
     """
     from app.tuning.search import importances
 

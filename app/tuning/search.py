@@ -245,15 +245,15 @@ class Search:
         if left is not None:
             return self._make(left.number, left.params)
         while _counted(self._all()) < self.plan.trials:
-            asked = self.study.ask()
-            self._note(asked.number, "by", self._me)
-            if self._is_surplus(asked.number):  # another process asked at the same time
-                self._drop(asked.number)
+            trial = self.study.ask()
+            self._note(trial.number, "by", self._me)
+            if self._is_surplus(trial.number):  # another process began one at the same time
+                self._drop(trial.number)
                 continue
-            self.study.sampler = self._sampler(asked.number)
+            self.study.sampler = self._sampler(trial.number)
             for axis in self.plan.axes:
-                axis.suggest(asked)
-            return self._make(asked.number, asked.params)
+                axis.suggest(trial)
+            return self._make(trial.number, trial.params)
         return None
 
     @property

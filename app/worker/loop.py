@@ -97,7 +97,7 @@ class WorkerLoop:
         self._recent = recent or RecentScans()
         self._taken: deque[ToWorker | None] = deque()
         self._replay = ReplayClock()
-        self._run, self._asked = 0, ""
+        self._run, self._requested = 0, ""
         self._held = False
         self._prepared = False
         self._reported: tuple[Status, float] | None = None
@@ -204,12 +204,12 @@ class WorkerLoop:
         """Continue a rerun for up to `_REMAP_S`, and send the new map when the rerun is complete."""
         begun = self._clock()
         while True:
-            asked = self._clock()
+            requested = self._clock()
             done = self._session.remap(self._at_once)
             now = self._clock()
-            if now > asked + 2.0 * _REMAP_S:
+            if now > requested + 2.0 * _REMAP_S:
                 self._at_once = max(1, self._at_once // 2)
-            elif now < asked + _REMAP_S:
+            elif now < requested + _REMAP_S:
                 self._at_once = min(_AT_ONCE, 2 * self._at_once)
             if done is not None or not self._session.is_remapping or now >= begun + _REMAP_S:
                 break
@@ -263,7 +263,7 @@ class WorkerLoop:
                 self._begin(command)
 
     def _open(self, command: Open) -> None:
-        self._run, self._asked = self._run + 1, command.uri
+        self._run, self._requested = self._run + 1, command.uri
         opening = f"Opening {command.uri}"
         self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
         opened = self._session.open(
@@ -286,7 +286,7 @@ class WorkerLoop:
 
     def _tell_opened(self, opened: Opened) -> None:
         self._prepared = self._held = False
-        self._put(msgspec.structs.replace(opened, run=self._run, asked=self._asked))
+        self._put(msgspec.structs.replace(opened, run=self._run, requested=self._requested))
 
     def _begin(self, command: Begin) -> None:
         if command.run != self._run:  # another run was opened since

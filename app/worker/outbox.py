@@ -19,7 +19,7 @@ from pipeline.types.records import Frame, HeightMap, Path
 
 # A higher frame rate is not visible and would only fill the pipe and the sockets.
 _SHORTEST_PAUSE_S = 0.05
-# Answers and notices; a web process that reads none of this many has ended or hangs.
+# Answers and notices; a web process that reads none of them has ended or does not respond.
 MOST_MESSAGES = 500
 
 

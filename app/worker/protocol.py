@@ -166,7 +166,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
         end_s: Time of the last scan since the first [s], None if unknown.
         truth: Ground truth of the source, or None.
         digest: Digest of the recording, empty if unknown.
-        asked: URI of the `Open` that this message answers, empty if unknown.
+        requested: URI of the `Open` that this message answers, empty if unknown.
     """
 
     uri: str
@@ -177,7 +177,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
     truth: TruthTrees | None
     run: int = 0
     digest: str = ""
-    asked: str = ""
+    requested: str = ""
 
 
 class Shown(msgspec.Struct, frozen=True, tag="shown"):

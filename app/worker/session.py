@@ -70,7 +70,7 @@ class Session:
         self._make_run = RunFactory(make_mapper, make_synchroniser, open_caches)
         self._parameters = parameters
         self._revision = 0
-        self._asked: tuple[str, str, int] | None = None
+        self._requested: tuple[str, str, int] | None = None
         self._open_again: Callable[[], Opened | None] = lambda: None
         self._run: Run | None = None
         self._robot: LiveSource | None = None
@@ -144,7 +144,7 @@ class Session:
             SourceError: It cannot be read.
         """
         self._leave()
-        self._asked = uri, odometry, seed
+        self._requested = uri, odometry, seed
         self._open_again = lambda: self.open(uri, odometry, seed, record, publish=publish, options=options)
         source = self._open_source(uri, replace(options or SourceOptions(), seed=seed))
         if isinstance(source, LiveSource):
@@ -164,11 +164,11 @@ class Session:
         Raises:
             SourceError: What it sends cannot be read.
         """
-        if self._robot is None or self._asked is None:
+        if self._robot is None or self._requested is None:
             return None
         is_heard = self._run is None and self._robot.listen()
         self._warn(self._robot.notices())
-        return self._begin(self._robot, *self._asked[1:]) if is_heard else None
+        return self._begin(self._robot, *self._requested[1:]) if is_heard else None
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
         self._run, warnings = self._make_run(source, odometry, seed, self._parameters)
@@ -340,7 +340,7 @@ class Session:
         status = Status(
             state=self._state,
             detail=self._detail,
-            source=self._asked[0] if self._asked else "",
+            source=self._requested[0] if self._requested else "",
             time_s=self.time_s,
             warnings=list(self._warnings),
             revision=self._revision,

@@ -45,7 +45,7 @@ OPENING_LIMIT_S = 300.0
 # Another source may be opened before the first is open. A live recording that is left may need 10 s to close.
 _REPLACE_AFTER_S = 12.0
 _WRITE_LIMIT_S = 5.0
-# Ends without a result in between, after which a remembered speed is taken for their cause.
+# Ends without a result in between, after which the playback speed is reset, because it may be the cause.
 _SUSPICIOUS_ENDS = 2
 # What is remembered over a restart, or has no meaning for a new process.
 _REMEMBERED = (SetParameters, SetSpeed, Open, Play, Pause, Begin)
@@ -89,7 +89,7 @@ class WorkerProcess:
         self._wanted = asyncio.Event()
         self._ends_without_result = 0
         self._opening_limit_s = opening_limit_s
-        self._opening: Literal["", "asked", "begun"] = ""
+        self._opening: Literal["", "requested", "begun"] = ""
         self._opening_since = 0.0
         self._opening_timer: asyncio.TimerHandle | None = None
         self._replaced = False
@@ -170,7 +170,7 @@ class WorkerProcess:
             reason = await self._listen()
             self._stop_opening_timer()
             await self._end()
-            if self._replaced:  # another source was asked for while one did not finish opening
+            if self._replaced:  # another source was requested for while one did not finish opening
                 self._replaced = False
             elif self._gave_up:
                 self._gave_up = False
@@ -189,7 +189,7 @@ class WorkerProcess:
 
     def _await_opening(self) -> None:
         """Start the time limit within which the source must be opened or refused."""
-        self._opening, self._opening_since = "asked", self._clock()
+        self._opening, self._opening_since = "requested", self._clock()
         self._restart_opening_timer()
 
     def _restart_opening_timer(self) -> None:
@@ -208,7 +208,7 @@ class WorkerProcess:
         """Update from a message of the worker whether the source is still being opened."""
         if not self._opening or self._open is None:
             return
-        if isinstance(message, Opened) and message.asked in ("", self._open.uri):
+        if isinstance(message, Opened) and message.requested in ("", self._open.uri):
             self._stop_opening_timer()
         elif isinstance(message, Report) and message.status.source == self._open.uri:
             if message.status.state == "starting":

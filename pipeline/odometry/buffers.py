@@ -14,7 +14,7 @@ from pipeline.types.records import Odometry, PoseMeasurement
 
 KEEP_NS = 2_000_000_000
 JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; nothing that maps trees moves this fast
-STANDS = (0.005, 0.002)  # m, rad; a robot that stands stays within it
+STANDSTILL = (0.005, 0.002)  # m, rad; the pose of a robot that does not move varies by less
 STILL = (0.0, 0.0, 0.0)
 
 Tilt = tuple[float, float]  # roll, pitch [rad]
@@ -83,7 +83,7 @@ class OdometryBuffer:
     def _watch_standing(self, reading: Reading) -> None:
         if self.stands is not None:
             away = self.stands[1].inverse() @ reading.pose
-            if np.hypot(away.x, away.y) < STANDS[0] and abs(away.yaw) < STANDS[1]:
+            if np.hypot(away.x, away.y) < STANDSTILL[0] and abs(away.yaw) < STANDSTILL[1]:
                 return
         self.stands = (reading.stamp_ns, reading.pose)
 

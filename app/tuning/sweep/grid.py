@@ -114,7 +114,7 @@ def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
         return GridAxis(PRESET, tuple(dict.fromkeys(values)))
     spec = next((spec for spec in field_specs() if spec.name == name), None)
     if spec is None:
-        Parameters().replace({name: None})  # says which name is near
+        Parameters().replace({name: None})  # raises an error that names the nearest parameter
         raise ParameterError(f"there is no parameter {name!r}")
     values = [value for entry in entries for part in _parts(_text(entry)) for value in _values(spec, part)]
     if not values or len(values) > MOST_VALUES:

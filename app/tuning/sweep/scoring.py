@@ -38,7 +38,7 @@ class Scorer:
     """Scores jobs; the run of the last job stays open."""
 
     def __init__(self) -> None:
-        self._asked: RunWithTruth | None = None
+        self._requested: RunWithTruth | None = None
         self._run: OpenRun | None = None
 
     def score(self, job: Job) -> JobResult:
@@ -65,14 +65,14 @@ class Scorer:
         """Close the run."""
         if self._run is not None:
             self._run.close()
-        self._run = self._asked = None
+        self._run = self._requested = None
 
-    def _score(self, asked: RunWithTruth, parameters: Parameters) -> tuple[dict[str, Any], bool]:
-        if self._run is None or self._asked != asked:
+    def _score(self, requested: RunWithTruth, parameters: Parameters) -> tuple[dict[str, Any], bool]:
+        if self._run is None or self._requested != requested:
             self.close()
-            self._run, self._asked = _open(asked), asked
+            self._run, self._requested = _open(requested), requested
         mapped = self._run.map(parameters)
-        evaluation = mapped.evaluate(asked.truth.trees(), parameters)
+        evaluation = mapped.evaluate(requested.truth.trees(), parameters)
         if evaluation.TA.of + evaluation.TR.of == 0:
             raise StemmapError(far_truth(evaluation.reach))
         scores = {**asdict(evaluation), "scans": mapped.scans, "trees": len(mapped.trees.number)}
@@ -116,18 +116,18 @@ def _lock(file: IO[bytes]) -> None:
         fcntl.flock(file.fileno(), fcntl.LOCK_EX)
 
 
-def _open(asked: RunWithTruth) -> OpenRun:
+def _open(requested: RunWithTruth) -> OpenRun:
     try:
-        run = open_run(asked.source)
+        run = open_run(requested.source)
     except ParameterError:
         raise
     except StemmapError as error:
         raise NotHereError(error.what, where=error.where, remedy=error.remedy) from None
-    if run.digest != asked.digest:
+    if run.digest != requested.digest:
         run.close()
         raise NotHereError(
             "this worker has another recording of that name",
-            where=asked.source.uri,
+            where=requested.source.uri,
             remedy="All workers must have the same file at this place",
         )
     return run

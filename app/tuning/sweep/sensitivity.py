@@ -6,6 +6,7 @@ The points are computed one by one in a child process of low priority, while the
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -94,15 +95,15 @@ class Sensitivity:
         idle_s: float = IDLE_S,
     ) -> None:
         self._tell, self._command, self._idle_s = tell, command, idle_s
+        self._question: Question | None = None
+        self._changed = asyncio.Event()
+        self._scorer: _ScoringProcess | None = None
         self._task: asyncio.Task[None] | None = None
-        self._process: ChildProcess | None = None
-        self._turn = asyncio.Lock()
         self._known: dict[str, JobResult] = {}
-        self._scorings: set[asyncio.Task[JobResult]] = set()
-        self._lefts = self._asked = 0
 
     def ask(self, question: Question) -> None:
-        """Start a curve; the one before is cancelled.
+        """Start a curve in place of the one before, whose present point is still completed, because its cache
+        serves both.
 
         Raises:
             ParameterError: There is no such parameter, or there are too many values.
@@ -111,114 +112,120 @@ class Sensitivity:
             raise ParameterError(f"there is no parameter {question.name!r}")
         if not 1 <= len(question.values) <= MOST_VALUES:
             raise ParameterError(f"{len(question.values)} values are not between 1 and {MOST_VALUES}")
-        self._stop()
-        self._asked += 1
-        self._task = asyncio.create_task(self._answer(question), name="sensitivity")
+        self._question = question
+        self._changed.set()
+        self._tell(_state_of(question, []))
+        if self._scorer is None:
+            self._scorer = _ScoringProcess(self._command)
+            self._task = asyncio.create_task(self._work(self._scorer), name="sensitivity")
 
     async def leave(self) -> None:
         """Cancel the curve and end the process, because the run or the curve is closed."""
-        self._lefts += 1
-        task, scorings = self._stop(), set(self._scorings)
-        if task is not None:
+        scorer, task = self._scorer, self._task
+        self._question = self._scorer = self._task = None
+        self._changed.set()
+        if scorer is not None and task is not None:
+            await scorer.end()
             await asyncio.wait([task])
-        await self._end()
-        if scorings:  # one of them may just start the process, and then ends it
-            await asyncio.wait(scorings)
         self._known.clear()
         self._tell({})
 
-    def _stop(self) -> asyncio.Task[None] | None:
-        task, self._task = self._task, None
-        if task is not None:
-            task.cancel()
-        return task
+    async def _work(self, scorer: _ScoringProcess) -> None:
+        """Compute curves until none was requested for `idle_s`."""
+        while self._scorer is scorer and (question := self._question) is not None:
+            self._changed.clear()
+            await self._compute(question, scorer)
+            if self._question is question:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(self._changed.wait(), self._idle_s)
+            if self._scorer is scorer and self._question is question:
+                self._scorer = None
+        await scorer.end()
 
-    async def _answer(self, question: Question) -> None:
-        state: dict[str, Any] = {
-            "name": question.name,
-            "asked_with": question.parameters.flat(),
-            "of": len(question.values),
-            "points": [],
-            "error": "",
-        }
-        self._tell(state)
+    async def _compute(self, question: Question, scorer: _ScoringProcess) -> None:
+        """Compute the points of a curve until it is complete or replaced."""
+        points: list[dict[str, Any]] = []
+        error = ""
         try:
             code = await asyncio.to_thread(code_digest)
             for value in question.values:
-                point = await self._point(question, value, code)
-                state = {**state, "points": [*state["points"], point]}
-                self._tell(state)
-        except StemmapError as error:
-            self._tell({**state, "error": str(error)})
-        await asyncio.sleep(self._idle_s)
-        async with self._turn:  # a job of an earlier question may still run
-            await self._end()
+                point = await self._point(question, value, code, scorer)
+                if self._question is not question:
+                    return
+                points = [*points, point]
+                self._tell(_state_of(question, points))
+        except StemmapError as failure:
+            error = str(failure)
+        if error and self._question is question:
+            self._tell(_state_of(question, points, error))
 
-    async def _point(self, question: Question, value: Value, code: str) -> dict[str, Any]:
+    async def _point(
+        self, question: Question, value: Value, code: str, scorer: _ScoringProcess
+    ) -> dict[str, Any]:
         try:
             parameters = question.parameters.replace({question.name: value})
         except ParameterError as error:  # it contradicts another one
             return {"value": value, "error": error.what}
         job = Job(question.run, parameters.model_dump(), code)
         key = job.key()
-        answer = self._known.get(key)
-        if answer is None:
-            # A job is completed even if another question comes meanwhile, because its cache serves both.
-            scoring = asyncio.create_task(
-                self._scored(job, key, (self._lefts, self._asked)), name="sensitivity of a value"
-            )
-            self._scorings.add(scoring)
-            scoring.add_done_callback(self._is_scored)
-            answer = await asyncio.shield(scoring)
-        if answer.fault in ("worker", "version"):
-            raise StemmapError(answer.error)
-        return {"value": value, **_figures(answer)}
+        result = self._known.get(key) or await scorer.score(job)
+        if result is None:  # `leave` was called
+            return {}
+        if result.fault in ("worker", "version"):
+            raise StemmapError(result.error)
+        if len(self._known) < REMEMBERED:
+            self._known[key] = result
+        return {"value": value, **_figures(result)}
 
-    async def _scored(self, job: Job, key: str, asked: tuple[int, int]) -> JobResult:
-        """Return the result of a job from the child process, which is restarted once if it ends.
 
-        Args:
-            job: The job.
-            key: Its key.
-            asked: Numbers of calls of `leave` and `ask` when the job was requested; other numbers cancel it.
+class _ScoringProcess:
+    """The child process that scores jobs. It starts with the first job.
+
+    Args:
+        command: Program and arguments.
+    """
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self._command = command
+        self._process: ChildProcess | None = None
+        self._is_ended = False
+
+    async def score(self, job: Job) -> JobResult | None:
+        """Return the result of a job; None after `end`. The process is restarted once if it ends.
 
         Raises:
-            StemmapError: The process ended twice, or the job was cancelled.
+            StemmapError: The process ended twice, or cannot be started.
         """
-        async with self._turn:
-            if asked != (self._lefts, self._asked):  # not begun yet
-                raise StemmapError("something else was asked for")
-            if key in self._known:  # the earlier question had it computed
-                return self._known[key]
-            for _ in range(2):
-                process = await self._started()
-                if asked[0] != self._lefts:  # `leave` could not end it while it started
-                    await self._end()
-                    break
-                answer = await _ask(process, job)
-                if answer is not None:
-                    if asked[0] == self._lefts and len(self._known) < REMEMBERED:
-                        self._known[key] = answer
-                    return answer
-                await self._end()
+        for _ in range(2):
+            if self._process is None:
+                self._process = await ChildProcess.start(
+                    self._command, line_limit=_LONGEST_ANSWER, one_thread=True
+                )
+            result = None if self._is_ended else await _ask(self._process, job)
+            if result is not None:
+                return result
+            await self._process.end()
+            self._process = None
+            if self._is_ended:
+                return None
         raise StemmapError("the process that maps the run ended twice", remedy="The terminal may show why")
 
-    def _is_scored(self, scoring: asyncio.Task[JobResult]) -> None:
-        self._scorings.discard(scoring)
-        if not scoring.cancelled():
-            scoring.exception()  # retrieved, because no task may wait for it any more
+    async def end(self) -> None:
+        """End the process. A call of `score` in progress returns None."""
+        self._is_ended = True
+        if self._process is not None:
+            await self._process.end()
 
-    async def _started(self) -> ChildProcess:
-        if self._process is None:
-            self._process = await ChildProcess.start(
-                self._command, line_limit=_LONGEST_ANSWER, one_thread=True
-            )
-        return self._process
 
-    async def _end(self) -> None:
-        process, self._process = self._process, None
-        if process is not None:
-            await process.end()
+def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
+    """Return a curve for the page, with the points so far."""
+    return {
+        "name": question.name,
+        "asked_with": question.parameters.flat(),
+        "of": len(question.values),
+        "points": points,
+        "error": error,
+    }
 
 
 async def _ask(process: ChildProcess, job: Job) -> JobResult | None:

@@ -93,8 +93,8 @@ def lead_on(request: Request, port: int) -> Response:
     """Redirect to another port of this host with a ticket that opens it once for the same role. Redirects are
     kept in histories and logs, so they must not contain the token."""
     once = ticket(request.app.state.token, port, role_of(request.scope))
-    asked = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
-    host = f"[{asked}]" if ":" in asked else asked
+    hostname = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
+    host = f"[{hostname}]" if ":" in hostname else hostname
     answer = RedirectResponse(f"{request.url.scheme}://{host}:{port}/?ticket={once}", 303)
     answer.headers["Cache-Control"] = "no-store"
     return answer

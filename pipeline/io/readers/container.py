@@ -145,7 +145,7 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
         raise UnpackError("a block is too large")
     raw = _unpack_up_to(block, compression, size)
     if len(raw) != size:
-        raise UnpackError("a block has another size than its header says")
+        raise UnpackError("a block has another size than in its header")
     return raw
 
 

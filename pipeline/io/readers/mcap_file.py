@@ -173,7 +173,7 @@ class McapFile(ChunkedFile):
         compression, at = _text(head, CHUNK_HEAD.size)
         (packed,) = struct.unpack_from("<Q", head, at)
         if at + 8 + packed > length:
-            raise ValueError("the chunk is shorter than its header says")
+            raise ValueError("the chunk is shorter than in its header")
         self._chunks.append(Chunk(body + at + 8, packed, start_ns, end_ns, compression, size, crc, None))
 
     def _add_run(self, start: int, end: int) -> None:

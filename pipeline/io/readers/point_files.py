@@ -490,7 +490,7 @@ class _NumpyArray:
         member: Name in the .npz, None for an .npy.
         start: Bytes of its header.
         size: Bytes of the file, or of the unpacked member by the directory of the zip.
-        shape, dtype, fortran: As its header says.
+        shape, dtype, fortran: As in its header.
     """
 
     member: str | None

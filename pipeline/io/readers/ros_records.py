@@ -91,7 +91,7 @@ def _dtype(cloud: ros2.sensor_msgs__msg__PointCloud2, step: int) -> np.dtype[np.
             continue
         code = TYPES[int(field.datatype)]
         if offset + int(code[1]) * max(count, 1) > step:
-            raise LayoutError(f"the field {name} lies outside of the {step} bytes of a point")
+            raise LayoutError(f"the field {name} is outside of the {step} bytes of a point")
         names.append(name)
         formats.append(order + code)
         offsets.append(offset)

@@ -1,4 +1,4 @@
-"""Folders with one file per scan: KITTI .bin, PCD, PLY, NumPy and LAS, with poses and times beside them."""
+"""Folders with one file per scan: KITTI .bin, PCD, PLY, NumPy and LAS, and files with poses and times."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ function nowUsed() {
   return [inUse(inForce()), button("learn-package", "Use the built-in ones", "Classify with the built-in decision trees again", backToPackage)];
 }
 
-// When the decision trees were trained and from what. Their name, a digest, tells two of the same day apart.
+// Date and training data of the decision trees. Their name, a digest, distinguishes two of the same day.
 function inUse(name) {
   const from = known?.in_use?.name === name ? known.in_use : null;
   const words = from ? `In use: trained ${from.date.replace(/:\d\d UTC$/, " UTC")} from ${inWords(from.things)} in ${count(from.runs, "run")}` : "In use: trained decision trees";

@@ -69,9 +69,9 @@ def browser_knows(dashboard: Dashboard) -> dict[str, Any]:
 async def test_a_source_that_was_left_before_it_was_open_is_not_shown(dashboard: Dashboard) -> None:
     await dashboard.open(Open("fake:second"))
     before = len(worker(dashboard).commands)
-    await dashboard.receive(msgspec.structs.replace(opened(run=1), asked="fake:"))
+    await dashboard.receive(msgspec.structs.replace(opened(run=1), requested="fake:"))
     assert len(worker(dashboard).commands) == before
-    await dashboard.receive(msgspec.structs.replace(opened(run=2), asked="fake:second"))
+    await dashboard.receive(msgspec.structs.replace(opened(run=2), requested="fake:second"))
     assert begun(dashboard).run == 2
 
 
