@@ -9,7 +9,15 @@ from dataclasses import replace
 from pathlib import Path as FilePath
 from typing import Any
 
-from app.robot.address import ALL_ROBOTS, Address, DdsAddress, VelodyneAddress, ZenohAddress, parse_address
+from app.robot.address import (
+    ALL_ROBOTS,
+    Address,
+    DdsAddress,
+    VelodyneAddress,
+    ZenohAddress,
+    is_live,
+    parse_address,
+)
 from app.robot.dds import DdsLink
 from app.robot.inbox import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox
 from app.robot.link import Link
@@ -21,7 +29,8 @@ from app.robot.velodyne import VelodyneLink
 from app.robot.zenoh import ZenohLink
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.io.readers import open_source
+from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
 from pipeline.io.recording import outputs
@@ -441,3 +450,12 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
             remedy="Name it, or show all of them with `stemmap serve`",
         )
     return LiveSource(address, chosen, make_link, kind)
+
+
+def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:
+    """Open a source by its URI: recorded, simulated or live.
+
+    Raises:
+        SourceError: The source does not exist, has an unknown format, or is damaged.
+    """
+    return open_live(uri, options) if is_live(uri) else open_source(uri, options)

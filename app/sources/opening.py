@@ -1,4 +1,4 @@
-"""Opens any source, recorded, simulated or live, and selects where its motion comes from."""
+"""Selects where the motion of a source comes from: its own odometry, LiDAR odometry, a file, or none."""
 
 from __future__ import annotations
 
@@ -6,10 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from app.robot.address import is_live
-from app.robot.source import LiveSource, open_live
 from pipeline.errors import SourceError
-from pipeline.io.readers import Source, SourceOptions, open_source
+from pipeline.io.readers import Source
 from pipeline.io.readers.base import SourceDescription
 from pipeline.odometry.odometry_override import OdometryEstimator, OdometryOverride
 from pipeline.odometry.synchroniser import OdometryChoice
@@ -129,12 +127,3 @@ def with_odometry(source: Source, choice: str) -> tuple[Source, ChosenOdometry]:
         return source, chosen
     digest = digest_of([Path(choice.removeprefix(FILE)).expanduser()]) if chosen.method == "file" else ""
     return OdometryOverride(source, motion, digest), chosen
-
-
-def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:
-    """Open a source by its URI: recorded, simulated or live.
-
-    Raises:
-        SourceError: The source does not exist, has an unknown format, or is damaged.
-    """
-    return open_live(uri, options) if is_live(uri) else open_source(uri, options)

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from app.common.text import version
-from app.robot.source import LiveSource
-from app.sources.opening import open_any, with_odometry
+from app.robot.source import LiveSource, open_any
+from app.sources.opening import with_odometry
 from app.sources.request import SourceRequest
 from app.store.records import Content
 from app.store.store import AnnotatedSource

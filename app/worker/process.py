@@ -39,17 +39,15 @@ def new_session(folder: Path | None = None) -> Session:
         folder: Folder of the scan caches, which the next opening of a recording uses again; None for
             temporary caches.
     """
-    from app.sources.opening import open_any
+    from app.robot.source import open_any
     from app.worker.mapper_factory import mapper_of
     from app.worker.numba_warmup import compile_ahead, warm_up
-    from pipeline.odometry.synchroniser import OdometryChoice, steps
-
-    choices: dict[str, OdometryChoice] = {"auto": "auto", "wheels": "wheels", "static": "static"}
+    from pipeline.odometry.synchroniser import steps
 
     return Session(
         open_source=open_any,
         make_mapper=lambda source, *rest: mapper_of(source.description, *rest),
-        make_synchroniser=lambda odometry: partial(steps, odometry=choices[odometry]),
+        make_synchroniser=lambda odometry: partial(steps, odometry=odometry),
         parameters=Parameters(),
         open_caches=unnamed_caches if folder is None else caches_in(folder),
         compile_ahead=compile_ahead,

@@ -30,6 +30,7 @@ from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
+from pipeline.odometry.synchroniser import OdometryChoice
 from pipeline.remapping import KnownMap, Reread, Rerun, Sample, ScanCaches, preview_trees
 from pipeline.types.records import Float, Frame, Path, Step, Trees
 
@@ -330,7 +331,7 @@ class Run:
         self.source.close()
 
 
-MakeSynchroniser = Callable[[str], StepsFunction]
+MakeSynchroniser = Callable[[OdometryChoice], StepsFunction]
 OpenCaches = Callable[[Source | LiveSource, str, int], ScanCaches]
 
 _LARGE = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the file has no name

@@ -12,9 +12,9 @@ import pytest
 
 from app.common.settings import Settings
 from app.robot.inbox import Inbox
+from app.robot.source import open_any
 from app.robot.topics import Publisher
 from app.sources import inspection
-from app.sources.opening import open_any
 from app.sources.request import SourceRequest
 from app.worker.protocol import Open
 from app.worker.session import Session
