@@ -89,8 +89,13 @@ def _rows(points: list[list[float]]) -> Float:
 def _paired(
     a: list[dict[str, Any]], b: list[dict[str, Any]], place_a: Float, place_b: Float
 ) -> tuple[list[dict[str, Any]], list[int], list[int]]:
-    """Return the pairs of trees of both maps, the largest shift first, and the numbers of those in only one
-    map."""
+    """Return the pairs of trees of both maps, the largest shift first, and the numbers of the trees in only
+    one map, for each map.
+
+    Args:
+        a, b: Trees of the two maps as on the page.
+        place_a, place_b: Their positions in the frame of a, shape (T, 2) [m].
+    """
     from pipeline.evaluation import match
 
     a_of = match(place_b, place_a, MATCH)

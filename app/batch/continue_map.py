@@ -174,7 +174,13 @@ class RunStart:
     truth: Truth | None = None
 
     def steps(self, source: Source, odometry: OdometryChoice, left_out: Counter[str]) -> Iterator[Step]:
-        """Return the steps that are not in the map yet, with continued numbers and times."""
+        """Yield the steps that are not in the map yet, with indices and times that continue those of the map.
+
+        Args:
+            source: Source of the run.
+            odometry: Choice of the odometry.
+            left_out: Counts the scans that are left out, by reason.
+        """
         index = self.scans
         for step in steps(source.records(), odometry=odometry, losses=left_out):
             stamp = step.scan.stamp_ns + self.stamp_shift_ns
@@ -185,7 +191,12 @@ class RunStart:
 
 
 def at_origin(source: Source, warnings: list[str]) -> RunStart:
-    """Return the start of the first run of a map."""
+    """Return the start of the first run of a map, whose first pose is the origin.
+
+    Args:
+        source: Source of the run.
+        warnings: Messages for the user are appended.
+    """
     known = source.description
     first = RunSource(known.uri, known.digest, 0, "origin", (0.0, 0.0, 0.0), 0, 0)
     return RunStart(RunTotals(Counter(warnings)), sources=(first,))

@@ -184,7 +184,17 @@ def _map_scans(
     progress: Progress,
     stopwatch: Stopwatch,
 ) -> tuple[Frame, int]:
-    """Map all scans; return the last frame and the time of the first scan [ns]."""
+    """Map all scans and write their detections; return the last frame and the time of the first scan [ns].
+
+    Args:
+        plan: The run.
+        mapper: The mapper.
+        begun: How the run begins.
+        to_map: Steps of the scans.
+        files: Output files.
+        progress: Updated after each scan.
+        stopwatch: Measures the stages.
+    """
     start_ns, frame = begun.start_ns, None
     for step in to_map:
         _use_revisions(plan, mapper, step.index)
@@ -281,7 +291,8 @@ def _run_record(
     error: PathError | None,
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """run.json, without times of day and computing times, so that the same run gives the same bytes."""
+    """Return the contents of run.json, without times of day and computing times, so that the same run gives
+    the same bytes."""
     description, tally = plan.source.description, begun.tally
     first, *others = begun.sources
     return {

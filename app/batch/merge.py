@@ -171,7 +171,14 @@ def _correspondence(
     merged: MergedMap, b: SavedMap, shown: set[int], of_a: set[int], of_b: set[int]
 ) -> list[list[str]]:
     """Return rows of CORRESPONDENCE_COLUMNS for the confirmed trees of the merged map, by number. The cell of
-    a run in which the tree was not confirmed is empty."""
+    a run in which the tree was not confirmed is empty.
+
+    Args:
+        merged: The merged map.
+        b: Map of run b.
+        shown: Numbers of the confirmed trees of the merged map.
+        of_a, of_b: Numbers of the confirmed trees of the two runs.
+    """
     rows = {n: [str(n), str(n) if n in of_a else "", "", ""] for n in sorted(shown)}
     merged_rows = zip(
         b.tracks.number.tolist(), merged.number_of.tolist(), merged.distance.tolist(), strict=True
@@ -186,7 +193,15 @@ def _correspondence(
 def _moved_rows(
     file: FilePath, T: Pose2, scans: int, shift: int, a: SavedRun, b: SavedRun
 ) -> list[list[str]]:
-    """Return the detections of run b with frame, scan numbers and times of run a."""
+    """Return the detections of run b with frame, scan numbers and times of run a.
+
+    Args:
+        file: Table of the detections of run b.
+        T: Pose of the frame of b in that of a.
+        scans: Number of scans of run a.
+        shift: Offset that is added to the times of run b [ns].
+        a, b: The two runs.
+    """
     seconds = (b.start_ns + shift - a.start_ns) * 1e-9
     try:
         with file.open(encoding="utf-8", newline="") as text:

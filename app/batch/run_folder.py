@@ -136,7 +136,11 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
 
 
 def _table(rows: list[list[str]], names: tuple[str, ...]) -> dict[str, Float]:
-    """Return columns by name; an empty cell is NaN.
+    """Return the columns of a CSV table by name; an empty cell is NaN.
+
+    Args:
+        rows: Cells of the rows, the header first.
+        names: Names of the columns.
 
     Raises:
         ValueError: A row does not fit the columns.

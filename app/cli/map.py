@@ -200,7 +200,15 @@ def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
 def _tell(
     summary: list[str], out: Path, warnings: list[str], losses: dict[str, int], *, replaces: bool
 ) -> int:
-    """Print the result; return the exit code."""
+    """Print the result of a mapping command; return the exit code.
+
+    Args:
+        summary: Lines to print.
+        out: Folder of the files.
+        warnings: Messages to print on stderr.
+        losses: Number of messages that were left out, by reason.
+        replaces: Whether the folder had the files of an earlier run.
+    """
     for line in summary:
         print(line)
     print(f"files in {out}" + (" (replaced)" if replaces else ""))

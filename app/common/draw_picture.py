@@ -58,7 +58,12 @@ class Drawing(msgspec.Struct, frozen=True):
     def of(
         cls, picture: Picture, box: tuple[float, float, float, float] | None = None, text: str = ""
     ) -> Drawing:
-        """Return the drawing of a picture of a camera."""
+        """Return the drawing of a picture of a camera.
+
+        Args:
+            picture: The picture.
+            box, text: As in `Drawing`.
+        """
         return cls(picture.encoding, picture.width, picture.height, picture.step, picture.data, box, text)
 
 

@@ -62,8 +62,12 @@ def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees 
     """Return the ground truth of the source with the annotations applied.
 
     An annotation replaces the object within SAME_THING that has another class. One of the same class keeps
-    the position of the source, and its diameter unless one was typed, because a person who confirms a
-    mapped tree has not measured its position.
+    the position of the source, and its diameter unless one was typed, because a person who confirms a mapped
+    tree has not measured its position.
+
+    Args:
+        own: Ground truth of the source, if any.
+        rows: The annotations.
     """
     if not rows:
         return own
@@ -83,7 +87,13 @@ def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees 
 
 
 def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
-    """Return the number of annotations whose class differs from that of the source."""
+    """Return the number of annotations whose class differs from that of the nearest object of the source
+    within SAME_THING.
+
+    Args:
+        own: Ground truth of the source, if any.
+        rows: The annotations.
+    """
     if own is None or not rows or not len(own.x):
         return 0
     near = zip(_nearest(own, rows).tolist(), rows, strict=True)

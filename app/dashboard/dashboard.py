@@ -476,7 +476,13 @@ class Dashboard:
 def _map_and_counts(
     shown: Shown, truth: TruthTrees | None, match_distance: float
 ) -> tuple[dict[str, Any], Counts]:
-    """Return the message "map" without its path, and the verdict counts of the scan."""
+    """Return the message "map" without its path, and the verdict counts of the scan.
+
+    Args:
+        shown: Shown frame.
+        truth: Ground truth, or None.
+        match_distance: Maximum distance between a detection and its true tree [m].
+    """
     return map_payload(shown), counts_of(shown.frame, truth, match_distance)
 
 

@@ -228,7 +228,12 @@ _PRESET = re.compile(r"# preset: ([a-z0-9-]{1,40})\s*\n")
 
 
 def file_of(preset_name: str, parameters: Parameters) -> str:
-    """Return all values as the text of a file for `--config`; a comment names their preset."""
+    """Return all values as the text of a file for `--config`; a comment names their preset.
+
+    Args:
+        preset_name: Name of the preset.
+        parameters: The values.
+    """
     return f"# preset: {preset_name}\n{to_toml(parameters)}"
 
 

@@ -102,7 +102,12 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 
 def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
-    """Return the confirmed trees of a table, one dict each; unknown values are None."""
+    """Return the confirmed trees of a table as dicts for the page; unknown values are None.
+
+    Args:
+        trees: The table.
+        start_ns: Time of the first scan, from which the seconds count [ns].
+    """
     keep = np.flatnonzero(trees.confirmed)
     columns: dict[str, Sequence[Any]] = {
         "number": trees.number[keep].tolist(),

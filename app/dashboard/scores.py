@@ -85,7 +85,14 @@ class Scores:
 
 
 def score_map(trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> dict[str, Any]:
-    """Return the scores of a map for the page, see `score_payload`."""
+    """Return the scores of a map for the page, see `score_payload`.
+
+    Args:
+        trees: The map.
+        truth: Ground truth.
+        parameters: Distances of a match and of the ground truth from the path.
+        path_xy: Path, shape (N, 2) [m].
+    """
     return score_payload(evaluate(trees, truth, parameters, path_xy))
 
 

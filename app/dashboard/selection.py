@@ -88,7 +88,12 @@ class Selector:
             self._select(Selection(story.tree, story))
 
     def cluster_soon(self, scan: int, cluster: int) -> None:
-        """Select a cluster without waiting for the answer; of several clicks the last one counts."""
+        """Select a cluster in the background; of several calls the last one counts.
+
+        Args:
+            scan: Index of the scan.
+            cluster: Row of the cluster.
+        """
         self.leave()
         self._task = asyncio.create_task(self._if_known(scan, cluster), name="select")
 

@@ -50,7 +50,12 @@ def warm_up(sensor: Sensor) -> None:
 
 
 def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
-    """Return the story of a cluster of a recent scan of an opened run.
+    """Return the explanation of a cluster of a recent scan.
+
+    Args:
+        run: The open run, or None.
+        frame: Results of the scan.
+        cluster: Row of the cluster.
 
     Raises:
         StemmapError: The scan has no such cluster.
@@ -62,7 +67,11 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
 
 
 def tree_story(run: Run | None, number: int) -> TreeStory:
-    """Return the story of a tree after the newest scan of an opened run.
+    """Return the explanation of a tree after the newest scan.
+
+    Args:
+        run: The open run, or None.
+        number: Number of the tree.
 
     Raises:
         StemmapError: The run has no such tree at this time.
@@ -154,7 +163,13 @@ def tree_of_frame(
 
 
 def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[CheckResult]:
-    """Return the checks of one cluster in the order in which they decide; empty for an external stem."""
+    """Return the checks of one cluster in the order in which they decide; empty for an external stem.
+
+    Args:
+        clusters: Clusters of the scan.
+        row: Row of the cluster.
+        parameters: Parameters with which the scan was mapped.
+    """
     titles = {spec.name: spec.title for spec in field_specs()}
     if np.isnan(clusters.eccentricity[row]):  # an external stem
         return []
@@ -175,9 +190,14 @@ def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[Chec
 
 
 def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor) -> ColumnStory | None:
-    """Return the classification of the accumulated scans at a place (x, y) of the map [m].
+    """Return the classification of the accumulated scans at a place; None if no voxel column is within 0.45
+    m.
 
-    None where no voxel column is within 0.45 m.
+    Args:
+        frame: Results of the newest scan, with its voxel columns.
+        place: x, y in the map [m].
+        parameters: Parameters with which the scan was mapped.
+        sensor: The LiDAR.
     """
     columns = frame.columns
     if columns is None or not len(columns.verdict):
@@ -239,7 +259,14 @@ def _nearest_tree(frame: Frame, place: Float, reach: float) -> tuple[int | None,
 
 
 def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
-    """Return the row of the cluster nearest to a tree, preferring clusters with the verdict tree; or None."""
+    """Return the row of the cluster nearest to a place, preferring clusters with the verdict tree; None if
+    none is near.
+
+    Args:
+        frame: Results of the scan.
+        place: x, y in the map [m].
+        reach: Maximum distance [m].
+    """
     centre = frame.estimate.T_map_base.apply(frame.clusters.centre + frame.sensor_offset[:2])
     distance = np.linalg.norm(centre - place, axis=1)
     for rows in (frame.detections.cluster, np.arange(len(distance))):

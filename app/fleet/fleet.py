@@ -308,7 +308,12 @@ class Fleet:
 
     def add(self, name: str, source: Open) -> bool:
         """Add a robot and start its dashboard; return False if there is no room for it, which the page
-        reports."""
+        reports.
+
+        Args:
+            name: Name of the robot on the page.
+            source: Source that its dashboard opens.
+        """
         if name in self.members:
             return True
         if len(self.members) >= MOST_ROBOTS:

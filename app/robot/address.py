@@ -213,8 +213,13 @@ def _topics(options: dict[str, str]) -> dict[str, str]:
 def _files(uri: str, endpoint: str, named: dict[str, str]) -> dict[str, str]:
     """Return the absolute paths of the certificates by role.
 
+    Args:
+        uri: The address, for errors.
+        endpoint: Endpoint of the router.
+        named: Paths of the certificates by role.
+
     Raises:
-        SourceError: A file is missing, or the endpoint does not use certificates.
+        SourceError: A file is missing, a certificate has no key, or the endpoint is not encrypted.
     """
     if named and endpoint.startswith("tcp/"):
         raise SourceError(

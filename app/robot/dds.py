@@ -246,7 +246,14 @@ class DdsLink(Link):
                 self.version += changed
 
     def _adjust(self, participant: Any, waiting: Any, readers: dict[int, _Reader]) -> None:  # noqa: ANN401
-        """Keep a reader for each channel that requests no more than all writers of its topic offer."""
+        """Create, replace and remove readers, so that each channel has one that requests no more than all
+        writers of its topic offer.
+
+        Args:
+            participant: Participant of cyclonedds.
+            waiting: WaitSet to which new readers are attached.
+            readers: Readers by number of the channel, modified.
+        """
         for channel in self._channels:
             with self.lock:
                 offer = self._graph.common(channel.topic, channel.msgtype)

@@ -219,7 +219,12 @@ class CountingInbox(Inbox):
         self.put(message, is_scan=False)
 
     def put(self, message: Message, *, is_scan: bool) -> None:
-        """Count the message."""
+        """Count the message.
+
+        Args:
+            message: The message.
+            is_scan: Not used.
+        """
         del is_scan
         with self._guard:
             known = self._heard.setdefault(message.channel, Heard(0, message.log_ns))

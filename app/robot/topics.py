@@ -110,14 +110,21 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
 
 
 def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publisher | None:
-    """Return the topic of the poses of another SLAM, where the user named it."""
+    """Return the topic of the poses of another SLAM if the user named it, else None.
+
+    Args:
+        there: Publishers of the robot.
+        topics: Topic by role where the user named it.
+        where: The address, for errors.
+    """
     if "pose" not in topics:
         return None
     return _of_role(there, topics, "pose", TYPES_BY_ROLE["pose"], lambda p: (p.topic,), where)
 
 
 def _camera(there: list[Publisher], topics: dict[str, str], where: str) -> list[Publisher]:
-    """Return the topics of the pictures and of their CameraInfo; [] for none."""
+    """Return the topics of the pictures and of their CameraInfo; [] without a camera. Arguments as in
+    `_pose`."""
     if topics.get("camera") == NO_CAMERA:
         return []
     seen = there if "camera" in topics else [p for p in there if not _has_word(p, _NO_SCENE)]

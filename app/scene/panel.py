@@ -180,7 +180,11 @@ class SceneCommands(Protocol):
         """Reset parameters to the preset; an empty list means all."""
 
     async def choose_view(self, name: str, value: str | bool) -> None:
-        """Choose a layer, the colouring, the labels or following.
+        """Set one choice of the view.
+
+        Args:
+            name: Name of a layer, "follow", "colour_by" or "label_by".
+            value: Visibility or following as bool; for colours and labels the name of the choice.
 
         Raises:
             ParameterError: There is no such choice.

@@ -173,8 +173,14 @@ def way_lines(curvature: float, backward: bool, begins: float, parameters: Obsta
 
 
 def _on_way(s: Float, left: float | Float, curvature: float, backward: bool) -> Float:
-    """Return the points at arc lengths `s` [m] from the base and at a lateral distance `left` [m] from the
-    path, shape (N, 3) [m]."""
+    """Return points at a lateral distance from the path ahead, shape (N, 3) [m], in the level base frame.
+
+    Args:
+        s: Distances along the path from the base, shape (N,) [m].
+        left: Distance to the left of the path [m].
+        curvature: Curvature of the path [1/m], positive to the left.
+        backward: Whether the robot drives backward.
+    """
     if abs(curvature) < 1e-6:
         x, y = s, np.zeros_like(s) + left
     else:

@@ -54,7 +54,12 @@ class ScanNodes:
             _report(batch, self._markers, on_cluster)
 
     def show(self, frame: Frame, view: ViewSettings) -> None:
-        """Show a new scan."""
+        """Show a new scan.
+
+        Args:
+            frame: Results of the scan.
+            view: Visible layers, colours and labels.
+        """
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
         self._numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
         self._sensor.position = frame.sensor_offset
@@ -63,7 +68,7 @@ class ScanNodes:
         self.repaint(frame, view)
 
     def repaint(self, frame: Frame, view: ViewSettings) -> None:
-        """Update the same scan after a change of colours, labels or layers."""
+        """Show the same scan after a change of the view; arguments as in `show`."""
         self._raw.visible = view.layers["raw"]
         self._filtered.visible = view.layers["filtered"]
         self._clusters.visible = view.layers["clusters"]
@@ -172,9 +177,13 @@ class VoxelNode:
         self.count = 0
 
     def show(self, filtered: NDArray[np.float32], size: float, visible: bool) -> None:
-        """Show the voxels of filtered points (N, 3) [m] for a voxel size [m]; 0 means no voxels.
+        """Show the voxels that contain filtered points. `count` is the number of all voxels; at most
+        MOST_VOXELS are drawn.
 
-        `count` is the number of all voxels; at most MOST_VOXELS are drawn.
+        Args:
+            filtered: Points, shape (N, 3) [m].
+            size: Side of a voxel [m]; 0 shows none.
+            visible: Whether the layer is on.
         """
         self._boxes.visible = visible
         if not visible or size <= 0.0:

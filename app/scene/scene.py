@@ -78,7 +78,12 @@ class Scene:
         self._show_frame()
 
     def show_parameters(self, parameters: Parameters, preset_name: str) -> None:
-        """Set the widgets to parameters, without a callback."""
+        """Set the widgets to parameters, without a callback.
+
+        Args:
+            parameters: The values.
+            preset_name: Their preset.
+        """
         self._parameters, self._preset = parameters, preset_name
         with self._server.atomic():
             self._tune.show(parameters, preset_name, self._tuning.moving)

@@ -253,7 +253,13 @@ def heard(uri: str) -> dict[str, Any]:
 
 
 def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, Any]:
-    """Return the description of a topic."""
+    """Return the description of a topic for the page.
+
+    Args:
+        publisher: The topic.
+        heard: Number and times of its messages.
+        listened: Whether its messages were counted.
+    """
     why = ""
     if listened and not heard.messages and not publisher.topic.endswith("tf_static"):
         why = f"silent for {COUNT_S:g} s"

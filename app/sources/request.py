@@ -108,7 +108,13 @@ def request_of_kept(
 
 
 def request_of_options(uri: str, options: SourceOptions, odometry: str = "auto") -> SourceRequest:
-    """Return the request of a run that a command opened with reader options."""
+    """Return the request of a run that a command opened with reader options.
+
+    Args:
+        uri: URI of the source.
+        options: Topics, mounting and seed.
+        odometry: Choice of the odometry.
+    """
     mounted = options.T_base_lidar
     mount = None if mounted is None else mount_of(mounted)
     return SourceRequest(uri, odometry, options.seed, dict(options.topics), mount)

@@ -116,7 +116,12 @@ class RunRecords:
             return record
 
     def update(self, record: int, figures: RunFigures) -> None:
-        """Update the record of a run."""
+        """Update the record of a run.
+
+        Args:
+            record: Number of the record.
+            figures: Present results.
+        """
         with self._engine.begin() as connection:
             values = {"changed_ns": self._clock(), **_figures(figures)}
             connection.execute(update(_records).where(_records.c.id == record).values(**values))
@@ -191,7 +196,14 @@ class RunRecords:
     # --- uploads ---------------------------------------------------------------------------------
 
     def add_upload(self, file: str, name: str, kind: str, size: int) -> None:
-        """Store the original name of an uploaded file."""
+        """Store the original name of an uploaded file.
+
+        Args:
+            file: Name of the file in the folder of uploads.
+            name: Original name.
+            kind: Name of its format.
+            size: Number of bytes.
+        """
         values = {"name": name[:200], "kind": kind[:200], "bytes": size, "at_ns": self._clock()}
         with self._engine.begin() as connection:
             connection.execute(insert(_uploads).values(file=file, **values))

@@ -260,7 +260,7 @@ class Store:
             self._change(connection, self._step(connection, run, author), author, row, content)
 
     def _step(self, connection: Connection, run: int, author: Author) -> int:
-        """Create a new step; steps that were undone before can no longer be redone."""
+        """Store a new step and return its number; steps that were undone before can no longer be redone."""
         of_browser = (_steps.c.run == run, _steps.c.browser == author.browser)
         connection.execute(update(_steps).where(*of_browser, _steps.c.state == "undone").values(state="left"))
         values = {"browser": author.browser, "who": author.who, "at_ns": self._clock(), "state": "done"}
@@ -290,7 +290,15 @@ class Store:
     def _put(
         self, connection: Connection, author: Author, row: Row[Any], content: dict[str, Any] | None, by: int
     ) -> None:
-        """Set the current content of an annotation; None deletes it."""
+        """Set the current content of an annotation.
+
+        Args:
+            connection: Connection with an open transaction.
+            author: Author of the edit.
+            row: Present row of the annotation.
+            content: New content; None deletes the annotation.
+            by: Number of the change that led to the content.
+        """
         edit = {"who": author.who, "at_ns": self._clock(), "version": row.version + 1, "made_by": by}
         connection.execute(
             update(_annotations)
@@ -340,7 +348,17 @@ def _request_of(connection: Connection, run: Row[Any]) -> SourceRequest:
 
 
 def _next_step(connection: Connection, run: int, author: Author, to: str) -> int:
-    """Return the next step to undo or redo."""
+    """Return the number of the next step to undo or redo.
+
+    Args:
+        connection: Connection with an open transaction.
+        run: Number of the source.
+        author: Author, with the browser.
+        to: State after the step: "undone" or "done".
+
+    Raises:
+        StemmapError: There is no such step.
+    """
     # Undone steps follow the active ones and were undone from the end.
     newest, state = (func.max, "done") if to == "undone" else (func.min, "undone")
     query = select(newest(_steps.c.id)).where(

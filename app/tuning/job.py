@@ -362,6 +362,10 @@ def plan_of(
 def check_same(stopped: Plan, now: Plan) -> None:
     """Check that a stopped search can continue under the same conditions.
 
+    Args:
+        stopped: Plan of the stopped search.
+        now: Plan that the same request gives now.
+
     Raises:
         StemmapError: Something has changed since it began.
     """

@@ -101,8 +101,13 @@ def best_parameters(plan: Plan, result: Result) -> Parameters:
 
 
 def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
-    """Return the provenance of the best set: goal, trials, runs with their digests, scores before and
-    after."""
+    """Return the provenance of the best set: goal, trials, runs with their digests, scores before and after.
+
+    Args:
+        plan: The search.
+        result: Its result.
+        date: Date of the search.
+    """
     return {
         "tuned": {
             "stemmap": version(),
@@ -309,6 +314,6 @@ def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float |
 
 
 def _changes(plan: Plan, result: Result) -> list[list[Any]]:
-    """Name, value at the start and best value of each parameter."""
+    """Return name, value at the start and best value of each parameter."""
     before = plan.parameters.flat()
     return [[name, before[name], value] for name, value in result.best.values.items()]

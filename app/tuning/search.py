@@ -109,8 +109,13 @@ def scores_of(runs: Sequence[SearchRun], parameters: Parameters, tick: Tick = la
 def check_start(run: SearchRun, evaluation: MapScores, parameters: Parameters) -> None:
     """Check that a run can be scored at all.
 
+    Args:
+        run: The run.
+        evaluation: Scores of its first map.
+        parameters: Parameters of that map.
+
     Raises:
-        StemmapError: No true tree is near the path, or the first map has none of them.
+        StemmapError: No true tree is near the path, or the map has none of them.
     """
     if not evaluation.TA.of:
         others = evaluation.TR.of > 0
@@ -144,7 +149,16 @@ def _open(plan: Plan, planned: PlannedRun) -> SearchRun:
 
 
 def _truth(planned: PlannedRun, own: TruthTrees | None) -> TruthTrees:
-    """The true trees: those that were given, else the source's own with the annotations applied."""
+    """Return the true trees of a run: those that were given, else those of the source with the annotations
+    applied.
+
+    Args:
+        planned: The run.
+        own: True trees of the source, or None.
+
+    Raises:
+        SourceError: There are no true trees.
+    """
     uri = planned.source.uri
     if planned.truth is not None:
         return planned.truth.trees()
@@ -323,8 +337,13 @@ class Search:
         return list(self.study.get_trials(deepcopy=False))
 
     def _note(self, number: int, name: str, value: object) -> bool:
-        """Store an attribute of a trial. Returns False for a trial that is complete, because two processes
-        that take over the same trial get the same result."""
+        """Store an attribute of a trial. Return False if the trial is complete, because two processes that
+        take over the same trial get the same result.
+
+        Args:
+            number: Number of the trial.
+            name, value: The attribute.
+        """
         from optuna.exceptions import UpdateFinishedTrialError
 
         trial_id = self._storage.get_trial_id_from_study_id_trial_number(self._study_id, number)

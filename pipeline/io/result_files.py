@@ -218,7 +218,7 @@ class RunFiles:
             hold(self._detections)
 
     def add(self, frame: Frame, start_ns: int) -> None:
-        """Write the clusters of a scan."""
+        """Write the clusters of a scan; seconds count from `start_ns`."""
         writer = csv.writer(self._detections, lineterminator="\n")
         writer.writerows(detection_rows(frame, start_ns))
 

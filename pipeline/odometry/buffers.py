@@ -122,7 +122,13 @@ class OdometryBuffer:
 
 
 def _tilt_between(before: Reading, after: Reading, fraction: float) -> Tilt | None:
-    """Interpolate roll and pitch between two readings; a reading without a tilt is level."""
+    """Return roll and pitch between two readings; a reading without a tilt is level. None if neither has a
+    tilt.
+
+    Args:
+        before, after: The readings.
+        fraction: Position between them, from 0 (before) to 1 (after).
+    """
     if before.tilt is None and after.tilt is None:
         return None
     (roll, pitch), (roll_after, pitch_after) = before.tilt or (0.0, 0.0), after.tilt or (0.0, 0.0)

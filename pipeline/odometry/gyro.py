@@ -153,7 +153,8 @@ class Gyro:
         return found[::-1]
 
     def _integral(self, from_ns: int, to_ns: int) -> float | None:
-        """Integrate the rate by trapezoids [rad]; it is constant outside of the readings."""
+        """Return the turn between two times [ns], integrated by trapezoids [rad]; outside of the readings the
+        rate is constant. None if readings are missing."""
         inside = self._between(from_ns - GAP_NS, to_ns + GAP_NS)
         if self._is_dead or not inside or to_ns <= from_ns:
             return None

@@ -158,7 +158,8 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
 
 
 def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemory:
-    """Return the marks of both; the uncertainty of T is added to those of b."""
+    """Return the uncertainty of the frame of the merged map: the records of both runs, those of b with the
+    uncertainty of T added."""
     own, other = a.frame.forgotten(), b.frame
     if not len(other.serial):
         return own

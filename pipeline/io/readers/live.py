@@ -531,7 +531,13 @@ def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
 
 
 def _channels(container: McapFile, run: LiveRunHeader, where: str) -> list[Channel]:
-    """Return the channels of the robot in the order of the live run."""
+    """Return the channels of the robot in the order of the live run.
+
+    Args:
+        container: The recording.
+        run: Settings of the live run.
+        where: Name of the recording in errors.
+    """
     by_topic = {channel.topic: channel for channel in container.channels}
     missing = [topic for topic in run.topics if topic not in by_topic]
     if missing:
@@ -544,7 +550,12 @@ def _channels(container: McapFile, run: LiveRunHeader, where: str) -> list[Chann
 
 
 def open_live_recording(uri: str, path: Path, options: SourceOptions) -> LiveRecording | None:
-    """Open an MCAP as the recording of a live run; None when it is another recording.
+    """Open an MCAP file as the recording of a live run; return None if it is another recording.
+
+    Args:
+        uri: As the user wrote it.
+        path: The file.
+        options: Choices of the user.
 
     Raises:
         SourceError: It is the recording of a live run and cannot be read.

@@ -591,7 +591,13 @@ def _open_npz(path: Path) -> PointTable:
 
 
 def _numpy_table(path: Path, kind: str, arrays: dict[_NumpyArray, np.dtype[Any]]) -> PointTable:
-    """Return the table of arrays that are read side by side, each with its record type."""
+    """Return the table of arrays whose columns belong to the same points.
+
+    Args:
+        path: The file.
+        kind: Name of the format.
+        arrays: Type of one row of each array.
+    """
     usable = _usable([name for dtype in arrays.values() for name in dtype.names or ()])
     points = next(iter(arrays)).shape[0]
     for array, dtype in arrays.items():

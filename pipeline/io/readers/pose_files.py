@@ -220,7 +220,12 @@ def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
 
 
 def between(first: Pose3, second: Pose3, fraction: float) -> Pose3:
-    """Interpolate between two poses: the position on a line, the attitude by slerp."""
+    """Return the pose between two poses: the position on a line, the attitude by slerp.
+
+    Args:
+        first, second: The poses.
+        fraction: Position between them, from 0 (first) to 1 (second).
+    """
     q, p = first.quaternion(), second.quaternion()
     dot = float(q @ p)
     if dot < 0.0:

@@ -173,7 +173,12 @@ class RosSource:
     def _arrivals(
         self, start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Stamped[Message | Odometry]]:
-        """Yield the messages that are read with their times, in the order of recording."""
+        """Yield the messages that are read with their times, in the order of recording.
+
+        Args:
+            start_ns: Time of the first message [ns]; None for all.
+            losses: Counts what cannot be used.
+        """
         log_start = None if start_ns is None else start_ns - self._clock.offset_ns - WINDOW_NS
         wanted = self._wanted | self._alignments.numbers
         for message in self._container.messages(wanted, log_start, losses):
@@ -329,7 +334,13 @@ class RosSource:
 def open_ros(
     uri: str, open_container: Callable[[], Container], paths: list[Path], options: SourceOptions
 ) -> RosSource:
-    """Open a recording; its files are closed when it cannot be read.
+    """Open a recording; its files are closed if it cannot be read.
+
+    Args:
+        uri: As the user wrote it.
+        open_container: Opens the recording.
+        paths: Files of the recording, for the digest.
+        options: Choices of the user.
 
     Raises:
         SourceError: See RosSource.

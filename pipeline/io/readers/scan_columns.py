@@ -81,7 +81,12 @@ OFFSET_LIMIT_NS = 2_000_000_000
 def first_of(
     columns: Mapping[str, NDArray[np.generic]], names: tuple[str, ...]
 ) -> NDArray[np.generic] | None:
-    """Return the column with the first of some names that exists, None when none exists."""
+    """Return the first of some columns that exists, None if none exists.
+
+    Args:
+        columns: Columns by name.
+        names: Names in the order of preference.
+    """
     return next((columns[name] for name in names if name in columns), None)
 
 

@@ -173,7 +173,14 @@ class ScanFolder(FileSource):
     def _fitting(
         self, name: str, times: Int | None, poses: list[Pose3], numbers: Int
     ) -> list[Pose3 | None] | None:
-        """Return the pose of each scan, or None when the rows of the file do not belong to the scans."""
+        """Return the pose of each scan, or None if the rows of a file do not belong to the scans.
+
+        Args:
+            name: Name of the file.
+            times: Times of its rows [ns], or None.
+            poses: Pose of each row.
+            numbers: Number in the name of each scan file.
+        """
         if times is not None and self._timed:
             found = [pose_at(times, poses, int(stamp_ns)) for stamp_ns in self._stamp]
             if any(pose is not None for pose in found):
@@ -289,7 +296,12 @@ def open_table_scans(uri: str, folder: Path, options: SourceOptions) -> ScanFold
 
 
 def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a KITTI .bin file; a last row that is cut is left out and counted.
+    """Read a KITTI .bin file as a scan; an incomplete last row is left out and counted.
+
+    Args:
+        path: The file.
+        stamp_ns: Time of the scan [ns].
+        losses: Counts what is left out.
 
     Raises:
         ScanFileError: It is too large, or most of its rows are no positions.
@@ -310,7 +322,8 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 
 def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a PCD, PLY or NumPy file as a scan; rows of NaN in organised clouds are no returns.
+    """Read a PCD, PLY or NumPy file as a scan; arguments as in `load_bin`. Rows of NaN in organised clouds
+    are no returns.
 
     Raises:
         ScanFileError: See `read_columns`.
@@ -320,7 +333,7 @@ def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 
 def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a LAS or LAZ file as a scan; its coordinates are in the sensor frame.
+    """Read a LAS or LAZ file as a scan; arguments as in `load_bin`. Its coordinates are in the sensor frame.
 
     Raises:
         ScanFileError: It is damaged or too large.

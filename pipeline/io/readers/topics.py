@@ -148,7 +148,12 @@ def _free(topics: list[Topic], role: str, wanted: Mapping[str, str]) -> list[Top
 
 
 def _why_not(topic: Topic, chosen: Topic | None) -> str:
-    """Return the reason why a topic is not read, for the user."""
+    """Return the reason why a topic is not read, for the user.
+
+    Args:
+        topic: The topic.
+        chosen: Topic that is read in its role, or None.
+    """
     if chosen is None and topic.count and topic.msgtype == POSE_WITH_COVARIANCE:
         return "it is read when it is named as pose"
     if chosen is None:

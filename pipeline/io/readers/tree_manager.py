@@ -247,7 +247,12 @@ def _read_frame(file: Path, uri: str) -> _FrameTable:
 
 
 def _axes(table: Float, at: dict[str, int]) -> Float:
-    """Return unit vectors along the stems, upwards, shape (N, 3); NaN for invalid ones."""
+    """Return unit vectors along the stems, upwards, shape (N, 3); NaN for invalid ones.
+
+    Args:
+        table: Rows of the file, shape (N, columns).
+        at: Index of each column by name.
+    """
     if not all(name in at for name in STEM_AXIS):
         return np.full((len(table), 3), np.nan)
     axis = table[:, [at[name] for name in STEM_AXIS]]
@@ -258,7 +263,7 @@ def _axes(table: Float, at: dict[str, int]) -> Float:
 
 
 def _dbh(table: Float, at: dict[str, int]) -> Float:
-    """Return diameters [m], shape (N,); NaN for missing or impossible ones."""
+    """Return diameters [m], shape (N,); NaN for missing or impossible ones. Arguments as in `_axes`."""
     if DBH not in at:
         return np.full(len(table), np.nan)
     dbh = table[:, at[DBH]]
@@ -267,7 +272,8 @@ def _dbh(table: Float, at: dict[str, int]) -> Float:
 
 
 def _numbers(body: bytes, columns: int) -> tuple[Float, int]:
-    """Return the rows of numbers, NaN for an empty field, and the number of damaged rows."""
+    """Return the rows of numbers, shape (N, columns), with NaN for an empty field, and the number of damaged
+    rows."""
     text = (b"\n" + body + b"\n").replace(b"\r", b"").replace(b"True", b"1").replace(b"False", b"0")
     for gap, filled in ((b",,", b",nan,"), (b",,", b",nan,"), (b",\n", b",nan\n"), (b"\n,", b"\nnan,")):
         text = text.replace(gap, filled)

@@ -351,7 +351,12 @@ def _data_packets(block: bytes, found: Int, link: int, losses: dict[str, int]) -
 
 
 def _sweep_starts(azimuth: Int, stamp_ns: Int) -> Int:
-    """Return the rows at which a sweep begins: after a full rotation, or after a silence."""
+    """Return the rows at which a sweep begins: after a full rotation, or after a pause.
+
+    Args:
+        azimuth: Azimuth of each packet [0.01 degrees], shape (N,).
+        stamp_ns: Time of arrival of each packet [ns], shape (N,).
+    """
     step = np.diff(azimuth) % 36000
     step[step >= 18000] = 0  # a small step back is jitter of the motor
     silent = np.diff(stamp_ns) > _GAP_NS

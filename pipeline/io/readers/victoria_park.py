@@ -203,7 +203,12 @@ class VictoriaParkSource(FileSource):
         return table
 
     def _ascending(self, table: Float, reason: str) -> Float:
-        """Return the rows with finite numbers whose times do not go back; count the others."""
+        """Return the rows with finite numbers whose times do not go back.
+
+        Args:
+            table: Rows with the time in the first column.
+            reason: Reason under which the other rows are counted as losses.
+        """
         time = table[:, 0]
         with np.errstate(invalid="ignore"):
             sound = (time >= 0.0) & (time < _LONGEST_S) & np.isfinite(table).all(axis=1)

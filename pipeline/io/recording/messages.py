@@ -61,7 +61,7 @@ def definition(type_name: str) -> str:
 
 
 def header(stamp_ns: int, frame: str) -> Message:
-    """Return a std_msgs/Header.
+    """Return a std_msgs/Header with a time [ns] and the name of a frame.
 
     Raises:
         StemmapError: ROS cannot represent the time.
@@ -184,7 +184,13 @@ def compressed_image(stamp_ns: int, data: bytes) -> Message:
 
 
 def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) -> Message:
-    """Return a sensor_msgs/CameraInfo of a pinhole camera without distortion."""
+    """Return a sensor_msgs/CameraInfo of a pinhole camera without distortion.
+
+    Args:
+        stamp_ns: Time [ns].
+        width, height: Size of its pictures [pixels].
+        K: Camera matrix, shape (3, 3) [pixels].
+    """
     return make(
         "sensor_msgs/CameraInfo",
         header=header(stamp_ns, CAMERA),

@@ -66,7 +66,8 @@ def mend(path: Path, out: Path) -> Mended:
 
 
 def _end_of_whole_records(stream: BinaryIO, size: int) -> int:
-    """Return the end of the last complete record; the library does not notice incomplete ones."""
+    """Return the end of the last complete record of a file of `size` bytes; the library does not notice
+    incomplete records."""
     at = len(MAGIC)
     while at + _RECORD.size <= size:
         stream.seek(at)

@@ -34,7 +34,13 @@ _THIN, _SIDE, _NEAR = 0.06, 0.8, 0.4  # m
 def with_pictures(
     records: Iterator[Record], trees: TruthTrees, path: TruthPath
 ) -> Iterator[Record | Picture]:
-    """Yield the records of a simulated run, and a picture after every EVERY-th scan."""
+    """Yield the records of a simulated run, and a picture after every EVERY-th scan.
+
+    Args:
+        records: Records of the run.
+        trees: Trees and other objects.
+        path: True path, from which the pictures are taken.
+    """
     count = 0
     yaw = np.unwrap(path.yaw)
     for record in records:
@@ -49,7 +55,12 @@ def with_pictures(
 
 
 def rendered(trees: TruthTrees, pose: tuple[float, float, float]) -> bytes:
-    """Return a JPEG of the objects seen from a pose x, y [m], yaw [rad]."""
+    """Return a JPEG of the objects seen from a pose.
+
+    Args:
+        trees: Trees and other objects.
+        pose: x, y [m], yaw [rad] of the camera.
+    """
     from PIL import Image, ImageDraw
 
     picture = Image.new("RGB", (WIDTH, HEIGHT), (168, 196, 214))
