@@ -139,7 +139,11 @@ class Source(Protocol):
 
 
 class FileSource:
-    """Parts that sources of files share: description, losses, no ground truth, nothing to close."""
+    """Parts that sources share: description, losses, no ground truth, nothing to close.
+
+    A subclass sets `_description`, adds to `_damage` what it leaves out on opening, and replaces `_losses` in
+    each reading.
+    """
 
     _description: SourceDescription
 
@@ -155,7 +159,10 @@ class FileSource:
     @property
     def losses(self) -> dict[str, int]:
         """Records left out on opening and in the latest reading, by reason."""
-        return {**self._damage, **self._losses}
+        total = dict(self._damage)
+        for reason, number in self._losses.items():
+            count_loss(total, reason, number)
+        return total
 
     def truth(self) -> Truth | None:
         """Return None: there is no ground truth."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Protocol, runtime_checkable
 import numpy as np
 
 from pipeline.geometry.poses import Float, Pose3
+from pipeline.io.readers.base import FileSource
 from pipeline.io.readers.container import Channel, Container, Message, plain_message
 from pipeline.io.readers.message_time import header_stamp
 from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, MessageDecoder
@@ -265,3 +266,36 @@ class RecordedPictures:
             stamp_ns = self._time_of(header_stamp(self._channels[message.channel], plain.payload), plain)
             if stamp_ns is not None:
                 yield stamp_ns, plain
+
+
+class MessageSource(FileSource):
+    """Parts that sources of recorded messages share: losses, pictures, and closing the recording.
+
+    Args:
+        container: The recording; the source closes it.
+    """
+
+    def __init__(self, container: Container) -> None:
+        super().__init__()
+        self._container = container
+        self._damage = container.damage
+
+    def _pictures(self) -> RecordedPictures:
+        """Return the pictures of the camera."""
+        raise NotImplementedError
+
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it."""
+        return self._pictures().near(stamp_ns, within_ns)
+
+    def picture_stamps(self) -> list[int]:
+        """Return the times of the pictures, ascending [ns]."""
+        return self._pictures().stamps()
+
+    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
+        """Yield the pictures of some of `picture_stamps`, each once."""
+        return self._pictures().at(wanted_ns)
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._container.close()

@@ -23,6 +23,7 @@ from pipeline.io.readers.base import (
 from pipeline.io.readers.camera import (
     SAME_TIME_NS,
     Camera,
+    MessageSource,
     Picture,
     RecordedPictures,
     find_camera,
@@ -36,7 +37,7 @@ from pipeline.io.readers.ros import RosSource, open_ros
 from pipeline.io.readers.ros_messages import CAMERA_INFO, MessageDecoder, standard_types
 from pipeline.io.readers.topics import TYPES_BY_ROLE, Topic
 from pipeline.io.readers.transforms import Extrinsics
-from pipeline.types.records import Notice, Record, Truth
+from pipeline.types.records import Notice, Record
 
 #: The source is described this long after the first scan, or after this many scans: then its topics and
 #: extrinsics are known.
@@ -349,7 +350,7 @@ def read_live_header(container: McapFile, where: str) -> LiveRunHeader | None:
     return run
 
 
-class LiveRecording:
+class LiveRecording(MessageSource):
     """Source that reads the recording of a live run: the same records in the same order.
 
     Args:
@@ -366,29 +367,27 @@ class LiveRecording:
     def __init__(
         self, uri: str, container: McapFile, run: LiveRunHeader, path: Path, options: SourceOptions
     ) -> None:
-        self._uri, self._container, self._run = uri, container, run
+        super().__init__(container)
+        self._uri, self._run = uri, run
         self._options = replace(options, topics={"scan": run.topics[0], **options.topics})
         self._channels = _channels(container, run, uri)
-        self._losses: dict[str, int] = {}
         self._skipped = self._read_skipped()
         self._base, self._offset_ns = "", 0
         self._found_camera: tuple[Camera | None, str] | None = None
         camera = [c for c in container.channels if c.topic in run.camera]
         self._camera = tuple(replace(c, definition="", definition_format="") for c in camera)
-        self.description = self._describe(path)
-        self._recorded = RecordedPictures(
-            container,
+        self._description = self._describe(path)
+
+    def _pictures(self) -> RecordedPictures:
+        """Return the pictures of the camera."""
+        return RecordedPictures(
+            self._container,
             MessageDecoder(self._camera),
             {channel.number: channel for channel in self._camera},
             frozenset(c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]),
             lambda stamp_ns, message: time_beside(stamp_ns, message.log_ns, self._offset_ns),
             self._offset_ns,
         )
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Records left out on opening and in the latest reading, by reason."""
-        return {**self._container.damage, **self._losses}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records in the order of arrival; messages before `start_ns` are not decoded."""
@@ -400,10 +399,6 @@ class LiveRecording:
             yield from reader.add(message)
         yield from reader.finish()
 
-    def truth(self) -> Truth | None:
-        """Return None: the ground truth of a live run is unknown."""
-        return None
-
     def camera(self) -> tuple[Camera | None, str]:
         """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
         if self._found_camera is None:  # needed for each picture
@@ -414,22 +409,6 @@ class LiveRecording:
                     self._container, MessageDecoder(()), pictures[0], self._base
                 )
         return self._found_camera
-
-    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time, None when none is within `within_ns` of it."""
-        return self._recorded.near(stamp_ns, within_ns)
-
-    def picture_stamps(self) -> list[int]:
-        """Return the times of the pictures, ascending [ns]."""
-        return self._recorded.stamps()
-
-    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `picture_stamps`, each once."""
-        return self._recorded.at(wanted_ns)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._container.close()
 
     def _reader(self) -> ArrivalReader:
         return ArrivalReader(self._uri, KIND, self._channels, self._options)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -13,7 +13,7 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture, RecordedPictures, find_camera
+from pipeline.io.readers.camera import Camera, MessageSource, RecordedPictures, find_camera
 from pipeline.io.readers.container import Channel, Container, Message, plain_message
 from pipeline.io.readers.frame_alignment import FrameAlignments
 from pipeline.io.readers.message_time import WINDOW_NS, Clock, Stamped, by_stamp, header_stamp
@@ -30,7 +30,7 @@ from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
 _TRIES = 20
 
 
-class RosSource:
+class RosSource(MessageSource):
     """Source of records from ROS messages, in a recording or live.
 
     Args:
@@ -58,7 +58,8 @@ class RosSource:
         *,
         live: bool = False,
     ) -> None:
-        self._uri, self._container = uri, container
+        super().__init__(container)
+        self._uri = uri
         channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
         decoder = MessageDecoder(channels.values())
         self._channels, self._decoder = channels, decoder
@@ -66,7 +67,6 @@ class RosSource:
         self._extrinsics = Extrinsics(container, decoder)
         self._extrinsics.read(self._topics.fixed, self._topics.moving)
         self._records = RecordDecoder(channels, decoder, self._extrinsics.tree)
-        self._losses: dict[str, int] = {}
         self._warnings: list[str] = []
         self._camera: tuple[Camera | None, str] | None = None
         named = [t for t in (self._topics.scan, self._topics.odometry, self._topics.imu) if t is not None]
@@ -84,19 +84,6 @@ class RosSource:
         self._alignments = FrameAlignments(container, self._records, self._topics, odometry, self._times_of)
         self._description = self._alignments.begin(self._description, live=live)
         self.notices = self._alignments.notices
-
-    @property
-    def description(self) -> SourceDescription:
-        """Description that is known before reading."""
-        return self._description
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Records left out on opening and in the latest reading, by reason."""
-        total = dict(self._container.damage)
-        for reason, count in self._losses.items():
-            count_loss(total, reason, count)
-        return total
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records in the order of time; messages before `start_ns` are not decoded."""
@@ -140,26 +127,10 @@ class RosSource:
             )
         return self._camera
 
-    def picture_stamps(self) -> list[int]:
-        """Return the times of the pictures, ascending [ns]."""
-        return self._pictures().stamps()
-
-    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `picture_stamps`, each once."""
-        return self._pictures().at(wanted_ns)
-
-    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time, None when none is within `within_ns` of it."""
-        return self._pictures().near(stamp_ns, within_ns)
-
     @property
     def base(self) -> str:
         """Name of the base frame, "" when it is unknown."""
         return self._records.base
-
-    def close(self) -> None:
-        """Close the recording."""
-        self._container.close()
 
     # --- reading ---------------------------------------------------------------------------------
 

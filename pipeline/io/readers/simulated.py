@@ -7,7 +7,7 @@ from pathlib import Path
 from urllib.parse import urlencode
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.base import SourceDescription, SourceOptions
+from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions
 from pipeline.simulation.motion_sensors import IMU_HZ, ODOMETRY_HZ
 from pipeline.simulation.run import START_NS, SimulatedRun, open_run
 from pipeline.simulation.scenarios import CLOUD, SCHEME, RunRequest, parse_uri, scenarios
@@ -18,7 +18,7 @@ __all__ = ["SimulatedSource", "open_simulated", "scenarios"]
 _TICK_NS = 1_000_000_000 // IMU_HZ
 
 
-class SimulatedSource:
+class SimulatedSource(FileSource):
     """A simulated run as a source (see `pipeline.io.readers.base.Source`)."""
 
     def __init__(
@@ -30,10 +30,11 @@ class SimulatedSource:
         kind: str = "simulated run",
         warnings: tuple[str, ...] = (),
     ) -> None:
+        super().__init__()
         self.run = run
         self._knows_trees = knows_trees
         last = START_NS + (run.scans - 1) * run.lidar.period_ns
-        self.description = SourceDescription(
+        self._description = SourceDescription(
             uri=uri,
             kind=kind,
             sensor=run.lidar.sensor,
@@ -46,7 +47,6 @@ class SimulatedSource:
             digest=run.digest(),
             warnings=warnings,
         )
-        self.losses: dict[str, int] = {}
 
     def records(self, start_ns: int | None = None, *, every: int = 1) -> Iterator[Record]:
         """Yield all records in the order of time; with equal times IMU, odometry, scan.
@@ -72,9 +72,6 @@ class SimulatedSource:
         """Return the trees and other objects, and the true path."""
         trees = self.run.true_trees() if self._knows_trees else None
         return Truth(trees=trees, path=self.run.true_path())
-
-    def close(self) -> None:
-        """Nothing is held open."""
 
 
 def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedSource:

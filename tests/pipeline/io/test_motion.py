@@ -34,7 +34,7 @@ class NoWheels(SimulatedSource):
 
     def __init__(self, inner: SimulatedSource) -> None:
         super().__init__(URI, inner.run)
-        self.description = replace(self.description, has_odometry=False)
+        self._description = replace(self.description, has_odometry=False)
 
     def records(self, start_ns: int | None = None, *, every: int = 1) -> Iterator[Record]:
         return (r for r in super().records(start_ns, every=every) if not isinstance(r, Odometry))
