@@ -26,11 +26,11 @@ from app.robot.address import ROOT, ZenohAddress
 from app.robot.inbox import Inbox
 from app.robot.zenoh import ZenohLink
 from app.web.app import guarded
-from app.web.auth import new_token, role_of, viewer_token
+from app.web.auth import role_of
 from app.web.responses import error_reply
 from app.web.routes.page import access, lead_on, page_answer, page_file, page_folder
 from app.web.routes.sockets import telling
-from app.web.serving import LinkedServer, bind, link_of, uvicorn_config
+from app.web.serving import run_server
 from app.worker.numba_warmup import PATIENCE_S
 from app.worker.protocol import Open
 
@@ -226,7 +226,7 @@ def robot_page(request: Request, name: str) -> Response:
         return error_reply(404, "there is no such robot", where=name[:200])
     if not member.answers:
         remedy = (
-            "The terminal shows why" if member.ended else "Try again in a moment; its card shows how it goes"
+            "The terminal shows why" if member.ended else "Try again in a moment; its card shows the state"
         )
         return error_reply(503, "its dashboard does not answer", where=name[:200], remedy=remedy)
     return lead_on(request, member.port)
@@ -243,7 +243,7 @@ async def fleet_live(browser: WebSocket) -> None:
         await browser.accept()
         async with telling(browser, fleet.live):
             if (await browser.receive())["type"] != "websocket.disconnect":
-                await browser.close(_REFUSED, "nothing is taken here")
+                await browser.close(_REFUSED, "messages are not accepted here")
 
 
 def serve_fleet(
@@ -268,13 +268,8 @@ def serve_fleet(
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
     """
-    listening = bind(settings)
-    port = listening.getsockname()[1]
-    token = settings.token or new_token()
-    if viewer:
-        print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
 
-    async def served() -> bool:
+    def make_app(port: int, token: str) -> FastAPI:
         fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warm_kernels)
         for name, source in sources.items():
             fleet.add(name, source)
@@ -283,12 +278,6 @@ def serve_fleet(
             address, source = watched
             there = address.mapped_there
             watching = RemoteRobots(fleet, address.uri) if there else RobotWatch(fleet, address, source)
-        app = build_fleet(settings, port=port, token=token, fleet=fleet, watching=watching)
-        server = LinkedServer(
-            uvicorn_config(app, settings), settings, link_of(settings, port, token), open_browser=open_browser
-        )
-        await server.serve(sockets=[listening])
-        return server.started
+        return build_fleet(settings, port=port, token=token, fleet=fleet, watching=watching)
 
-    with contextlib.closing(listening):
-        return 0 if asyncio.run(served()) else 1
+    return run_server(settings, make_app, open_browser=open_browser, viewer=viewer)

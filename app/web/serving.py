@@ -12,7 +12,7 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import uvicorn
@@ -62,7 +62,7 @@ _PORTS_TRIED = 10
 _SEND_BUFFER = 128 * 1024
 _GRACE_S = 1
 _OF_THE_PORT = (errno.EADDRINUSE, errno.EACCES)
-_OTHER_HOST = "Give an address of this machine with --host, or leave it away"
+_OTHER_HOST = "Give an address of this machine with --host, or omit it"
 
 
 def serve(
@@ -85,17 +85,48 @@ def serve(
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
     """
+    return run_server(
+        settings,
+        lambda port, token: build(
+            settings, port=port, token=token, source=source, parameter_state=parameter_state
+        ),
+        open_browser=open_browser,
+        viewer=viewer,
+    )
+
+
+def run_server(
+    settings: Settings,
+    make_app: Callable[[int, str], ASGIApp],
+    *,
+    open_browser: bool,
+    viewer: bool,
+) -> int:
+    """Serve an application until SIGINT or SIGTERM; return the exit code.
+
+    Args:
+        settings: Settings of the deployment.
+        make_app: Called on the event loop with port and token; returns the application.
+        open_browser: Whether to open the page in the browser of this machine.
+        viewer: Whether to print the view-only link.
+
+    Raises:
+        StemmapError: The port is in use, or the address is not an address of this machine.
+    """
     listening = bind(settings)
     port = listening.getsockname()[1]
     token = settings.token or new_token()
-    app = build(settings, port=port, token=token, source=source, parameter_state=parameter_state)
-    link = link_of(settings, port, token)
     if viewer:
         print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
-    server = LinkedServer(uvicorn_config(app, settings), settings, link, open_browser=open_browser)
+
+    async def served() -> bool:
+        config, link = uvicorn_config(make_app(port, token), settings), link_of(settings, port, token)
+        server = LinkedServer(config, settings, link, open_browser=open_browser)
+        await server.serve(sockets=[listening])
+        return server.started
+
     with contextlib.closing(listening):
-        asyncio.run(server.serve(sockets=[listening]))
-    return 0 if server.started else 1
+        return 0 if asyncio.run(served()) else 1
 
 
 def link_of(settings: Settings, port: int, token: str) -> str:

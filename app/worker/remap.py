@@ -239,7 +239,7 @@ class Snapshots(Generic[S]):
         return best, self._states[best]
 
     def forget_after(self, scans: int) -> None:
-        """Drop the states with more scans."""
+        """Drop the states that contain more than this number of scans."""
         self._states = {n: s for n, s in self._states.items() if n <= scans}
 
 

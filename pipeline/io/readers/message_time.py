@@ -120,7 +120,13 @@ class ClockStepFilter(Clock):
         return stamp_ns + known.shift_ns
 
     def _first_of(self, offset_ns: int, stamp_ns: int) -> _ChannelClock | None:
-        """Return the state of a new channel, with the correction of the channel that has the same clock."""
+        """Return the state of a channel that is seen for the first time, with the correction of the channel
+        that has the same clock; None if its stamp is impossible.
+
+        Args:
+            offset_ns: Stamp minus arrival of its first message [ns].
+            stamp_ns: Stamp of this message [ns].
+        """
         if not self._channels:
             return _ChannelClock(offset_ns, stamp_ns, 0, 0)
         nearest = min(self._channels.values(), key=lambda known: abs(known.offset_ns - offset_ns))

@@ -91,7 +91,13 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
 
 
 def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> SimulatedSource:
-    """Open a drive through the real cloud of a plot."""
+    """Open a drive through the real cloud of a plot.
+
+    Args:
+        uri: As the user wrote it.
+        request: Scenario and options of the URI.
+        options: Choices of the user.
+    """
     from pipeline.io.ground_truth import read_truth_trees
     from pipeline.io.readers.clouds import open_cloud
     from pipeline.simulation.cloud_run import open_cloud_run
