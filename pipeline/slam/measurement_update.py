@@ -7,14 +7,14 @@ import numpy as np
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.candidate_pairs import room_for
-from pipeline.slam.motion import Wheels, moved_pose, moved_poses, weighted_pose
+from pipeline.slam.motion import OdometryTrust, moved_pose, moved_poses, weighted_pose
 from pipeline.slam.particle_maps import ROOM, Maps, blocks_in_reach, known_near, with_room
 from pipeline.slam.particle_update import Rules, near_for, observe, predict
 from pipeline.slam.resampling import normalised
 from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
-from pipeline.slam.scan_statistics import TOLD, mean_told
-from pipeline.slam.shared_errors import Measured
-from pipeline.slam.slip_detection import SEARCH, ByTrees, motion_by_trees
+from pipeline.slam.scan_statistics import STATISTICS, mean_statistics
+from pipeline.slam.shared_errors import MeasuredPose
+from pipeline.slam.slip_detection import SEARCH, TreeMotion, motion_by_trees
 from pipeline.types.records import Int
 
 
@@ -26,20 +26,20 @@ def against_slip(
     motion: Float,
     motion_covariance: Float,
     driven: float,
-    wheels: Wheels,
+    wheels: OdometryTrust,
     centre: Float,
     R: Float,
     rules: Rules,
-) -> ByTrees:
+) -> TreeMotion:
     """What the scan tells of the motion by the map of the best particle: see `slip.motion_by_trees`.
 
     Args:
         pose: shape (P, 3) before the motion; maps: of the particles; best: which one is asked.
         motion, motion_covariance, centre, R, rules: See `particle_update.observe`.
-        driven, wheels: How far the odometry may be wrong, see away_from_trees.
+        driven, wheels: How far the odometry may be wrong, see drift_variances.
     """
     if centre.shape[0] < FEWEST_PAIRS:
-        return ByTrees(False, motion.copy(), motion_covariance.copy(), False)
+        return TreeMotion(False, motion.copy(), motion_covariance.copy(), False)
     at = moved_pose(pose[best], motion)
     known, spread, hits = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
     return motion_by_trees(
@@ -61,13 +61,13 @@ def use_scan(
     clear_range: Float,
     first_birth: int,
     rules: Rules,
-    measured: Measured,
+    measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, float, Int]:
     """Update every particle in place; the arguments are those of `particle_update.observe`.
 
     Returns:
-        The maps, in which room was made; the weights, shape (P,); what `mean_told` gives; and the births of
-        the associated landmarks, shape (P, D).
+        The maps, in which room was made; the weights, shape (P,); what `mean_statistics` gives; and the
+        births of the associated landmarks, shape (P, D).
     """
     found = centre.shape[0]
     reach = 0.0
@@ -79,7 +79,7 @@ def use_scan(
     maps = with_room(maps, found, rows)
     landmarks = lengths.max() * ROOM + found
     near, room = near_for(landmarks), room_for(found, landmarks)
-    told = np.zeros((pose.shape[0], TOLD))
+    told = np.zeros((pose.shape[0], STATISTICS))
     births = np.empty((pose.shape[0], found), np.int64)
     observe(
         pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
@@ -88,7 +88,7 @@ def use_scan(
     )  # fmt: skip
     log_weight -= log_weight.max()
     weights = normalised(log_weight)
-    mean, odometry = mean_told(told, weights, motion_covariance)
+    mean, odometry = mean_statistics(told, weights, motion_covariance)
     return maps, weights, mean, odometry, births
 
 

@@ -17,7 +17,7 @@ from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.particle_maps import ROOM, Maps, own_block, widen
 from pipeline.slam.proposal import recognise
 from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT
-from pipeline.slam.shared_errors import Measured, corrected_by, learn_shared
+from pipeline.slam.shared_errors import MeasuredPose, correct_by_measured, update_shared_errors
 from pipeline.types.records import Bool, Float32, Int, Int32
 
 SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
@@ -132,7 +132,7 @@ def observe(
     near: Near,
     room: Room,
     told: Float,
-    measured: Measured,
+    measured: MeasuredPose,
     births: Int,
     mu: Float,
     P: Float,
@@ -149,7 +149,7 @@ def observe(
         reach: Landmarks farther than this are left alone [m].
         first_birth: Serial number of the first of the detections.
         near, room: Memory for the landmarks in reach and for pairs.
-        told: shape (P, TOLD), filled: what each particle tells of the scan (see health).
+        told: shape (P, STATISTICS), filled: what each particle tells of the scan (see health).
         measured: The pose by another source; what its poses err by alike is learned.
         births: shape (P, D), filled: birth of the landmark that each particle associates with each detection.
         mu, P: Memory for a pose, shape (3,), and its covariance, shape (3, 3), zeros.
@@ -163,7 +163,7 @@ def observe(
         if rules.use_proposal:
             _turned_covariance(motion_covariance, before_c, before_s, P)
         if measured.z.shape[0] > 0:
-            log_weight[p] += corrected_by(mu, P, measured, p)
+            log_weight[p] += correct_by_measured(mu, P, measured, p)
         known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
         fill(near.cells, near.mean, known, scale)
         likelihood = recognise(
@@ -176,7 +176,7 @@ def observe(
         else:
             pose[p, 0], pose[p, 1], pose[p, 2] = mu[0], mu[1], mu[2]
         if measured.mean.shape[0] > 0:
-            learn_shared(pose, measured, p)
+            update_shared_errors(pose, measured, p)
         c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
         all_near = _learn(
             pose, p, c, s, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules

@@ -1,4 +1,5 @@
-"""What one scan tells of the pose: which known trees it shows, and how far off the odometry they lie."""
+"""Statistics of one scan for the quality of the pose: recognised and missed landmarks, and the deviation from
+the odometry."""
 
 from __future__ import annotations
 
@@ -10,22 +11,31 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import wrapped
 
-# What a particle tells of a scan, columns of `told`.
+# Columns of the statistics of a scan by particle; SHIFT is the deviation x, y [m], yaw [rad] from the
+# odometry.
 INNOVATION, RECOGNISED, AMBIGUOUS, FOUND, MISSED, SHIFT = 0, 1, 2, 3, 4, slice(5, 8)
-TOLD = 8
-# Landmarks count by their hits, so that trees begun at a wrong place do not soon outvote the map.
+STATISTICS = 8  # number of columns
+# Maximum hits by which a landmark is weighted. Weighting by hits prevents new landmarks at a wrong pose from
+# outvoting the map soon.
 MOST_HITS = 20.0
 
-SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad
+# m, m, rad; added to the sigmas of the odometry, which are zero while the robot stands.
+SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])
 
 
 @dataclass(frozen=True, slots=True)
-class ScanTold:
-    """What one scan told, mean over the particles; see Health.
+class ScanStatistics:
+    """Statistics of one scan, means over the particles. "Well known" is a landmark with `slam.hits_to_weigh`
+    hits.
 
     Attributes:
-        found, missed: Hits of the well known landmarks that were recognised, and of those in free view
-            that were not.
+        detections: Number of detections.
+        recognised: Number of detections of well-known landmarks.
+        ambiguous: Number of detections with two likely landmarks.
+        found: Hits of the recognised landmarks, each limited to MOST_HITS.
+        missed: Hits of the well-known landmarks in free view that were not detected, limited likewise.
+        innovation: Normalised innovation squared per degree of freedom; NaN without a recognised landmark.
+        odometry: Mahalanobis distance between the motion by SLAM and the odometry [sigma].
     """
 
     detections: int = 0
@@ -37,21 +47,31 @@ class ScanTold:
     odometry: float = 0.0
 
 
-def scan_told(told: Float, weights: Float, detections: int, motion_covariance: Float) -> ScanTold:
-    """The mean of what the particles tell.
+def average_statistics(
+    statistics: Float, weights: Float, detections: int, motion_covariance: Float
+) -> ScanStatistics:
+    """Return the weighted mean of the statistics of all particles.
 
     Args:
-        told: shape (P, TOLD); weights: shape (P,).
-        detections: Their number.
-        motion_covariance: Of the odometry since the scan before, shape (3, 3).
+        statistics: shape (P, STATISTICS).
+        weights: Weights with sum 1, shape (P,).
+        detections: Number of detections.
+        motion_covariance: Covariance of the odometry since the scan before, shape (3, 3).
     """
-    return scan_of(*mean_told(told, weights, motion_covariance), detections)
+    return named_statistics(*mean_statistics(statistics, weights, motion_covariance), detections)
 
 
-def scan_of(mean: Float, odometry: float, detections: int) -> ScanTold:
-    """What `mean_told` gives, by name."""
+def named_statistics(mean: Float, odometry: float, detections: int) -> ScanStatistics:
+    """Return the results of `mean_statistics` as a record. The innovation becomes NaN below 0.5 recognised
+    landmarks.
+
+    Args:
+        mean: Mean columns, shape (STATISTICS,).
+        odometry: Deviation from the odometry [sigma].
+        detections: Number of detections.
+    """
     recognised = float(mean[RECOGNISED])
-    return ScanTold(
+    return ScanStatistics(
         detections=detections,
         recognised=recognised,
         ambiguous=float(mean[AMBIGUOUS]),
@@ -63,18 +83,27 @@ def scan_of(mean: Float, odometry: float, detections: int) -> ScanTold:
 
 
 @compiled
-def mean_told(told: Float, weights: Float, motion_covariance: Float) -> tuple[Float, float]:
-    """The mean of what the particles tell, shape (TOLD,), and how far it lies from the odometry [sigma]."""
-    mean = np.zeros(TOLD)
-    for p in range(told.shape[0]):
-        for i in range(TOLD):
-            mean[i] += weights[p] * told[p, i]
+def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float) -> tuple[Float, float]:
+    """Return the weighted mean of the columns, shape (STATISTICS,), and the Mahalanobis norm of its SHIFT
+    [sigma].
+
+    The arguments are those of `average_statistics`.
+    """
+    mean = np.zeros(STATISTICS)
+    for p in range(statistics.shape[0]):
+        for i in range(STATISTICS):
+            mean[i] += weights[p] * statistics[p, i]
     return mean, np.sqrt(_mahalanobis2(mean[SHIFT], motion_covariance))
 
 
 @compiled
 def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> float:
-    """How far two motions, shape (3,), lie apart [sigma]; covariance: of the odometry's, shape (3, 3)."""
+    """Return the Mahalanobis distance of two motions [sigma].
+
+    Args:
+        by_trees, by_odometry: x, y [m], yaw [rad], shape (3,).
+        covariance: Covariance of the odometry, shape (3, 3); SIGMA_FLOOR squared is added to its diagonal.
+    """
     shift = by_trees - by_odometry
     shift[2] = wrapped(shift[2])
     return float(np.sqrt(_mahalanobis2(shift, covariance)))
@@ -82,8 +111,8 @@ def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> floa
 
 @compiled
 def _mahalanobis2(shift: Float, covariance: Float) -> float:
-    """d^T P^-1 d of three numbers by elimination; P has no less than the floor on its diagonal, for an
-    odometry that stands still has no sigma."""
+    """Return d^T (P + F)^-1 d by Gaussian elimination, where F is the diagonal of SIGMA_FLOOR squared, for d
+    = `shift`, shape (3,), and P = `covariance`, shape (3, 3)."""
     P = covariance.copy()
     for i in range(3):
         P[i, i] += SIGMA_FLOOR[i] ** 2
