@@ -72,7 +72,7 @@ def test_pictures_of_a_live_robot_show_the_trees_of_its_map(
         last = made.ask("/api/status")["scan_index"]
         expect(page.locator("#over-camera")).to_have_attribute("data-scan", str(last))
         expect(page.locator("#camera-lead")).to_contain_text(re.compile(r"Trees of the map in view: [1-9]"))
-        expect(page.locator("#camera-told")).to_contain_text(
+        expect(page.locator("#camera-received")).to_contain_text(
             re.compile(r"Live: of \d+ pictures \d+ were taken in")
         )
         made.until("() => document.querySelector('#camera-image').naturalWidth > 100")

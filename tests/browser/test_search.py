@@ -36,7 +36,7 @@ def test_a_search_finds_a_better_set_and_a_stopped_search_is_resumed(dashboard: 
     expect(page.locator("#tune-error")).to_contain_text("must be less than")
     low.fill("0.1")
     page.locator("#search-start").click()
-    status = page.locator("#search-told")
+    status = page.locator("#search-status")
     expect(status).to_be_in_viewport()  # although the button is below a long form
     expect(status).to_contain_text("Best of 5 trials", timeout=120_000)
     expect(page.locator("#search-drawn .trial")).to_have_count(5)

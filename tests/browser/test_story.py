@@ -28,7 +28,7 @@ def test_the_story_of_a_selected_tree_is_updated_while_the_run_plays(dashboard: 
         expect(panel.locator(".story-fit .list")).to_contain_text(f"{100 * story['dbh']:#.3g} ±")
     assert len(story["history"]["x"]) > 5
     assert panel.locator("ellipse.sigma").count() >= 3
-    expect(panel.locator(".told > div").first).to_be_visible()
+    expect(panel.locator(".influence > div").first).to_be_visible()
     before = int(panel.get_attribute("data-scan") or -1)
     page.get_by_role("button", name="Play", exact=True).click()
     dashboard.until("was => Number(document.querySelector('#panel-story').dataset.scan) > was + 5", before)

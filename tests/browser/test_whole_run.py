@@ -55,7 +55,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     dashboard.stand()
     dashboard.tab("Tune")
     page = dashboard.page
-    told = page.locator("#tune-whole-told")
+    told = page.locator("#tune-whole-status")
     expect(page.locator("#tune-whole")).to_be_checked()
     known = trees(dashboard)
     assert known > 3
@@ -106,7 +106,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     dashboard.tab("Trees")
     assert page.evaluate(f"{STATE} state.ghost)") is None
     page.evaluate(ANEW)
-    expect(page.locator("[data-figure=trees]")).to_have_class(re.compile("anew"))
+    expect(page.locator("[data-figure=trees]")).to_have_class(re.compile("remapping"))
     expect(page.locator("[data-figure=trees] dt")).to_have_text("trees; re-mapping, 43 %")
     assert dashboard.errors == []
 
@@ -125,7 +125,7 @@ def test_a_change_can_apply_from_the_current_scan_onwards(dashboard: Dashboard):
         dashboard.until_server("/api/parameters", "it.changed.length === 1")
         dashboard.until_server("/api/status", "it.revision > 0 && it.remapped === null")
         assert trees(dashboard) == known
-        expect(page.locator("#tune-whole-told")).to_contain_text("from the current scan onwards")
+        expect(page.locator("#tune-whole-status")).to_contain_text("from the current scan onwards")
     finally:
         page.locator("#tune-whole").check()
         dashboard.until_server("/api/parameters", "it.whole === true")

@@ -64,7 +64,7 @@ function freeEndText(share) {
 
 function influence(features) {
   const most = Math.max(...features.map(({ effect }) => Math.abs(effect)), 0.01);
-  return el("div", { class: "told" }, el("p", { class: "dim", text: "Most influential features: votes for a tree that each one adds or removes" }),
+  return el("div", { class: "influence" }, el("p", { class: "dim", text: "Most influential features: votes for a tree that each one adds or removes" }),
     ...features.map(({ figure: name, value, effect }) => el("div", { title: hint(name) },
       el("span", { text: name }), el("span", { class: "value", text: figure(value) }),
       el("span", { class: "effect" }, el("i", { class: effect < 0 ? "against" : "for", style: { width: `${(50 * Math.abs(effect)) / most}%` } })),

@@ -67,14 +67,14 @@ async function send(file, done) {
   }
   const made = box();
   const bar = el("progress", { max: file.size, value: 0, "aria-label": "Progress of the upload" });
-  const told = el("span", { class: "dim", text: "" });
+  const note = el("span", { class: "dim", text: "" });
   const request = new XMLHttpRequest();
-  made.append(el("p", { text: `Uploading ${file.name}` }), bar, el("div", { class: "row" }, told,
+  made.append(el("p", { text: `Uploading ${file.name}` }), bar, el("div", { class: "row" }, note,
     el("button", { type: "button", class: "small", text: "Cancel", onclick: () => request.abort() })));
   sending = request;
   request.upload.onprogress = ({ loaded }) => {
     bar.value = loaded;
-    setText(told, loaded < file.size ? `${size(loaded)} of ${size(file.size)}` : "Detecting the format …");
+    setText(note, loaded < file.size ? `${size(loaded)} of ${size(file.size)}` : "Detecting the format …");
   };
   request.onloadend = () => { sending = null; finish(request, file, made, done); };
   request.open("POST", `/api/uploads?name=${encodeURIComponent(file.name)}`);

@@ -59,7 +59,7 @@ function empty(message) {
   byId("camera-frame").hidden = true;
   byId("over-camera").dataset.scan = "";
   setText(byId("camera-lead"), "");
-  setText(byId("camera-told"), "");
+  setText(byId("camera-received"), "");
   setText(byId("camera-empty"), capital(message));
   byId("camera-empty").hidden = false;
 }
@@ -74,7 +74,7 @@ function draw() {
   const trees = marks.filter(({ kind }) => kind === "tree").length;
   setText(byId("camera-lead"), seen.why ? `Scan ${seen.index}${late}. No marks: ${seen.why}.`
     : `Scan ${seen.index}${late}. Trees of the map in view: ${trees}; clusters: ${marks.length - trees}. Click one for its story.`);
-  setText(byId("camera-told"), seen.received && `Live: ${seen.received}.`);
+  setText(byId("camera-received"), seen.received && `Live: ${seen.received}.`);
   byId("over-camera").dataset.scan = String(seen.index);
   choose();
 }

@@ -26,9 +26,9 @@ let data = null;
 function build() {
   byId("stages-grid").replaceChildren(...Object.entries(STAGES).map(([name, [letter, title]]) => {
     const canvas = el("canvas", { tabindex: "0", role: "img", "aria-label": title });
-    const told = el("b");
-    pictures[name] = { picture: new PointPicture(canvas, eye, redraw), told, canvas };
-    return el("figure", { "data-stage": name }, canvas, el("figcaption", {}, el("i", { text: letter }), ` ${title} `, told));
+    const caption = el("b");
+    pictures[name] = { picture: new PointPicture(canvas, eye, redraw), caption, canvas };
+    return el("figure", { "data-stage": name }, canvas, el("figcaption", {}, el("i", { text: letter }), ` ${title} `, caption));
   }));
   new ResizeObserver(redraw).observe(byId("stages-grid"));
 }
@@ -50,9 +50,9 @@ function draw() {
     if (!trees[k]) c.picture.letter(x, y, z, verdictOf(data.clusters.verdict[k])[0], colour("text"), colour("ground"));
   }
   for (const { picture } of Object.values(pictures)) picture.robot(colour("robot"));
-  for (const [name, { told, canvas }] of Object.entries(pictures)) {
+  for (const [name, { caption, canvas }] of Object.entries(pictures)) {
     const [, title, text] = STAGES[name];
-    setText(told, text(data));
+    setText(caption, text(data));
     canvas.setAttribute("aria-label", `${title}: ${text(data)}`);
   }
 }

@@ -27,7 +27,7 @@ const cells = {};
 
 // During a re-mapping the shown map is the one before.
 function remapping({ remapped }) {
-  return remapped === null || remapped === undefined ? [] : ["anew", `trees; re-mapping, ${Math.floor(100 * remapped)} %`];
+  return remapped === null || remapped === undefined ? [] : ["remapping", `trees; re-mapping, ${Math.floor(100 * remapped)} %`];
 }
 
 // Time between two scans [ms]; slower mapping falls behind.

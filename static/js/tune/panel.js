@@ -55,10 +55,10 @@ function build() {
 function stageOf(stage) {
   const specs = tuning.specs.filter((spec) => spec.stage === stage);
   for (const spec of specs) rows.set(spec.name, rowOf(spec, ...(spec.kind === "name" ? [] : [sensitivityButton(spec)])));
-  const told = el("small");
-  const group = el("details", { "data-stage": stage }, el("summary", {}, stage, told), ...specs.map(({ name }) => rows.get(name).node));
+  const changedCount = el("small");
+  const group = el("details", { "data-stage": stage }, el("summary", {}, stage, changedCount), ...specs.map(({ name }) => rows.get(name).node));
   group.open = OPEN_FIRST.includes(stage);
-  groups.set(stage, { group, told, specs, open: group.open });
+  groups.set(stage, { group, changedCount, specs, open: group.open });
   group.addEventListener("toggle", () => { if (!sifting()) groups.get(stage).open = group.open; });
   return group;
 }
@@ -95,9 +95,9 @@ function show() {
   if (!rows.size || !state.parameters) return;
   const { changed, preset, undo: steps, redo: undone } = state.parameters;
   for (const [name, row] of rows) row.show(presetValues[name] ?? specOf(name)?.default);
-  for (const { told, specs } of groups.values()) {
+  for (const { changedCount, specs } of groups.values()) {
     const number = specs.filter(({ name }) => changed.includes(name)).length;
-    setText(told, number ? ` ● ${number} changed` : "");
+    setText(changedCount, number ? ` ● ${number} changed` : "");
   }
   byId("tune-undo").disabled = !steps;
   byId("tune-redo").disabled = !undone;
@@ -111,14 +111,14 @@ function show() {
 function showSets() {
   const list = byId("tune-set");
   const inForce = state.parameters.set || (state.parameters.changed.length ? "" : state.parameters.preset);
-  const told = [...tuning.presets.map(({ name, doc }) => [name, doc]), ...savedSets().map(({ name, who }) => [name, who])];
-  const key = JSON.stringify([told, state.parameters.preset]);
+  const choices = [...tuning.presets.map(({ name, doc }) => [name, doc]), ...savedSets().map(({ name, who }) => [name, who])];
+  const key = JSON.stringify([choices, state.parameters.preset]);
   if (list.dataset.shown !== key) {
     list.dataset.shown = key;
     const option = ([name, title]) => el("option", { value: name, text: name, title });
     list.replaceChildren(el("option", { value: "", text: `${state.parameters.preset}, changed`, hidden: true }),
-      el("optgroup", { label: "Presets" }, ...told.slice(0, tuning.presets.length).map(option)),
-      ...(savedSets().length ? [el("optgroup", { label: "Saved sets" }, ...told.slice(tuning.presets.length).map(option))] : []));
+      el("optgroup", { label: "Presets" }, ...choices.slice(0, tuning.presets.length).map(option)),
+      ...(savedSets().length ? [el("optgroup", { label: "Saved sets" }, ...choices.slice(tuning.presets.length).map(option))] : []));
   }
   if (list.value !== inForce) list.value = inForce;
   byId("tune-delete").hidden = !state.parameters.set;

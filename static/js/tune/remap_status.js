@@ -10,17 +10,17 @@ import { attempt, isTuning } from "./parameters.js";
 const MOST = 30; // lines of the list
 const FOLDED_FROM = 9; // lines; a longer list would push the sliders out of view
 const SIGNS = { appeared: "+", vanished: "−", moved: "→" };
-let begun = null; // {share, at, left, told}: start of the re-mapping, and the estimate of the time left [s]
+let begun = null; // {share, at, left, estimatedAt}: start of the re-mapping, and the estimate of the time left [s]
 let known = 0; // lines of the list
 const progress = el("progress", { id: "tune-progress", max: "1", hidden: true, "aria-label": "Progress of the re-mapping" });
-const told = el("p", { id: "tune-whole-told", class: "note dim", role: "status" });
+const note = el("p", { id: "tune-whole-status", class: "note dim", role: "status" });
 const list = el("ul", { id: "tune-changes" });
 const folded = el("summary");
 const all = el("details", { id: "tune-changes-all" }, folded, list);
 const box = el("input", { id: "tune-whole", type: "checkbox", onchange: () => attempt(() => put("/api/parameters/reach", { whole: box.checked })) });
 export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The whole run" },
   el("label", { title: "On: each change re-maps the run from its first scan, so that the map and its scores follow. Off: changes apply from the current scan onwards" }, box, " re-map the whole run"),
-  progress, told, all);
+  progress, note, all);
 
 // Trees that remain under another number, as [before, now].
 const renumbered = ({ renamed }) => renamed.filter(([before, now]) => before !== now);
@@ -46,12 +46,12 @@ const SMOOTH = 0.15; // weight of the newest estimate
 // The estimated time left as text; empty while there is no estimate.
 function left(share) {
   const now = performance.now() / 1000;
-  if (!begun || share < begun.share) begun = { share, at: now, left: null, told: now };
+  if (!begun || share < begun.share) begun = { share, at: now, left: null, estimatedAt: now };
   const spent = now - begun.at;
   if (spent < FIRST || share - begun.share < 0.02) return "";
   const guess = (spent * (1 - share)) / (share - begun.share);
-  const before = begun.left === null ? guess : Math.max(begun.left - (now - begun.told), 0);
-  Object.assign(begun, { left: before + SMOOTH * (guess - before), told: now });
+  const before = begun.left === null ? guess : Math.max(begun.left - (now - begun.estimatedAt), 0);
+  Object.assign(begun, { left: before + SMOOTH * (guess - before), estimatedAt: now });
   return `, exact result in about ${roughly(begun.left)}`;
 }
 
@@ -75,8 +75,8 @@ function show() {
     state.ghost = ghost;
     changed("ghost");
   }
-  if (share !== null) setText(told, progressText(share, preview));
-  else setText(told, newest ? resultText(newest) : box.checked ? "Changes apply to the whole run: map, trees and scores follow." : "Changes apply from the current scan onwards.");
+  if (share !== null) setText(note, progressText(share, preview));
+  else setText(note, newest ? resultText(newest) : box.checked ? "Changes apply to the whole run: map, trees and scores follow." : "Changes apply from the current scan onwards.");
 }
 
 const lineOf = (kind, sign, node, why) => el("li", { "data-kind": kind }, el("b", { text: sign, "aria-hidden": "true" }), node, el("small", { text: why }));

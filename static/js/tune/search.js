@@ -65,7 +65,7 @@ const form = el("form", { id: "search-form", hidden: true, onsubmit: start },
   el("label", { class: "search-goal" }, "Goal ", goal), el("div", { class: "search-names dim", "aria-hidden": "true" }, ...["Searched over", "from", "to", ""].map((text) => el("span", { text }))), list, more, otherRuns,
   el("div", { class: "search-limits" }, number("search-trials", "Trials", 200, 5000), number("search-minutes", "Time limit [min]", 10, 1440)),
   el("div", { class: "search-buttons" }, el("button", { id: "search-start", class: "small primary", text: "Search" }), button("search-cancel", "Cancel", "Close without a search", () => openForm(false))));
-const told = el("p", { id: "search-told", class: "note", role: "status" });
+const statusNote = el("p", { id: "search-status", class: "note", role: "status" });
 const failed = el("p", { id: "search-error", class: "error", role: "alert", hidden: true });
 const progress = el("progress", { id: "search-progress", max: "1", hidden: true, "aria-label": "Trials done" });
 const warning = el("p", { id: "search-warning", class: "note", hidden: true });
@@ -78,7 +78,7 @@ const again = button("search-again", "Search again …", "Another search", () =>
 const name = el("input", { id: "search-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the found set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && (naming.hidden = true) });
 const naming = el("form", { id: "search-name-form", class: "search-buttons", hidden: true, onsubmit: saveFound }, name, el("button", { class: "small primary", text: "Save" }));
 const changes = el("ul", { id: "search-changes", "aria-label": "Found values" });
-const outcome = el("div", { id: "search-outcome", hidden: true }, told, failed, progress, drawn, warning, changes, el("div", { class: "search-buttons" }, stop, use, save, goOn, again), naming);
+const outcome = el("div", { id: "search-outcome", hidden: true }, statusNote, failed, progress, drawn, warning, changes, el("div", { class: "search-buttons" }, stop, use, save, goOn, again), naming);
 export const searchPart = el("section", { id: "tune-search", "aria-label": "Search for parameters" }, opener, form, outcome);
 
 async function openForm(open) {
@@ -156,9 +156,9 @@ function show() {
   outcome.hidden = !search || !form.hidden;
   if (!search) return;
   failed.hidden = search.state !== "failed";
-  told.hidden = search.state === "failed";
+  statusNote.hidden = search.state === "failed";
   setText(failed, search.error ?? "");
-  setText(told, progressText(search));
+  setText(statusNote, progressText(search));
   progress.hidden = !working;
   if (search.wanted && search.state !== "looking") progress.value = search.made / search.wanted;
   else progress.removeAttribute("value");

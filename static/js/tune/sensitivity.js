@@ -22,14 +22,14 @@ const MEASURES = {
   rmse: { words: "position error, cm", of: (point) => point.position_rmse_m === null ? null : 100 * point.position_rmse_m },
   pairs: { words: "pair error, %", of: (point) => point.mean_pair_error_percent },
 };
-const told = el("p", { class: "note dim", role: "status" });
+const note = el("p", { class: "note dim", role: "status" });
 const plot = el("div", { class: "sensitivity-plot" });
 const choice = el("select", { "aria-label": "Quantity of the curve", class: "small", onchange: draw }, ...Object.entries(MEASURES).map(([name, { words }]) => el("option", { value: name, text: words })));
 const best = el("button", { class: "small", type: "button", hidden: true });
 const again = el("button", { class: "small", type: "button", text: "Update", title: "Compute it again with the present values", onclick: () => requestSensitivity(specOf(state.sensitivity.name)) });
 const close = el("button", { class: "small", type: "button", text: "Close", onclick: () => attempt(() => remove("/api/sensitivity")) });
 const section = el("section", { class: "sensitivity", "aria-label": "Sensitivity" },
-  el("div", { class: "sensitivity-head" }, choice, best, el("span", { class: "grow" }), again, close), plot, told);
+  el("div", { class: "sensitivity-head" }, choice, best, el("span", { class: "grow" }), again, close), plot, note);
 
 // Values in the order of computation: present value, default, both ends, then the middles of the largest gaps.
 function valuesOf(spec, present) {
@@ -148,7 +148,7 @@ function tell(asked, spec, points, measure) {
     : flat ? [`${measure.words} does not depend on this parameter.`] : ["Click on the curve to set the value."];
   if (failed.length) parts.push(`${shown(failed[0].value, spec)}: ${failed[0].error}${failed.length > 1 ? `, and ${failed.length - 1} more` : ""}.`);
   if (stale.length) parts.push(`${stale.slice(0, 2).join(", ")}${stale.length > 2 ? " …" : ""} changed since then.`);
-  setText(told, parts.join(" "));
+  setText(note, parts.join(" "));
 }
 
 export function startSensitivity() {
