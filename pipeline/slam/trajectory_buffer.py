@@ -1,4 +1,4 @@
-"""Buffer for the path of a run, which grows scan by scan."""
+"""A path that grows scan by scan."""
 
 from __future__ import annotations
 
@@ -8,14 +8,8 @@ from pipeline.geometry.poses import Float, Pose2
 from pipeline.types.records import Int, Path
 
 
-class TrajectoryBuffer:
-    """Time, sigma and odometry of each scan; the capacity doubles when it is full.
-
-    Args:
-        stamp_ns: Times of the scans so far [ns], int64, shape (N,); None for none.
-        sigma: Their position sigmas [m], shape (N,).
-        motion: Their steps, shape (N, 3); see `motion`.
-    """
+class GrowingPath:
+    """Stamps, sigmas and the odometry of a path that grows by doubling."""
 
     def __init__(
         self, stamp_ns: Int | None = None, sigma: Float | None = None, motion: Float | None = None
@@ -30,22 +24,21 @@ class TrajectoryBuffer:
 
     @property
     def stamp_ns(self) -> Int:
-        """Times of the scans [ns], int64, shape (N,); a view."""
+        """Of the scans so far."""
         return self._stamp[: self._length]
 
     @property
     def sigma_xy(self) -> Float:
-        """Standard deviations of the positions [m], shape (N,); a view."""
+        """Of the poses so far [m]."""
         return self._sigma[: self._length]
 
     @property
     def motion(self) -> Float:
-        """Steps x, y [m], yaw [rad] by odometry from the scan before to each scan, shape (N, 3); a view."""
+        """x, y [m], yaw [rad] by the odometry to each scan from the one before, shape (N, 3)."""
         return self._motion[: self._length]
 
     def append(self, stamp_ns: int, motion: Pose2) -> None:
-        """Add a scan with its time [ns] and the odometry step to it. Its sigma is undefined until
-        `set_sigma`."""
+        """Add a scan; `set_sigma` follows once its pose is estimated."""
         if self._length == len(self._stamp):
             self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
             self._sigma = np.concatenate([self._sigma, np.zeros_like(self._sigma)])
@@ -55,16 +48,15 @@ class TrajectoryBuffer:
         self._length += 1
 
     def set_sigma(self, covariance: Float) -> None:
-        """Set the sigma of the last scan to sqrt((Cxx + Cyy) / 2), from the covariance C of x, y [m], yaw
-        [rad], shape (3, 3)."""
+        """Set the sigma of the newest pose from the covariance of x, y, yaw, shape (3, 3)."""
         self._sigma[self._length - 1] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
 
     def cut(self, length: int) -> None:
-        """Keep only the first `length` scans."""
+        """Keep the first scans alone."""
         self._length = length
 
     def columns(self, poses: Float) -> Path:
-        """Return the path with poses x, y [m], yaw [rad], shape (N, 3); its arrays are copies."""
+        """With the poses, shape (N, 3): x, y [m], yaw [rad]."""
         n = self._length
         return Path(
             self._stamp[:n].copy(),
