@@ -31,8 +31,8 @@ from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.odometry.gyro import fused
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.slam.motion import noise_of, step_variances
-from pipeline.slam.pose_gate import REFUSED, within_gate
-from pipeline.slam.trajectory_buffer import GrowingPath
+from pipeline.slam.pose_gate import REJECTED, within_gate
+from pipeline.slam.trajectory_buffer import TrajectoryBuffer
 from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
@@ -124,7 +124,7 @@ class Mapper:
         self._terrain = HeightMapper()
         self._tracker = Tracker(parameters.tracking)
         self._relocaliser: Relocaliser[MapperState] = Relocaliser(seed)
-        self._path = GrowingPath()
+        self._path = TrajectoryBuffer()
         self._odometry: Pose2 | None = None
         self._placed = self._closed = 0
         self._last: tuple[Pose2, Float] | None = None
@@ -244,7 +244,7 @@ class Mapper:
             sigma_xy: Standard deviation of each position [m].
             motion: Motion by odometry to each scan, shape (N, 3).
         """
-        self._path = GrowingPath(stamp_ns, sigma_xy, motion)
+        self._path = TrajectoryBuffer(stamp_ns, sigma_xy, motion)
         self.restore(state)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
@@ -282,10 +282,10 @@ class Mapper:
         """The motion without a measured pose that fails its gate, and the warning about it."""
         if self._last is None or motion.measured is None:
             return motion, ()
-        expected = motion._replace(measured=self._slam.as_seen(motion.measured))
+        expected = motion._replace(measured=self._slam.without_shared_error(motion.measured))
         if within_gate(*self._last, expected, noise_of(self._parameters.slam)):
             return motion, ()
-        return motion._replace(measured=None), (REFUSED,)
+        return motion._replace(measured=None), (REJECTED,)
 
     def _update_slam(
         self, index: int, motion: Motion, found: DetectionResult, scan: SegmentedScan
@@ -359,7 +359,7 @@ class Mapper:
         if relocaliser.is_searching:
             run = self._history(estimate)
             return relocaliser.search(index, motion, found.detections, scan.free, p, run)
-        return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_astray else None
+        return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_lost else None
 
     def _check_loop(self, index: int, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
         """The loop that the robot has just closed, if any, or that the graph should be solved."""

@@ -25,7 +25,7 @@ from pipeline.preprocessing.acquisition import acquire
 from pipeline.simulation.run import open_run
 from pipeline.simulation.scenarios import parse_uri
 from pipeline.simulation.street_scenes import simulate_street
-from pipeline.types.records import Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict
+from pipeline.types.records import HIDDEN, Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict
 
 # Numbers of scans after which examples are taken, besides the end: trees are classified from the first scan
 # on.
@@ -92,11 +92,11 @@ def stand_examples(
     """Yield the examples of a simulated run; `furnished` adds objects that are not trees, and only every n-th
     scan is simulated."""
     source = SimulatedSource(uri, open_run(replace(parse_uri(uri), furnished=furnished)))
-    about, truth = source.description, source.run.scene.truth
-    run = steps(source.records(every=every))
+    about, truth = source.description, source.run.true_trees()
+    run, around = steps(source.records(every=every)), about.sensor.rings > 0
     for columns in columns_of(run, about.sensor, about.T_base_lidar, parameters):
         label = label_by_truth(columns.axis, truth)
-        yield Examples(stand_name(uri, furnished), True, True, columns.axis, columns.figures, label)
+        yield Examples(stand_name(uri, furnished), True, around, columns.axis, columns.figures, label)
 
 
 def stand_name(uri: str, furnished: bool) -> str:
@@ -114,6 +114,7 @@ def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
         label[near] = CLASSES.index(_VERDICT_OF_KIND[name])
     to_tree = _distance(axis, place[kind == "tree"])
     label[(to_tree >= SAME) & (to_tree < DOUBT)] = UNKNOWN
+    label[_distance(axis, place[kind == HIDDEN]) < DOUBT] = UNKNOWN
     label[to_tree < SAME] = CLASSES.index(Verdict.TREE)
     return label
 

@@ -1,4 +1,4 @@
-"""The particle whose map and past are shown, and whose pose is told where the particles lie far apart."""
+"""Choice of the best particle, whose map, path and, if the particles are far apart, pose are reported."""
 
 from __future__ import annotations
 
@@ -11,8 +11,15 @@ from pipeline.types.records import Int
 
 @compiled
 def are_apart(pose: Float, weights: Float, distance: float) -> bool:
-    """Whether particles, shape (P, 3), of weights that sum to 1, lie farther from one another than a distance
-    [m] (one sigma)."""
+    """Return whether the weighted position scatter of particles exceeds a distance per axis.
+
+    The criterion is sum_p w_p |p - mean|^2 > 2 distance^2.
+
+    Args:
+        pose: x, y [m], yaw [rad], shape (P, 3).
+        weights: Weights with sum 1, shape (P,).
+        distance: Standard deviation per axis [m].
+    """
     x, y, square = 0.0, 0.0, 0.0
     for p in range(pose.shape[0]):
         x += weights[p] * pose[p, 0]
@@ -23,15 +30,29 @@ def are_apart(pose: Float, weights: Float, distance: float) -> bool:
 
 
 @compiled
-def leader(weights: Float, before: int, pose: Float, distance: float) -> int:
-    """The particle that explains the scans best; the one before it, where the particles lie farther apart
-    than trees are told apart: there they are hypotheses of which each has a map of its own, the weights of a
-    few scans choose another one every time, and what is mapped by one after the other fits none."""
+def select_best(weights: Float, before: int, pose: Float, distance: float) -> int:
+    """Return the row of the best particle: the heaviest one, or the previous one if the particles are apart.
+
+    Particles that are farther apart than trees can be distinguished are hypotheses with different maps. The
+    weights of a few scans would select another hypothesis in each scan, and the mapped trees would agree with
+    none of them.
+
+    Args:
+        weights: Weights with sum 1, shape (P,).
+        before: Row of the previous best particle.
+        pose, distance: See `are_apart`.
+    """
     return before if are_apart(pose, weights, distance) else int(np.argmax(weights))
 
 
 @compiled
-def heir(best: int, ancestors: Int, weights: Float) -> int:
-    """The best particle after resampling: itself, for survivors keep their slot; the one that explained the
-    scans best (which survives) where it has not."""
+def best_after_resampling(best: int, ancestors: Int, weights: Float) -> int:
+    """Return the row of the best particle after resampling: `best` if it survived, else the heaviest
+    particle.
+
+    Args:
+        best: Row before resampling.
+        ancestors: Ancestor of each row; survivors keep their row, so that ancestors[k] == k. Shape (P,).
+        weights: Weights before resampling, shape (P,). The heaviest particle always survives.
+    """
     return best if ancestors[best] == best else int(np.argmax(weights))

@@ -19,8 +19,8 @@ from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
-from pipeline.slam.best_particle import are_apart, heir, leader
-from pipeline.slam.frame_uncertainty import NOISE, FrameMemory, at_least
+from pipeline.slam.best_particle import are_apart, best_after_resampling, select_best
+from pipeline.slam.frame_uncertainty import NOISE, FrameUncertainty, at_least
 from pipeline.slam.keyframe_graph import (
     REVISIT_DISTANCE,
     Keyframe,
@@ -41,14 +41,14 @@ from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrap
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import shared_map, take_ancestors
 from pipeline.slam.particle_update import AMBIGUOUS, INNOVATION, RECOGNISED, Rules
-from pipeline.slam.pose_quality import is_astray, judged
+from pipeline.slam.pose_quality import is_lost, pose_health
 from pipeline.slam.poses import composed, inverse
 from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
-from pipeline.slam.running_statistics import Doubted, Recent, remembered
-from pipeline.slam.scan_statistics import ScanTold, disagreement
+from pipeline.slam.running_statistics import OdometryDoubt, RunningStatistics, update_statistics
+from pipeline.slam.scan_statistics import ScanStatistics, disagreement
 from pipeline.slam.shared_errors import SharedErrors
-from pipeline.slam.slip_detection import ByTrees
+from pipeline.slam.slip_detection import TreeMotion
 from pipeline.slam.state import SlamState
 from pipeline.types.pose_health import Health
 from pipeline.types.records import Detections, Int, Landmarks, PoseEstimate, PoseMeasurement
@@ -87,14 +87,14 @@ class FastSlam:
         trees = self._by_trees(state, detections.centre, R, rules)
         used = index == 0 or state.since_update >= p.update_distance or trees.slipped
         slipped = trees.slipped or state.recent.slipped
-        doubted = Doubted(bool(doubt), slipped)
-        doubt = doubt or slip_detection.why(state.motion, slipped, trees.unsure)
+        doubted = OdometryDoubt(bool(doubt), slipped)
+        doubt = doubt or slip_detection.slip_message(state.motion, slipped, trees.unsure)
         if used:
             state, scan, weights, births = self._observed(
                 state, trees, detections.centre, R, clear_range, noise, motion.measured, doubted, rules
             )
         else:
-            scan, weights, births = ScanTold(), normalised(state.log_weight), None
+            scan, weights, births = ScanStatistics(), normalised(state.log_weight), None
         estimate, frame, by_trees = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
         if used:
             at = estimate.T_map_base.as_array()
@@ -103,16 +103,16 @@ class FastSlam:
         if used and len(detections.cluster):
             serial = state.detections - len(detections.cluster)
             at = estimate.T_map_base.as_array()
-            frame = frame.marked(serial, len(state.genealogy), at, estimate.covariance)
+            frame = frame.with_reference(serial, len(state.genealogy), at, estimate.covariance)
         if used and estimate.n_eff < p.resample_below * p.particles:
             ancestors = low_variance_ancestors(weights, offset)
             take_ancestors(ancestors, state.pose, state.maps)
             shared = state.shared.drawn(ancestors)
-            state = replace(state, best=heir(state.best, ancestors, weights), shared=shared)
+            state = replace(state, best=best_after_resampling(state.best, ancestors, weights), shared=shared)
             state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         self.state = state = replace(state, genealogy=genealogy, frame=frame)
-        health = judged(
+        health = pose_health(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
         if births is None:
@@ -122,9 +122,9 @@ class FastSlam:
             self.state = self._with_keyframe(state, detections, landmark_of)
         return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
 
-    def as_seen(self, pose: PoseMeasurement) -> PoseMeasurement:
+    def without_shared_error(self, pose: PoseMeasurement) -> PoseMeasurement:
         """Return a measured pose corrected by the estimated error that all poses of its source share."""
-        return self.state.shared.as_seen(pose, normalised(self.state.log_weight))
+        return self.state.shared.without_shared_error(pose, normalised(self.state.log_weight))
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Set the pose of all particles by another source; they keep the map of the best particle.
@@ -236,7 +236,7 @@ class FastSlam:
             maps=shared_map(particles, moved if names is None else joined(moved, *names)),
             genealogy=Genealogy.of_path(after, particles),
             recent=before.recent,
-            frame=frame.forgotten(),
+            frame=frame.without_hidden(),
             graph=graph.solved_by(solution),
             keyframe_motion=np.zeros(3),
             keyframe_covariance=np.zeros((3, 3)),
@@ -245,9 +245,9 @@ class FastSlam:
         return correction
 
     @property
-    def is_astray(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether most known trees are missing where they should be visible."""
-        return is_astray(self.state.recent)
+        return is_lost(self.state.recent)
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
         """Return the pose after `place`, with the health and the associations of an estimate before it."""
@@ -258,11 +258,13 @@ class FastSlam:
     def lost(self, estimate: PoseEstimate) -> Health:
         """Return the health of an estimate without any tree."""
         ancestors = self.state.genealogy.distinct_ancestors
-        return judged(self.state.recent, ScanTold(), estimate.n_eff, ancestors, _relative(estimate))
+        return pose_health(
+            self.state.recent, ScanStatistics(), estimate.n_eff, ancestors, _relative(estimate)
+        )
 
     def reset_health(self) -> None:
-        """Discard the statistics of recent scans, by which the health is judged."""
-        self.state = replace(self.state, recent=Recent(mapped=self.state.recent.mapped))
+        """Discard the statistics of recent scans, by which the health is pose_health."""
+        self.state = replace(self.state, recent=RunningStatistics(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
         """Return the path of the best particle: x, y [m], yaw [rad] at every scan, shape (N, 3)."""
@@ -298,15 +300,15 @@ class FastSlam:
     def _observed(
         self,
         state: SlamState,
-        trees: ByTrees,
+        trees: TreeMotion,
         centre: Float,
         R: Float,
         clear_range: Float,
         noise: Float,
         measured: PoseMeasurement | None,
-        doubted: Doubted,
+        doubted: OdometryDoubt,
         rules: Rules,
-    ) -> tuple[SlamState, ScanTold, Float, Int]:
+    ) -> tuple[SlamState, ScanStatistics, Float, Int]:
         """Return the state after a scan, its statistics, the weights, shape (P,), and the birth of the
         landmark of each detection, shape (D,)."""
         found = len(centre)
@@ -324,7 +326,7 @@ class FastSlam:
         if trees.slipped:
             mean[ODOMETRY] = disagreement(motion, state.motion, state.motion_covariance)
         known = float(mean[RECOGNISED])
-        scan = ScanTold(
+        scan = ScanStatistics(
             detections=found,
             recognised=known,
             ambiguous=float(mean[AMBIGUOUS]),
@@ -343,8 +345,8 @@ class FastSlam:
             distance=state.distance + (state.since_update if math.isfinite(state.since_update) else 0.0),
             since_update=0.0,
             detections=state.detections + found,
-            best=leader(weights, state.best, state.pose, rules.distance_max),
-            recent=remembered(recent, scan, state.since_update, doubted),
+            best=select_best(weights, state.best, state.pose, rules.distance_max),
+            recent=update_statistics(recent, scan, state.since_update, doubted),
             shared=shared,
         )
         return state, scan, weights, births
@@ -389,10 +391,10 @@ class FastSlam:
             state.keyframe_covariance, birth, centre, R,
         )  # fmt: skip
 
-    def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> ByTrees:
+    def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> TreeMotion:
         return against_slip(
             state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
-            state.recent.wheels(noise_of(self.parameters)), centre, R, rules,
+            state.recent.odometry_trust(noise_of(self.parameters)), centre, R, rules,
         )  # fmt: skip
 
     def _shared(
@@ -444,24 +446,26 @@ def rules_of(p: Slam) -> Rules:
 
 def _estimate(
     state: SlamState, weights: Float, p: Slam, reach: float
-) -> tuple[PoseEstimate, FrameMemory, bool]:
+) -> tuple[PoseEstimate, FrameUncertainty, bool]:
     """The pose, the memory of the frame after it, and, asked for only where poses of another source count,
     whether landmarks within `reach` [m] told it."""
     pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
     landmarks = state.map_of(state.best)
-    covariance, frame = state.frame.told(
+    covariance, frame = state.frame.with_pose(
         mean, spread, n_eff, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
     )
     by_trees = False
     if state.shared.begun:
-        by_trees = frame.knows(mean, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach)
+        by_trees = frame.observes_known(
+            mean, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
+        )
         shared = state.shared.moved(state.motion, state.motion_covariance)
         known = covariance if by_trees else None
         if not by_trees and len(shared.by_trees):
             # What trees told last still holds, but for the odometry since then: a scan that shows none is no
             # reason to know the place as badly as the other source does.
             known = at_least(spread, shared.by_trees, NOISE / np.sqrt(n_eff))
-        covariance, frame = frame.told_at_least(spread, n_eff, shared.joint[:3, :3], known)
+        covariance, frame = frame.with_measured_pose(spread, n_eff, shared.joint[:3, :3], known)
     told = mean
     if are_apart(pose, weights, p.distance_max):
         # Of hypotheses that trees tell apart the mean is none: where one of them stands, its trees fit. About

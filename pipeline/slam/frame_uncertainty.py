@@ -1,11 +1,11 @@
-"""How well the place in the frame of the map is known, where the particles alone would say too much.
+"""Lower bound for the covariance of the pose in the frame of the map.
 
-The spread of the particles tells of errors in which they still differ. Once all of them come from one
-ancestor they share its map, and with it an error that no spread shows: coming back to it they agree, and
-would say that they know the frame as well as they know each other. So it is kept how uncertain the pose was
-where landmarks were begun, and a pose that is found by those landmarks is never told to be known better: what
-they have in common with the pose of then is an error of the frame (Julier, Uhlmann 2001: what is shared
-by an unknown part does not shrink when it is taken together).
+The spread of the particles shows only the errors in which they differ. Once all particles descend from one
+ancestor they share its map and the error of that map; back at an old place they agree, although the place
+itself is uncertain in the frame of the map. This module therefore stores the pose covariance at reference
+poses along the path, where landmarks were begun. A pose that is found by those landmarks gets at least the
+stored covariance: an unknown common error does not shrink when estimates that share it are combined (Julier,
+Uhlmann 2001).
 """
 
 from __future__ import annotations
@@ -20,21 +20,28 @@ from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam.motion import wrapped
 from pipeline.types.records import Int, Int32
 
-APART = 0.5  # m, or as many radians, between two marks
-NOISE = 4.0  # two sigma of the ratio of two variances of N particles each, times the root of N
-SMALL = 1e-12  # m^2, rad^2; so that a pose without spread has a direction to grow in
+APART = 0.5  # m or rad; minimum change of x, y or yaw between two reference poses
+# Two sigma of the ratio of two variances that are each estimated from N particles, times sqrt(N): the
+# relative variance of one is 2 / N, that of the ratio 4 / N.
+NOISE = 4.0
+SMALL = 1e-12  # m^2, rad^2; regularises a covariance without spread
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FrameMemory:
-    """Immutable. Columns of M marks along the way, in order, and what the particles do not show now.
+class FrameUncertainty:
+    """Covariances of the pose in the frame of the map at M reference poses, and the part that particles do
+    not show.
+
+    Instances are immutable.
 
     Attributes:
-        serial: int64, shape (M,): landmarks born with this serial number or a later one belong to a mark.
-        scan: int64, shape (M,): the scan there.
-        pose: x, y [m], yaw [rad] there, shape (M, 3); covariance: of it, shape (M, 3, 3).
-        hidden: Of the error that all particles share, at `at`, shape (3, 3).
-        at: Where, shape (3,).
+        serial: int64, shape (M,), ascending. Landmarks with this birth number or a later one, up to the next
+            serial, belong to the reference pose.
+        scan: int64, shape (M,): number of the scan of each reference pose.
+        pose: x, y [m], yaw [rad] of the reference poses, shape (M, 3).
+        covariance: Their covariances, shape (M, 3, 3).
+        hidden: Covariance of the error that all particles share, at the pose `at`, shape (3, 3).
+        at: x, y [m], yaw [rad], shape (3,).
     """
 
     serial: Int = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -44,7 +51,7 @@ class FrameMemory:
     hidden: Float = field(default_factory=lambda: np.zeros((3, 3)))
     at: Float = field(default_factory=lambda: np.zeros(3))
 
-    def told(
+    def with_pose(
         self,
         pose: Float,
         spread: Float,
@@ -54,14 +61,21 @@ class FrameMemory:
         hits: Int32,
         hits_min: int,
         reach: float,
-    ) -> tuple[Float, FrameMemory]:
-        """The covariance of a pose in the frame of the map, and the memory after it.
+    ) -> tuple[Float, FrameUncertainty]:
+        """Return the covariance of a pose in the frame of the map, shape (3, 3), and the state after it.
+
+        With landmarks of reference poses in reach, the result is `at_least(spread, C)`, where C is the mean
+        of the covariances of their reference poses, transported to the pose and weighted by the numbers of
+        landmarks. Otherwise it is `spread` plus the transported `hidden`.
 
         Args:
-            pose: shape (3,); spread: covariance that the particles show, shape (3, 3); n_eff: so many they
-                are worth.
-            mean, birth, hits: Of the landmarks, shape (L, ...); those nearer than `reach` [m] and seen
-                `hits_min` times are what the pose was found by.
+            pose: x, y [m], yaw [rad], shape (3,).
+            spread: Covariance of the particles, shape (3, 3).
+            n_eff: Effective number of particles.
+            mean, birth, hits: Positions [m], birth numbers and hits of the landmarks, shapes (L, 2), (L,) and
+                (L,).
+            hits_min: Landmarks with fewer hits are ignored.
+            reach: Landmarks farther from the pose are ignored [m].
         """
         covariance, hidden = _with_frame(
             pose, spread, n_eff, mean, birth, hits, hits_min, reach, self.serial, self.pose, self.covariance,
@@ -69,31 +83,44 @@ class FrameMemory:
         )  # fmt: skip
         return covariance, replace(self, hidden=hidden, at=pose)
 
-    def knows(self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float) -> bool:
-        """Whether a pose was found by landmarks that belong to a mark; see `told`."""
+    def observes_known(
+        self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
+    ) -> bool:
+        """Return whether a landmark with `hits_min` hits or more, within `reach` [m] of the pose, belongs to
+        a reference pose. The arguments are those of `with_pose`."""
         if not len(self.serial):
             return False
         near = np.hypot(*(mean - pose[:2]).T) <= reach
         return bool(np.any(near & (hits >= hits_min) & (birth >= self.serial[0])))
 
-    def told_at_least(
+    def with_measured_pose(
         self, spread: Float, n_eff: float, least: Float, by_landmarks: Float | None
-    ) -> tuple[Float, FrameMemory]:
-        """The covariance of a pose, shape (3, 3), where measured poses tell it no better than `least`, and
-        the memory after it.
+    ) -> tuple[Float, FrameUncertainty]:
+        """Return the covariance of a pose that another source measures, shape (3, 3), and the state after it.
+
+        The result is `at_least(spread, least)`, or `by_landmarks` if its position variance is smaller: with
+        two independent ways to find the pose, it is known at least as well as by the better one.
 
         Args:
-            spread, n_eff: See `told`.
-            by_landmarks: Covariance by the landmarks around, None where there are none: who can go by two
-                things knows the place at least as well as by the better one.
+            spread: Covariance of the particles, shape (3, 3).
+            n_eff: Effective number of particles.
+            least: Lower bound of the covariance by measured poses and odometry, shape (3, 3).
+            by_landmarks: Covariance by the landmarks in reach, shape (3, 3); None without any.
         """
         covariance = at_least(spread, np.ascontiguousarray(least), NOISE / np.sqrt(n_eff))
         if by_landmarks is not None and np.trace(by_landmarks[:2, :2]) < np.trace(covariance[:2, :2]):
             covariance = by_landmarks
         return covariance, replace(self, hidden=covariance - spread)
 
-    def marked(self, serial: int, scan: int, pose: Float, covariance: Float) -> FrameMemory:
-        """With a mark here if the last one is far enough behind; `serial`: of this scan's first detection."""
+    def with_reference(self, serial: int, scan: int, pose: Float, covariance: Float) -> FrameUncertainty:
+        """Return the state with a new reference pose, or unchanged if the last one is nearer than APART.
+
+        Args:
+            serial: Birth number of the first landmark that this scan may begin.
+            scan: Number of the scan.
+            pose: x, y [m], yaw [rad], shape (3,).
+            covariance: Covariance of the pose in the frame of the map, shape (3, 3).
+        """
         if len(self.serial):
             away = pose - self.pose[-1]
             away[2] = wrapped(away[2])
@@ -108,32 +135,44 @@ class FrameMemory:
         )
 
     def scan_of(self, birth: Int) -> Int:
-        """The scan of the mark that landmarks belong to, shape (L,); 0 where they are older than all."""
+        """Return the scan of the reference pose of each landmark, int64, shape (L,), by birth numbers of
+        shape (L,); 0 for landmarks that precede all reference poses."""
         if not len(self.serial):
             return np.zeros(len(birth), np.int64)
         k = np.searchsorted(self.serial, birth, side="right") - 1
         return np.where(k >= 0, self.scan[np.maximum(k, 0)], 0)
 
-    def corrected(self, correction: PathCorrection, covariance: Float) -> FrameMemory:
-        """Return the memory after a correction of the path.
+    def corrected(self, correction: PathCorrection, covariance: Float) -> FrameUncertainty:
+        """Return the state after a correction of the path: reference poses move, and their covariances are
+        replaced.
 
         Args:
-            correction: The correction.
-            covariance: Covariance of the pose of each scan, shape (N, 3, 3).
+            correction: Path before and after.
+            covariance: Covariance of the corrected pose of each scan, shape (N, 3, 3).
         """
         if not len(self.scan):
             return self
         return replace(self, pose=correction.poses(self.pose, self.scan), covariance=covariance[self.scan])
 
-    def forgotten(self) -> FrameMemory:
-        """Nothing hidden: the particles were put somewhere with the spread that is known."""
+    def without_hidden(self) -> FrameUncertainty:
+        """Return the state with `hidden` = 0: the particles were drawn with the complete covariance of the
+        pose."""
         return replace(self, hidden=np.zeros((3, 3)))
 
 
 @compiled
-def carried(covariance: Float, dx: float, dy: float) -> Float:
-    """A Sigma A^T, A = [[1, 0, -dy], [0, 1, dx], [0, 0, 1]]: the same error of the frame, seen at a pose that
-    lies further on by dx, dy [m]; written out, for the library's product of such small matrices is slow."""
+def transported_covariance(covariance: Float, dx: float, dy: float) -> Float:
+    """Return the covariance of a frame error at another pose: A Sigma A^T, A = [[1, 0, -dy], [0, 1, dx], [0,
+    0, 1]].
+
+    Args:
+        covariance: Sigma of x, y [m], yaw [rad] at the first pose, shape (3, 3).
+        dx, dy: From the first to the second position along the axes of the map [m].
+
+    Returns:
+        Covariance at the second pose, shape (3, 3). The product is written out, because library calls for
+        small matrices are slow.
+    """
     C, moved = covariance, np.empty((3, 3))
     t = C[2, 2]
     moved[0, 0] = C[0, 0] - 2.0 * dy * C[0, 2] + dy * dy * t
@@ -161,7 +200,8 @@ def _with_frame(
     hidden: Float,
     at: Float,
 ) -> tuple[Float, Float]:
-    """What the pose's covariance is at least by the landmarks around, joined with the spread."""
+    """Return the covariance and the new `hidden`, both of shape (3, 3); see `FrameUncertainty.with_pose`.
+    `place` holds the reference poses."""
     least, known = np.zeros((3, 3)), 0
     counts = np.zeros(len(serial), np.int64)
     for j in range(len(hits)):
@@ -173,28 +213,35 @@ def _with_frame(
             counts[m] += 1
             known += 1
     if known == 0:
-        hidden = carried(hidden, pose[0] - at[0], pose[1] - at[1])
+        hidden = transported_covariance(hidden, pose[0] - at[0], pose[1] - at[1])
         return spread + hidden, hidden
     for m in range(len(serial)):
         if counts[m]:
-            least += counts[m] / known * carried(covariance[m], pose[0] - place[m, 0], pose[1] - place[m, 1])
+            least += (
+                counts[m]
+                / known
+                * transported_covariance(covariance[m], pose[0] - place[m, 0], pose[1] - place[m, 1])
+            )
     both = at_least(spread, least, NOISE / np.sqrt(n_eff))
     return both, both - spread
 
 
 @compiled
 def at_least(spread: Float, least: Float, noise: float = 0.0) -> Float:
-    """The covariance that is no smaller than `spread` in any direction, and as large as `least` where that is
-    larger by more than `noise`; no larger in their common axes.
+    """Return `spread`, enlarged to the variance of `least` in each common principal axis where that is
+    larger.
+
+    In the coordinates in which `spread` is the identity, let 1 + m be a variance of `least`. The result has
+    the variance 1 + max(m - noise^2 / m, 0) (non-negative garrote; Gao 1998): an excess m below `noise` is
+    ignored, and a large excess counts almost entirely. Without this threshold, the larger of two equal
+    covariances that are each estimated from particles would be too large, and grow with each repetition.
 
     Args:
-        spread, least: shape (3, 3) each, of x, y [m] and heading [rad].
-        noise: Error of the ratio of their variances, both being taken from particles. Of two that are alike
-            but for this the larger one would always be too large, and more so each time that it is kept; so
-            what is larger by less counts for nothing, and what is larger by much, for all that it is
-            (non-negative garrote; Gao 1998).
+        spread, least: Covariances of x, y [m], yaw [rad], shape (3, 3).
+        noise: Standard error of the ratio of their variances; 0 for exact covariances.
     """
-    # Two particles far apart spread along a line; what rounding leaves of the rest grows with the distance.
+    # The regularisation grows with the spread: two distant particles spread along a line, and the rounding
+    # error of the other directions is relative to that distance.
     L = np.linalg.cholesky(spread + SMALL * max(1.0, np.trace(spread)) * np.eye(3))
     L_inv = np.linalg.inv(L)
     values, axes = np.linalg.eigh(L_inv @ least @ L_inv.T)

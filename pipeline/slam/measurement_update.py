@@ -9,7 +9,7 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.candidate_pairs import candidate_pairs, relative_positions, rotated_rows
 from pipeline.slam.landmarks import clean, decide, update_existence, update_positions
-from pipeline.slam.motion import Wheels, moved_pose, moved_poses, weighted_pose
+from pipeline.slam.motion import OdometryTrust, moved_pose, moved_poses, weighted_pose
 from pipeline.slam.particle_maps import ROOM, Maps, slots_near, with_room
 from pipeline.slam.particle_update import (
     STATISTICS,
@@ -22,8 +22,8 @@ from pipeline.slam.particle_update import (
 from pipeline.slam.resampling import normalised
 from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
 from pipeline.slam.scan_statistics import disagreement
-from pipeline.slam.shared_errors import Measured, corrected_by, learn_shared
-from pipeline.slam.slip_detection import SEARCH, ByTrees, motion_by_trees
+from pipeline.slam.shared_errors import MeasuredPose, correct_by_measured, update_shared_errors
+from pipeline.slam.slip_detection import SEARCH, TreeMotion, motion_by_trees
 from pipeline.types.records import Int
 
 FOUND, MISSED, ODOMETRY = STATISTICS, STATISTICS + 1, STATISTICS + 2
@@ -37,20 +37,20 @@ def against_slip(
     motion: Float,
     motion_covariance: Float,
     driven: float,
-    wheels: Wheels,
+    wheels: OdometryTrust,
     centre: Float,
     R: Float,
     rules: Rules,
-) -> ByTrees:
+) -> TreeMotion:
     """Return what the scan says of the motion, by the map of one particle: see `motion_by_trees`.
 
     Args:
         pose: shape (P, 3) before the motion; maps: of the particles; best: the particle.
         motion, motion_covariance, centre, R, rules: See `use_scan`.
-        driven, wheels: How far the odometry may be wrong, see away_from_trees.
+        driven, wheels: How far the odometry may be wrong, see drift_variances.
     """
     if centre.shape[0] < FEWEST_PAIRS:
-        return ByTrees(False, motion.copy(), motion_covariance.copy(), False)
+        return TreeMotion(False, motion.copy(), motion_covariance.copy(), False)
     at = moved_pose(pose[best], motion)
     slots, known = slots_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
     return motion_by_trees(
@@ -73,7 +73,7 @@ def use_scan(
     clear_range: Float,
     first_birth: int,
     rules: Rules,
-    measured: Measured,
+    measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, Int]:
     """Update poses, weights and maps of all particles in place.
 
@@ -118,7 +118,7 @@ def use_scan(
         )
         log_weight[p] += rules.weight_power * likelihood
         if measured.mean.shape[0] > 0:
-            learn_shared(after, measured, p)
+            update_shared_errors(after, measured, p)
     log_weight -= log_weight.max()
     weights = normalised(log_weight)
 
@@ -161,7 +161,7 @@ def use_scan(
 @compiled
 def _moved(
     pose: Float, log_weight: Float, motion: Float, covariance: Float, noise: Float, use_proposal: bool,
-    measured: Measured, best: int,
+    measured: MeasuredPose, best: int,
 ) -> tuple[Float, Float]:  # fmt: skip
     """Return the poses after the motion and a measured pose, shape (P, 3), and the covariance that is left in
     the body frame, shape (3, 3): none where the poses are drawn."""
@@ -178,7 +178,7 @@ def _moved(
             yaw = moved[p, 2]
             one = _turned(Q, yaw)
             mu[:] = moved[p]
-            log_weight[p] += corrected_by(mu, one, measured, p)
+            log_weight[p] += correct_by_measured(mu, one, measured, p)
             moved[p] = mu
             if p == best:
                 left = _turned(one, -yaw)

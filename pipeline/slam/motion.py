@@ -1,4 +1,5 @@
-"""The motion model (Eq. 6): what the odometry told since a scan was used, and how far it may lie."""
+"""Motion model of the robot (Eq. 6): odometry steps, their accumulation between scans, and their
+covariance."""
 
 from __future__ import annotations
 
@@ -15,12 +16,18 @@ from pipeline.types.records import PoseMeasurement
 
 @compiled
 def wrapped(angle: float) -> float:
-    """The same direction between -pi and pi."""
+    """Return an angle [rad] wrapped to [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
 class Noise(NamedTuple):
-    """How the odometry errs: position [m/sqrt m], heading [rad/sqrt m], and heading [rad/sqrt rad]."""
+    """Standard deviations of the odometry noise, each per square root of its cause (a random walk).
+
+    Attributes:
+        distance: Position noise [m/sqrt(m)].
+        turn_distance: Heading noise by distance [rad/sqrt(m)].
+        turn: Heading noise by turning [rad/sqrt(rad)].
+    """
 
     distance: float
     turn_distance: float
@@ -28,62 +35,85 @@ class Noise(NamedTuple):
 
 
 def noise_of(p: Slam) -> Noise:
-    """As the parameters have it."""
+    """Return the odometry noise of the parameters; their angles in degrees become radians."""
     return Noise(p.noise_distance, math.radians(p.noise_turn_distance), math.radians(p.noise_turn))
 
 
 @compiled
 def step_variances(x: float, y: float, yaw: float, noise: Noise) -> tuple[float, float]:
-    """Variances of one step of the odometry in its own frame: of x and of y [m^2], and of yaw [rad^2].
+    """Return the variances of one odometry step, in the frame in which the step begins.
 
-    They grow with the distance and the turn, so many short steps scatter as one long one does.
+    With the distance s = hypot(x, y), the position variance is (noise.distance)^2 s for x and for y [m^2],
+    and the heading variance is (noise.turn_distance)^2 s + (noise.turn)^2 |yaw| [rad^2]. They are linear in
+    distance and turn, so that many short steps scatter the particles like one long step.
+
+    Args:
+        x, y, yaw: Step [m, m, rad].
+        noise: Noise of the odometry.
+
+    Returns:
+        Variance of x and of y [m^2], and variance of yaw [rad^2].
     """
     distance = np.hypot(x, y)
     heading = noise.turn_distance**2 * distance + noise.turn**2 * abs(yaw)
     return noise.distance**2 * distance, heading
 
 
-class Wheels(NamedTuple):
-    """How far an odometry may lie from what the trees say.
+class OdometryTrust(NamedTuple):
+    """How far the odometry may deviate from the motion relative to the trees.
 
     Attributes:
-        noise: Of one that is as good as it should be.
-        distrust: 0 to 1, how much it was wrong lately.
-        alone: Distance that it led alone, without two known trees in view [m].
-        familiar: Fading share of the detections that were well known trees.
+        noise: Noise of an odometry without faults.
+        distrust: 0 to 1; 1 directly after the trees contradicted the odometry, then decaying.
+        unobserved: Distance driven since two known trees were last recognised in one scan [m].
+        known_share: Running mean of the share of detections that belong to well-known trees, 0 to 1.
     """
 
     noise: Noise
     distrust: float
-    alone: float
-    familiar: float
+    unobserved: float
+    known_share: float
 
 
 @compiled
-def away_from_trees(motion: Float, driven: float, wheels: Wheels) -> tuple[float, float]:
-    """Variances with respect to the trees around of a place that an honest odometry led to: of x and of y
-    [m^2], and of yaw [rad^2].
+def drift_variances(motion: Float, driven: float, trust: OdometryTrust) -> tuple[float, float]:
+    """Return the variances of the predicted pose relative to the surrounding trees, for an odometry without
+    faults.
+
+    The distance beyond the net motion (a detour, or distance without known trees) counts both as distance and
+    as turn, because its composition is unknown. A heading error that accumulates uniformly over a distance s
+    displaces the end by the variance (heading variance) s^2 / 3, which is added to the position variance.
 
     Args:
-        motion: Since the last scan that was used, shape (3,); driven: all the way there, turns as well, more
-            than the motion where the robot came back [m], infinite where that was not counted. Of wheels that
-            were wrong lately it is not asked: each step of theirs counts for more, see advanced.
+        motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
+        driven: Path length since that scan, plus TURN_AS_DISTANCE per radian [m]; infinite if it was not
+            measured. It is ignored while the odometry is distrusted, because each step then has a larger
+            covariance (see `advanced`).
+        trust: State of the odometry.
+
+    Returns:
+        Variance of x and of y [m^2], and variance of yaw [rad^2].
     """
-    way, turned = np.hypot(motion[0], motion[1]), abs(motion[2])
-    counted = np.isfinite(driven) and wheels.distrust == 0.0
-    besides = max(driven - way - TURN_AS_DISTANCE * turned, 0.0) if counted else 0.0
-    besides += wheels.alone  # it is not known how much of these was a turn
-    way, turned = way + besides, turned + besides / TURN_AS_DISTANCE
-    position, heading = step_variances(way, 0.0, turned, wheels.noise)
-    return position + heading * way * way / 3.0, heading  # the heading went astray on the way
+    distance, turned = np.hypot(motion[0], motion[1]), abs(motion[2])
+    counted = np.isfinite(driven) and trust.distrust == 0.0
+    detour = max(driven - distance - TURN_AS_DISTANCE * turned, 0.0) if counted else 0.0
+    detour += trust.unobserved  # the share of turns in this distance is unknown
+    distance, turned = distance + detour, turned + detour / TURN_AS_DISTANCE
+    position, heading = step_variances(distance, 0.0, turned, trust.noise)
+    return position + heading * distance * distance / 3.0, heading
 
 
 def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -> tuple[Float, Float]:
-    """A motion and then a step, with the covariance of both (Smith, Self, Cheeseman 1990).
+    """Return the composition of a motion and a step, and its covariance (Smith, Self, Cheeseman 1990).
 
     Args:
-        motion: x, y [m], yaw [rad], shape (3,); covariance: shape (3, 3).
-        step: In the frame where the motion ends; step_noise: its covariance, shape (3, 3).
+        motion: x, y [m], yaw [rad], shape (3,).
+        covariance: Covariance of the motion in the frame in which it begins, shape (3, 3).
+        step: Step in the frame in which the motion ends.
+        step_noise: Covariance of the step in the same frame, shape (3, 3).
+
+    Returns:
+        Motion, shape (3,), and covariance, shape (3, 3), in the frame in which the motion begins.
     """
     return compounded(motion, covariance, step.x, step.y, step.yaw, step_noise)
 
@@ -92,8 +122,12 @@ def compound(motion: Float, covariance: Float, step: Pose2, step_noise: Float) -
 def compounded(
     motion: Float, covariance: Float, x: float, y: float, yaw: float, noise: Float
 ) -> tuple[Float, Float]:
-    """See `compound`: F P F^T + G Q G^T, where F moves the error of the motion along, and G turns that of
-    the step into its frame."""
+    """Return the composition of a motion and a step x, y [m], yaw [rad], and its covariance F P F^T + G Q
+    G^T.
+
+    F is the Jacobian by the motion and G the rotation of the step into the frame of the motion; P is
+    `covariance` and Q is `noise`, both of shape (3, 3). See `compound`.
+    """
     c, s = np.cos(motion[2]), np.sin(motion[2])
     dx, dy = c * x - s * y, s * x + c * y
     moved = np.array([motion[0] + dx, motion[1] + dy, wrapped(motion[2] + yaw)])
@@ -109,14 +143,14 @@ def compounded(
 
 
 class Motion(NamedTuple):
-    """What is known of the motion from one scan to the next.
+    """Motion from one scan to the next.
 
     Attributes:
         step: T_base(t-1)_base(t) by the odometry.
-        slack: Added to its standard deviations where the odometry is doubtful: position [m], heading [rad].
-        doubt: Why, for people; empty when nothing is.
-        measured: The pose by another source.
-        turn_sigma: Of the step's turn [rad] where it is known better than the odometry alone knows it.
+        slack: Standard deviations that are added where the odometry is doubtful: position [m], heading [rad].
+        doubt: Message with the reason of the doubt; empty without one.
+        measured: Pose that another source measured at this scan, if any.
+        turn_sigma: Standard deviation of the yaw of the step [rad] if a gyroscope measured it, else None.
     """
 
     step: Pose2
@@ -126,20 +160,30 @@ class Motion(NamedTuple):
     turn_sigma: float | None = None
 
 
-DISTRUST = (0.1, 0.03)  # m, rad; added to a step of wheels that just slipped, for they slip again
-UNKNOWN = -1.0  # a sigma that nobody told
-TURN_AS_DISTANCE = 1.0  # m/rad; a robot that turns on the spot sees the trees anew as well
+# m, rad; standard deviations added to each step at full distrust, because wheels that slipped slip again.
+DISTRUST = (0.1, 0.03)
+UNKNOWN = -1.0  # replaces an absent sigma in compiled code
+# m/rad; distance to which a turn is equivalent, because a turn on the spot also changes the view of the
+# trees.
+TURN_AS_DISTANCE = 1.0
 
 
 def accumulated(
     before: Float, covariance: Float, motion: Motion, distrust: float, p: Slam
 ) -> tuple[Float, Float, float] | None:
-    """A motion so far and one step more, with its covariance, and what the step counts as driven [m]; None
-    where nothing moved and nothing is new.
+    """Return the motion since the last used scan after one more step, or None if there is nothing to add.
 
     Args:
-        before: x, y [m], yaw [rad] since the last scan that was used; covariance: shape (3, 3).
-        distrust: 0 to 1, how much the odometry was wrong lately.
+        before: x, y [m], yaw [rad] since the last used scan, shape (3,).
+        covariance: Covariance of `before`, shape (3, 3).
+        motion: The step with its uncertainty.
+        distrust: 0 to 1, see OdometryTrust; scales DISTRUST, which is added to the noise of the step.
+        p: Noise of the odometry and `update_distance`.
+
+    Returns:
+        Motion, shape (3,); its covariance, shape (3, 3); and the distance that the step counts towards
+        `update_distance` [m], with TURN_AS_DISTANCE per radian. None if the step is zero and brings neither
+        slack nor a measured pose.
     """
     step = motion.step
     news = motion.measured is not None
@@ -166,16 +210,24 @@ def advanced(
     noise: Noise,
     update_distance: float,
 ) -> tuple[bool, Float, Float, float]:
-    """The same by numbers, and first whether anything moved or is new.
+    """Return the same as `accumulated` in compiled code, with a flag in place of None.
 
     Args:
-        x, y, yaw: The step [m, rad]; slack, slack_yaw, turn_sigma: of it, see Motion; UNKNOWN means None.
-        news: Whether another source told the pose.
-        update_distance: After so much a scan is used [m].
+        before, covariance: See `accumulated`.
+        x, y, yaw: Step [m, m, rad].
+        slack, slack_yaw, turn_sigma: See Motion [m, rad, rad]; `turn_sigma` is UNKNOWN for None.
+        news: Whether another source measured the pose.
+        distrust: See `accumulated`.
+        noise: Noise of the odometry.
+        update_distance: Distance after which a scan is used [m]; a doubtful step or a measured pose counts at
+            least this much, so that its scan is used.
+
+    Returns:
+        Whether there is anything to add; motion, shape (3,); covariance, shape (3, 3); and the distance [m].
     """
     slack += distrust * DISTRUST[0]
     if turn_sigma < 0.0:
-        slack_yaw += distrust * DISTRUST[1]  # but wheels that slip turn no gyroscope
+        slack_yaw += distrust * DISTRUST[1]  # slipping wheels do not affect a gyroscope
     news = news or slack != 0.0 or slack_yaw != 0.0
     if x == 0.0 and y == 0.0 and yaw == 0.0 and not news:
         return False, before.copy(), covariance.copy(), 0.0
@@ -186,14 +238,22 @@ def advanced(
         before, covariance, x, y, yaw, position + slack * slack, heading + slack_yaw * slack_yaw
     )
     driven = np.hypot(x, y) + TURN_AS_DISTANCE * abs(wrapped(yaw))
-    return True, moved, spread, max(driven, update_distance) if news else driven  # news must not wait
+    return True, moved, spread, max(driven, update_distance) if news else driven
 
 
 @compiled
 def stepped(
     motion: Float, covariance: Float, x: float, y: float, yaw: float, position: float, heading: float
 ) -> tuple[Float, Float]:
-    """A motion and then a step whose errors are independent; see `compounded` and `step_variances`."""
+    """Return the composition of a motion and a step with independent errors, and its covariance; see
+    `compound`.
+
+    Args:
+        motion, covariance: The motion, shapes (3,) and (3, 3).
+        x, y, yaw: Step [m, m, rad].
+        position: Variance of x and of y of the step [m^2].
+        heading: Variance of its yaw [rad^2].
+    """
     noise = np.zeros((3, 3))
     noise[0, 0] = noise[1, 1] = position
     noise[2, 2] = heading
@@ -202,11 +262,17 @@ def stepped(
 
 @compiled
 def correct_by_pose(mu: Float, P: Float, z: Float, R: Float) -> float:
-    """Kalman update of a pose by a measured one, in place; returns the log likelihood of the measurement.
+    """Correct a pose by a measured pose (Kalman update with H = I), in place.
 
     Args:
-        mu: shape (3,): x, y [m], yaw [rad]; P: its covariance, shape (3, 3).
-        z, R: Likewise of the measurement; R is positive definite.
+        mu: x, y [m], yaw [rad], shape (3,); is replaced by the corrected pose.
+        P: Covariance of `mu`, shape (3, 3); is replaced likewise.
+        z: Measured pose, shape (3,).
+        R: Covariance of `z`, shape (3, 3), positive definite.
+
+    Returns:
+        Log likelihood of the measurement without its constant: -(y^T S^-1 y + ln det S) / 2 with the
+        innovation y = z - mu and S = P + R.
     """
     S, y, before = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(3):
@@ -232,8 +298,8 @@ def correct_by_pose(mu: Float, P: Float, z: Float, R: Float) -> float:
 
 @compiled
 def inverted(S: Float) -> tuple[Float, float]:
-    """Inverse of a symmetric positive definite matrix, shape (3, 3), by its cofactors, and its determinant:
-    the library's takes seven seconds to compile."""
+    """Return the inverse of a symmetric positive definite matrix of shape (3, 3), and its determinant.
+    Cofactors are used because the library function takes seven seconds to compile."""
     inverse = np.empty((3, 3))
     for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
@@ -249,7 +315,13 @@ def inverted(S: Float) -> tuple[Float, float]:
 
 @compiled
 def moved_poses(pose: Float, motion: Float) -> Float:
-    """Poses of shape (P, 3) after one and the same motion, each in its own frame."""
+    """Return poses after one common motion, each applied in the frame of its pose: pose * motion, shape (P,
+    3).
+
+    Args:
+        pose: x, y [m], yaw [rad] of each pose, shape (P, 3).
+        motion: x, y [m], yaw [rad], shape (3,).
+    """
     moved = np.empty_like(pose)
     for p in range(pose.shape[0]):
         c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
@@ -261,7 +333,7 @@ def moved_poses(pose: Float, motion: Float) -> Float:
 
 @compiled
 def moved_pose(pose: Float, motion: Float) -> Float:
-    """One pose, shape (3,), after a motion in its own frame."""
+    """Return one pose x, y [m], yaw [rad], shape (3,), after a motion in its own frame, shape (3,)."""
     one = np.empty((1, 3))
     for i in range(3):
         one[0, i] = pose[i]
@@ -273,11 +345,18 @@ def moved_pose(pose: Float, motion: Float) -> Float:
 def weighted_pose(
     pose: Float, weights: Float, motion: Float, motion_covariance: Float
 ) -> tuple[Float, Float]:
-    """Mean x, y, yaw and covariance, shape (3, 3), of weighted poses of shape (P, 3), a yaw being a
-    direction.
+    """Return the mean of weighted poses, shape (3,), and their covariance, shape (3, 3), in the frame of the
+    poses.
+
+    The mean yaw is the direction of the weighted sum of unit vectors. The covariance is the weighted scatter
+    about the mean plus the covariance of the motion since the poses were drawn, rotated into the frame of the
+    poses.
 
     Args:
-        motion, motion_covariance: What the poses were moved by since they were drawn, in their frame.
+        pose: x, y [m], yaw [rad] after the motion, shape (P, 3).
+        weights: Weights with sum 1, shape (P,).
+        motion: Motion since the poses were drawn, the same for all, shape (3,).
+        motion_covariance: Covariance of `motion` in the frame in which it begins, shape (3, 3).
     """
     mean = np.zeros(3)
     cos, sin = 0.0, 0.0

@@ -1,4 +1,5 @@
-"""Whether a measured pose can be: another SLAM that closes a loop jumps, and must not tear our map."""
+"""Gate for measured poses: a pose of another source that jumps, for example by a loop closure, is
+rejected."""
 
 from __future__ import annotations
 
@@ -9,16 +10,20 @@ import numpy as np
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.motion import Motion, Noise, compound, step_variances
 
-REFUSED = "left out: a measured pose that lies too far from what is known (another SLAM may have jumped)"
+REJECTED = "a measured pose is rejected: it is too far from the estimated pose (another SLAM may have jumped)"
 
 
 def within_gate(T_map_base: Pose2, covariance: Float, motion: Motion, noise: Noise) -> bool:
-    """Whether the pose that was measured after a motion fits what is known: y^T S^-1 y <= its gate.
+    """Return whether a measured pose agrees with the prediction: y^T (P + R)^-1 y <= gate of the measurement.
+
+    y is the difference to the predicted pose, P the covariance of the prediction and R that of the
+    measurement. Without a measured pose, or with an infinite gate, the result is True.
 
     Args:
-        T_map_base: Pose before the motion; covariance: of its x, y [m], yaw [rad], shape (3, 3).
-        motion: With the measured pose.
-        noise: Of the odometry.
+        T_map_base: Pose before the motion.
+        covariance: Its covariance of x, y [m], yaw [rad], shape (3, 3).
+        motion: Motion with the measured pose.
+        noise: Noise of the odometry.
     """
     z = motion.measured
     if z is None or math.isinf(z.gate):

@@ -1,38 +1,48 @@
-"""How far the pose can be trusted: one word for people, and its reason."""
+"""Quality of the pose: good, weak or lost, with the reason."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.slam.running_statistics import STRANGE_LOST, Recent
-from pipeline.slam.scan_statistics import ScanTold
+from pipeline.slam.running_statistics import STRANGE_LOST, RunningStatistics
+from pipeline.slam.scan_statistics import ScanStatistics
 from pipeline.types.pose_health import Health, HealthState
 
-# Position sigmas up to which a tree map stays usable, and beyond which trees get mixed up: a third of
-# the usual distance between neighbouring trunks, and the whole of it.
+# Standard deviations of the position up to which a pose is good, and weak: a third of the usual distance
+# between neighbouring trunks, and that distance, beyond which associations become wrong.
 SIGMA_GOOD, SIGMA_WEAK = 0.5, 1.5  # m
-INNOVATION_WEAK = 3.0  # fading mean; the errors are 1.7 times as large as their covariances say
-FOUND_WEAK, FOUND_LOST = 0.35, 0.2  # fading share of the known trees in free view that were found
-ODOMETRY_WEAK = 5.0  # sigma
-AMBIGUOUS_WEAK = 0.5  # fading share of the detections
-ALONE_WEAK = 5.0  # m without two known trees: then the heading is the odometry's alone
+INNOVATION_WEAK = 3.0  # normalised innovation squared; errors are sqrt(3) = 1.7 times their sigma
+FOUND_WEAK, FOUND_LOST = 0.35, 0.2  # minimum share of the known trees in free view that are found
+ODOMETRY_WEAK = 5.0  # sigma; deviation from the odometry
+AMBIGUOUS_WEAK = 0.5  # share of the detections with two likely landmarks
+ALONE_WEAK = 5.0  # m without two known trees, which determine the heading
 
 
-def judged(
-    recent: Recent, scan: ScanTold, n_eff: float, ancestors: int, covariance: Float, doubt: str = ""
+def pose_health(
+    recent: RunningStatistics,
+    scan: ScanStatistics,
+    n_eff: float,
+    ancestors: int,
+    covariance: Float,
+    doubt: str = "",
 ) -> Health:
-    """The health after a scan. An odometry that is doubted makes it weak until the trees have led for long
-    enough to be believed in that.
+    """Return the quality of the pose after a scan.
+
+    The pose is lost if its sigma is too large or the known trees are not found, and weak if any figure
+    exceeds its limit. A doubted odometry makes it weak until trees have determined the motion for long
+    enough.
 
     Args:
-        recent, scan: What the last scans and this one told.
-        n_eff, ancestors: See Health.
-        covariance: Of the pose, shape (3, 3).
-        doubt: What is wrong with the odometry, for people; empty when nothing is.
+        recent: Running statistics after the scan.
+        scan: Statistics of the scan.
+        n_eff: Effective number of particles.
+        ancestors: Number of distinct ancestors, see Health.
+        covariance: Covariance of x, y [m], yaw [rad] relative to the landmarks, shape (3, 3).
+        doubt: Message why the odometry is doubted; empty without doubt.
     """
     sigma_xy = float(np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1])))
-    state, reason = _word(recent, sigma_xy, doubt)
+    state, reason = _state_and_reason(recent, sigma_xy, doubt)
     return Health(
         state=state,
         reason=reason,
@@ -49,30 +59,36 @@ def judged(
     )
 
 
-def _word(recent: Recent, sigma_xy: float, doubt: str) -> tuple[HealthState, str]:
+def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) -> tuple[HealthState, str]:
+    """Return the state and the message of its reason, which is empty for a good pose. The first rule that
+    applies decides; `sigma_xy` is in metres."""
     if not sigma_xy <= SIGMA_WEAK:
-        return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than trees stand apart"
-    if is_astray(recent):
-        return "lost", "the known trees are not where they should be seen"
-    if doubt and not recent.trees_lead:
+        return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than the distance between trees"
+    if is_lost(recent):
+        return "lost", "the known trees are not found where they should be visible"
+    if doubt and not recent.is_tree_motion_reliable:
         return "weak", doubt
     if recent.strange:
-        return "weak", "most detections stand where the map has no tree"
+        return "weak", "most detections are at places without a tree in the map"
     if sigma_xy > SIGMA_GOOD:
         return "weak", f"the position is uncertain by {sigma_xy:.1f} m"
     if recent.mapped and recent.found < FOUND_WEAK:
-        return "weak", "most of the known trees are not seen where they should be"
+        return "weak", "most of the known trees are not found where they should be visible"
     if recent.odometry > ODOMETRY_WEAK:
-        return "weak", "the trees contradict the odometry: the wheels slip, or it jumped"
+        return "weak", "the trees contradict the odometry: wheel slip or a jump"
     if recent.innovation > INNOVATION_WEAK:
-        return "weak", "the trees are seen farther from their places than their errors allow"
+        return "weak", "the trees deviate from their map positions by more than their covariances allow"
     if recent.ambiguous > AMBIGUOUS_WEAK:
-        return "weak", "most detections could be one of two trees"
+        return "weak", "most detections match two trees"
     if recent.mapped and recent.alone > ALONE_WEAK:
-        return "weak", f"no two known trees in view for {recent.alone:.0f} m: the odometry leads alone"
+        return (
+            "weak",
+            f"fewer than two known trees in view for {recent.alone:.0f} m: only odometry is used",
+        )
     return "good", ""
 
 
-def is_astray(recent: Recent) -> bool:
-    """Whether the known trees are not where they should be seen."""
+def is_lost(recent: RunningStatistics) -> bool:
+    """Return whether the known trees are not found where they should be visible. Before any tree is well
+    known the result is False."""
     return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)

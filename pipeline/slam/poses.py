@@ -1,4 +1,4 @@
-"""Arrays of poses and covariances, one per row, and the path between corrected keyframes."""
+"""Operations on arrays of planar poses and covariances, one per row."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from pipeline.types.records import Int
 
 
 def composed(a: Float, b: Float) -> Float:
-    """T_a_b @ T_b_c of poses x, y [m], yaw [rad], shape (N, 3)."""
+    """Return T_a_c = T_a_b T_b_c for each row, shape (N, 3).
+
+    Args:
+        a: T_a_b as x, y [m], yaw [rad], shape (N, 3).
+        b: T_b_c, shape (N, 3).
+    """
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     return np.column_stack(
         [
@@ -21,22 +26,23 @@ def composed(a: Float, b: Float) -> Float:
 
 
 def inverse(a: Float) -> Float:
-    """T_b_a of T_a_b, shape (N, 3)."""
+    """Return T_b_a for each row of T_a_b, x, y [m], yaw [rad], shape (N, 3)."""
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     return np.column_stack([-c * a[:, 0] - s * a[:, 1], s * a[:, 0] - c * a[:, 1], wrap_angle(-a[:, 2])])
 
 
 def interpolated(keyframes: Float, motions: Float, keyframe: Int, since: Float) -> Float:
-    """x, y [m], yaw [rad] of every scan, shape (N, 3).
+    """Return the pose of each scan between corrected keyframes, x, y [m], yaw [rad], shape (N, 3).
 
-    The odometry leads from one keyframe on; what it lacks at the next one is spread evenly over the scans
-    between the two.
+    Each pose is its keyframe composed with the odometry since then. The remaining difference to the next
+    keyframe is distributed linearly over the scans between the two.
 
     Args:
-        keyframes: shape (K, 3).
-        motions: By the odometry from keyframe k - 1 to k, shape (K, 3); NaN where it tells nothing.
-        keyframe: int64, shape (N,), ascending, the last keyframe before each scan or at it.
-        since: Motion by the odometry since then, shape (N, 3).
+        keyframes: Corrected poses, shape (K, 3).
+        motions: Motion by odometry from keyframe k - 1 to k, shape (K, 3); NaN without odometry, then nothing
+            is distributed.
+        keyframe: Row of the last keyframe before or at each scan, int64, shape (N,), ascending.
+        since: Motion by odometry from that keyframe to the scan, shape (N, 3).
     """
     lacking = np.zeros_like(keyframes)
     if len(keyframes) > 1:
@@ -49,7 +55,7 @@ def interpolated(keyframes: Float, motions: Float, keyframe: Int, since: Float) 
 
 
 def rotated_rows(covariance: Float, turn: Float) -> Float:
-    """Return covariances xx, xy, yy, shape (N, 3), rotated by angles, shape (N,)."""
+    """Return covariances xx, xy, yy, shape (N, 3), rotated by angles [rad], shape (N,)."""
     c, s = np.cos(turn), np.sin(turn)
     xx, xy, yy = covariance.T
     return np.column_stack(

@@ -1,4 +1,4 @@
-"""The random numbers of one scan, from the seed of the run and the number of the scan alone."""
+"""Random numbers of a scan, which depend only on the seed of the run and the number of the scan."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 
-WORD = 2**32
+WORD = 2**32  # seeds below it need one 32-bit word
 
 
 def draws(seed: int, index: int, particles: int) -> tuple[Float, float]:
-    """Standard normal numbers, shape (P, 3), and one that is uniform in [0, 1).
+    """Return standard normal numbers, shape (P, 3), and one uniform number in [0, 1).
 
     Args:
-        seed: Of the run; index: of the scan.
-        particles: P.
+        seed: Seed of the run.
+        index: Number of the scan.
+        particles: Number of particles P.
     """
-    # Words of 32 bits mean the same as the numbers, and are taken in faster.
+    # An array of 32-bit words gives the same stream as the list and is converted faster.
     fit = 0 <= seed < WORD and 0 <= index < WORD
     rng = np.random.default_rng(np.array([seed, index], np.uint32) if fit else [seed, index])
     return rng.standard_normal((particles, 3)), float(rng.random())

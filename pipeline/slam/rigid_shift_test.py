@@ -1,12 +1,14 @@
-"""Trees that all lie off alike: a small motion of the robot that its odometry does not tell of.
+"""Rigid-shift test for wheel slip: a motion of the robot that the odometry does not report shifts all
+detections alike.
 
-Wheels that are stuck or slip a little contradict no single tree: each one lies off by less than a gate, and a
-filter that believes the odometry moves its landmarks instead of the robot, scan after scan. All of them
-together contradict it at once: the motion of the robot that lays the detections upon the landmarks (least
-squares over the pairs that agree) is far beyond what odometry and trees can err by.
+Wheels that slip a little contradict no single tree: each deviation is within a gate, and a filter that trusts
+the odometry moves its landmarks instead of the robot, scan by scan. All trees together contradict the
+odometry at once: the rigid motion that fits the detections to the landmarks (least squares over the pairs
+that agree) exceeds the errors of odometry and trees.
 
-People who walk side by side look alike. So only what stood where the odometry had it for a while may vote, in
-a place where most of what is seen is that, or more at once than walk together; and nobody may stand beside.
+People who walk side by side look the same. Only landmarks that stood for a while may therefore vote, in a
+place where most detections are such landmarks; otherwise more pairs are required than people walk together. A
+pair that agrees with the odometry and not with the motion refutes it.
 """
 
 from __future__ import annotations
@@ -15,51 +17,60 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.slam.motion import Wheels, inverted
+from pipeline.slam.motion import OdometryTrust, inverted
 from pipeline.types.records import Bool, Int
 
-NEAR = 0.8  # m; farther from where it was seen the nearest tree may be another one
-FEWEST = 5  # pairs; fewer fit by chance, and so few may be a company that stood for long and walks off:
-SEVERAL = 8  # pairs overrule an odometry that was not wrong lately
-MANY = 10  # pairs, where none of them was known before: more than people walk side by side
-FAMILIAR = 0.6  # of the last detections were well known trees: what walks is new wherever it comes
-CONVINCING = 0.7  # of all that should be seen must agree
-CLEARLY = 6.0  # of twice the log-likelihood is a pair as the odometry has it that would agree otherwise too
-STANDING = 16  # agreeing pairs for each one that stands where the odometry has it, by chance or on the robot
-AGREE = 3.5  # sigma of a pair's distance after the motion
-ROUNDS = 5  # of leaving out what does not agree
-BEYOND, STILL_BEYOND = 6.0, 4.0  # sigma of the motion; of an odometry that was wrong just now
-LEAST, STILL_LEAST = 0.05, 0.02  # m, or as much at LEVER; so much all views from one side err alike
-LEVER = 5.0  # m, of a typical tree
-MISFIT = 3.0  # times as large squares as their sigmas say are no rigid motion
+NEAR = 0.8  # m; maximum distance of a pair; beyond it the nearest tree may be another one
+# Minimum numbers of agreeing pairs: of well-known landmarks, fewer fit by chance; without a recent fault of
+# the odometry, since a smaller group may be people who stood for long and walk off; and of landmarks that are
+# not well known, more than people walk side by side.
+FEWEST, SEVERAL, MANY = 5, 8, 10
+FAMILIAR = 0.6  # share of well-known trees among recent detections, from which new objects are an exception
+CONVINCING = 0.7  # share of the expected pairs that must agree
+CLEARLY = 6.0  # excess in squared sigma (twice the log likelihood) by which a pair must prefer the odometry
+STANDING = 16  # agreeing pairs per permitted pair that prefers the odometry, by chance or on the robot itself
+AGREE = 3.5  # sigma; maximum distance of a pair after the motion
+ROUNDS = 5  # iterations of fitting and removing pairs that do not agree
+BEYOND, STILL_BEYOND = 6.0, 4.0  # sigma; minimum motion, and the same directly after a fault of the odometry
+# m, at LEVER for a turn; minimum motion, likewise: errors that all views from one side share are as large.
+LEAST, STILL_LEAST = 0.05, 0.02
+LEVER = 5.0  # m; distance of a typical tree
+MISFIT = 3.0  # maximum mean squared deviation, relative to the variances, of a rigid motion
 
 
 @compiled
-def moved_together(
+def estimate_rigid_shift(
     pose: Float,
     position: float,
     heading: float,
-    wheels: Wheels,
+    trust: OdometryTrust,
     centre: Float,
     R: Float,
     known: Float,
     spread: Float,
     well: Bool,
 ) -> tuple[bool, bool, Float, Float]:
-    """Whether the trees tell that the robot is elsewhere; whether they would if they were more; where, x, y
-    [m], yaw [rad], shape (3,); and the covariance of that, shape (3, 3).
+    """Return whether the trees contradict the odometry by a rigid shift, and the pose that they determine.
 
     Args:
-        pose: Where the odometry has it, shape (3,).
-        position, heading: Variances of that with respect to the known trees [m^2, rad^2].
-        wheels: How much the odometry was wrong lately, and how familiar the place is.
-        centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance xx, xy, yy, (D, 3).
-        known: Landmarks, shape (L, 2) [m]; spread: their covariance xx, xy, yy, shape (L, 3) [m^2]; well:
-            which of them are well known, shape (L,).
+        pose: x, y [m], yaw [rad] by the odometry, shape (3,).
+        position, heading: Variances of this pose relative to the landmarks [m^2, rad^2], see
+            `drift_variances`.
+        trust: Trust in the odometry; distrust lowers the limits.
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        known: Landmarks in the frame of the map, shape (L, 2) [m].
+        spread: Their covariances xx, xy, yy, shape (L, 3) [m^2].
+        well: Which landmarks are well known, shape (L,).
+
+    Returns:
+        Whether the shift is significant and enough pairs agree; whether it is significant with too few pairs
+        (SEVERAL); the pose x, y [m], yaw [rad] by the trees, shape (3,); and its covariance, shape (3, 3).
+        Without either, the pose is that of the odometry and the covariance has no meaning.
     """
     lever, off, variance, landmark = _pairs(pose, centre, R, known, spread)
     place, motion, N_inv = pose.copy(), np.zeros(3), np.zeros((3, 3))
-    familiar = wheels.familiar >= FAMILIAR and well[landmark].sum() >= FEWEST
+    familiar = trust.known_share >= FAMILIAR and well[landmark].sum() >= FEWEST
     fewest, votes = (FEWEST, well) if familiar else (MANY, np.ones(well.shape[0], np.bool_))
     may = votes[landmark]
     kept, agree, misfit = may.copy(), may.sum(), 0.0
@@ -76,7 +87,7 @@ def moved_together(
         if agree < fewest:
             return False, False, place, N_inv
     away = motion[0] * motion[0] + motion[1] * motion[1] + (LEVER * motion[2]) ** 2
-    least, expected = LEAST + wheels.distrust * (STILL_LEAST - LEAST), _expected(pose, centre, known, votes)
+    least, expected = LEAST + trust.distrust * (STILL_LEAST - LEAST), _expected(pose, centre, known, votes)
     if agree < CONVINCING * expected or misfit > MISFIT or away < least * least:
         return False, False, place, N_inv
     if _standing(lever, off, variance, position, heading, motion, kept) > agree // STANDING:
@@ -87,18 +98,19 @@ def moved_together(
     S[1, 1] += position
     S[2, 2] += heading
     S_inv, _ = inverted(S)
-    square, beyond = 0.0, BEYOND + wheels.distrust * (STILL_BEYOND - BEYOND)
+    square, beyond = 0.0, BEYOND + trust.distrust * (STILL_BEYOND - BEYOND)
     for i in range(3):
         for j in range(3):
             square += motion[i] * S_inv[i, j] * motion[j]
         place[i] += motion[i]
-    told, enough = square > beyond * beyond, agree >= SEVERAL or wheels.distrust > 0.0
+    told, enough = square > beyond * beyond, agree >= SEVERAL or trust.distrust > 0.0
     return told and enough, told and not enough, place, N_inv
 
 
 @compiled
 def _expected(pose: Float, centre: Float, known: Float, votes: Bool) -> int:
-    """How many detections should agree: as many as there are, or as landmarks that may vote stand as near."""
+    """Return the number of expected pairs: the smaller of the number of detections and the number of
+    landmarks in `votes` that are no farther from the pose than the farthest detection."""
     farthest, expected = 0.0, 0
     for d in range(centre.shape[0]):
         farthest = max(farthest, centre[d, 0] ** 2 + centre[d, 1] ** 2)
@@ -112,12 +124,15 @@ def _expected(pose: Float, centre: Float, known: Float, votes: Bool) -> int:
 def _standing(
     lever: Float, off: Float, variance: Float, position: float, heading: float, motion: Float, kept: Bool
 ) -> int:
-    """How many pairs are as the odometry has it, and not as this motion does. Beside people who stroll a tree
-    lies within the gate of their motion as well and is kept: it must tell clearly.
+    """Count the pairs that agree with the odometry and fit it better than the motion.
+
+    A pair that also agrees with the motion counts only if it prefers the odometry by CLEARLY: near people who
+    walk slowly, a tree is within the gate of their motion as well.
 
     Args:
-        variance: Of the pairs, shape (K,) [m^2].
-        position, heading: Variances of the place by odometry [m^2, rad^2].
+        lever, off, variance: Results of `_pairs`.
+        position, heading: Variances of the pose by odometry [m^2, rad^2].
+        motion: Rigid motion x, y [m], yaw [rad], shape (3,).
         kept: Which pairs agree with the motion, shape (K,).
     """
     standing = 0
@@ -135,12 +150,15 @@ def _standing(
 def _pairs(
     pose: Float, centre: Float, R: Float, known: Float, spread: Float
 ) -> tuple[Float, Float, Float, Int]:
-    """Detections and landmarks that are nearest to one another.
+    """Pair each landmark with the nearest detection, of the detections whose nearest landmark it is.
+
+    Args:
+        pose, centre, R, known, spread: See `estimate_rigid_shift`.
 
     Returns:
-        From the robot to the detection, frame of the map, shape (K, 2) [m]; from the detection to the
-        landmark, shape (K, 2) [m]; the variance of that along an axis, shape (K,) [m^2]; and which landmark
-        it is, shape (K,).
+        For each of K pairs: vector from the robot to the detection, shape (K, 2) [m]; vector from the
+        detection to the landmark, shape (K, 2) [m], both in the frame of the map; variance of the latter per
+        axis, shape (K,) [m^2]; and row of the landmark, shape (K,).
     """
     found, c, s = centre.shape[0], np.cos(pose[2]), np.sin(pose[2])
     nearest, owner = np.full(found, -1, np.int64), np.full(known.shape[0], -1, np.int64)
@@ -156,14 +174,15 @@ def _pairs(
         j = nearest[d]
         if j >= 0 and best < least[j]:
             least[j], owner[j] = best, d
-    return _laid_out(pose, c, s, centre, R, known, spread, owner)
+    return _pair_arrays(pose, c, s, centre, R, known, spread, owner)
 
 
 @compiled
-def _laid_out(
+def _pair_arrays(
     pose: Float, c: float, s: float, centre: Float, R: Float, known: Float, spread: Float, owner: Int
 ) -> tuple[Float, Float, Float, Int]:
-    """What `_pairs` gives, of landmarks and their detections, -1 for none, shape (L,)."""
+    """Return the results of `_pairs`, for the detection of each landmark, `owner`, shape (L,), -1 for none; c
+    and s are cosine and sine of the yaw."""
     n = (owner >= 0).sum()
     lever, off, variance = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
     landmark, k = np.empty(n, np.int64), 0
@@ -183,7 +202,8 @@ def _laid_out(
 
 @compiled
 def _normal_equations(lever: Float, off: Float, variance: Float, kept: Bool) -> tuple[Float, Float]:
-    """Of off = t + theta (-lever_y, lever_x) over the pairs that are kept: shapes (3, 3) and (3,)."""
+    """Return the normal equations N, b, shapes (3, 3) and (3,), of off = t + theta (-lever_y, lever_x) for
+    the unknowns t [m] and theta [rad], over the pairs in `kept`, weighted by 1 / variance."""
     N, b = np.zeros((3, 3)), np.zeros(3)
     for k in range(lever.shape[0]):
         if not kept[k]:
@@ -205,8 +225,11 @@ def _normal_equations(lever: Float, off: Float, variance: Float, kept: Bool) -> 
 def _agreeing(
     lever: Float, off: Float, variance: Float, motion: Float, may: Bool, kept: Bool
 ) -> tuple[int, float]:
-    """Keep the pairs that may vote and agree with a motion, and leave out all others; returns how many those
-    are, and the mean of their squared distances by what it should be."""
+    """Mark the pairs in `may` that agree with a motion, in `kept`, in place.
+
+    Returns:
+        Number of these pairs, and their sum of squared normalised deviations per degree of freedom.
+    """
     square, total, n = np.empty(lever.shape[0]), 0.0, 0
     for k in range(lever.shape[0]):
         ex = off[k, 0] - motion[0] + motion[2] * lever[k, 1]

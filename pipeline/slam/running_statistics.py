@@ -1,4 +1,4 @@
-"""What the last scans told of the pose: fading means, and what is counted from scan to scan."""
+"""Running statistics of the scans, from which the quality of the pose is derived."""
 
 from __future__ import annotations
 
@@ -7,44 +7,51 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from pipeline.jit import compiled
-from pipeline.slam.motion import Noise, Wheels
+from pipeline.slam.motion import Noise, OdometryTrust
 from pipeline.slam.rigid_shift_test import FAMILIAR, MANY
-from pipeline.slam.scan_statistics import ScanTold
+from pipeline.slam.scan_statistics import ScanStatistics
 
-# Scans in a row that show another place. More than make a tree well known: what a bend or an end of leaves
-# hid is new as well, and must have the time to become known before the robot is told lost. Trees of another
-# place become known as soon, so that from then on the hits count: a few new ones outvote no map.
-STRANGE_LOST, STRANGE_MISSED = 5, 15.0  # scans; hits of the known trees in free view that such a scan misses
-FADING = 0.1  # of a fading mean is the newest scan
-FADING_FOUND = 0.2
-OVERRULED = 0.5  # of the distrust is left for six scans
-FEWEST = 2.0  # trees; fewer say nothing about shares
-EXPECTED = 100.0  # hits in free view that are missed in a known place where few are recognised by chance:
-BY_CHANCE, STILL_BY_CHANCE = 0.15, 0.4  # share of those found that is so; of the scans after such a one
-NEARBY = 3.0  # m without a known tree, after which a place is a known one no more
-LEADING = 3.0  # well known trees tell the motion where there is no odometry, MANY where there is one,
-LED = 20  # and are believed in that after so many scans;
-LED_MOST, LED_AGAIN = 60, 2  # what counts for more, so that a doubt that comes and goes does not begin anew
+# A strange scan misses nearly all known trees in free view. After STRANGE_LOST of them in a row the robot is
+# lost. The number exceeds the hits that make a tree well known, so that trees that were hidden by a bend or
+# by leaves become known before. A scan is strange only if the trees it misses have at least STRANGE_MISSED
+# hits together, so that a few new trees do not outvote the map.
+STRANGE_LOST, STRANGE_MISSED = 5, 15.0  # scans; hits
+FADING = 0.1  # weight of the newest scan in a running mean
+FADING_FOUND = 0.2  # the same for shares of recognised trees
+OVERRULED = 0.5  # distrust that remains six scans after the trees contradicted the odometry: 0.9^6
+FEWEST = 2.0  # minimum number of trees for a share, and for a heading from trees
+# In a known place, a scan is strange in spite of a few trees that are recognised by chance if it misses trees
+# with EXPECTED hits and finds less than the share BY_CHANCE of the hits; STILL_BY_CHANCE after a strange
+# scan.
+EXPECTED = 100.0  # hits
+BY_CHANCE, STILL_BY_CHANCE = 0.15, 0.4  # shares of the hits
+NEARBY = 3.0  # m without two known trees, up to which the place counts as known
+# Recognised trees that are needed to trust their motion without an odometry; MANY of them contradict one.
+TREES_WITHOUT_ODOMETRY = 3.0
+TREE_MOTION_SCANS = 20  # scans after which their motion is trusted
+# Bound and increment of the counter of these scans. Scans without a doubt decrease it by one, so that an
+# intermittent doubt does not restart it.
+TREE_MOTION_MAX, TREE_MOTION_STEP = 60, 2
 
 
 @dataclass(frozen=True, slots=True)
-class Recent:
-    """Fading means over the last scans.
+class RunningStatistics:
+    """Running statistics after a scan. "Well known" is a landmark with `slam.hits_to_weigh` hits.
 
     Attributes:
-        innovation: Normalised innovation squared a degree of freedom.
-        found: Share of the well known landmarks in free view that were found.
-        ambiguous: Share of the detections that have two likely landmarks.
-        odometry: Largest disagreement with the odometry where that was not doubted anyway, fading [sigma].
-        alone: Distance driven since two known trees were recognised in a scan [m].
-        mapped: Whether any landmark is well known.
-        distrust: 1 when the trees overruled the odometry, fading.
-        strange: Scans in a row that miss nearly all known trees in free view, and recognise none or, in a
-            place that was well known, few.
-        missed: Most hits of known trees in free view that one of these scans missed.
-        familiar: Fading share of the detections that are well known.
-        led: Of scans in which trees told the motion as the odometry was doubted, LED_AGAIN for each; one less
-            for each scan since then.
+        innovation: Running mean of the normalised innovation squared per degree of freedom.
+        found: Running mean of the hits of recognised landmarks, as a share of all well-known landmarks in
+            free view.
+        ambiguous: Running mean of the share of detections with two likely landmarks.
+        odometry: Largest deviation from an odometry without doubt [sigma], decaying by FADING per scan.
+        alone: Distance driven since two known trees were last recognised in one scan [m].
+        mapped: Whether any well-known landmark was ever recognised.
+        distrust: 1 when the trees contradict the odometry, decaying by FADING per scan.
+        strange: Number of strange scans in a row, see STRANGE_LOST.
+        missed: Most hits of well-known landmarks that one of these scans missed.
+        familiar: Running mean of the share of detections that belong to well-known landmarks.
+        led: Counter of the scans in which trees determined the motion while the odometry was doubted: plus
+            TREE_MOTION_STEP for each, minus one for each scan without doubt.
     """
 
     innovation: float = 1.0
@@ -61,92 +68,132 @@ class Recent:
 
     @property
     def slipped(self) -> bool:
-        """Whether the trees overruled the odometry in one of the last scans."""
+        """Whether the trees contradicted the odometry within the last six scans."""
         return self.distrust >= OVERRULED
 
     @property
-    def trees_lead(self) -> bool:
-        """Whether the trees have told the motion for long enough to be believed in that."""
-        return self.led >= LED_AGAIN * LED
+    def is_tree_motion_reliable(self) -> bool:
+        """Whether trees determined the motion in enough scans (TREE_MOTION_SCANS) to be trusted without the
+        odometry."""
+        return self.led >= TREE_MOTION_STEP * TREE_MOTION_SCANS
 
-    def wheels(self, noise: Noise) -> Wheels:
-        """How far an odometry of this noise may lie from what the trees say now."""
-        return Wheels(noise, self.distrust, self.alone, self.familiar)
-
-
-class Doubted(NamedTuple):
-    """Whether the odometry is not believed: as it came, or by the trees, now or just before."""
-
-    as_it_came: bool = False
-    by_trees: bool = False
+    def odometry_trust(self, noise: Noise) -> OdometryTrust:
+        """Return the trust in an odometry with this noise."""
+        return OdometryTrust(noise, self.distrust, self.alone, self.familiar)
 
 
-BELIEVED = Doubted()
+class OdometryDoubt(NamedTuple):
+    """Reasons not to trust the odometry.
+
+    Attributes:
+        reported: The step came with a doubt, for example because the odometry was missing.
+        contradicted: The trees contradict the odometry, in this scan or in one of the last scans.
+    """
+
+    reported: bool = False
+    contradicted: bool = False
 
 
-def remembered(recent: Recent, scan: ScanTold, driven: float, doubted: Doubted = BELIEVED) -> Recent:
-    """The fading means after one scan more, `driven` metres after the one before it."""
+NO_DOUBT = OdometryDoubt()
+
+
+def update_statistics(
+    recent: RunningStatistics, scan: ScanStatistics, driven: float, doubted: OdometryDoubt = NO_DOUBT
+) -> RunningStatistics:
+    """Return the running statistics after one more scan.
+
+    Args:
+        recent: Statistics before the scan.
+        scan: Statistics of the scan.
+        driven: Distance since the scan before [m].
+        doubted: Doubts about the odometry at this scan.
+    """
     expected, told = scan.found + scan.missed, math.isfinite(scan.innovation)
-    strange = _strange(recent, scan, any(doubted) or recent.alone + driven < NEARBY)
-    return Recent(
-        innovation=_faded(recent.innovation, scan.innovation, FADING if told else 0),
-        found=_faded(recent.found, scan.found / max(expected, 1e-9), FADING_FOUND if expected > 0 else 0),
-        ambiguous=_faded(
+    strange = _strange_scans(recent, scan, any(doubted) or recent.alone + driven < NEARBY)
+    return RunningStatistics(
+        innovation=_exponential_mean(recent.innovation, scan.innovation, FADING if told else 0),
+        found=_exponential_mean(
+            recent.found, scan.found / max(expected, 1e-9), FADING_FOUND if expected > 0 else 0
+        ),
+        ambiguous=_exponential_mean(
             recent.ambiguous,
             scan.ambiguous / max(scan.detections, 1),
             FADING if scan.detections >= FEWEST else 0,
         ),
         odometry=max(0.0 if any(doubted) else scan.odometry, (1.0 - FADING) * recent.odometry),
-        alone=driven_alone(recent.alone, scan.recognised, driven),
+        alone=distance_without_trees(recent.alone, scan.recognised, driven),
         mapped=recent.mapped or scan.recognised > 0.5,
-        distrust=fading_distrust(recent.distrust),
+        distrust=decayed_distrust(recent.distrust),
         strange=strange,
         missed=max(recent.missed, scan.missed) if strange else 0.0,
-        familiar=fading_familiar(recent.familiar, scan.recognised, scan.detections),
-        led=_led(recent.led, scan, doubted),
+        familiar=updated_familiar(recent.familiar, scan.recognised, scan.detections),
+        led=_tree_motion_count(recent.led, scan, doubted),
     )
 
 
 @compiled
-def driven_alone(alone: float, recognised: float, driven: float) -> float:
-    """The distance without two known trees after one scan more, see Recent."""
+def distance_without_trees(alone: float, recognised: float, driven: float) -> float:
+    """Return the distance driven since two known trees were last recognised in one scan [m].
+
+    Args:
+        alone: The distance before [m].
+        recognised: Number of recognised trees in the scan.
+        driven: Distance since the scan before [m].
+    """
     return 0.0 if recognised >= FEWEST else alone + driven
 
 
 @compiled
-def fading_distrust(distrust: float) -> float:
-    """The distrust after one scan more, see Recent."""
+def decayed_distrust(distrust: float) -> float:
+    """Return the distrust after one more scan: less by FADING, and 0 from 0.01 on."""
     return (1.0 - FADING) * distrust if distrust > 0.01 else 0.0
 
 
 @compiled
-def fading_familiar(familiar: float, recognised: float, detections: int) -> float:
-    """The share of well known trees after one scan more, see Recent."""
+def updated_familiar(familiar: float, recognised: float, detections: int) -> float:
+    """Return the running mean of the share of detections of known trees after one more scan.
+
+    Args:
+        familiar: The mean before.
+        recognised: Number of recognised trees in the scan.
+        detections: Number of detections; with fewer than FEWEST the mean is unchanged.
+    """
     if detections < FEWEST:
         return familiar
     return familiar + FADING_FOUND * (recognised / detections - familiar)
 
 
-def _led(before: int, scan: ScanTold, doubted: Doubted) -> int:
-    """Counted while trees tell what the odometry does not; forgotten when it is right for long."""
+def _tree_motion_count(before: int, scan: ScanStatistics, doubted: OdometryDoubt) -> int:
+    """Return `RunningStatistics.led` after a scan. A doubted scan with too few recognised trees resets it to
+    0."""
     if not any(doubted):
         return max(before - 1, 0)
-    leading = LEADING if doubted.as_it_came else MANY
-    return min(before + LED_AGAIN, LED_MOST) if scan.recognised >= leading else 0
+    leading = TREES_WITHOUT_ODOMETRY if doubted.reported else MANY
+    return min(before + TREE_MOTION_STEP, TREE_MOTION_MAX) if scan.recognised >= leading else 0
 
 
-def _strange(recent: Recent, scan: ScanTold, here: bool) -> int:
-    """Counted until a known tree is recognised; a scan that misses none in free view or sees nothing says
-    nothing. In a place that is `here`, where known trees were seen last, or may be, a few of many are
-    recognised by chance, and those of the new place once they were seen for long enough."""
+def _strange_scans(recent: RunningStatistics, scan: ScanStatistics, here: bool) -> int:
+    """Return the number of strange scans in a row after a scan.
+
+    A scan is strange if it misses enough known trees (STRANGE_MISSED) and finds none. A scan that misses none
+    in free view, or detects too little, leaves the number unchanged. In a known place, a scan that finds a
+    few of many known trees (see BY_CHANCE) is strange as well; later scans of such a row may also find young
+    trees, which were begun after its start. Any other scan that finds known trees resets the number to 0.
+
+    Args:
+        recent: Statistics before the scan.
+        scan: Statistics of the scan.
+        here: Whether the robot may be elsewhere than estimated although the place is known: two known trees
+            were seen within the last NEARBY metres, or the odometry is doubted.
+    """
     before = recent.strange
     told = scan.detections >= FEWEST and scan.missed >= STRANGE_MISSED
     share = scan.found / max(scan.found + scan.missed, 1e-9)
     if scan.recognised < 0.5 and scan.found == 0.0:
         return before + 1 if told else before
     if before:
-        # What was recognised has no more hits than what was begun since the first of these scans, and more
-        # is missed than one tree, which may have fallen.
+        # The recognised trees have no more hits than trees begun since the first strange scan, and more trees
+        # than one are missed: a single one may have fallen.
         young = scan.found <= (min(before, STRANGE_LOST) + 2) * scan.recognised
         young = young and max(recent.missed, scan.missed) >= FEWEST * STRANGE_MISSED
         return before + 1 if told and (young or share < STILL_BY_CHANCE) else 0
@@ -155,6 +202,7 @@ def _strange(recent: Recent, scan: ScanTold, here: bool) -> int:
     )
 
 
-def _faded(mean: float, value: float, newest: float) -> float:
-    """The mean when the newest value has this part in it."""
+def _exponential_mean(mean: float, value: float, newest: float) -> float:
+    """Return the mean after a new value of the weight `newest`; unchanged if that is 0, for then the value
+    may be NaN."""
     return mean + newest * (value - mean) if newest else mean

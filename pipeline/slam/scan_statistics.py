@@ -1,4 +1,5 @@
-"""What one scan says of the pose: which known trees it shows, and how far it is from the odometry."""
+"""Statistics of one scan for the quality of the pose: recognised and missed landmarks, and the deviation from
+the odometry."""
 
 from __future__ import annotations
 
@@ -13,21 +14,23 @@ from pipeline.slam.motion import wrapped
 # Landmarks count by their hits, so that trees begun at a wrong place do not soon outvote the map.
 HITS_MAX = 20.0
 
-SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad
+# m, m, rad; added to the sigmas of the odometry, which are zero while the robot stands.
+SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])
 
 
 @dataclass(frozen=True, slots=True)
-class ScanTold:
-    """Statistics of one scan, means over the particles; see Health.
+class ScanStatistics:
+    """Statistics of one scan, means over the particles. "Well known" is a landmark with `slam.hits_to_weigh`
+    hits.
 
     Attributes:
         detections: Number of detections.
-        recognised: Number of well-known landmarks among them.
+        recognised: Number of detections of well-known landmarks.
         ambiguous: Number of detections with two likely landmarks.
-        found, missed: Hits of the well-known landmarks that were recognised, and of those in free view that
-            were not.
-        innovation: Normalised innovation squared per degree of freedom, NaN without a known landmark.
-        odometry: Distance of the pose from the odometry [sigma].
+        found: Hits of the recognised landmarks, each limited to HITS_MAX.
+        missed: Hits of the well-known landmarks in free view that were not detected, limited likewise.
+        innovation: Normalised innovation squared per degree of freedom; NaN without a recognised landmark.
+        odometry: Mahalanobis distance between the motion by SLAM and the odometry [sigma].
     """
 
     detections: int = 0

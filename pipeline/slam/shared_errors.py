@@ -1,14 +1,14 @@
-"""What all measured poses of one source err by alike, above all how its frame lies in the map.
+"""Errors that all measured poses of one source share, above all the alignment of its frame with the map.
 
-Taken for an error of each pose alone it would average out over many of them, and the filter would soon know
-better where it is than anybody told it. So it is a state of the filter: given the path of a particle it is
-Gaussian, and each particle estimates it as it does a landmark (Rao-Blackwell; Murphy, Russell 2001):
+Treated as an independent error of each pose, such an error would average out, and the filter would report a
+smaller sigma than the source has. It is therefore part of the state: given the path of a particle it is
+Gaussian, and each particle estimates it like a landmark (Rao-Blackwellisation; Murphy, Russell 2001):
 
-z = x + H e + v,  e ~ N(0, I) at first,  v ~ N(0, R) independent from pose to pose.
+z = x + H e + v,  e ~ N(0, I) a priori,  v ~ N(0, R) independent for each pose.
 
-Particles that were drawn from one ancestor share its e, and no spread shows any more what it may err by. So
-how well poses of this source can tell the pose at all is told by a Gaussian of pose and errors beside them,
-with the covariances of a Kalman filter that knows odometry and measured poses alone.
+Particles that descend from one ancestor share its e, so that their spread does not show its uncertainty. The
+uncertainty of the pose by measured poses is therefore also computed by a Kalman filter over pose and errors
+that uses only odometry and measured poses (`SharedErrors.joint`).
 """
 
 from __future__ import annotations
@@ -24,17 +24,18 @@ from pipeline.slam.motion import compounded, correct_by_pose, inverted
 from pipeline.types.records import Int
 from pipeline.types.sensor_data import SHARED, SOURCES, PoseMeasurement
 
-POSE = 3
+POSE = 3  # dimensions of a pose
 
 
-class Measured(NamedTuple):
-    """A measured pose, and what each of P particles takes its source's shared errors for.
+class MeasuredPose(NamedTuple):
+    """A measured pose, with the estimates that P particles have of the shared errors of its source.
 
     Attributes:
-        z: x, y [m], yaw [rad], shape (3,), or of no length where there is none.
-        own: Covariance of what this pose errs by alone, shape (3, 3).
-        H: See PoseMeasurement.shared, shape (3, SHARED).
-        mean: shape (P, SHARED); covariance: shape (P, SHARED, SHARED).
+        z: x, y [m], yaw [rad], shape (3,); shape (0,) if no pose was measured.
+        own: Covariance of the error of this pose that is independent of other poses, shape (3, 3).
+        H: Effect of the shared errors on the pose, see `PoseMeasurement.shared`, shape (3, SHARED).
+        mean: Estimated shared errors, shape (P, SHARED); P is 0 for a source without shared errors.
+        covariance: Their covariances, shape (P, SHARED, SHARED).
     """
 
     z: Float
@@ -44,9 +45,9 @@ class Measured(NamedTuple):
     covariance: Float
 
 
-def nothing_measured() -> Measured:
-    """No pose was measured."""
-    return Measured(
+def no_measured_pose() -> MeasuredPose:
+    """Return the record for a scan without a measured pose."""
+    return MeasuredPose(
         np.zeros(0),
         np.zeros((3, 3)),
         np.zeros((3, SHARED)),
@@ -57,15 +58,18 @@ def nothing_measured() -> Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SharedErrors:
-    """Columns of P particles; nothing until a pose counts whose source errs by something that is shared.
+    """Estimates of the shared errors by P particles and by a joint Gaussian.
+
+    All arrays are empty until the first pose of a source with shared errors is used.
 
     Attributes:
-        mean: shape (SOURCES, P, SHARED); covariance: shape (SOURCES, P, SHARED, SHARED).
-        joint: Covariance of the pose in the frame of the map and of all sources' errors, by odometry and
-            measured poses alone, shape (3 + SOURCES * SHARED,) * 2.
-        at: x, y [m], yaw [rad] where that was, shape (3,).
-        by_trees: Covariance of the pose as landmarks told it last, grown by the odometry since then, shape
-            (3, 3); (0, 0) as long as none told it.
+        mean: Estimated errors of each source and particle, shape (SOURCES, P, SHARED).
+        covariance: Their covariances, shape (SOURCES, P, SHARED, SHARED).
+        joint: Covariance of the pose in the frame of the map and of the errors of all sources, by odometry
+            and measured poses only, shape (3 + SOURCES * SHARED, 3 + SOURCES * SHARED).
+        at: x, y [m], yaw [rad] to which `joint` and `by_trees` refer, shape (3,).
+        by_trees: Covariance of the pose when landmarks last determined it, plus the odometry since then,
+            shape (3, 3); shape (0, 0) before.
     """
 
     mean: Float = field(default_factory=lambda: np.zeros((0, 0, SHARED)))
@@ -76,12 +80,18 @@ class SharedErrors:
 
     @property
     def begun(self) -> bool:
-        """Whether anything is known."""
+        """Whether a pose with shared errors was used."""
         return len(self.joint) > 0
 
     @classmethod
     def begun_at(cls, particles: int, pose: Float, covariance: Float) -> SharedErrors:
-        """Nothing known of the errors yet, and a pose, shape (3,), with its covariance, shape (3, 3)."""
+        """Return the estimates before the first measured pose: errors N(0, I), independent of the pose.
+
+        Args:
+            particles: Number of particles.
+            pose: Estimated pose, shape (3,).
+            covariance: Its covariance in the frame of the map, shape (3, 3).
+        """
         one = np.eye(SHARED)
         joint = np.eye(POSE + SOURCES * SHARED)
         joint[:POSE, :POSE] = covariance
@@ -93,15 +103,21 @@ class SharedErrors:
         )
 
     def drawn(self, rows: Int) -> SharedErrors:
-        """Of particles drawn anew, one of each row; an independent copy."""
+        """Return the estimates of resampled particles: those of the given rows, int64, shape (P,). The arrays
+        are independent copies."""
         if not self.begun:
             return self
-        # An index in brackets would lay the rows otherwise in memory, and kernels be compiled for that too.
+        # Indexing with brackets gives another memory layout, for which the kernels would be compiled again.
         mean, covariance = np.take(self.mean, rows, axis=1), np.take(self.covariance, rows, axis=1)
         return replace(self, mean=mean, covariance=covariance)
 
     def moved(self, motion: Float, motion_covariance: Float) -> SharedErrors:
-        """After a motion by the odometry, shape (3,), with its covariance, shape (3, 3), in its own frame."""
+        """Return the estimates after a motion by the odometry: the pose block of `joint` and `by_trees` grow.
+
+        Args:
+            motion: x, y [m], yaw [rad] in the frame of the pose before, shape (3,).
+            motion_covariance: Its covariance, shape (3, 3).
+        """
         if not self.begun:
             return self
         joint, before = self.joint.copy(), self.joint[:POSE, :POSE].copy()
@@ -117,18 +133,22 @@ class SharedErrors:
         return replace(self, joint=joint, at=at, by_trees=by_trees)
 
     def corrected(self, pose: Float, by_trees: Float | None) -> SharedErrors:
-        """After a pose, shape (3,), was estimated: covariances move on from there. By odometry alone `at`
-        would turn away from the path, and what is unknown in one direction be taken for known in another.
+        """Return the estimates with `at` at the estimated pose.
+
+        Without this correction `at` would follow the odometry, turn away from the path, and rotate the
+        covariances wrongly.
 
         Args:
-            by_trees: The covariance of the pose, shape (3, 3), where landmarks told it, else None.
+            pose: Estimated pose, shape (3,).
+            by_trees: Covariance of the pose if landmarks determined it, shape (3, 3), else None.
         """
         if not self.begun:
             return self
         return replace(self, at=pose, by_trees=self.by_trees if by_trees is None else by_trees)
 
     def measured(self, pose: PoseMeasurement) -> SharedErrors:
-        """What the joint Gaussian knows after a measured pose: P - K S K^T."""
+        """Return the estimates after a measured pose: `joint` becomes P - K S K^T, with the gain K = P H^T
+        S^-1. The errors of the particles are updated in the kernels, see `update_shared_errors`."""
         if not self.begun:
             return self
         H = np.zeros((POSE, len(self.joint)))
@@ -140,11 +160,15 @@ class SharedErrors:
         joint = self.joint - cross @ np.linalg.solve(H @ cross + pose.own, cross.T)
         return replace(self, joint=0.5 * (joint + joint.T))
 
-    def as_seen(self, pose: PoseMeasurement, weights: Float) -> PoseMeasurement:
-        """The measured pose without what its source is known by now to err by.
+    def without_shared_error(self, pose: PoseMeasurement, weights: Float) -> PoseMeasurement:
+        """Return a measured pose minus the estimated shared error, H e, with the covariance R + H E H^T.
+
+        e and E are the mean and the covariance of the error over the particles. A pose without shared errors
+        is returned unchanged.
 
         Args:
-            weights: Of the particles, shape (P,).
+            pose: The measured pose.
+            weights: Weights of the particles with sum 1, shape (P,).
         """
         if not self.begun or pose.shared is None:
             return pose
@@ -155,24 +179,31 @@ class SharedErrors:
         at = pose.T_map_base.as_array() - H @ middle
         return replace(pose, T_map_base=type(pose.T_map_base)(*at), covariance=pose.own + H @ E @ H.T)
 
-    def for_particles(self, pose: PoseMeasurement | None) -> Measured:
-        """As the kernels take it; they change mean and covariance of the source in place."""
-        nothing = nothing_measured()
+    def for_particles(self, pose: PoseMeasurement | None) -> MeasuredPose:
+        """Return a measured pose, or None, as the record for the kernels. Its mean and covariance are views,
+        which `update_shared_errors` changes in place."""
+        nothing = no_measured_pose()
         if pose is None:
             return nothing
         z = pose.T_map_base.as_array()
         if pose.shared is None:
             return nothing._replace(z=z, own=np.ascontiguousarray(pose.covariance))
         own, H = np.ascontiguousarray(pose.own), np.ascontiguousarray(pose.shared)
-        return Measured(z, own, H, self.mean[pose.source], self.covariance[pose.source])
+        return MeasuredPose(z, own, H, self.mean[pose.source], self.covariance[pose.source])
 
 
 @compiled
-def corrected_by(mu: Float, P: Float, measured: Measured, p: int) -> float:
-    """Kalman update of the pose of particle p by a measured one, in place; its log likelihood.
+def correct_by_measured(mu: Float, P: Float, measured: MeasuredPose, p: int) -> float:
+    """Correct the pose of a particle by a measured pose (Kalman update), in place, and return its log
+    likelihood.
+
+    The shared error of the particle is subtracted from the measurement, and its covariance is added.
 
     Args:
-        mu: x, y [m], yaw [rad], shape (3,); P: its covariance, shape (3, 3).
+        mu: x, y [m], yaw [rad], shape (3,); is corrected.
+        P: Covariance of `mu`, shape (3, 3); is corrected.
+        measured: The measured pose.
+        p: Row of the particle.
     """
     z, R = measured.z.copy(), measured.own.copy()
     if measured.mean.shape[0] > 0:
@@ -181,9 +212,15 @@ def corrected_by(mu: Float, P: Float, measured: Measured, p: int) -> float:
 
 
 @compiled
-def learn_shared(x: Float, measured: Measured, p: int) -> None:
-    """What particle p, which stands at x now, shape (P, 3), takes the shared errors for after the pose that
-    was measured: a Kalman update, in place."""
+def update_shared_errors(x: Float, measured: MeasuredPose, p: int) -> None:
+    """Update the shared errors of a particle by a measured pose (Kalman update with the pose known), in
+    place.
+
+    Args:
+        x: Poses of the particles after sampling, shape (P, 3).
+        measured: The measured pose; row p of its `mean` and `covariance` is changed.
+        p: Row of the particle.
+    """
     y, S = measured.z.copy(), measured.own.copy()
     _add_shared(measured, p, y, S)
     for i in range(3):
@@ -209,8 +246,8 @@ def learn_shared(x: Float, measured: Measured, p: int) -> None:
 
 
 @compiled
-def _add_shared(measured: Measured, p: int, z: Float, R: Float) -> None:
-    """z - H e and R + H E H^T of particle p, in place."""
+def _add_shared(measured: MeasuredPose, p: int, z: Float, R: Float) -> None:
+    """Replace z by z - H e and R by R + H E H^T, with the errors e, E of particle p, in place."""
     E, H = measured.covariance[p], measured.H
     for i in range(3):
         for a in range(SHARED):

@@ -1,8 +1,8 @@
-"""Wheels that slip or are stuck, an odometry that jumped: how far the robot really moved, told by the trees.
+"""Motion of the robot from trees, where the wheels slip or are stuck or the odometry jumps.
 
-Where all trees lie off alike by a little, that is the motion that the odometry does not tell of (see
-`together`). Where a scan contradicts the map, the offset is sought that brings most detections onto known
-landmarks: the filter's own gates are far too narrow for it, and would begin all trees again.
+Small errors are found by a rigid shift of all detections (`rigid_shift_test`). Where a scan contradicts the
+map entirely, the pose offset is searched that brings most detections onto known landmarks: the gates of the
+filter are too narrow for it, and the filter would begin all trees a second time.
 """
 
 from __future__ import annotations
@@ -13,34 +13,36 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.slam.motion import Wheels, away_from_trees, moved_pose
-from pipeline.slam.rigid_shift_test import STANDING, moved_together
+from pipeline.slam.motion import OdometryTrust, drift_variances, moved_pose
+from pipeline.slam.rigid_shift_test import STANDING, estimate_rigid_shift
 from pipeline.types.records import Int32
 
-SEARCH = 8.0  # m around where the odometry has the robot
-TURNS = np.radians(np.arange(-12.0, 12.5, 2.0))
-NEAR = 0.3  # m, added to the error of a detection that lies off by half a step of TURNS
-FEWEST = 6  # detections; in a park three fit somewhere by chance, and throw a good pose away
-EXPLAINED = 0.4  # of the detections on known landmarks contradict nothing
-CONVINCING = 0.7  # of the detections must lie on landmarks after the offset
-MARGIN = 2  # detections more than at any other place
-SIGMA = np.array([0.15, 0.15, np.radians(1.5)])  # of the offset that is found: m, m, rad
-FITTED = np.array([0.05, 0.05, np.radians(0.5)])  # the same of the least squares, and
-OWN = 2.0  # times their own sigma: the filter takes in the scan that told them once more
-WIDE = 0.5  # m; with so unsure a motion trees are mixed up
-STOOD = (0.005, 0.002)  # m, rad; an odometry that moves less since a scan says that the robot stands
-STUCK = "the odometry says that the robot stands, but the trees go by: it is stuck, and the trees lead"
-UNSURE = "a few known trees go by, and the odometry passes none: it is wrong, or people walk there; it leads"
-SLIPPED = "the trees contradict the odometry (wheels that slip, or a jump): the trees lead"
+SEARCH = 8.0  # m; radius of the search around the pose by odometry
+TURNS = np.radians(np.arange(-12.0, 12.5, 2.0))  # rad; searched headings relative to the odometry
+NEAR = 0.3  # m; added to two sigma of a detection: half a step of TURNS at a distance of 15 m
+FEWEST = 6  # minimum number of detections and landmarks; in a park, three fit somewhere by chance
+EXPLAINED = 0.4  # share of the expected matches from which a scan does not contradict the map
+CONVINCING = 0.7  # share of the detections that must match after the offset
+MARGIN = 2  # matches more than at any other offset
+SIGMA = np.array([0.15, 0.15, np.radians(1.5)])  # m, m, rad; of an offset found by the search
+FITTED = np.array([0.05, 0.05, np.radians(0.5)])  # m, m, rad; systematic part of a rigid shift
+OWN = 2.0  # factor on the sigmas of the fit of a rigid shift, since the filter uses the same scan again
+WIDE = 0.5  # m; sigma of a motion from which detections are associated with wrong trees
+STOOD = (0.005, 0.002)  # m, rad; an odometry that moves less between two scans reports standstill
+STUCK = "the odometry reports standstill, but the trees move: it is stuck, and the trees determine the motion"
+UNSURE = "a few known trees move against the odometry: it is wrong, or they are people; it is used"
+SLIPPED = "the trees contradict the odometry (wheel slip or a jump): the trees determine the motion"
 
 
-class ByTrees(NamedTuple):
-    """What a scan tells of the motion.
+class TreeMotion(NamedTuple):
+    """Motion by odometry, corrected by trees where they contradict it.
 
     Attributes:
-        slipped: Whether the trees say that it was another one.
-        motion: Then that one, else as it was, shape (3,); covariance: of it, shape (3, 3).
-        unsure: Whether they say so, but are so few that they may as well be people who walk off.
+        slipped: Whether the trees contradict the odometry; `motion` is then that of the trees.
+        motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
+        covariance: Covariance of `motion`, shape (3, 3).
+        unsure: Whether trees contradict the odometry that are too few to be distinguished from walking
+            people; `motion` is then that of the odometry.
     """
 
     slipped: bool
@@ -49,9 +51,14 @@ class ByTrees(NamedTuple):
     unsure: bool
 
 
-def why(motion: Float, corrected: bool, unsure: bool) -> str:
-    """Why a motion of the odometry, shape (3,), is not believed, for people; empty when it is. `corrected`:
-    the trees have, in this scan or one of the last ones; unsure: see ByTrees."""
+def slip_message(motion: Float, corrected: bool, unsure: bool) -> str:
+    """Return the message why the odometry is doubted: STUCK, SLIPPED or UNSURE; empty without doubt.
+
+    Args:
+        motion: Motion by the odometry since the last used scan, shape (3,).
+        corrected: Whether trees contradicted it in this scan or in one of the last scans.
+        unsure: See TreeMotion.
+    """
     stood = np.hypot(motion[0], motion[1]) < STOOD[0] and abs(motion[2]) < STOOD[1]
     if corrected:
         return STUCK if stood else SLIPPED
@@ -64,7 +71,7 @@ def motion_by_trees(
     motion: Float,
     covariance: Float,
     driven: float,
-    wheels: Wheels,
+    trust: OdometryTrust,
     centre: Float,
     R: Float,
     known: Float,
@@ -72,34 +79,42 @@ def motion_by_trees(
     hits_of: Int32,
     hits_to_weigh: int,
     gate: float,
-) -> ByTrees:
-    """What a scan tells of the motion.
+) -> TreeMotion:
+    """Return the motion since the last used scan, from trees where they contradict the odometry.
+
+    If neither the rigid shift nor the search finds a contradiction, the result is the odometry. If its
+    covariance was large (WIDE) and most detections match, the covariance is reduced to that of an undisturbed
+    odometry.
 
     Args:
-        before: x, y [m], yaw [rad] in the frame of the map.
-        motion: By the odometry since then, shape (3,); covariance: shape (3, 3); driven: see away_from_trees.
-        wheels: How it errs if it is right: what is added where it is doubted does not count here, for it is
-            contradicted still.
-        centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance xx, xy, yy, (D, 3).
-        known: Landmarks within SEARCH of what the robot can see, shape (L, 2) [m]; spread: their covariance
-            xx, xy, yy, shape (L, 3) [m^2]; hits_of: shape (L,).
-        hits_to_weigh: With fewer a landmark is not well known.
-        gate: [sigma].
+        before: x, y [m], yaw [rad] in the frame of the map at the last used scan, shape (3,).
+        motion: Motion by the odometry since then, shape (3,).
+        covariance: Its covariance with all doubts, shape (3, 3).
+        driven: Path length since then [m], see `drift_variances`.
+        trust: Trust in the odometry. Its noise excludes doubts, since the test assumes an undisturbed
+            odometry.
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        known: Landmarks within the view plus SEARCH, in the frame of the map, shape (L, 2) [m].
+        spread: Their covariances xx, xy, yy, shape (L, 3) [m^2].
+        hits_of: Their hits, shape (L,).
+        hits_to_weigh: Minimum hits of a well-known landmark.
+        gate: Association gate [sigma].
     """
     pose = moved_pose(before, motion)
-    position, heading = away_from_trees(motion, driven, wheels)
+    position, heading = drift_variances(motion, driven, trust)
     well_known = hits_of >= hits_to_weigh
-    sure, unsure, place, fitted = moved_together(
-        pose, position, heading, wheels, centre, R, known, spread, well_known
+    sure, unsure, place, fitted = estimate_rigid_shift(
+        pose, position, heading, trust, centre, R, known, spread, well_known
     )
     if sure:
         told = np.zeros((3, 3))
         told[0, 0] = told[1, 1] = FITTED[0] ** 2 + OWN * OWN * max(fitted[0, 0], fitted[1, 1])
         told[2, 2] = FITTED[2] ** 2 + OWN * OWN * fitted[2, 2]
-        return ByTrees(True, _from(before, place), told, False)
+        return TreeMotion(True, _from(before, place), told, False)
     well = known[well_known]
     sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
-    hits, expected, by_chance = explained(pose, centre, sigma, well, position, heading, gate)
+    hits, expected, by_chance = count_matches(pose, centre, sigma, well, position, heading, gate)
     told = np.zeros((3, 3))
     told[0, 0], told[1, 1], told[2, 2] = position, position, heading
     for i in range(3):
@@ -107,17 +122,17 @@ def motion_by_trees(
     if expected < FEWEST or hits >= EXPLAINED * expected:
         wide = covariance[0, 0] + covariance[1, 1] > 2.0 * WIDE * WIDE
         if wide and expected >= FEWEST and hits >= CONVINCING * expected:
-            return ByTrees(False, motion.copy(), told, unsure)  # what was feared did not happen
-        return ByTrees(False, motion.copy(), covariance.copy(), unsure)
-    agree, sure, place = offset(pose, centre, sigma, well)
+            return TreeMotion(False, motion.copy(), told, unsure)  # the doubt is refuted
+        return TreeMotion(False, motion.copy(), covariance.copy(), unsure)
+    agree, sure, place = search_offset(pose, centre, sigma, well)
     if not sure or hits > by_chance + agree // STANDING:
-        return ByTrees(False, motion.copy(), covariance.copy(), unsure)
-    return ByTrees(True, _from(before, place), told, False)
+        return TreeMotion(False, motion.copy(), covariance.copy(), unsure)
+    return TreeMotion(True, _from(before, place), told, False)
 
 
 @compiled
 def _from(before: Float, place: Float) -> Float:
-    """The motion from a pose to a place, shape (3,)."""
+    """Return the motion from pose `before` to pose `place` in the frame of `before`, shape (3,)."""
     c, s = np.cos(before[2]), np.sin(before[2])
     dx, dy = place[0] - before[0], place[1] - before[1]
     turn = (place[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
@@ -125,7 +140,7 @@ def _from(before: Float, place: Float) -> Float:
 
 
 @compiled
-def explained(
+def count_matches(
     pose: Float,
     centre: Float,
     sigma: Float,
@@ -134,16 +149,21 @@ def explained(
     heading: float,
     gate: float,
 ) -> tuple[int, int, float]:
-    """How many detections lie where a landmark is; how many of them should: as many as landmarks stand within
-    their reach; and how many would if they stood anywhere in it. Where most of many do not, the scan
-    contradicts the map.
+    """Count the detections that match a landmark at the pose by the odometry.
 
     Args:
-        pose: x, y [m], yaw [rad] by the odometry.
-        centre: Detections, base frame, shape (D, 2) [m]; sigma: of each one [m].
-        landmarks: Well known ones near by, shape (L, 2) [m].
-        position: Variance of x and of y of the pose [m^2]; heading: of its yaw [rad^2].
-        gate: [sigma].
+        pose: x, y [m], yaw [rad] by the odometry, shape (3,).
+        centre: Detections in the base frame, shape (D, 2) [m].
+        sigma: Standard deviation of each detection [m], shape (D,).
+        landmarks: Well-known landmarks in the frame of the map, shape (L, 2) [m].
+        position: Variance of x and of y of the pose [m^2].
+        heading: Variance of its yaw [rad^2].
+        gate: Maximum distance of a match [sigma].
+
+    Returns:
+        Number of matches; number of expected matches, which is the smaller of D and the number of landmarks
+        within the range of the detections; and the number of matches of uniformly distributed detections. All
+        are 0 with fewer than FEWEST detections or landmarks.
     """
     found = centre.shape[0]
     if found < FEWEST or landmarks.shape[0] < FEWEST:
@@ -162,9 +182,19 @@ def explained(
 
 
 @compiled
-def offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[int, bool, Float]:
-    """Where the robot is instead: how many detections lie on landmarks there, whether that is certain, and
-    x, y [m], yaw [rad], shape (3,)."""
+def search_offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[int, bool, Float]:
+    """Search the pose with most matches between detections and landmarks, within SEARCH and TURNS.
+
+    Each pair of a detection and a landmark proposes a position for each heading. Positions whose grid cell of
+    0.5 m has at least half of the votes of the best pose are counted exactly.
+
+    Args:
+        pose, centre, sigma, landmarks: See `count_matches`.
+
+    Returns:
+        Number of matches; whether the pose is unambiguous (FEWEST, CONVINCING, MARGIN); and the pose x, y
+        [m], yaw [rad], shape (3,).
+    """
     found = centre.shape[0]
     best, second = 0, 0
     place = pose.copy()
@@ -185,7 +215,7 @@ def offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[
                     continue
                 u, v = int((dx + SEARCH) / step), int((dy + SEARCH) / step)
                 counts[u, v] += 1
-                if counts[u, v] * 2 < best:  # neighbouring cells share what lies at their border
+                if counts[u, v] * 2 < best:  # a pose at a border divides its votes between two cells
                     continue
                 hits = 0
                 for k in range(found):
@@ -206,6 +236,8 @@ def offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[
 def _on_landmark(
     x: float, y: float, c: float, s: float, centre: Float, d: int, landmarks: Float, reach: float
 ) -> int:
+    """Return 1 if detection d at a pose x, y [m] with cosine c and sine s of its yaw is within `reach` [m] of
+    a landmark, else 0."""
     wx = x + c * centre[d, 0] - s * centre[d, 1]
     wy = y + s * centre[d, 0] + c * centre[d, 1]
     for j in range(landmarks.shape[0]):

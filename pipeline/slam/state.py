@@ -1,4 +1,4 @@
-"""What FastSLAM knows between two scans, as columns of particles and their landmarks."""
+"""State of FastSLAM between two scans, as arrays over particles and landmarks."""
 
 from __future__ import annotations
 
@@ -8,37 +8,38 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.io.checkpoints.codec import ADDED, NOT_SAVED
-from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import KeyframeGraph, ScanDetections
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.resampling import normalised
-from pipeline.slam.running_statistics import Recent
+from pipeline.slam.running_statistics import RunningStatistics
 from pipeline.slam.shared_errors import SharedErrors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlamState:
-    """Columns of P particles.
+    """State of P particles with their maps.
 
     Attributes:
-        pose: shape (P, 3): x, y [m], yaw [rad] at the last scan that was used, frame of the map.
-        log_weight: shape (P,), up to a constant.
-        maps: The landmarks of all particles; `map_of` gives those of one.
-        motion: shape (3,): motion by odometry since the last scan that was used.
-        motion_covariance: shape (3, 3), of `motion`.
-        since_update: Distance driven, and a metre per radian turned, since then [m].
-        detections: How many detections were seen so far.
-        best: The particle that explained the last scans best; its map and past are shown.
-        genealogy: Where the particles came from.
-        recent: What the health is judged by.
-        frame: How well the frame was known where landmarks were begun.
-        graph: Keyframes and the landmarks that they show.
-        keyframe_motion: Motion since the last keyframe, shape (3,); keyframe_covariance: of it, shape (3, 3).
-        distance: Distance driven, and a metre per radian turned [m].
+        pose: x, y [m], yaw [rad] at the last used scan in the frame of the map, shape (P, 3).
+        log_weight: Log weights up to a constant, shape (P,).
+        maps: Landmarks of all particles; the method `map_of` returns those of one.
+        motion: Motion by odometry since the last used scan, shape (3,).
+        motion_covariance: Covariance of `motion`, shape (3, 3).
+        since_update: Distance driven since then, with 1 m per radian of turn [m].
+        detections: Number of detections in all scans so far; the next detection gets this birth number.
+        best: Row of the best particle, whose map and path are reported.
+        genealogy: Ancestors of the particles and their paths.
+        recent: Running statistics, from which the quality of the pose is derived.
+        frame: Lower bound of the pose covariance in the frame of the map.
+        graph: Graph of keyframes and landmarks.
+        keyframe_motion: Motion by odometry since the last keyframe, shape (3,).
+        keyframe_covariance: Covariance of `keyframe_motion`, shape (3, 3).
+        distance: Distance driven, with 1 m per radian of turn [m].
         since_keyframe: Detections of the scans since the last keyframe.
-        shared: Error that the measured poses of one source share; it is not saved, because another source has
-            another error.
+        shared: Errors that the measured poses of one source share. They are not saved, because the source of
+            a continued run has other errors.
     """
 
     pose: Float
@@ -50,8 +51,8 @@ class SlamState:
     detections: int = 0
     best: int = 0
     genealogy: Genealogy = field(default_factory=Genealogy)
-    recent: Recent = field(default_factory=Recent)
-    frame: FrameMemory = field(default_factory=FrameMemory)
+    recent: RunningStatistics = field(default_factory=RunningStatistics)
+    frame: FrameUncertainty = field(default_factory=FrameUncertainty)
     graph: KeyframeGraph = field(default_factory=KeyframeGraph, metadata={ADDED: None})
     keyframe_motion: Float = field(default_factory=lambda: np.zeros(3), metadata={ADDED: None})
     keyframe_covariance: Float = field(default_factory=lambda: np.zeros((3, 3)), metadata={ADDED: None})
@@ -61,7 +62,8 @@ class SlamState:
 
     @classmethod
     def at_origin(cls, particles: int) -> SlamState:
-        """All particles at the origin, no landmark."""
+        """Return the state of a new map: all particles at the origin, with zero log weights and without
+        landmarks."""
         return cls(
             pose=np.zeros((particles, 3)),
             log_weight=np.zeros(particles),
@@ -72,7 +74,12 @@ class SlamState:
 
     @classmethod
     def in_map(cls, pose: Float, landmarks: MapColumns) -> SlamState:
-        """Particles at poses of shape (P, 3), all with the same landmarks: to go on in a known map."""
+        """Return a state in which all particles have the same known map.
+
+        Args:
+            pose: Poses of the particles, shape (P, 3).
+            landmarks: Landmarks of the map.
+        """
         return replace(
             cls.at_origin(len(pose)),
             pose=pose.copy(),
@@ -81,15 +88,22 @@ class SlamState:
         )
 
     def map_of(self, particle: int) -> MapColumns:
-        """The landmarks of one particle, copied."""
+        """Return a copy of the landmarks of one particle."""
         return MapColumns(*map_of(self.maps, particle))
 
     def copy(self) -> SlamState:
-        """An independent copy, without the room that no landmark uses."""
+        """Return an independent copy, without unused capacity."""
         return self._drawn(np.arange(len(self.pose)))
 
     def placed(self, pose: Float) -> SlamState:
-        """All particles with the map and the past of the best one, at new poses, shape (P, 3)."""
+        """Return a state with the particles at new poses, all with the map and the path of the best particle.
+
+        Weights, the motion since the last scan, running statistics (except `mapped`) and shared errors are
+        reset.
+
+        Args:
+            pose: New poses, shape (P, 3); P may differ from the present number.
+        """
         rows = np.full(len(pose), self.best)
         return replace(
             self,
@@ -100,13 +114,14 @@ class SlamState:
             motion_covariance=np.zeros((3, 3)),
             best=0,
             genealogy=self.genealogy.redrawn(rows),
-            recent=Recent(mapped=self.recent.mapped),
-            frame=self.frame.forgotten(),
+            recent=RunningStatistics(mapped=self.recent.mapped),
+            frame=self.frame.without_hidden(),
             shared=SharedErrors(),
         )
 
     def with_particles(self, particles: int) -> SlamState:
-        """The same belief with another number of particles, drawn as low-variance resampling does."""
+        """Return the state resampled to another number of particles, systematically by their weights with the
+        offset 1/2; the state itself if the number is unchanged."""
         if particles == len(self.pose):
             return self
         weights = normalised(self.log_weight)
@@ -120,6 +135,7 @@ class SlamState:
         )
 
     def _drawn(self, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> SlamState:
+        """Return the state with the particles of the given rows, int64, shape (P,); rows may repeat."""
         return replace(
             self,
             pose=self.pose[rows],

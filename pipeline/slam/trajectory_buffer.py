@@ -1,4 +1,4 @@
-"""A path that grows scan by scan."""
+"""Buffer for the path of a run, which grows scan by scan."""
 
 from __future__ import annotations
 
@@ -8,8 +8,14 @@ from pipeline.geometry.poses import Float, Pose2
 from pipeline.types.records import Int, Path
 
 
-class GrowingPath:
-    """Stamps, sigmas and the odometry of a path that grows by doubling."""
+class TrajectoryBuffer:
+    """Time, sigma and odometry of each scan; the capacity doubles when it is full.
+
+    Args:
+        stamp_ns: Times of the scans so far [ns], int64, shape (N,); None for none.
+        sigma: Their position sigmas [m], shape (N,).
+        motion: Their steps, shape (N, 3); see `motion`.
+    """
 
     def __init__(
         self, stamp_ns: Int | None = None, sigma: Float | None = None, motion: Float | None = None
@@ -24,21 +30,22 @@ class GrowingPath:
 
     @property
     def stamp_ns(self) -> Int:
-        """Of the scans so far."""
+        """Times of the scans [ns], int64, shape (N,); a view."""
         return self._stamp[: self._length]
 
     @property
     def sigma_xy(self) -> Float:
-        """Of the poses so far [m]."""
+        """Standard deviations of the positions [m], shape (N,); a view."""
         return self._sigma[: self._length]
 
     @property
     def motion(self) -> Float:
-        """x, y [m], yaw [rad] by the odometry to each scan from the one before, shape (N, 3)."""
+        """Steps x, y [m], yaw [rad] by odometry from the scan before to each scan, shape (N, 3); a view."""
         return self._motion[: self._length]
 
     def append(self, stamp_ns: int, motion: Pose2) -> None:
-        """Add a scan; `set_sigma` follows once its pose is estimated."""
+        """Add a scan with its time [ns] and the odometry step to it. Its sigma is undefined until
+        `set_sigma`."""
         if self._length == len(self._stamp):
             self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
             self._sigma = np.concatenate([self._sigma, np.zeros_like(self._sigma)])
@@ -48,15 +55,16 @@ class GrowingPath:
         self._length += 1
 
     def set_sigma(self, covariance: Float) -> None:
-        """Set the sigma of the newest pose from the covariance of x, y, yaw, shape (3, 3)."""
+        """Set the sigma of the last scan to sqrt((Cxx + Cyy) / 2), from the covariance C of x, y [m], yaw
+        [rad], shape (3, 3)."""
         self._sigma[self._length - 1] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
 
     def cut(self, length: int) -> None:
-        """Keep the first scans alone."""
+        """Keep only the first `length` scans."""
         self._length = length
 
     def columns(self, poses: Float) -> Path:
-        """With the poses, shape (N, 3): x, y [m], yaw [rad]."""
+        """Return the path with poses x, y [m], yaw [rad], shape (N, 3); its arrays are copies."""
         n = self._length
         return Path(
             self._stamp[:n].copy(),

@@ -14,7 +14,7 @@ from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.slam import SlamState
 from pipeline.slam.association import associate
-from pipeline.slam.frame_uncertainty import FrameMemory, carried
+from pipeline.slam.frame_uncertainty import FrameUncertainty, transported_covariance
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
 from pipeline.tracking.observation import SECTORS
@@ -157,10 +157,10 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
     )
 
 
-def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemory:
+def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameUncertainty:
     """Return the uncertainty of the frame of the merged map: the records of both runs, those of b with the
     uncertainty of T added."""
-    own, other = a.frame.forgotten(), b.frame
+    own, other = a.frame.without_hidden(), b.frame
     if not len(other.serial):
         return own
     pose = np.column_stack([T.apply(other.pose[:, :2]), wrap_angle(other.pose[:, 2] + T.yaw)])
@@ -168,7 +168,7 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameMemo
     C[:2, :2] = T.rotation()
     moved = C @ other.covariance @ C.T
     for k, (x, y, _) in enumerate(pose):
-        moved[k] += carried(covariance, x - T.x, y - T.y)
+        moved[k] += transported_covariance(covariance, x - T.x, y - T.y)
     return replace(
         own,
         serial=np.concatenate([own.serial, other.serial + a.detections]),

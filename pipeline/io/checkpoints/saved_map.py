@@ -17,7 +17,7 @@ from pipeline.ground.terrain_map import PackedHeightMap
 from pipeline.loop_closure.kidnapped_robot import RelocaliserState
 from pipeline.mapper import Mapper, MapperState
 from pipeline.slam import SlamState
-from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import KEYFRAMES_MAX, Keyframe, LoopEdge, ScanDetections
 from pipeline.slam.particle_ancestry import BLOCK
 from pipeline.slam.particle_maps import is_sound
@@ -146,9 +146,9 @@ def _check_slam(slam: SlamState) -> None:
     _check_graph(slam, len(past))
 
 
-def _check_frame(frame: FrameMemory, scans: int) -> None:
-    marks, template = len(frame.serial), FrameMemory()
-    for f in fields(FrameMemory):
+def _check_frame(frame: FrameUncertainty, scans: int) -> None:
+    marks, template = len(frame.serial), FrameUncertainty()
+    for f in fields(FrameUncertainty):
         column, wanted = getattr(frame, f.name), getattr(template, f.name)
         if column.shape != ((marks, *wanted.shape[1:]) if len(wanted) == 0 else wanted.shape):
             raise ValueError(f"{f.name} of the frame has another shape")

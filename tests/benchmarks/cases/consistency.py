@@ -130,7 +130,7 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
             pose.append(float(error @ np.linalg.solve(at.covariance, error)))
             position.append(float(error[:2] @ np.linalg.solve(at.covariance[:2, :2], error[:2])))
             nis.append(at.health.innovation)
-            errors.astray += slam.is_astray
+            errors.astray += slam.is_lost
     errors.pose.append(pose)
     errors.position.append(position)
     errors.innovations.append(float(np.nanmean(nis)))

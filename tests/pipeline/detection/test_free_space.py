@@ -53,6 +53,21 @@ def test_where_the_sensor_does_not_look_nothing_is_free():
     assert not free_at(np.pi, 5.0, ahead, nothing)
 
 
+def test_beyond_the_edge_of_the_field_of_view_nothing_is_free():
+    half = np.radians(35.0)
+    ahead = circle(20.0, np.linspace(-half, half, 300))
+    nothing = np.zeros((0, 3), np.float32)
+    for side in (-1.0, 1.0):
+        assert free_at(side * (half - 0.03), 5.0, ahead, nothing)
+        assert not free_at(side * (half + 0.05), 5.0, ahead, nothing), "no beam went there"
+
+
+def test_a_gap_between_returns_is_inside_the_field_of_view():
+    gap = np.radians(0.5 * FIELD)
+    around = np.concatenate([np.linspace(-0.6, -0.5 * gap, 200), np.linspace(0.5 * gap, 0.6, 200)])
+    assert free_at(0.0, 5.0, circle(20.0, around), np.zeros((0, 3), np.float32))
+
+
 def test_an_empty_scan_frees_nothing():
     nothing = np.zeros((0, 3), np.float32)
     np.testing.assert_array_equal(clear_range(nothing, nothing, np.zeros(3)), np.zeros(BINS))
@@ -96,11 +111,12 @@ def test_the_free_distance_is_that_of_the_nearest_point_by_direction(seed, sprea
     raw = random.normal(0.0, spread, (300, 3)).astype(np.float32)
     raw[:60, :2] = np.round(raw[:60, :2])  # on the axes, on the diagonals, at the origin
     sensor = np.array([0.25, -0.5, 1.0]) * float(random.integers(0, 2))
-    nearest, looked = np.full(BINS, np.inf), np.zeros(BINS, bool)
+    nearest, left, right = np.full(BINS, np.inf), np.zeros(BINS, bool), np.zeros(BINS, bool)
     for x, y in raw[:, :2] + sensor[:2]:
         k = direction_bin(x, y, BINS)
-        looked[[(k + j) % BINS for j in range(-FIELD, FIELD + 1)]] = True
+        left[[(k - j) % BINS for j in range(FIELD + 1)]] = True
+        right[[(k + j) % BINS for j in range(FIELD + 1)]] = True
         nearest[k] = min(nearest[k], np.hypot(x, y))
-    free = np.where(looked, nearest, 0.0)
+    free = np.where(left & right, nearest, 0.0)
     wanted = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
     np.testing.assert_allclose(clear_range(raw, raw, sensor), wanted)

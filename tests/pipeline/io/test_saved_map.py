@@ -21,7 +21,7 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import decode, encode, read_archive, write_archive
 from pipeline.io.checkpoints.saved_map import SavedMap
-from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import LoopEdge
 from pipeline.types.records import Float, Float32, Int
 from tests.pipeline.test_mapper import as_bytes, fed, mapper, run
@@ -89,11 +89,11 @@ def test_a_placed_robot_stands_where_it_was_put():
 @pytest.mark.parametrize(
     "changed",
     [
-        FrameMemory(serial=np.arange(5)),
-        FrameMemory(np.array([3, 1]), np.arange(2), np.zeros((2, 3)), np.zeros((2, 3, 3))),
-        FrameMemory(np.arange(2), np.array([0, 10**6]), np.zeros((2, 3)), np.zeros((2, 3, 3))),
-        FrameMemory(hidden=np.full((3, 3), np.nan)),
-        FrameMemory(at=np.zeros(2)),
+        FrameUncertainty(serial=np.arange(5)),
+        FrameUncertainty(np.array([3, 1]), np.arange(2), np.zeros((2, 3)), np.zeros((2, 3, 3))),
+        FrameUncertainty(np.arange(2), np.array([0, 10**6]), np.zeros((2, 3)), np.zeros((2, 3, 3))),
+        FrameUncertainty(hidden=np.full((3, 3), np.nan)),
+        FrameUncertainty(at=np.zeros(2)),
     ],
     ids=[
         "marks without poses",

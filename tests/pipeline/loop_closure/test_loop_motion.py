@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.poses import Pose2
 from pipeline.loop_closure.detection import RunHistory, loop_to
 from pipeline.loop_closure.map_correction import PathCorrection
-from pipeline.slam.frame_uncertainty import FrameMemory
+from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, Solution
 from pipeline.slam.loop_correction import corrected_landmarks, without_jumps
 from pipeline.slam.particle_maps import MapColumns
@@ -152,9 +152,13 @@ def test_trees_seen_at_different_times_move_with_their_own_scans(seed):
 
 
 def test_landmarks_that_are_older_than_all_marks_are_of_the_first_scan():
-    memory = FrameMemory().marked(7, 50, np.zeros(3), np.eye(3)).marked(9, 80, np.ones(3), np.eye(3))
+    memory = (
+        FrameUncertainty()
+        .with_reference(7, 50, np.zeros(3), np.eye(3))
+        .with_reference(9, 80, np.ones(3), np.eye(3))
+    )
     assert memory.scan_of(np.array([0, 6, 7, 8, 9, 30])).tolist() == [0, 0, 50, 50, 80, 80]
-    assert FrameMemory().scan_of(np.array([0, 6])).tolist() == [0, 0]
+    assert FrameUncertainty().scan_of(np.array([0, 6])).tolist() == [0, 0]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
-from pipeline.slam.best_particle import are_apart, heir, leader
+from pipeline.slam.best_particle import are_apart, best_after_resampling, select_best
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from tests.pipeline.strategies import detections, seeds
 
@@ -23,10 +23,10 @@ def test_where_particles_lie_apart_one_is_followed_until_it_dies(seed, power):
     near, far = random.normal(0.0, 0.2, (40, 3)), random.normal(0.0, 8.0, (40, 3))
     far[weights.argmax(), :2] += 1e3  # however the weights are
     assert (are_apart(near, weights, 1.0), are_apart(far, weights, 1.0)) == (False, True)
-    assert leader(weights, 7, near, 1.0) == weights.argmax()
-    assert leader(weights, 7, far, 1.0) == 7
+    assert select_best(weights, 7, near, 1.0) == weights.argmax()
+    assert select_best(weights, 7, far, 1.0) == 7
     ancestors = low_variance_ancestors(weights, offset)
-    chosen = heir(7, ancestors, weights)
+    chosen = best_after_resampling(7, ancestors, weights)
     assert ancestors[chosen] == chosen, "a survivor keeps its slot"
     assert chosen == (7 if 7 in ancestors else weights.argmax())
 

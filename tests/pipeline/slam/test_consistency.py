@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
-from pipeline.slam.frame_uncertainty import FrameMemory, at_least, carried
+from pipeline.slam.frame_uncertainty import FrameUncertainty, at_least, transported_covariance
 from pipeline.tracking import Tracker
 from pipeline.tracking.split_covariance_intersection import split, weight
 from tests.benchmarks.cases.consistency import Errors, one_run
@@ -105,22 +105,24 @@ def test_the_larger_of_two_covariances_is_as_large_as_both(seed):
 
 
 def test_an_error_of_the_heading_moves_what_lies_far_from_where_it_was_made():
-    C = carried(np.diag([0.0, 0.0, 0.01**2]), 20.0, 0.0)
+    C = transported_covariance(np.diag([0.0, 0.0, 0.01**2]), 20.0, 0.0)
     np.testing.assert_allclose(np.sqrt(np.diag(C)), [0.0, 0.2, 0.01])
 
 
 def test_what_the_particles_forgot_is_remembered_where_the_landmarks_stand():
     wide, thin = np.eye(3) * 0.04, np.eye(3) * 1e-4
     here = np.zeros(3)
-    memory = FrameMemory().marked(0, 0, here, wide)
+    memory = FrameUncertainty().with_reference(0, 0, here, wide)
     landmarks = (np.array([[2.0, 0.0]]), np.array([3]), np.array([5], np.int32), 3)
-    told, memory = memory.told(here, thin, MANY, *landmarks, 10.0)
+    told, memory = memory.with_pose(here, thin, MANY, *landmarks, 10.0)
     np.testing.assert_allclose(told, wide, atol=1e-9)
     away = np.array([5.0, 0.0, 0.0])
-    told, _ = memory.told(away, thin, MANY, *landmarks, 1.0)  # no landmark near: what was hidden stays hidden
-    np.testing.assert_allclose(told, thin + carried(wide - thin, 5.0, 0.0), atol=1e-9)
+    told, _ = memory.with_pose(
+        away, thin, MANY, *landmarks, 1.0
+    )  # no landmark near: what was hidden stays hidden
+    np.testing.assert_allclose(told, thin + transported_covariance(wide - thin, 5.0, 0.0), atol=1e-9)
     older = (np.array([[2.0, 0.0]]), np.array([-1]), np.array([5], np.int32), 3)
-    told, _ = FrameMemory().told(here, thin, MANY, *older, 10.0)
+    told, _ = FrameUncertainty().with_pose(here, thin, MANY, *older, 10.0)
     np.testing.assert_allclose(told, thin)
 
 
@@ -156,17 +158,17 @@ def test_a_spread_along_a_line_may_be_as_long_as_a_forest():
 
 
 def test_a_robot_that_heads_backwards_makes_no_marks_while_it_stands():
-    memory = FrameMemory()
+    memory = FrameUncertainty()
     for k in range(10):
         yaw = (np.pi - 0.001) * (-1.0) ** k
-        memory = memory.marked(k, k, np.array([0.0, 0.0, yaw]), np.eye(3))
+        memory = memory.with_reference(k, k, np.array([0.0, 0.0, yaw]), np.eye(3))
     assert len(memory.serial) == 1
 
 
 def test_marks_stand_apart():
-    memory = FrameMemory()
+    memory = FrameUncertainty()
     for k in range(100):
-        memory = memory.marked(k, k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3))
+        memory = memory.with_reference(k, k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3))
     assert 15 <= len(memory.serial) <= 20
     assert np.all(np.diff(memory.pose[:, 0]) > 0.49)
 

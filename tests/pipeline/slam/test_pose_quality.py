@@ -18,12 +18,19 @@ from pipeline.slam.pose_quality import (
     ODOMETRY_WEAK,
     SIGMA_GOOD,
     SIGMA_WEAK,
-    is_astray,
-    judged,
+    is_lost,
+    pose_health,
 )
 from pipeline.slam.rigid_shift_test import MANY
-from pipeline.slam.running_statistics import LED, LED_MOST, STRANGE_LOST, Doubted, Recent, remembered
-from pipeline.slam.scan_statistics import ScanTold, disagreement
+from pipeline.slam.running_statistics import (
+    STRANGE_LOST,
+    TREE_MOTION_MAX,
+    TREE_MOTION_SCANS,
+    OdometryDoubt,
+    RunningStatistics,
+    update_statistics,
+)
+from pipeline.slam.scan_statistics import ScanStatistics, disagreement
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam
@@ -78,7 +85,10 @@ def test_wheels_that_slip_show_in_the_odometry():
     assert slipped.warnings("") == (slipped.doubt,)
     assert slipped.warnings(slipped.doubt) == honest[-1].warnings("") == ()
     assert (
-        judged(Recent(odometry=1.01 * ODOMETRY_WEAK), ScanTold(), 50.0, 9, np.zeros((3, 3))).state == "weak"
+        pose_health(
+            RunningStatistics(odometry=1.01 * ODOMETRY_WEAK), ScanStatistics(), 50.0, 9, np.zeros((3, 3))
+        ).state
+        == "weak"
     )
 
 
@@ -102,33 +112,33 @@ def test_driving_where_nothing_is_known_is_weak():
     empty = [slam.process(k, Pose2(0.5), detections([]), NOTHING_SEEN).health for k in range(30, 42)]
     told = empty[-1]
     assert told.state == "weak"
-    assert "the odometry leads alone" in told.reason
+    assert "only odometry" in told.reason
     assert np.isnan(told.innovation)
 
 
 @pytest.mark.parametrize(
     ("recent", "sigma", "doubt", "state"),
     [
-        (Recent(), 0.1, "", "good"),
-        (Recent(), 1.01 * SIGMA_GOOD, "", "weak"),
-        (Recent(), 1.01 * SIGMA_WEAK, "", "lost"),
-        (Recent(), float("nan"), "", "lost"),
-        (Recent(), 0.1, "no odometry", "weak"),
-        (Recent(innovation=1.01 * INNOVATION_WEAK), 0.1, "", "weak"),
-        (Recent(found=0.5 * FOUND_LOST, mapped=True), 0.1, "", "lost"),
-        (Recent(found=0.5 * FOUND_LOST, mapped=False), 0.1, "", "good"),
-        (Recent(ambiguous=0.9), 0.1, "", "weak"),
+        (RunningStatistics(), 0.1, "", "good"),
+        (RunningStatistics(), 1.01 * SIGMA_GOOD, "", "weak"),
+        (RunningStatistics(), 1.01 * SIGMA_WEAK, "", "lost"),
+        (RunningStatistics(), float("nan"), "", "lost"),
+        (RunningStatistics(), 0.1, "no odometry", "weak"),
+        (RunningStatistics(innovation=1.01 * INNOVATION_WEAK), 0.1, "", "weak"),
+        (RunningStatistics(found=0.5 * FOUND_LOST, mapped=True), 0.1, "", "lost"),
+        (RunningStatistics(found=0.5 * FOUND_LOST, mapped=False), 0.1, "", "good"),
+        (RunningStatistics(ambiguous=0.9), 0.1, "", "weak"),
     ],
 )
 def test_the_word_and_its_reason(recent, sigma, doubt, state):
-    health = judged(recent, ScanTold(), 50.0, 20, np.diag([sigma**2, sigma**2, 0.01**2]), doubt)
+    health = pose_health(recent, ScanStatistics(), 50.0, 20, np.diag([sigma**2, sigma**2, 0.01**2]), doubt)
     assert health.state == state
     assert bool(health.reason) == (state != "good")
 
 
 def test_a_scan_that_says_nothing_leaves_the_means():
-    recent = Recent(innovation=2.0, found=0.4, ambiguous=0.3, mapped=True)
-    after = remembered(recent, ScanTold(), 1.0)
+    recent = RunningStatistics(innovation=2.0, found=0.4, ambiguous=0.3, mapped=True)
+    after = update_statistics(recent, ScanStatistics(), 1.0)
     assert (after.innovation, after.found, after.ambiguous) == (2.0, 0.4, 0.3)
     assert after.alone == 1.0
 
@@ -136,30 +146,36 @@ def test_a_scan_that_says_nothing_leaves_the_means():
 @pytest.mark.parametrize(("trees", "state"), [(MANY - 1, "weak"), (MANY, "good")])
 def test_trees_that_contradict_an_odometry_for_long_must_be_many(trees, state):
     """Fewer may be people."""
-    recent, scan = Recent(mapped=True), ScanTold(detections=trees, recognised=float(trees))
-    for _ in range(2 * LED):
-        recent = remembered(recent, scan, 0.0, Doubted(by_trees=True))
-    assert judged(recent, scan, 50.0, 20, np.zeros((3, 3)), "stuck").state == state
+    recent, scan = RunningStatistics(mapped=True), ScanStatistics(detections=trees, recognised=float(trees))
+    for _ in range(2 * TREE_MOTION_SCANS):
+        recent = update_statistics(recent, scan, 0.0, OdometryDoubt(contradicted=True))
+    assert pose_health(recent, scan, 50.0, 20, np.zeros((3, 3)), "stuck").state == state
 
 
 def test_trees_that_led_for_long_make_a_doubted_odometry_good():
-    recent, states = Recent(mapped=True), []
-    for _ in range(LED + 5):
-        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.0, Doubted(True))
-        states.append(judged(recent, ScanTold(), 50.0, 20, np.zeros((3, 3)), "no odometry").state)
-    assert states == ["weak"] * (LED - 1) + ["good"] * 6
-    few = remembered(recent, ScanTold(detections=2, recognised=2.0), 0.0, Doubted(True))
+    recent, states = RunningStatistics(mapped=True), []
+    for _ in range(TREE_MOTION_SCANS + 5):
+        recent = update_statistics(
+            recent, ScanStatistics(detections=6, recognised=5.0), 0.0, OdometryDoubt(True)
+        )
+        states.append(pose_health(recent, ScanStatistics(), 50.0, 20, np.zeros((3, 3)), "no odometry").state)
+    assert states == ["weak"] * (TREE_MOTION_SCANS - 1) + ["good"] * 6
+    few = update_statistics(recent, ScanStatistics(detections=2, recognised=2.0), 0.0, OdometryDoubt(True))
     assert few.led == 0
-    for k in range(2 * LED):
-        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.1, Doubted(k % 2 == 1))
-        word = judged(recent, ScanTold(), 50.0, 20, np.zeros((3, 3)), "no odometry" if k % 2 else "").state
+    for k in range(2 * TREE_MOTION_SCANS):
+        recent = update_statistics(
+            recent, ScanStatistics(detections=6, recognised=5.0), 0.1, OdometryDoubt(k % 2 == 1)
+        )
+        word = pose_health(
+            recent, ScanStatistics(), 50.0, 20, np.zeros((3, 3)), "no odometry" if k % 2 else ""
+        ).state
         assert word == "good", "a doubt that comes and goes does not begin anew"
-    for _ in range(LED_MOST):
-        recent = remembered(recent, ScanTold(detections=6, recognised=5.0), 0.1)
+    for _ in range(TREE_MOTION_MAX):
+        recent = update_statistics(recent, ScanStatistics(detections=6, recognised=5.0), 0.1)
     assert recent.led == 0, "another doubt is another one"
 
 
-CHANCE = ScanTold(detections=12, recognised=1.0, found=20.0, missed=200.0)
+CHANCE = ScanStatistics(detections=12, recognised=1.0, found=20.0, missed=200.0)
 
 
 @pytest.mark.parametrize(
@@ -177,23 +193,25 @@ def test_a_known_place_whose_trees_are_all_missed_at_once_is_another_one(
     familiar, alone, doubted, missed, lost
 ):
     """Some trees are recognised there by chance."""
-    recent, states = Recent(mapped=True, familiar=familiar, alone=alone), []
+    recent, states = RunningStatistics(mapped=True, familiar=familiar, alone=alone), []
     for _ in range(STRANGE_LOST):
-        recent = remembered(recent, replace(CHANCE, missed=missed), 0.2, Doubted(doubted))
-        states.append(judged(recent, CHANCE, 50.0, 20, np.zeros((3, 3))).state)
+        recent = update_statistics(recent, replace(CHANCE, missed=missed), 0.2, OdometryDoubt(doubted))
+        states.append(pose_health(recent, CHANCE, 50.0, 20, np.zeros((3, 3))).state)
     assert (recent.strange == STRANGE_LOST) == lost
     assert (states == ["weak"] * (STRANGE_LOST - 1) + ["lost"]) == lost
-    assert is_astray(recent) == lost
-    assert remembered(recent, replace(CHANCE, found=200.0), 0.2).strange == 0
+    assert is_lost(recent) == lost
+    assert update_statistics(recent, replace(CHANCE, found=200.0), 0.2).strange == 0
 
 
 def test_the_trees_of_another_place_do_not_soon_make_it_the_known_one():
     assert preset("forest").slam.hits_to_weigh < STRANGE_LOST
-    recent = Recent(mapped=True, familiar=0.9)
+    recent = RunningStatistics(mapped=True, familiar=0.9)
     for hits in (0, 0, 0, 3, 4):
-        scan = ScanTold(detections=12, recognised=12.0 if hits else 0.0, found=12.0 * hits, missed=200.0)
-        recent = remembered(recent, scan, 0.2)
-    assert is_astray(recent)
+        scan = ScanStatistics(
+            detections=12, recognised=12.0 if hits else 0.0, found=12.0 * hits, missed=200.0
+        )
+        recent = update_statistics(recent, scan, 0.2)
+    assert is_lost(recent)
 
 
 def test_distinct_ancestors_are_those_of_the_generations():

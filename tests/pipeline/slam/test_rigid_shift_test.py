@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.slam.motion import Noise, Wheels
-from pipeline.slam.rigid_shift_test import AGREE, FEWEST, MANY, SEVERAL, moved_together
-from pipeline.slam.slip_detection import SLIPPED, STUCK, UNSURE, motion_by_trees, why
+from pipeline.slam.motion import Noise, OdometryTrust
+from pipeline.slam.rigid_shift_test import AGREE, FEWEST, MANY, SEVERAL, estimate_rigid_shift
+from pipeline.slam.slip_detection import SLIPPED, STUCK, UNSURE, motion_by_trees, slip_message
 from tests.pipeline.strategies import seeds
 
 SIGMA = 0.03
@@ -31,13 +31,13 @@ def scene(seed, trees=14):
 def asked(
     known, seen, *, pose=(0.0, 0.0, 0.0), position=0.0, heading=0.0, distrust=0.0, familiar=1.0, well=None
 ):
-    """Of `moved_together` with round covariances, in a place that is well known: whether it moved, where it
-    is, and the covariance."""
+    """Return the results of `estimate_rigid_shift` but the second, with circular covariances: whether the
+    shift is significant, the pose, and its covariance."""
     rows = np.array([SIGMA**2, 0.0, SIGMA**2])
     R, spread = np.tile(rows, (len(seen), 1)), np.tile(rows, (len(known), 1))
     well = np.ones(len(known), np.bool_) if well is None else well
-    wheels = Wheels(SURE, distrust, 0.0, familiar)
-    moved, unsure, place, C = moved_together(
+    wheels = OdometryTrust(SURE, distrust, 0.0, familiar)
+    moved, unsure, place, C = estimate_rigid_shift(
         np.array(pose), position, heading, wheels, seen, R, known, spread, well
     )
     assert not (moved and unsure)
@@ -143,7 +143,7 @@ def test_a_few_well_known_ones_tell_only_of_an_odometry_that_was_wrong(pairs):
     assert not told.slipped
     assert told.unsure
     np.testing.assert_array_equal(told.motion, 0.0)
-    assert why(told.motion, told.slipped, told.unsure) == UNSURE
+    assert slip_message(told.motion, told.slipped, told.unsure) == UNSURE
     again = told_of([0.0, 0.0, 0.0], known, seen, distrust=0.5)
     assert again.slipped
     assert not again.unsure
@@ -180,7 +180,7 @@ def told_of(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0, dist
     rows = np.array([SIGMA**2, 0.0, SIGMA**2])
     return motion_by_trees(
         np.zeros(3), np.array(motion), covariance * np.eye(3), driven,
-        Wheels(SURE, distrust, alone, 1.0), seen,
+        OdometryTrust(SURE, distrust, alone, 1.0), seen,
         np.tile(rows, (len(seen), 1)), known, np.tile(rows, (len(known), 1)),
         np.full(len(known), 10, np.int32), 3, 3.5,
     )  # fmt: skip
@@ -192,9 +192,9 @@ def test_stuck_wheels_are_put_right_over_any_way(true):
     told = told_of([0.0, 0.0, 0.0], known, true.inverse().apply(known))
     assert told.slipped
     np.testing.assert_allclose(told.motion, true.as_array(), atol=0.15)
-    assert why(np.zeros(3), told.slipped, False) == STUCK
-    assert why(np.array([0.1, 0.0, 0.0]), told.slipped, False) == SLIPPED
-    assert why(np.zeros(3), False, False) == ""
+    assert slip_message(np.zeros(3), told.slipped, False) == STUCK
+    assert slip_message(np.array([0.1, 0.0, 0.0]), told.slipped, False) == SLIPPED
+    assert slip_message(np.zeros(3), False, False) == ""
 
 
 def test_a_motion_that_is_not_known_is_told_by_trees_that_agree_with_it():

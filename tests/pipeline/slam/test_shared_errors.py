@@ -10,7 +10,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam import FastSlam, Motion
 from pipeline.slam.motion import inverted, noise_of, step_variances
-from pipeline.slam.shared_errors import Measured, SharedErrors, corrected_by, learn_shared
+from pipeline.slam.shared_errors import MeasuredPose, SharedErrors, correct_by_measured, update_shared_errors
 from pipeline.slam.state import SlamState
 from pipeline.types.sensor_data import SHARED, SOURCES, PoseMeasurement
 from tests.benchmarks.stands import RING
@@ -128,14 +128,14 @@ def test_a_particle_learns_what_the_joint_gaussian_of_pose_and_errors_says(seed)
     K = joint @ G.T @ np.linalg.inv(S)
     y = z - mu - H @ e
     mean, after = np.concatenate([mu, e]) + K @ y, joint - K @ S @ K.T
-    measured = Measured(z, own, H, e[None].copy(), E[None].copy())
+    measured = MeasuredPose(z, own, H, e[None].copy(), E[None].copy())
     told_mu, told_P = mu.copy(), P.copy()
-    likelihood = corrected_by(told_mu, told_P, measured, 0)
+    likelihood = correct_by_measured(told_mu, told_P, measured, 0)
     np.testing.assert_allclose(told_mu, mean[:3], atol=1e-9)
     np.testing.assert_allclose(told_P, after[:3, :3], atol=1e-8)
     assert likelihood == pytest.approx(-0.5 * y @ np.linalg.solve(S, y) - 0.5 * np.log(np.linalg.det(S)))
     x = told_mu + rng.normal(0.0, 0.1, 3)  # the pose that is drawn
-    learn_shared(x[None], measured, 0)
+    update_shared_errors(x[None], measured, 0)
     gain = after[3:, :3] @ np.linalg.inv(after[:3, :3])
     np.testing.assert_allclose(measured.mean[0], mean[3:] + gain @ (x - mean[:3]), atol=1e-6)
     np.testing.assert_allclose(measured.covariance[0], after[3:, 3:] - gain @ after[:3, 3:], atol=1e-6)
@@ -165,10 +165,10 @@ def test_a_gate_asks_for_what_the_source_is_known_to_err_by():
     z = PoseMeasurement(0, Pose2(1.0, 0.0, 0.0), np.diag(OWN**2) + H @ H.T, shared=H)
     begun = SharedErrors.begun_at(2, np.zeros(3), np.eye(3))
     weights = np.array([0.5, 0.5])
-    same = begun.as_seen(z, weights)
+    same = begun.without_shared_error(z, weights)
     np.testing.assert_allclose(same.covariance, z.covariance, atol=1e-12)
     begun.mean[0, :, 0], begun.covariance[0, :, 0, 0] = 2.0, 0.01
-    seen = begun.as_seen(z, weights)
+    seen = begun.without_shared_error(z, weights)
     assert seen.T_map_base.x == pytest.approx(1.0 - 2.0 * SHIFT)
     assert seen.covariance[0, 0] == pytest.approx(OWN[0] ** 2 + 0.01 * SHIFT**2)
 
