@@ -1,15 +1,15 @@
-"""Errors that are meant for people: what went wrong, where, and what to do about it."""
+"""Errors with messages for users: what went wrong, where, and how to correct it."""
 
 from __future__ import annotations
 
 
 class StemmapError(Exception):
-    """A failure that a person can act on. Its text is one line: `what (where). remedy`.
+    """An error that a user can act on. Its message is one line: `what (where). remedy`.
 
     Args:
         what: What went wrong, in one clause without a full stop.
-        where: The file, topic, parameter or address it happened at; empty if `what` says it.
-        remedy: What to do about it, one sentence; empty if nothing can be done.
+        where: File, topic, parameter or address at which it happened; empty if `what` contains it.
+        remedy: How to correct it, one sentence; empty if nothing can be done.
     """
 
     def __init__(self, what: str, *, where: str = "", remedy: str = "") -> None:
@@ -26,8 +26,8 @@ class SourceError(StemmapError):
 
 
 class UsageError(SourceError):
-    """A source that is no file and was mistyped: a scenario, option or scheme that does not exist."""
+    """A source argument that is not a file and is not valid: an unknown scenario, option or scheme."""
 
 
 class ParameterError(StemmapError):
-    """A parameter that does not exist, has the wrong type or lies out of its bounds."""
+    """A parameter that does not exist, has the wrong type or is out of its bounds."""

@@ -27,14 +27,12 @@ from pipeline.geometry.quantisation import GROUND, POINT, rounded
 from pipeline.ground import scan_ground
 from pipeline.ground.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
 from pipeline.preprocessing import filters
-from pipeline.preprocessing.acquisition import acquire, acquire_near, driven_with
+from pipeline.preprocessing.acquisition import acquire, acquire_near, base_velocity
 from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.types.clearance import Clearance
 from pipeline.types.records import Clusters, Detections, Float32, Int32, Sensor, Stems, Step, UInt16
 
-FIRST_SCANS = (
-    10  # every one of these updates columns and terrain, so that a short recording gets all its evidence
-)
+FIRST_SCANS = 10  # scans that all update columns and terrain, so that a short recording uses all its data
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +66,7 @@ class SegmentedScan:
         free: Free range by direction (see `pipeline.detection.free_space`).
         column_input: Input of the voxel columns; None for scans that do not update them or show no ground.
         terrain: Ground that updates the terrain map; None for scans that do not update it, or without ground.
-        clearance: Free space in the robot's way; None where obstacles are not looked for.
+        clearance: Free space in the path of the robot; None if obstacle detection is off.
     """
 
     raw: Float32
@@ -100,7 +98,8 @@ class DetectionResult(NamedTuple):
 
 
 def updates_columns(index: int, every: int) -> bool:
-    """Whether a scan updates the voxel columns: each of the first scans, then one of `every`."""
+    """Return whether scan `index` updates the voxel columns: each of the first FIRST_SCANS, then one of
+    `every`."""
     return index < FIRST_SCANS or index % every == 0
 
 
@@ -113,14 +112,14 @@ def updates_terrain(index: int, every: int) -> bool:
 def segment(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, timer: StageTimer = no_timer
 ) -> SegmentedScan:
-    """Filter a scan and find its ground and clusters.
+    """Return a scan filtered and segmented into ground and clusters.
 
     Args:
         step: The scan: points of a LiDAR, or stems that another program has detected.
         sensor: The LiDAR.
         T_base_lidar: Pose of the LiDAR on the robot.
         parameters: Parameters of all stages.
-        timer: Entered around each stage with its name.
+        timer: Called with the name of each stage; its context encloses the stage.
     """
     if step.scan.stems is not None:
         return _segment_stems(step, step.scan.stems, T_base_lidar, parameters, timer)
@@ -128,7 +127,7 @@ def segment(
 
 
 def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_timer) -> DetectionResult:
-    """Give each cluster of a scan its verdict, and return those that are trees."""
+    """Return the verdicts on the clusters of a scan, and the clusters that are trees as detections."""
     with timer("detection"):
         clusters = classify_clusters(scan.clusters, parameters)
         found = detections(clusters, scan.sensor_offset, parameters)
@@ -139,6 +138,7 @@ def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_ti
 def _segment_points(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
+    """Return the segmented scan of a LiDAR; see `segment`."""
     with timer("acquisition"):
         raw, sensor_offset = acquire(step, T_base_lidar, p.acquisition)
 
@@ -167,7 +167,7 @@ def _segment_points(
     grounded = terrain is not None and shows_ground(terrain)
     with timer("obstacles"):
         near = acquire_near(step, T_base_lidar, p.acquisition)
-        twist = driven_with(step, p.acquisition)
+        twist = base_velocity(step, p.acquisition)
         seen = terrain if grounded else None
         clearance = find_clearance(raw, near, seen, sensor_offset, twist, p.obstacles)
 
@@ -208,6 +208,7 @@ def _column_input(
     sensor_offset: Float,
     sensor: Sensor,
 ) -> ColumnInput | None:
+    """Return the input of the voxel columns, see ColumnInput; None without terrain."""
     if height is None or terrain is None:
         return None
     steepest = steepest_by_direction(raw, sensor_offset, sensor.rings > 0)
@@ -221,7 +222,7 @@ def _column_input(
 
 
 def _returns(step: Step, raw: Float32) -> dict[str, int]:
-    """Counts of the returns before the first filter."""
+    """Return the numbers of returns: all, without a value, and outside of the range limits."""
     returns = len(step.scan.points)
     return {
         "returns": returns,
@@ -233,6 +234,8 @@ def _returns(step: Step, raw: Float32) -> dict[str, int]:
 def _segment_stems(
     step: Step, stems: Stems, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
+    """Return the segmented scan of stems that another program detected: each stem is a cluster of one point;
+    see `segment`."""
     with timer("acquisition"):
         places, sensor_offset, clusters = external_clusters(step, stems, T_base_lidar, p.acquisition)
 

@@ -1,4 +1,4 @@
-"""Interface by which a caller measures the stages. The pipeline itself reads no clock."""
+"""Interface for measuring the stages of the pipeline. The pipeline itself reads no clock."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 
 StageTimer = Callable[[str], AbstractContextManager[None]]
-"""Returns the context that encloses one stage, given the name of the stage."""
+"""Function of the name of a stage that returns the context in which the stage runs."""
 
 
 def no_timer(_stage: str) -> AbstractContextManager[None]:
-    """Measure nothing: the default where the caller needs no times."""
+    """Return a context that measures nothing: the default for callers that need no times."""
     return nullcontext()

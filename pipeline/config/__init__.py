@@ -1,4 +1,4 @@
-"""Parameter declarations: each tunable value is declared once with bounds, unit, title, step and a sentence.
+"""Parameters: each tunable value is declared once with bounds, unit, title, step and explanation.
 
 The sliders, the REST schema, `--set stage.name=value`, the TOML file and docs/parameters.md derive from it.
 """

@@ -14,12 +14,21 @@ class Stage(BaseModel):
 
     @classmethod
     def title(cls) -> str:
-        """Return the name of the stage for people: its docstring up to the first colon."""
+        """Return the title of the stage: its docstring up to the first colon."""
         return (cls.__doc__ or cls.__name__).partition(":")[0].strip()
 
 
 def number(default: float, title: str, unit: str, low: float, high: float, step: float, doc: str) -> Any:  # noqa: ANN401 - pydantic's Field is the default of a field of any type
-    """Declare a floating-point parameter in [low, high]; `step` is the increment of its slider."""
+    """Return the declaration of a floating-point parameter.
+
+    Args:
+        default: Value in the preset `forest`.
+        title: Label of the slider.
+        unit: Unit symbol; empty if dimensionless.
+        low, high: Bounds, inclusive.
+        step: Increment of the slider.
+        doc: Explanation in one sentence, for the help text and docs/parameters.md.
+    """
     return Field(
         default=default,
         title=title,
@@ -31,7 +40,15 @@ def number(default: float, title: str, unit: str, low: float, high: float, step:
 
 
 def count(default: int, title: str, unit: str, low: int, high: int, doc: str) -> Any:  # noqa: ANN401
-    """Declare an integer parameter in [low, high]."""
+    """Return the declaration of an integer parameter.
+
+    Args:
+        default: Value in the preset `forest`.
+        title: Label of the slider.
+        unit: Unit symbol; empty if dimensionless.
+        low, high: Bounds, inclusive.
+        doc: Explanation in one sentence, for the help text and docs/parameters.md.
+    """
     return Field(
         default=default,
         title=title,
@@ -43,10 +60,12 @@ def count(default: int, title: str, unit: str, low: int, high: int, doc: str) ->
 
 
 def name(default: str, title: str, pattern: str, doc: str) -> Any:  # noqa: ANN401
-    """Declare a parameter that holds a name; the regular expression `pattern` defines valid names."""
+    """Return the declaration of a parameter that holds a name; the regular expression `pattern` defines the
+    valid names. See `number` for the other arguments."""
     return Field(default=default, title=title, description=doc, pattern=pattern)
 
 
 def choice(default: str | bool, title: str, doc: str) -> Any:  # noqa: ANN401
-    """Declare a parameter whose type is a Literal of words, or bool."""
+    """Return the declaration of a parameter of type bool or Literal, which lists the valid words. See
+    `number` for the arguments."""
     return Field(default=default, title=title, description=doc)

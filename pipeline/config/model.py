@@ -153,6 +153,7 @@ def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _first_message(error: ValidationError) -> str:
+    """Return the first error of a validation as one line with the dotted name of the parameter."""
     first = error.errors()[0]
     name = ".".join(str(part) for part in first["loc"])
     if first["type"] == "value_error":  # a rule across fields, whose message names them
@@ -164,6 +165,8 @@ def _first_message(error: ValidationError) -> str:
 
 
 def _nearest(name: str) -> str:
+    """Return the text "; the nearest is ..." with the most similar parameter name; empty without a similar
+    one."""
     close = difflib.get_close_matches(name, [spec.name for spec in field_specs()], n=1)
     return f"; the nearest is {close[0]!r}" if close else ""
 
@@ -208,6 +211,7 @@ def field_specs() -> tuple[FieldSpec, ...]:
 
 
 def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
+    """Return the description of one parameter."""
     field = stage_model.model_fields[name]
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     bounds = {type(m).__name__: m for m in field.metadata}

@@ -31,7 +31,7 @@ class Acquisition(Stage):
     deskew: bool = choice(
         True, "De-skew", "Compensate the motion of the robot during the sweep for each point."
     )
-    gyro: bool = choice(True, "Gyroscope", "Take the rotation of the robot from the gyroscope of the IMU.")
+    gyro: bool = choice(True, "Gyroscope", "Use the gyroscope of the IMU for the yaw rate of the robot.")
     range_min: float = number(
         0.5,
         "Minimum range",
@@ -78,7 +78,9 @@ class Ground(Stage):
     """Ground: the terrain model and the height band above it that is searched for trunks."""
 
     method: Literal["none", "polar"] = choice(
-        "polar", "Ground model", "No ground model, or a polar grid with a maximum slope."
+        "polar",
+        "Ground model",
+        "polar: ground surface on a polar grid with a maximum slope; none: no ground.",
     )
     height_min: float = number(
         0.3, "Minimum height", "m", -1.0, 10.0, 0.05, "Points lower above the ground are removed."
@@ -98,7 +100,9 @@ class Clustering(Stage):
     """Clustering: DBSCAN, or cuts at range jumps for a planar laser."""
 
     method: Literal["dbscan", "range_jump"] = choice(
-        "dbscan", "Method", "DBSCAN on the points, or a cut where the range of neighbouring beams jumps."
+        "dbscan",
+        "Method",
+        "dbscan: density of the points; range_jump: a cut where the range of neighbouring beams jumps.",
     )
     engine: Literal["grid", "sklearn", "open3d"] = choice(
         "grid",
@@ -144,7 +148,9 @@ class Shape(Stage):
         "2 uses x and y, 3 uses x, y and z; the eccentricity is lambda1 / lambda2.",
     )
     centre: Literal["centroid", "circle"] = choice(
-        "circle", "Trunk centre", "The centroid of the visible arc, as in the paper, or a fitted circle."
+        "circle",
+        "Trunk centre",
+        "centroid: mean of the visible arc, as in the paper; circle: centre of a fitted circle.",
     )
     split_slices: int = count(
         4,
@@ -364,7 +370,7 @@ class Slam(Stage):
         0.1,
         100.0,
         0.1,
-        "Motion between two keyframes of the graph that corrects path and map; a turn of 1 rad counts 1 m.",
+        "Motion between two keyframes of the graph that corrects path and map; 1 rad of turn counts as 1 m.",
     )
 
 
@@ -374,7 +380,7 @@ class Relocalisation(Stage):
     method: Literal["none", "constellation"] = choice(
         "constellation",
         "Method",
-        "Search the map for the visible stems by their pairwise distances, or no relocalisation.",
+        "constellation: search the map for the visible stems by their pairwise distances; none: off.",
     )
     stems_min: int = count(
         6, "Minimum agreeing stems", "", 4, 100, "Stems that must agree with a pose before it is accepted."
@@ -399,7 +405,7 @@ class Classification(Stage):
     method: Literal["none", "columns"] = choice(
         "columns",
         "Method",
-        "Classify trees by their voxel columns, or accept trees by their number of hits.",
+        "columns: class of the voxel column of a tree; none: number of hits of a tree.",
     )
     range_max: float = number(
         25.0, "Maximum range", "m", 1.0, 100.0, 1.0, "Farther returns are not accumulated in the voxel map."
@@ -511,7 +517,9 @@ class Obstacles(Stage):
     """Obstacles: returns in the path of the robot, and the zones in which it should slow down and stop."""
 
     method: Literal["none", "way"] = choice(
-        "way", "Obstacle detection", "Search the path that results from the current velocities, or off."
+        "way",
+        "Obstacle detection",
+        "way: search the path that results from the current velocities; none: off.",
     )
     width: float = number(
         0.9, "Path width", "m", 0.1, 10.0, 0.05, "Width of the robot including the lateral clearance."

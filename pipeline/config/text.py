@@ -82,7 +82,7 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
     tree: dict[str, Any] = base.model_dump()
     for dotted, value in values.items():
         stage, _, name = dotted.partition(".")
-        # TOML distinguishes 1 from 1.0; a person who writes 1 for a length means 1.0.
+        # TOML distinguishes 1 from 1.0; both are valid for a floating-point parameter.
         integral = dotted in floats and type(value) is int
         tree.setdefault(stage, {})[name] = _as_float(value) if integral else value
     try:

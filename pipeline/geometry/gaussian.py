@@ -1,7 +1,7 @@
-"""Gaussians of poses and positions in the plane, and small positive definite systems.
+"""Gaussians of poses and positions in the plane, and solution of small positive definite systems.
 
-The products are written out with scalars, which stay in registers; library calls for such small matrices take
-longer than all the rest.
+The matrix products are written out with scalars, which stay in registers; library calls for such small
+matrices are slower.
 """
 
 from __future__ import annotations
@@ -15,7 +15,12 @@ from pipeline.jit import compiled, compiled_borrowing, compiled_within
 
 
 class Pose(NamedTuple):
-    """x, y [m], yaw [rad] and the upper half of their covariance."""
+    """A Gaussian pose as scalars.
+
+    Attributes:
+        x, y, yaw: Mean [m, m, rad].
+        xx, xy, xt, yy, yt, tt: Upper half of the covariance of x, y and yaw (t) [m^2, m rad, rad^2].
+    """
 
     x: float
     y: float
@@ -39,7 +44,8 @@ def rows_of(covariance: Float) -> Float:
 
 @compiled_within
 def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
-    """Return the covariance R[d] (xx, xy, yy) rotated by the angle with cosine c and sine s."""
+    """Return xx, xy, yy of C R[d] C^T, where C is the rotation by the angle with cosine c and sine s; row d
+    of R holds the elements xx, xy, yy of a covariance."""
     xx, xy, yy = R[d, 0], R[d, 1], R[d, 2]
     return (
         c * c * xx - 2.0 * c * s * xy + s * s * yy,
@@ -92,6 +98,7 @@ def in_map(
 def _put_in_map(
     centre: Float, covariance: Float, pose: Float, Sigma: Float, place: Float, own: Float, added: Float
 ) -> None:
+    """Write the results of `in_map` into `place`, `own` and `added`."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for d in range(centre.shape[0]):
         x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
@@ -106,8 +113,13 @@ def _put_in_map(
 
 @compiled
 def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
-    """Return what the covariance Sigma of a pose, shape (3, 3), adds to positions along the axes of the map,
-    shape (N, 2) [m]: J Sigma J^T, shape (N, 2, 2) [m^2]."""
+    """Return the covariance that a pose adds to positions relative to it, J Sigma J^T, shape (N, 2, 2) [m^2].
+
+    Args:
+        position: Positions in the frame of the map, shape (N, 2) [m].
+        pose: x, y [m], yaw [rad], shape (3,); J is taken at the difference of positions and pose.
+        Sigma: Covariance of the pose, shape (3, 3).
+    """
     added = np.empty((position.shape[0], 2, 2))
     for k in range(position.shape[0]):
         xx, xy, yy = by_pose(position[k, 0] - pose[0], position[k, 1] - pose[1], Sigma)
@@ -117,8 +129,8 @@ def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
 
 @compiled_borrowing
 def by_pose(x: float, y: float, Sigma: Float) -> tuple[float, float, float]:
-    """Return J Sigma J^T as xx, xy, yy [m^2]: what the covariance of a pose adds to a position x, y [m] away
-    from it along the axes of the map."""
+    """Return xx, xy, yy of J Sigma J^T [m^2], the covariance that a pose with the covariance Sigma, shape (3,
+    3), adds to a position x, y [m] from it along the axes of the map: J = [[1, 0, -y], [0, 1, x]]."""
     return (
         Sigma[0, 0] - 2.0 * y * Sigma[0, 2] + y * y * Sigma[2, 2],
         Sigma[0, 1] + x * Sigma[0, 2] - y * Sigma[1, 2] - x * y * Sigma[2, 2],
@@ -130,8 +142,14 @@ def by_pose(x: float, y: float, Sigma: Float) -> tuple[float, float, float]:
 def corrected(
     pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float
 ) -> Pose:
-    """Return the Kalman update of a pose by one landmark with innovation y of covariance S (xx, xy, yy); J as
-    in `expected_spread`."""
+    """Return a pose corrected by the observation of one landmark (Kalman update).
+
+    Args:
+        pose: Pose before.
+        ax, ay: Vector from the robot to the detection in the frame of the map [m]; J as in `expected_spread`.
+        S0, S1, S2: Covariance xx, xy, yy of the innovation [m^2].
+        y0, y1: Innovation: landmark minus predicted detection, in the frame of the map [m].
+    """
     scale = 1.0 / (S0 * S2 - S1 * S1)
     a0, a1, a2 = pose.xx - ay * pose.xt, pose.xy - ay * pose.yt, pose.xt - ay * pose.tt
     b0, b1, b2 = pose.xy + ax * pose.xt, pose.yy + ax * pose.yt, pose.yt + ax * pose.tt
@@ -153,7 +171,15 @@ def corrected(
 
 @compiled_within
 def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
-    """Set out[p] = mu + L noise[p] with L L^T = P (Cholesky); a direction without variance gets no noise."""
+    """Draw row p of `out` from the Gaussian N(mu, P): mu + L noise[p] with L L^T = P (Cholesky), yaw wrapped.
+
+    Args:
+        mu: Mean x, y [m], yaw [rad], shape (3,).
+        P: Covariance, shape (3, 3), which may be singular: a direction without variance gets no noise.
+        noise: Standard normal numbers, shape (N, 3).
+        p: Row.
+        out: Poses, shape (N, 3); row p is changed.
+    """
     l00 = np.sqrt(max(P[0, 0], 0.0))
     l10 = P[1, 0] / l00 if l00 > 1e-12 else 0.0
     l20 = P[2, 0] / l00 if l00 > 1e-12 else 0.0
@@ -168,7 +194,8 @@ def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
 
 @compiled
 def factorise(H: Float, L: Float) -> None:
-    """Fill the lower triangle of L with that of H = L L^T, shape (n, n); H must be positive definite."""
+    """Write the Cholesky factor of H, H = L L^T, into the lower triangle of L; both have the shape (n, n),
+    and H must be positive definite."""
     for a in range(H.shape[0]):
         for b in range(a):
             total = H[a, b]
@@ -183,7 +210,7 @@ def factorise(H: Float, L: Float) -> None:
 
 @compiled
 def solve(L: Float, b: Float, x: Float) -> None:
-    """Fill x with the solution of L L^T x = b, shape (n,)."""
+    """Write the solution x of L L^T x = b into x, shape (n,); L is the lower triangle of `factorise`."""
     n = b.shape[0]
     for a in range(n):
         total = b[a]

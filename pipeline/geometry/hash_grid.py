@@ -1,4 +1,8 @@
-"""Hash grid: positions in cells, for searches within a radius."""
+"""Hash grid: chains of positions by square cells of the plane, for searches within a radius.
+
+A search of the radius r uses cells with a side of 2 r (`per_metre`), so that all positions within r of a
+point are in two by two cells. The plane is folded into SIDE x SIDE cells.
+"""
 
 from __future__ import annotations
 
@@ -38,33 +42,42 @@ def cells_for(places: int) -> Cells:
 
 @compiled_borrowing
 def per_metre(radius: float) -> float:
-    """Return the cells per metre for searches of a radius [m]: four cells contain all positions within it."""
+    """Return the number of cells per metre for searches of a radius [m]: two by two cells contain all
+    positions within it."""
     return 0.5 / (WIDER * radius)
 
 
 @compiled_within
 def cell_of(u: int, v: int) -> int:
-    """Return the number of the cell in a row and a column of the plane."""
+    """Return the index of a cell in `Cells.head` by its row u and its column v in the plane, which may be
+    negative."""
     return (u & (SIDE - 1)) * SIDE + (v & (SIDE - 1))
 
 
 @compiled_within
 def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
-    """Return row and column of the first of the two by two cells that contain all within the radius of a
-    position."""
+    """Return row and column of the first of the two by two cells that contain all positions within the radius
+    of x, y [m]; `scale` is the result of `per_metre`."""
     return int(np.floor(scale * x - 0.5)), int(np.floor(scale * y - 0.5))
 
 
 @compiled_within
 def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
-    """Put the first rows of `mean`, shape (L, 2 or more) [m], into empty cells, `scale` of them per metre."""
+    """Put positions into empty cells, the lowest row first in each chain.
+
+    Args:
+        cells: Empty cells.
+        mean: Positions, x, y first, shape (L, 2 or more) [m].
+        known: Number of rows of `mean` to put in.
+        scale: Cells per metre, see `per_metre`.
+    """
     for j in range(known - 1, -1, -1):
         put_in(cells, mean, j, scale)
 
 
 @compiled_within
 def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
-    """Add a position to its cell."""
+    """Put row j of `mean`, x, y first [m], into its cell, at the begin of the chain; see `fill`."""
     at = cell_of(int(np.floor(scale * mean[j, 0])), int(np.floor(scale * mean[j, 1])))
     cells.cell[j] = at
     cells.following[j] = cells.head[at]
@@ -73,7 +86,7 @@ def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
 
 @compiled_within
 def take_out(cells: Cells, j: int) -> None:
-    """Remove a position from its cell."""
+    """Remove row j, which `put_in` added, from its cell."""
     before = cells.head[cells.cell[j]]
     if before == j:
         cells.head[cells.cell[j]] = cells.following[j]
@@ -85,7 +98,14 @@ def take_out(cells: Cells, j: int) -> None:
 
 @compiled_within
 def nearest_in(cells: Cells, mean: Float, x: float, y: float, reach: float, scale: float) -> int:
-    """Return the position nearest to x, y, the first of equal ones; -1 without any within the reach."""
+    """Return the row of the position nearest to x, y [m], the lowest of equally near ones; -1 for none within
+    a reach.
+
+    Args:
+        cells, mean, scale: See `fill`.
+        x, y: Centre of the search [m].
+        reach: Maximum distance [m], exclusive, at most the radius of `scale`.
+    """
     u, v = first_of_four(x, y, scale)
     best, nearest = reach * reach, -1
     for quarter in range(4):

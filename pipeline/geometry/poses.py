@@ -161,7 +161,8 @@ class Pose3:
 
 
 def interpolate(a: Pose2, b: Pose2, fraction: float) -> Pose2:
-    """Return the pose at a fraction of the path from a (0) to b (1), with the shorter turn."""
+    """Return the pose at a fraction of the way from a (0) to b (1): linear in x and y, and in yaw along the
+    shorter turn."""
     turn = float(wrap_angle(b.yaw - a.yaw))
     return Pose2(
         a.x + fraction * (b.x - a.x),

@@ -11,14 +11,15 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-POINT = 1.0 / 256  # m, of a return: an error of 1.1 mm, where that of a sensor is 10 to 30 mm
-GROUND = 1.0 / 1024  # m, of the ground height
+POINT = 1.0 / 256  # m; step of a return: a standard error of 1.1 mm, that of a sensor is 10 to 30 mm
+GROUND = 1.0 / 1024  # m; step of a ground height
 
 T = TypeVar("T", np.float32, np.float64)
 
 
 def rounded(values: NDArray[T], step: float) -> NDArray[T]:
-    """Return values rounded to the nearest multiple of a step that is a power of two."""
+    """Return values rounded to the nearest multiple of `step`, a power of two, with the type of the
+    values."""
     kind = values.dtype.type
-    result: NDArray[T] = np.rint(values * kind(1.0 / step)) * kind(step) + kind(0.0)  # and no -0
+    result: NDArray[T] = np.rint(values * kind(1.0 / step)) * kind(step) + kind(0.0)  # + 0 turns -0 into 0
     return result

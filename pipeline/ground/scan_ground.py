@@ -14,25 +14,30 @@ from pipeline.ground.terrain import RINGS, SECTORS, Terrain, on_the_grid, ring_d
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float, Float32, Int32
 
-GHOST = 0.4  # m; a lowest return that is lower than the next one by more is a ghost echo
+GHOST = 0.4  # m; a return this far below the second lowest one of its cell is a ghost echo
 WIDEST = 1.4  # ratio of the widest diamond sector to the mean sector
 TOLERANCE = 0.15  # m; grass and noise above the maximum slope
 LAYER = 0.2  # m; returns up to this height above the lowest return of a cell are ground
-STANDS, STANDS_UP_TO = 0.3, 2.0  # m; height range of objects on the ground, for example trunks
+OBJECT_BOTTOM, OBJECT_TOP = 0.3, 2.0  # m; height range of objects on the ground, for example trunks
 WIDE = 0.4  # m; a ground layer with this spread is wider than a trunk
-WIDELY = 0.6  # minimum weight of such a layer
-FARTHEST = np.float32(1e6)  # m
+WIDE_WEIGHT = 0.6  # minimum weight of a layer with the spread WIDE, proportional below it
+FARTHEST = np.float32(1e6)  # m; returns with a larger |z| are ignored
 X, Y, Z = 0, 1, 2
-LOW, AT_X, AT_Y, TOTAL, COUNT, STANDING, SPREAD = range(7)
+# Columns of the sums of `evidence`.
+LOW, AT_X, AT_Y, TOTAL, COUNT, ABOVE_LAYER, SPREAD = range(7)
 
 
 @compiled
 def lowest_returns(points: Float32) -> tuple[Int32, Float]:
     """Return the cell of each point and the lowest return of each cell, without ghost echoes.
 
+    Args:
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
+
     Returns:
-        Cell of each point (sector * RINGS + ring), int32, shape (N,), -1 outside of the grid; and x, y, z [m]
-        of the lowest return of each cell, shape (SECTORS, rings, 3), with infinite z for an empty cell.
+        Cell of each point (sector * RINGS + ring), int32, shape (N,), -1 for a point that is not finite or
+        has |z| >= FARTHEST; and x, y, z [m] of the lowest return of each cell, shape (SECTORS, rings, 3),
+        with infinite z for an empty cell. `rings` is the number of rings up to the farthest point.
     """
     cell, rings = _cell_of(points)
     row = np.full((SECTORS * RINGS, 2), -1, np.int32)  # rows of the lowest and second lowest return
@@ -87,9 +92,15 @@ def _comes_first(points: Float32, i: int, other: int) -> bool:
 
 @compiled
 def remove_overhanging(lowest: Float, slope: float) -> None:
-    """Remove candidates that are steeper than `slope` above a nearby candidate, such as hedges and crowns.
+    """Remove ground candidates that are steeper than a slope above another candidate, such as hedges and
+    crowns.
 
-    Two passes in each direction propagate the cone of the maximum slope of each cell over the grid.
+    The limit of a cell is the lowest height that any other candidate plus the slope times the distance gives,
+    computed by two passes in each direction over the grid. A removed candidate gets an infinite z.
+
+    Args:
+        lowest: Lowest returns, see `lowest_returns`, shape (SECTORS, rings, 3) [m]; changed in place.
+        slope: Tangent of the maximum slope.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     cone = lowest[:, :, Z].copy()
@@ -120,14 +131,15 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
     """Return the height of the ground candidate of each cell and its weight.
 
     Args:
-        points: shape (N, 3) [m].
-        cell, lowest: Results of `lowest_returns`.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
+        cell, lowest: Results of `lowest_returns`, after `remove_overhanging`.
         plane: Trend: height at the origin [m] and slopes along x and y, shape (3,).
 
     Returns:
         Mean height of the lowest layer above the plane, shape (SECTORS, rings) [m], NaN without a candidate;
-        and its
-        weight from 0 to 1, same shape: the fraction of low returns that belong to the layer.
+        and its weight from 0 to 1, same shape. With n returns in the layer and m returns above it between
+        OBJECT_BOTTOM and OBJECT_TOP, the weight is (n / (n + 2 m))^2; a layer wider than a trunk has at least
+        WIDE_WEIGHT.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     # One row per cell, so that each point accesses one cache line: residual, x and y of the lowest return;
@@ -149,10 +161,10 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
         up = residual[i] - sums[c, LOW]
         x, y = points[i, X] - sums[c, AT_X], points[i, Y] - sums[c, AT_Y]
         # Zeros are added instead of an unpredictable branch.
-        layer, standing = -LAYER < up < LAYER, STANDS < up <= STANDS_UP_TO
+        layer, above_layer = -LAYER < up < LAYER, OBJECT_BOTTOM < up <= OBJECT_TOP
         sums[c, TOTAL] += up if layer else zero
         sums[c, COUNT] += one if layer else zero
-        sums[c, STANDING] += one if standing else zero
+        sums[c, ABOVE_LAYER] += one if above_layer else zero
         sums[c, SPREAD] += x * x + y * y if layer else zero
     height, weight = np.full((sectors, rings), np.nan), np.zeros((sectors, rings))
     for s in range(sectors):
@@ -161,13 +173,14 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
             n = np.float64(row[COUNT])
             if n > 0.0:
                 height[s, k] = row[LOW] + row[TOTAL] / n
-                part = n / (n + 2.0 * row[STANDING])
-                weight[s, k] = max(part * part, WIDELY * min(1.0, row[SPREAD] / (n * WIDE * WIDE)))
+                part = n / (n + 2.0 * row[ABOVE_LAYER])
+                weight[s, k] = max(part * part, WIDE_WEIGHT * min(1.0, row[SPREAD] / (n * WIDE * WIDE)))
     return height, weight
 
 
 @compiled
 def _above_plane(points: Float32, plane: Float) -> Float32:
+    """Return the height of each point above a plane (see `evidence`), float32, shape (N,) [m]."""
     above = np.empty(points.shape[0], np.float32)
     at, along, across = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     for i in range(points.shape[0]):
@@ -190,8 +203,12 @@ def trend(lowest: Float, slope: float) -> Float:
     """Fit a plane through the candidates by iteratively reweighted least squares with asymmetric Huber
     weights.
 
+    Args:
+        lowest: Ground candidates, shape (SECTORS, rings, 3) [m], with infinite z for none.
+        slope: Tangent of the maximum slope; a steeper plane is flattened to it.
+
     Returns:
-        Height at the origin [m] and slopes along x and y, shape (3,).
+        Height at the origin [m] and slopes along x and y, shape (3,); zeros without candidates.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     rows = np.empty((sectors * rings, 3))
@@ -353,11 +370,12 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
     """Return the terrain of one scan.
 
     A cell with many returns above its lowest layer has a small weight, since that layer may belong to a
-    trunk. The surface does not pass far above the lowest return of any cell.
+    trunk. The force that pulls the surface down to a candidate below it is stronger than the one that lifts
+    it (Huber weights).
 
     Args:
         points: The whole scan, float32, shape (N, 3) [m], level sensor frame.
-        parameters: Maximum slope.
+        parameters: `slope_max` is used.
     """
     slope = float(np.tan(np.radians(parameters.slope_max)))
     cell, lowest = lowest_returns(points)
@@ -368,12 +386,20 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
 
 
 def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
-    """Return the points whose height above the ground is within the height band, shape (M, 3)."""
+    """Return the points whose height above the ground is in [height_min, height_max], float32, shape (M, 3)
+    [m].
+
+    Args:
+        points: Points, float32, shape (N, 3) [m].
+        height: Their heights above the ground, float32, shape (N,) [m].
+        parameters: The height band.
+    """
     return _between(points, height, np.array([parameters.height_min, parameters.height_max], np.float32))
 
 
 @compiled
 def _between(points: Float32, height: Float32, band: Float32) -> Float32:
+    """Return the points with band[0] <= height <= band[1]."""
     low, high = band[0], band[1]
     inside = np.empty_like(points)
     n = 0

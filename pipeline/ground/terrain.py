@@ -15,7 +15,7 @@ from pipeline.types.records import Bool, Float32
 SECTORS = 72
 RINGS = 48  # the last ring is at infinity
 HALF_WAY = 20.0  # m; half of the rings are closer
-LEAST_SEEN = 60  # cells; walls around a sensor give up to 50 cells, visible ground gives over 400
+LEAST_SEEN = 60  # cells with ground; walls around a sensor give up to 50, visible ground over 400
 NO_GROUND = (
     "a scan shows no ground (only a wall or a ceiling?): heights are uncertain, and no diameters at breast "
     "height are reported"
@@ -27,8 +27,7 @@ class Terrain:
     """Heights of the ground around the sensor, in the level sensor frame.
 
     The nodes are the middles of the cells of a polar grid. The ring width grows with the distance like the
-    sector
-    width: 0.4 m at the sensor, 0.9 m at 10 m, 1.7 m at 20 m.
+    sector width: 0.4 m at the sensor, 0.9 m at 10 m, 1.7 m at 20 m.
 
     Attributes:
         height: Height of the ground at each node, shape (SECTORS, rings) [m].
@@ -41,7 +40,8 @@ class Terrain:
 
 
 def shows_ground(terrain: Terrain) -> bool:
-    """Return whether a scan shows the ground, not only the foot of a wall, a ceiling or scattered points."""
+    """Return whether a scan shows the ground: LEAST_SEEN cells or more with ground returns, and the ground
+    below the sensor. A scan of a wall, a ceiling or scattered points does not."""
     seen = int(np.count_nonzero(terrain.seen))
     return seen >= LEAST_SEEN and ground_at(terrain.height, 0.0, 0.0) < 0.0
 
@@ -61,7 +61,13 @@ def heights_of_places(places: Float, height: Float) -> Float:
 
 
 def height_above(points: Float32, terrain: Terrain) -> Float32:
-    """Return the height of each point above the terrain, float32, shape (N,) [m]."""
+    """Return the height of each point above the terrain, float32, shape (N,) [m]; NaN for a point that is not
+    finite.
+
+    Args:
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
+        terrain: Terrain of the scan.
+    """
     return _height_above(points, terrain.height)
 
 
@@ -125,6 +131,8 @@ def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
 
 @compiled
 def _height_above(points: Float32, height: Float) -> Float32:
+    """Return the same as `height_above`, from `Terrain.height`, by bilinear interpolation between the
+    nodes."""
     rings = height.shape[1]
     corners = _corners(height)
     node, f, g = _nodes(*on_the_grid(points), height.shape[0], rings)

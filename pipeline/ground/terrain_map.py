@@ -16,6 +16,8 @@ from pipeline.types.records import Bool, Float32, HeightMap, Int
 
 CELL = 0.5  # m
 SIDE = 16  # cells along each side of a tile
+# Columns of a cell: sum of weights [1/m^2], weighted mean [m] and variance [m^2] of the heights, number of
+# views.
 WEIGHT, MEAN, VARIANCE, VIEWS = range(4)
 COLUMNS = 4
 SIGMA, SIGMA_A_METRE = 0.03, 0.005  # m, m/m; sigma of one view: grass, and residual tilt
@@ -107,7 +109,7 @@ def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -
     moved, of = np.unique(place + shift, axis=0, return_inverse=True)
     fresh = _averaged(row, of.ravel(), len(moved))
     home, rest = np.divmod(moved, SIDE)
-    # In the order in which they were seen, as far as they were there before.
+    # Tiles keep their order, least recently seen first; new tiles follow.
     order = {tile: k for k, tile in enumerate(tiles)}
     names = [(int(a), int(b)) for a, b in np.unique(home, axis=0)]
     names.sort(key=lambda tile: order.get(tile, len(order)))
@@ -118,7 +120,13 @@ def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -
 
 
 def _averaged(row: Float, of: Int, cells: int) -> Float32:
-    """Rows of cells that fall into one, by their weights."""
+    """Return the weighted average of the cells that coincide, float32, shape (cells, COLUMNS).
+
+    Args:
+        row: Cells, shape (N, COLUMNS).
+        of: Index of the result to which each cell belongs, int64, shape (N,).
+        cells: Number of results.
+    """
     weight = np.bincount(of, row[:, WEIGHT], cells)
     mean = np.bincount(of, row[:, WEIGHT] * row[:, MEAN], cells) / weight
     apart = row[:, VARIANCE] + (row[:, MEAN] - mean[of]) ** 2
@@ -132,11 +140,12 @@ def _averaged(row: Float, of: Int, cells: int) -> Float32:
 TILE = SIDE * CELL  # m
 REACH = 15.0  # m; beyond it, a cell of the scan is much wider than a cell of the map
 NEAR_WEIGHT = 200.0  # 1/m^2; weight of a view within 12 m
-LEAST = 50  # known cells that are needed to estimate the height of the sensor
-RENEW = 5  # scans between updates of the record, plus
-TILES_A_SCAN = 100  # one scan per this many tiles, which bounds the cost per scan
+LEAST = 50  # minimum number of known cells for an estimate of the height of the sensor
+# Scans between two updates of the published map: RENEW, plus one per TILES_A_SCAN tiles, which bounds the
+# cost per scan.
+RENEW, TILES_A_SCAN = 5, 100
 MOST_TILES = 1 << 13  # 52 hectares, 34 MB; beyond it, the least recently seen tile is removed
-_FARTHEST = 1e6  # m
+_FARTHEST = 1e6  # m; scans at larger coordinates are ignored
 _UNKNOWN: Float32 = np.zeros((SIDE, SIDE, COLUMNS), np.float32)
 
 
@@ -160,10 +169,13 @@ class HeightMapState:
 
 
 class HeightMapper:
-    """Fuses the terrain of all scans.
+    """Map of the ground height, fused from the terrain of all scans.
 
     Height 0 is the ground below the sensor at the first scan. Odometry and SLAM are planar; the height of the
     sensor is estimated at each scan from the cells that are known already.
+
+    Attributes:
+        state: State after the last scan; it is replaced, never modified.
     """
 
     def __init__(self) -> None:
@@ -203,7 +215,7 @@ class HeightMapper:
         self.state = HeightMapState(tiles, z, scans, _record(tiles) if due else old.record)
 
     def correct(self, correction: PathCorrection) -> None:
-        """Move the terrain with a corrected path."""
+        """Move the terrain with a corrected path, see `corrected_tiles`."""
         tiles = corrected_tiles(self.state.tiles, correction)
         self.state = replace(self.state, tiles=tiles, record=_record(tiles))
 
@@ -212,14 +224,19 @@ class HeightMapper:
         return _record(self.state.tiles)
 
     def heights(self, places: Float) -> Float:
-        """Return the height of the ground [m] at places of shape (N, 2) [m].
+        """Return the height of the ground at places, shape (N,) [m].
 
-        An unknown cell takes the weighted mean of its known neighbours; without any the height is NaN.
+        A place in an unknown cell takes the weighted mean of the known cells among its eight neighbours;
+        without any, its height is NaN.
+
+        Args:
+            places: x, y in the frame of the map, shape (N, 2) [m].
         """
         cell = np.floor(places / CELL).astype(np.int64)
         return np.array([self._at(int(i), int(j)) for i, j in cell])
 
     def _at(self, i: int, j: int) -> float:
+        """Return the height at the cell with the indices i, j along x and y [m]; see `heights`."""
         mean, weight = 0.0, 0.0
         for di, dj in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
             tile = self.state.tiles.get(((i + di) // SIDE, (j + dj) // SIDE))
@@ -237,6 +254,8 @@ def no_height_map() -> HeightMap:
 
 
 def _around(at: Float) -> list[Tile]:
+    """Return the indices of the tiles that overlap the square of half side REACH around a position, shape
+    (2,) [m]."""
     low, high = np.floor((at - REACH) / TILE), np.floor((at + REACH) / TILE)
     return [
         (i, j) for i in range(int(low[0]), int(high[0]) + 1) for j in range(int(low[1]), int(high[1]) + 1)
@@ -244,8 +263,15 @@ def _around(at: Float) -> list[Tile]:
 
 
 def _register(block: Float32, below: Float, weight: Float, before: float | None) -> float | None:
-    """Return the height of the sensor in the map frame: the median over known cells, nearby ones
-    preferred."""
+    """Return the height of the sensor in the map frame [m]: the median of map height minus scan height over
+    known cells.
+
+    Cells within 12 m (NEAR_WEIGHT) are used if there are LEAST of them, else all.
+
+    Args:
+        block, below, weight: See `fuse`.
+        before: Height at the scan before, which is returned if fewer than LEAST cells are known.
+    """
     known = (block[..., VIEWS] > 0.0) & (weight > NEAR_WEIGHT)
     if np.count_nonzero(known) < LEAST:
         known = (block[..., VIEWS] > 0.0) & (weight > 0.0)
@@ -255,6 +281,7 @@ def _register(block: Float32, below: Float, weight: Float, before: float | None)
 
 
 def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
+    """Return the published map of tiles; cells are sorted by tile."""
     keys = sorted(tiles)
     cells = np.stack([tiles[key] for key in keys]) if keys else np.zeros((0, SIDE, SIDE, COLUMNS), np.float32)
     n, i, j = np.nonzero(cells[..., VIEWS])

@@ -20,18 +20,23 @@ def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[F
     """Return the points of a scan in the level sensor frame, de-skewed.
 
     The level sensor frame has its origin in the sensor, x along the heading of the robot and, if the scan is
-    levelled, z against gravity. De-skewing moves each point to its position at the stamp of the scan:
-    p' = R(w dt) p + v dt, where dt is the time offset of the point.
+    levelled, z against gravity. De-skewing moves each point to its position at the stamp of the scan: p' =
+    R(w dt) p + v dt in the base frame, where dt is the time offset of the point.
+
+    Args:
+        step: Scan with tilt and velocity of the robot.
+        T_base_lidar: Pose of the LiDAR on the robot.
+        parameters: Range limits (inclusive), levelling and de-skewing.
 
     Returns:
         Points, float32, shape (N, 3) [m]; and the position of the sensor in the level base frame, shape (3,)
         [m]. Their sum is the point in the level base frame.
     """
-    R_level_lidar, sensor_offset = _turn(step, T_base_lidar, parameters)
+    R_level_lidar, sensor_offset = _level_rotation(step, T_base_lidar, parameters)
     offset_ns = step.scan.offset_ns
-    twist = driven_with(step, parameters)
+    twist = base_velocity(step, parameters)
     moving = parameters.deskew and offset_ns is not None and any(twist)
-    points = _take(
+    points = _transformed_points(
         step.scan.points,
         offset_ns if moving and offset_ns is not None else np.zeros(0, np.int32),
         R_level_lidar,
@@ -50,20 +55,20 @@ def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Fl
     robot does not move relative to itself.
     """
     points = step.scan.points
-    rows = _nearer(points, min(HOUSING, parameters.range_min), parameters.range_min)
-    R_level_lidar, _ = _turn(step, T_base_lidar, parameters)
+    rows = _rows_in_range(points, min(HOUSING, parameters.range_min), parameters.range_min)
+    R_level_lidar, _ = _level_rotation(step, T_base_lidar, parameters)
     near: Float32 = (points[rows] @ R_level_lidar.T).astype(np.float32)
     return near
 
 
-def _turn(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
+def _level_rotation(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
     """Return R_level_lidar and the position of the sensor in the level base frame, shape (3,) [m]."""
     level = parameters.level == "imu" and step.tilt_known
     R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
     return R_level_base @ T_base_lidar.R, R_level_base @ T_base_lidar.t
 
 
-def driven_with(step: Step, parameters: Acquisition) -> tuple[float, float, float]:
+def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, float]:
     """Return the velocity of the base at a scan: forward, left [m/s], yaw rate [rad/s].
 
     The yaw rate is that of the gyroscope if it is available and enabled.
@@ -74,7 +79,7 @@ def driven_with(step: Step, parameters: Acquisition) -> tuple[float, float, floa
 
 
 @compiled
-def _nearer(points: Float32, least: float, below: float) -> Int32:
+def _rows_in_range(points: Float32, least: float, below: float) -> Int32:
     """Return the rows of the points with `least` <= range < `below`."""
     rows = np.empty(points.shape[0], np.int32)
     n = 0
@@ -87,7 +92,7 @@ def _nearer(points: Float32, least: float, below: float) -> Int32:
 
 
 @compiled
-def _take(
+def _transformed_points(
     points: Float32,
     offset_ns: Int32,
     R: Float,
@@ -96,6 +101,8 @@ def _take(
     range_min: float,
     range_max: float,
 ) -> Float32:
+    """Return the points within the range limits, rotated by R and de-skewed; an empty `offset_ns` means no
+    de-skewing. See `acquire`."""
     kept = np.empty((points.shape[0], 3), np.float32)
     n = 0
     # Blocks of contiguous rows and simple loops, which the compiler vectorises.
@@ -105,11 +112,11 @@ def _take(
         m = min(CHUNK, points.shape[0] - start)
         for i in range(m):
             u[i], v[i], w[i] = points[start + i, 0], points[start + i, 1], points[start + i, 2]
-        _turn_upright(u, v, w, inside, R, range_min * range_min, range_max * range_max)
+        _rotate_block(u, v, w, inside, R, range_min * range_min, range_max * range_max)
         if offset_ns.shape[0] > 0:
             for i in range(m):
                 dt[i] = offset_ns[start + i] * 1e-9
-            _move_to_one_time(u, v, dt, sensor, twist)
+            _deskew_block(u, v, dt, sensor, twist)
         for i in range(m):
             kept[n, 0], kept[n, 1], kept[n, 2] = u[i], v[i], w[i]
             n += inside[i]
@@ -117,10 +124,11 @@ def _take(
 
 
 @compiled
-def _turn_upright(
+def _rotate_block(
     u: Float, v: Float, w: Float, inside: Bytes, R: Float, square_min: float, square_max: float
 ) -> None:
-    """Rotate points by R, in place, and mark those within the range limits."""
+    """Rotate the points u, v, w of a block by R, in place, and set `inside` to 1 for squared ranges in
+    [square_min, square_max] [m^2], else to 0."""
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]
@@ -135,11 +143,17 @@ def _turn_upright(
 
 
 @compiled
-def _move_to_one_time(u: Float, v: Float, dt: Float, sensor: Float, twist: Float) -> None:
-    """De-skew points, in place.
+def _deskew_block(u: Float, v: Float, dt: Float, sensor: Float, twist: Float) -> None:
+    """De-skew the points u, v, w of a block, in place; see `acquire`.
 
     The rotation within a sweep is less than 0.5 rad; there, the series of sine and cosine are accurate to 0.1
     mm at 100 m and faster than the library functions.
+
+    Args:
+        u, v: x and y in the level sensor frame [m], shape (CHUNK,).
+        dt: Time offset of each point [s], shape (CHUNK,).
+        sensor: Position of the sensor in the level base frame, shape (3,) [m].
+        twist: Forward and left velocity [m/s], yaw rate [rad/s], shape (3,).
     """
     at_x, at_y, vx, vy, turning = sensor[0], sensor[1], twist[0], twist[1], twist[2]
     for i in range(CHUNK):

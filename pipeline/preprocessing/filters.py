@@ -14,7 +14,12 @@ _AXIS_CELLS = 1 << 21  # three axes of 21 bits fit one 64-bit key
 
 
 def pass_through(points: Float32, parameters: Filters) -> Float32:
-    """Return the points inside the box including its faces, shape (M, 3) [m]."""
+    """Return the points inside the box including its faces, float32, shape (M, 3) [m], in their order.
+
+    Args:
+        points: float32, shape (N, 3) [m].
+        parameters: Limits of the box in the frame of the points; they are compared in float32.
+    """
     p = parameters
     low = np.array([p.x_min, p.y_min, p.z_min], np.float32)
     high = np.array([p.x_max, p.y_max, p.z_max], np.float32)
@@ -23,6 +28,7 @@ def pass_through(points: Float32, parameters: Filters) -> Float32:
 
 @compiled
 def _box(points: Float32, low: Float32, high: Float32) -> Float32:
+    """Return the points with low <= point <= high on each axis; low and high have the shape (3,) [m]."""
     inside = np.empty_like(points)
     n = 0
     for i in range(points.shape[0]):
@@ -53,6 +59,7 @@ def voxel_grid(points: Float32, parameters: Filters) -> Float32:
 
 @compiled
 def _voxel_means(points: Float32, size: float) -> Float32:
+    """Return the mean of the points of each cube of the edge length `size` [m]; see `voxel_grid`."""
     n = points.shape[0]
     slots = 2
     while slots < 2 * n:

@@ -1,8 +1,8 @@
-"""Identity of the trees: each tree belongs to one landmark of SLAM's map.
+"""Identity of the trees: each tree belongs to one landmark of SLAM.
 
-SLAM associates detections, counts misses and merges landmarks; the tracks follow it. A track whose landmark
-is gone, because SLAM merged or removed it or because another particle is the best one now, continues with the
-landmark at its position, joins the track of that landmark, or ends.
+SLAM associates detections, counts misses and merges landmarks; the tracks follow it. If the landmark of a
+track no longer exists, because SLAM merged or removed it or because another particle is the best one now, the
+track takes the landmark at its position, joins the track of that landmark, or is removed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pipeline.slam.association import associate
 from pipeline.tracking.track_table import NO_LANDMARK, Rows, ScanPose, join
 from pipeline.types.records import Bool, Int, Verdict
 
-AGREE = 3.0  # sigma; a track farther from its landmark is moved there
+AGREE = 3.0  # sigma; maximum distance between a track and its landmark
 TREE = int(Verdict.TREE)
 
 
@@ -31,15 +31,20 @@ def follow(
     gate: float,
     distance_max: float,
 ) -> Bool:
-    """Let the tracks follow the landmarks of SLAM's map.
+    """Assign the tracks to the landmarks of the present map, in place.
 
     Args:
-        rows: Tracks, changed in place.
+        rows: Tracks; landmark, score and, for joined tracks, all columns are changed.
         scan: Pose of the robot.
-        birth, position, covariance, score, gate, distance_max: See `Landmarks`.
+        birth: Birth numbers of the landmarks, int64, shape (L,).
+        position: Their positions, shape (L, 2) [m].
+        covariance: Their covariances xx, xy, yy, shape (L, 3) [m^2].
+        score: Their hits less misses, shape (L,).
+        gate, distance_max: Maximum Mahalanobis [sigma] and Euclidean [m] distance between a track and a new
+            landmark.
 
     Returns:
-        Which tracks remain, shape (T,): those with a landmark, and those of a tree column.
+        Which tracks remain, shape (T,): those with a landmark, and trees by the class of their voxel column.
     """
     T, L = rows.number.shape[0], birth.shape[0]
     order = np.argsort(birth)
@@ -90,11 +95,11 @@ def follow(
 
 @compiled
 def tracks_of(landmark: Int, births: Int) -> Int:
-    """Return the row of the track of each birth, int64, shape (D,); -1 for none.
+    """Return the row of the track of each detection, int64, shape (D,); -1 for none.
 
     Args:
-        landmark: Landmark of each track, shape (T,).
-        births: Landmark of each detection, shape (D,); -1 for none.
+        landmark: Birth number of the landmark of each track, shape (T,).
+        births: Birth number of the landmark of each detection, shape (D,); -1 for none.
     """
     rows = np.full(births.shape[0], -1)
     order = np.argsort(landmark)
@@ -108,12 +113,14 @@ def tracks_of(landmark: Int, births: Int) -> Int:
 
 @compiled
 def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
-    """Join tracks nearer to each other than a radius; the older number and its landmark stay.
+    """Join the tracks that are nearer than a radius to a track that moved, in place.
+
+    The lower row, which is the older track, keeps its number and its landmark.
 
     Args:
-        rows: Tracks, changed in place.
+        rows: Tracks.
         seen: Rows of the tracks that moved in this scan, shape (K,).
-        radius: [m].
+        radius: Distance below which two tracks are one tree [m].
 
     Returns:
         Which tracks remain, shape (T,).
@@ -130,12 +137,13 @@ def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
 
 
 @compiled
-def stand_apart(position: Float, x: Float, radius: float) -> Bool:
-    """Return which positions are at least a radius from all tracks and from those before them, shape (K,).
+def are_separate(position: Float, x: Float, radius: float) -> Bool:
+    """Return which positions may begin a tree, shape (K,): those at least a radius from all tracks and from
+    accepted positions before them.
 
     Args:
         position: Positions, shape (K, 2) [m].
-        x: States of the tracks, shape (T, 4).
+        x: States of the tracks, x, y [m] first, shape (T, 4).
         radius: Minimum distance [m].
     """
     apart = np.ones(position.shape[0], np.bool_)
@@ -151,8 +159,9 @@ def stand_apart(position: Float, x: Float, radius: float) -> Bool:
 
 @compiled_borrowing
 def _fill_spread(rows: Rows, scan: ScanPose, spread: Float) -> None:
-    """Fill in the covariance xx, xy, yy of each track relative to the landmarks, shape (T, 3) [m^2]: without
-    the part that both share with the frame of the map."""
+    """Write the covariance xx, xy, yy of each track relative to the landmarks into `spread`, shape (T, 3)
+    [m^2]: P without the part that track and landmarks share, plus that of the pose relative to the
+    landmarks."""
     x, P, shared = rows.x, rows.P, rows.shared
     for t in range(spread.shape[0]):
         xx, xy, yy = by_pose(x[t, 0] - scan.pose[0], x[t, 1] - scan.pose[1], scan.relative)

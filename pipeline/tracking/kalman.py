@@ -1,6 +1,6 @@
-"""The Kalman filter of a tree (Eq. 10): state x = [x, y, vx, vy], measured position z = H x.
+"""Kalman filter of a tree (Eq. 10) with the state x = [x, y, vx, vy] and the measured position z = H x.
 
-Two engines give the same numbers: our compiled one and filterpy.
+Two engines give the same numbers: a compiled one and filterpy.
 """
 
 from __future__ import annotations
@@ -13,12 +13,13 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
 from pipeline.types.records import Int
 
+# Measurement matrix: the position of the state.
 H = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
 
 
 @compiled
 def transition(dt: float) -> Float:
-    """F of constant velocity over dt [s]."""
+    """Return the transition matrix F of constant velocity over dt [s], shape (4, 4)."""
     F = np.eye(4)
     F[0, 2] = F[1, 3] = dt
     return F
@@ -26,7 +27,13 @@ def transition(dt: float) -> Float:
 
 @compiled
 def process_noise(dt: float, acceleration_sigma: float) -> Float:
-    """Q of a white acceleration over dt [s] (Bar-Shalom, Li, Kirubarajan 2001, eq. 6.3.2-4)."""
+    """Return the process noise Q of a white acceleration over dt, shape (4, 4) (Bar-Shalom, Li, Kirubarajan
+    2001, eq. 6.3.2-4).
+
+    Args:
+        dt: Time step [s].
+        acceleration_sigma: Standard deviation of the acceleration, constant within the step [m/s^2].
+    """
     Q = np.zeros((4, 4))
     q = acceleration_sigma * acceleration_sigma
     for a in range(2):
@@ -40,7 +47,17 @@ def process_noise(dt: float, acceleration_sigma: float) -> Float:
 def update_rows(
     x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
 ) -> None:
-    """Predict the trees of some rows, in place, and correct each by its measurement, see `ENGINES`."""
+    """Predict some trees to the time of their measurements and correct them, in place.
+
+    Args:
+        x: States of all trees, shape (T, 4) [m, m/s].
+        P: Their covariances, shape (T, 4, 4).
+        rows: Row of the tree of each measurement, without duplicates, shape (D,).
+        dt: Time since the last update of each of these trees, shape (D,) [s].
+        acceleration_sigma: Standard deviation of the acceleration [m/s^2].
+        z: Measured positions, shape (D, 2) [m].
+        R: Their covariances, shape (D, 2, 2) [m^2].
+    """
     _update_rows(x, P, rows, dt, acceleration_sigma, z, R, np.empty((4, 2)), np.empty((4, 4)))
 
 
@@ -64,7 +81,7 @@ def _update_rows(
 
 @compiled_borrowing
 def _predict(x: Float, P: Float, dt: float, acceleration_sigma: float) -> None:
-    """x = F x, P = F P F^T + Q in place: velocities times dt come to the positions."""
+    """Replace x by F x and P by F P F^T + Q, in place; see `transition` and `process_noise`."""
     for a in range(2):
         x[a] += dt * x[a + 2]
         for b in range(4):
@@ -82,9 +99,9 @@ def _predict(x: Float, P: Float, dt: float, acceleration_sigma: float) -> None:
 
 @compiled_borrowing
 def _correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
-    """x = x + K y, P = (I - K H) P (I - K H)^T + K R K^T in place; K (4, 2) and M (4, 4) are room.
+    """Replace x by x + K y and P by (I - K H) P (I - K H)^T + K R K^T (Joseph form), in place.
 
-    Joseph's form stays symmetric and positive.
+    The Joseph form keeps P symmetric and positive. K, shape (4, 2), and M, shape (4, 4), are work arrays.
     """
     y0, y1 = z[0] - x[0], z[1] - x[1]
     S00, S01, S11 = P[0, 0] + R[0, 0], P[0, 1] + R[0, 1], P[1, 1] + R[1, 1]
@@ -107,9 +124,20 @@ def _correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None
 def expected_positions(
     x: Float, P: Float, shared: Float, hits: Int, stamp_ns: Int, now_ns: int, acceleration_sigma: float
 ) -> tuple[Float, Float]:
-    """Where each tree is expected now, shape (T, 2) [m], and its own covariance xx, xy, yy, shape (T, 3):
-    what it shares with the pose that looks for it is no reason to look farther. Of the pose's error in a
-    single view, a part is of that view alone, so of `hits` views one part in so many counts."""
+    """Return the predicted position of each tree, shape (T, 2) [m], and its covariance xx, xy, yy, shape (T,
+    3).
+
+    The covariance excludes the part that the tree shares with the pose of the robot, since that part does not
+    change their relative position. Of the shared part, 1 / hits is independent in each view and remains.
+
+    Args:
+        x, P: States and covariances, shapes (T, 4) and (T, 4, 4).
+        shared: Part of P from the poses of the robot, shape (T, 2, 2) [m^2].
+        hits: Number of observations, shape (T,).
+        stamp_ns: Time of the last observation [ns], shape (T,).
+        now_ns: Time of the prediction [ns].
+        acceleration_sigma: Standard deviation of the acceleration [m/s^2].
+    """
     place, spread = np.empty((x.shape[0], 2)), np.empty((x.shape[0], 3))
     _expect(x, P, shared, hits, stamp_ns, now_ns, acceleration_sigma, place, spread)
     return place, spread
@@ -140,6 +168,7 @@ def _expect(
 def _update_rows_filterpy(
     x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
 ) -> None:
+    """Do the same as `update_rows` with filterpy."""
     from filterpy.kalman import predict, update
 
     for k, row in enumerate(rows):
@@ -149,7 +178,7 @@ def _update_rows_filterpy(
         x[row], P[row] = update(x_row, P_row, z[k], R=R[k], H=H)
 
 
-# x (T, 4), P (T, 4, 4), rows (D,), dt (D,) [s], acceleration sigma [m/s^2], z (D, 2) [m], R (D, 2, 2)
+# Signature of an engine; see `update_rows`.
 UpdateRows = Callable[[Float, Float, Int, Float, float, Float, Float], None]
 COMPILED = "compiled"
 ENGINES: dict[str, UpdateRows] = {COMPILED: update_rows, "filterpy": _update_rows_filterpy}

@@ -1,4 +1,5 @@
-"""Attributes of a tree from its observations: sides, diameter, eccentricity."""
+"""Attributes of a tree from its observations: observed sides, diameter at breast height, eccentricity,
+confirmation."""
 
 from __future__ import annotations
 
@@ -79,7 +80,8 @@ def _add(
         dx, dy = pose[0] - position[d, 0], pose[1] - position[d, 1]
         if np.isfinite(radius[d]):
             reach = max(np.hypot(dx, dy), NEAREST)
-            # The box of heights shows the thicker foot of a near tree: its mean is below breast height.
+            # Of a near tree the height band shows mainly the thicker foot, so that the mean height of the
+            # cluster is below breast height.
             is_known = np.isfinite(above_breast[d])
             above = above_breast[d] if is_known else 0.0
             weight = 1.0 / ((radius_sigma[d] * reach) ** 2 * (1.0 + (above / HALF) ** 2))
@@ -124,7 +126,14 @@ def seen_sides(from_bearing: float, arc: float) -> np.int64:
 
 
 class FigureLimits(NamedTuple):
-    """Parameters of `table_figures`, see `Tracking`; dbh_arc_min in radians."""
+    """Limits for the attributes of the tree table.
+
+    Attributes:
+        hits_to_confirm: Minimum number of detections of a tree without a voxel column.
+        dbh_arc_min: Minimum observed arc for a diameter [rad].
+        out_of_round: Out-of-roundness, the sigma of a DBH relative to the DBH.
+        taper_sigma: Standard deviation of the taper, change of the diameter per height [m/m].
+    """
 
     hits_to_confirm: int
     dbh_arc_min: float
@@ -134,8 +143,12 @@ class FigureLimits(NamedTuple):
 
 @compiled
 def table_figures(tracks: Rows, limits: FigureLimits) -> tuple[Float, Float, Float, Float, Bool]:
-    """Return coverage [rad], DBH and its sigma [m], mean eccentricity, and which trees are confirmed, all of
-    shape (T,); NaN where unknown."""
+    """Return the attributes of all tracks for the tree table, each of shape (T,).
+
+    Returns:
+        Observed arc [rad]; DBH [m]; its standard deviation [m]; mean eccentricity; and which tracks are
+        trees. DBH and eccentricity are NaN where they are unknown.
+    """
     T = tracks.sides.shape[0]
     coverage, dbh, dbh_sigma, mean = np.empty(T), np.empty(T), np.empty(T), np.full(T, np.nan)
     confirmed = np.empty(T, np.bool_)
@@ -163,7 +176,7 @@ def _fill_figures(
 
 @compiled_borrowing
 def sides_of(bits: int) -> int:
-    """Return the number of sectors that were seen."""
+    """Return the number of observed sectors, the number of set bits."""
     seen = 0
     while bits:
         bits &= bits - 1  # clears the lowest bit

@@ -1,13 +1,13 @@
-"""What the views of a tree share: the error of the poses that they were seen from.
+"""Split covariance intersection (Julier, Uhlmann 2001; Li, Nashashibi, Yang 2013) for the positions of trees.
 
-From scan to scan the pose errs alike, for it is found by the same trees, so it does not average out. A tree's
-covariance is kept in two parts, its own (noise of the detections, which does average out) and a shared one
-(of the poses, correlated in a way that nobody knows), and both are joined by split covariance intersection
-(Julier, Uhlmann 2001; Li, Nashashibi, Yang 2013), which is right whatever the correlation is:
+The poses from which a tree is seen have correlated errors, since they are estimated from the same trees, and
+these errors do not average out. The covariance of a tree is therefore kept in two parts: its own part (noise
+of the detections, which averages out) and a shared part (of the poses, with an unknown correlation). The
+fusion of both is consistent for any correlation:
 
 P1 = P_own + P_shared / w,  P2 = R + B / (1 - w),  K = P1 (P1 + P2)^-1,  0 < w < 1
 
-The Kalman filter itself (Eq. 10) stays as it is; it is only told P1 and P2.
+The Kalman filter (Eq. 10) is unchanged; P1 and P2 replace its covariances P and R.
 """
 
 from __future__ import annotations
@@ -18,25 +18,29 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
 from pipeline.types.records import Int
 
-LEAST, MOST = 1e-3, 1.0 - 1e-6  # of the weight w
-NOTHING = 1e-12  # m^2
+LEAST, MOST = 1e-3, 1.0 - 1e-6  # bounds of the weight w
+NOTHING = 1e-12  # m^2; smaller shared variances are treated as 0
 
 
 @compiled
 def split(
     P: Float, shared: Float, rows: Int, R: Float, B: Float, dt: Float, acceleration_sigma: float
 ) -> Float:
-    """Make the Kalman filter's next update one of split covariance intersection, in place.
+    """Prepare the next Kalman update of some trees, so that it becomes one of split covariance intersection.
 
     Args:
-        P: shape (T, 4, 4), becomes P1 of the rows; shared: part of it, shape (T, 2, 2), becomes that after
-            the update.
-        rows: The tree of each measurement, none twice, shape (D,).
-        R: Own covariance of each measurement, shape (D, 2, 2); B: what it shares with the tree.
-        dt, acceleration_sigma: See `kalman.ENGINES`.
+        P: Covariances of the states, shape (T, 4, 4); those of `rows` are replaced by P1.
+        shared: Shared parts of P, shape (T, 2, 2) [m^2]; those of `rows` are replaced by the shared part
+            after the update.
+        rows: Row of the tree of each measurement, without duplicates, shape (D,).
+        R: Own covariance of each measurement, shape (D, 2, 2) [m^2].
+        B: Shared covariance of each measurement, by the pose, shape (D, 2, 2) [m^2].
+        dt: Time since the last update of each of these trees, shape (D,) [s]; the Kalman filter predicts
+            afterwards.
+        acceleration_sigma: Standard deviation of the acceleration [m/s^2].
 
     Returns:
-        P2 of each measurement, shape (D, 2, 2).
+        P2, the covariance of each measurement for the Kalman filter, shape (D, 2, 2) [m^2].
     """
     P2 = R.copy()
     room = np.empty((3, 2, 2))
@@ -76,7 +80,8 @@ def _split(
 
 @compiled_borrowing
 def _share(shared: Float, P1: Float, S: Float, w: float, B: Float) -> None:
-    """(I - K) P_shared / w (I - K)^T + K B / (1 - w) K^T in place, with K = P1 S^-1."""
+    """Replace the shared part of a tree by that after the update, in place: (I - K) P_shared / w (I - K)^T +
+    K B / (1 - w) K^T, with K = P1 S^-1."""
     det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     k00, k01 = (
         (P1[0, 0] * S[1, 1] - P1[0, 1] * S[1, 0]) / det,
@@ -97,7 +102,8 @@ def _share(shared: Float, P1: Float, S: Float, w: float, B: Float) -> None:
 def _turned(
     a: float, b: float, c: float, d: float, xx: float, xy: float, yy: float
 ) -> tuple[float, float, float]:
-    """xx, xy, yy of M C M^T with M = [[a, b], [c, d]]."""
+    """Return xx, xy, yy of M C M^T for M = [[a, b], [c, d]] and a covariance C with the elements xx, xy,
+    yy."""
     return (
         a * a * xx + 2.0 * a * b * xy + b * b * yy,
         a * c * xx + (a * d + b * c) * xy + b * d * yy,
@@ -107,12 +113,21 @@ def _turned(
 
 @compiled_borrowing
 def _mean(C: Float) -> float:
+    """Return the mean variance of a covariance, shape (2, 2)."""
     return float(0.5 * (C[0, 0] + C[1, 1]))
 
 
 @compiled_borrowing
 def weight(own: float, shared: float, R: float, B: float) -> float:
-    """The w that makes the joined variance least, in closed form for variances; any other is right too."""
+    """Return the w that minimises the variance of the fused estimate, in closed form for scalar variances.
+
+    Any other w within LEAST and MOST is consistent as well, only less accurate. Without shared variances the
+    result is 0.5.
+
+    Args:
+        own, shared: Own and shared variance of the tree [m^2].
+        R, B: Own and shared variance of the measurement [m^2].
+    """
     if shared < NOTHING and B < NOTHING:
         return 0.5
     p, b = np.sqrt(max(shared, 0.0)), np.sqrt(max(B, 0.0))

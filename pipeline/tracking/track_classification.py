@@ -120,12 +120,15 @@ def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
 
 
 def tree_columns(columns: Columns) -> Int:
-    """Return the rows of the tree columns; of columns that are one tree, the one with most votes."""
+    """Return the rows of the columns of class tree, those with most votes for tree first. Of columns within
+    ONE_TREE of each other, only the first remains."""
     return _best_first(columns.axis, columns.share, columns.verdict)
 
 
 @compiled
 def _best_first(axis: Float, votes: Float, verdict: Int32) -> Int:
+    """Return the same as `tree_columns`, from axes (x, y first), votes (tree first) and classes of the
+    columns."""
     rows, fewest, n = np.empty(verdict.shape[0], np.int64), np.empty(verdict.shape[0]), 0
     for c in range(verdict.shape[0]):
         if verdict[c] == TREE:
@@ -194,22 +197,24 @@ def classify_new(tracks: Rows, axis: Float, verdict: Int32) -> None:
                 nearest, least = c, dx * dx + dy * dy
         if nearest >= 0:
             found = np.int64(verdict[nearest])
-            tracks.verdict[t] = OTHER if found == TREE else found  # another track is that tree
+            tracks.verdict[t] = OTHER if found == TREE else found  # another track has the tree of this column
 
 
 @compiled_within
 def _is_due(tracks: Rows, t: int, scan: ScanPose, reach: float) -> bool:
-    """Return whether a tree at the position of a track would have a column by now."""
+    """Return whether a tree at the position of track t would have a column by now: it is within `reach` [m]
+    of the robot, and DUE_NS have passed since its first observation."""
     dx, dy = tracks.x[t, 0] - scan.pose[0], tracks.x[t, 1] - scan.pose[1]
     return bool(dx * dx + dy * dy < reach * reach and scan.stamp_ns - tracks.first_ns[t] >= DUE_NS)
 
 
 @compiled_within
 def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
-    """Return whether a track has been unseen for longer than it was seen, like a person who walked on.
+    """Return whether a track has been unobserved for longer than it was observed, like a person who walked
+    on.
 
-    The limit is at least GLIMPSE_NS and at most DUE_NS. A track that was last seen long ago is of another
-    drive, or a loop closure moved it.
+    The limit is the observed time, at least GLIMPSE_NS and at most DUE_NS. A track that has been unobserved
+    for FORMER_NS or longer belongs to an earlier pass of the robot and is not rejected.
     """
     unseen = now_ns - last_ns
     return min(max(last_ns - first_ns, GLIMPSE_NS), DUE_NS) < unseen < FORMER_NS
@@ -277,8 +282,15 @@ def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, 
 
 @compiled
 def nearest_other(place: Float, other: Float, reach: float) -> Int:
-    """Return the row of the nearest other position to each position, the first of equals, shape (N,); -1 for
-    none within reach."""
+    """Return for each position the row of the nearest other position within a reach, int64, shape (N,); -1
+    for none.
+
+    Args:
+        place: Positions, x, y first, shape (N, 2 or more) [m].
+        other: Other positions, x, y first, shape (M, 2 or more) [m]. The lowest row is returned of equally
+            near ones.
+        reach: Maximum distance [m].
+    """
     nearest = np.empty(place.shape[0], np.int64)
     cells, scale = cells_for(other.shape[0]), per_metre(reach)
     fill(cells, other, other.shape[0], scale)

@@ -33,18 +33,19 @@ class ScanPose(NamedTuple):
 
 
 def _no_landmarks(columns: dict[str, Int]) -> Int:
-    """The landmarks of a table that was saved without them; the next scan assigns the nearest ones."""
+    """Return the landmarks of a table that an earlier version saved without them: -1. The next scan assigns
+    the nearest ones."""
     return np.full(len(columns["number"]), NO_LANDMARK)
 
 
 @dataclass(slots=True, eq=False)
 class TrackTable:
-    """Columns of length T.
+    """Tracks, one row per tree; all columns have the length T.
 
     Attributes:
-        number: int64, ascending; a number is never used twice.
-        landmark: int64, birth of the landmark of the tree in SLAM's map; -1 for a tree that only a voxel
-            column supports.
+        number: int64, ascending; a number is never reused.
+        landmark: int64, birth number of the landmark of the tree; -1 for a tree that only a voxel column
+            supports.
         x: State x, y [m], vx, vy [m/s], shape (T, 4).
         P: Covariance of the state, shape (T, 4, 4).
         shared: Part of P that comes from the poses of the robot, shape (T, 2, 2) [m^2].
@@ -54,13 +55,13 @@ class TrackTable:
         score: Score of the landmark: hits less misses, see `Landmarks`.
         eccentricity: Sum of the finite eccentricities of the observations.
         eccentricities: int64, number of them.
-        radius: Sum of weights times radii.
+        radius: Sum of weights times radii [1/m^3].
         radius_weight: Sum of weights (see `add_observations`) [1/m^4].
-        radius_reach: Sum of weights times distances.
-        radius_above: Sum of weights times distances from breast height [m].
+        radius_reach: Sum of weights times distances of the sensor [1/m^3].
+        radius_above: Sum of weights times distances from breast height [1/m^3].
         radii: int64, number of radii.
-        sides: int64, bit k is set when sector k around the trunk was seen.
-        verdict: int64, class of the voxel column of the tree, see Verdict; -1 for unknown.
+        sides: int64, bit k is set when sector k around the trunk was observed.
+        verdict: int64, class of the voxel column of the tree, see `Verdict`; -1 for unknown.
     """
 
     number: Int
@@ -84,7 +85,7 @@ class TrackTable:
 
     @classmethod
     def empty(cls, rows: int = 0) -> TrackTable:
-        """Return rows of zeros, without landmark and class."""
+        """Return rows of zeros, with the score 1 and without landmark and class (-1)."""
         floats, ints = np.zeros(rows), np.zeros(rows, np.int64)
         return cls(
             number=ints.copy(),
@@ -183,11 +184,14 @@ class Rows(NamedTuple):
 
 @compiled
 def join(rows: Rows, old: int, young: int) -> None:
-    """Add the track of one row to another row, in place. The row `young` stays unchanged; the caller removes
-    it."""
+    """Fuse the track of row `young` into that of row `old`, in place.
+
+    Positions are fused by split covariance intersection, counts and sums are added, and the class tree
+    prevails. The row `young` stays unchanged; the caller removes it.
+    """
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, sides, verdict = rows.hits, rows.sides, rows.verdict
-    # Two halves of one trunk in one scan count once. Earlier scans that showed both halves count twice.
+    # Two parts of one trunk in the last scan count once; earlier scans with both parts count twice.
     if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
         hits[old] -= 1
     row, own, common = np.array([old]), np.empty((1, 2, 2)), np.empty((1, 2, 2))
@@ -203,7 +207,7 @@ def join(rows: Rows, old: int, young: int) -> None:
     stamp_ns[old] = max(stamp_ns[old], stamp_ns[young])
     first_ns[old] = min(first_ns[old], first_ns[young])
     sides[old] |= sides[young]
-    # A new track has no class yet, which does not change the class of the older one.
+    # A track without class does not change the class of the other one.
     if verdict[young] == Verdict.TREE or verdict[old] < 0:
         verdict[old] = verdict[young]
     hits[old] += hits[young]
@@ -218,6 +222,8 @@ def join(rows: Rows, old: int, young: int) -> None:
 def _fill_fused(
     x: Float, P: Float, other_x: Float, Q: Float, state: Float, K: Float, M: Float, joined: Float
 ) -> None:
+    """Write the results of `fuse` into `state` and `joined`; Q is the covariance of the other estimate, K and
+    M are work arrays."""
     S00, S01 = P[0, 0] + Q[0, 0], P[0, 1] + Q[0, 1]
     S10, S11 = P[1, 0] + Q[1, 0], P[1, 1] + Q[1, 1]
     det = S00 * S11 - S01 * S10
@@ -238,8 +244,15 @@ def _fill_fused(
 
 @compiled
 def fuse(x: Float, P: Float, other_x: Float, other_P: Float) -> tuple[Float, Float]:
-    """Return state, shape (4,), and covariance, shape (4, 4), of the first of two independent estimates, with
-    its position corrected by that of the second."""
+    """Return the first of two independent estimates, corrected by the position of the second (Kalman update).
+
+    Args:
+        x, other_x: States, shape (4,).
+        P, other_P: Covariances, shape (4, 4); only the position block of `other_P` is used.
+
+    Returns:
+        State, shape (4,), and covariance, shape (4, 4).
+    """
     state, joined = np.empty(4), np.empty((4, 4))
     _fill_fused(x, P, other_x, other_P, state, np.empty((4, 2)), np.empty((4, 4)), joined)
     return state, joined

@@ -10,7 +10,7 @@ from pipeline.config.stages import Classification, Tracking
 from pipeline.geometry.gaussian import in_map, spread_by_pose
 from pipeline.geometry.poses import Float
 from pipeline.loop_closure.map_correction import PathCorrection
-from pipeline.tracking.identity import follow, merge_near, stand_apart, tracks_of
+from pipeline.tracking.identity import are_separate, follow, merge_near, tracks_of
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
 from pipeline.tracking.split_covariance_intersection import split
@@ -21,16 +21,16 @@ from pipeline.types.records import Columns, Detections, Int, Landmarks, PoseEsti
 NANOSECONDS = 1e-9
 SHARED_SIGMA = 0.01  # m; error that all views of a trunk share, by its bark and its taper
 SHARED_COVARIANCE = SHARED_SIGMA**2 * np.eye(2)
-COLUMN_SIGMA = 0.1  # m; of the axis of a voxel column that was seen from one side
-LOOP_DISTANCE = 1.0  # m; trees of before and after a loop that are nearer are one
+COLUMN_SIGMA = 0.1  # m; of the axis of a voxel column that was observed from one side
+LOOP_DISTANCE = 1.0  # m; maximum distance of a tree to its landmark after a loop closure
 
 
 class Tracker:
-    """The trees of the map.
+    """Trees of the map: one Kalman filter each, with the data association of SLAM.
 
     Attributes:
         parameters: Parameters of the stage.
-        next_number: Number of the next new tree; a number is given once.
+        next_number: Number of the next new tree; a number is never reused.
         tracks: State of each tree; the next scan changes it in place.
     """
 
@@ -76,7 +76,7 @@ class Tracker:
 
         # New landmarks: new trees. A landmark next to a tree is another part of its trunk.
         new = np.flatnonzero((row < 0) & (births != NO_LANDMARK))
-        new = new[stand_apart(position[new], t.x, p.proximity_radius)] if len(new) else new
+        new = new[are_separate(position[new], t.x, p.proximity_radius)] if len(new) else new
         if len(new):
             row[new] = len(t) + np.arange(len(new))
             self._begin(stamp_ns, births[new], position[new], own[new], added[new])
@@ -94,7 +94,9 @@ class Tracker:
     def correct(
         self, correction: PathCorrection, stamps_ns: Int, estimate: PoseEstimate, landmarks: Landmarks
     ) -> None:
-        """Move the trees with a corrected path.
+        """Move the trees with a corrected path, and those with a landmark to its corrected position.
+
+        Trees that share a landmark afterwards are joined. The covariances are rotated with the path.
 
         Args:
             correction: The correction of the path.
@@ -111,7 +113,7 @@ class Tracker:
             for b in (slice(0, 2), slice(2, 4)):
                 t.P[:, a, b] = C @ t.P[:, a, b] @ C.transpose(0, 2, 1)
         t.shared[:] = C @ t.shared @ C.transpose(0, 2, 1)
-        # The graph estimates the landmarks from all detections, so the trees stand where they do.
+        # The graph estimates the landmarks from all detections, so that trees take their positions.
         order = np.argsort(landmarks.birth)
         at = np.minimum(np.searchsorted(landmarks.birth[order], t.landmark), max(len(order) - 1, 0))
         if len(order):
@@ -213,7 +215,15 @@ class Tracker:
         t.P[rows, 2:, :2] = 0.0
 
     def _begin(self, stamp_ns: int, landmark: Int, position: Float, own: Float, added: Float) -> None:
-        """Begin trees, see `TrackTable.begun`."""
+        """Begin trees at positions, with the numbers from `next_number` on.
+
+        Args:
+            stamp_ns: Time of the scan.
+            landmark: Birth numbers of their landmarks, shape (K,); -1 for none.
+            position: Positions in the map, shape (K, 2) [m].
+            own: Covariances of the measurements, shape (K, 2, 2) [m^2].
+            added: Covariances that the pose adds, shape (K, 2, 2) [m^2].
+        """
         new = TrackTable.begun(
             self.next_number, stamp_ns, position, own, added, self.parameters.velocity_sigma
         )

@@ -1,4 +1,4 @@
-"""Every tunable value is declared once, is checked at the door, and comes back from its text."""
+"""Parameters: one declaration each, validation, presets, and conversion to text and back."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_forest_is_the_default():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_every_preset_lies_within_the_bounds_and_says_where_it_comes_from(name):
+def test_every_preset_is_within_the_bounds_and_has_a_source(name):
     values: dict[str, Any] = dict(preset(name).flat())
     for spec in NUMBERS:
         assert spec.minimum is not None
@@ -86,7 +86,7 @@ def test_every_preset_lies_within_the_bounds_and_says_where_it_comes_from(name):
 
 
 @pytest.mark.parametrize("spec", SPECS, ids=lambda s: s.name)
-def test_every_parameter_is_said_to_people(spec):
+def test_every_parameter_has_title_unit_and_explanation(spec):
     assert spec.title
     assert spec.title[0].isupper() or spec.title[0] in "xyz"
     assert spec.doc.endswith(".")
@@ -105,7 +105,7 @@ def test_every_number_has_bounds_a_step_and_a_default_between(spec):
 
 
 @pytest.mark.parametrize("spec", NUMBERS, ids=lambda s: s.name)
-def test_bounds_belong_to_the_range_and_nothing_beyond(spec):
+def test_bounds_are_inclusive(spec):
     number = int if spec.kind == "int" else float
     beyond = 1 if spec.kind == "int" else 1e-6
     for value in (number(spec.minimum - beyond), number(spec.maximum + beyond)):
@@ -120,13 +120,13 @@ def test_bounds_belong_to_the_range_and_nothing_beyond(spec):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf"), True, "0.3", None, [0.3], 1j])
-def test_what_is_no_number_is_refused(value):
+def test_an_invalid_number_is_rejected(value):
     with pytest.raises(ParameterError, match=r"clustering\.eps"):
         preset("forest").replace({"clustering.eps": value})
 
 
 @pytest.mark.parametrize("value", [True, 3.0, 3.5, "3", None])
-def test_what_is_no_whole_number_is_refused(value):
+def test_an_invalid_integer_is_rejected(value):
     with pytest.raises(ParameterError, match=r"clustering\.min_points"):
         preset("forest").replace({"clustering.min_points": value})
 
@@ -134,7 +134,7 @@ def test_what_is_no_whole_number_is_refused(value):
 @pytest.mark.parametrize(
     ("name", "value"), [("acquisition.deskew", 1), ("acquisition.level", "imuu"), ("clustering.engine", 0)]
 )
-def test_what_is_no_choice_is_refused(name, value):
+def test_an_invalid_choice_is_rejected(name, value):
     with pytest.raises(ParameterError, match=name.replace(".", r"\.")):
         preset("forest").replace({name: value})
 
@@ -152,19 +152,19 @@ def test_what_is_no_choice_is_refused(name, value):
     ],
 )
 @pytest.mark.parametrize("apart", [0.0, 0.5])
-def test_two_bounds_that_cross_are_both_named(low, high, apart):
+def test_the_message_names_both_crossing_limits(low, high, apart):
     with pytest.raises(ParameterError) as caught:
         preset("forest").replace({low: 1.5 + apart, high: 1.5})
     assert low in str(caught.value)
     assert high in str(caught.value)
 
 
-def test_crossing_bounds_may_be_moved_together():
+def test_both_limits_may_change_in_one_call():
     moved = preset("forest").replace({"filters.z_min": 30.0, "filters.z_max": 40.0})
     assert (moved.filters.z_min, moved.filters.z_max) == (30.0, 40.0)
 
 
-def test_a_set_does_not_change_when_another_is_made_of_it():
+def test_replace_does_not_modify_the_original():
     before = preset("forest")
     after = before.replace({"clustering.eps": 0.3})
     assert after.changes_from(before) == {"clustering.eps": 0.3}
@@ -174,7 +174,7 @@ def test_a_set_does_not_change_when_another_is_made_of_it():
 
 
 @pytest.mark.parametrize("name", ["clustering.epz", "clustering", "", ".", "clusterin.eps", "a.b.c"])
-def test_an_unknown_name_is_refused_and_the_nearest_said(name):
+def test_an_unknown_name_is_rejected_with_the_nearest_name(name):
     with pytest.raises(ParameterError) as caught:
         preset("forest").replace({name: 1.0})
     assert "\n" not in str(caught.value)
@@ -192,12 +192,12 @@ def test_an_unknown_preset_names_the_known_ones():
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_toml_brings_every_preset_back(name):
+def test_presets_round_trip_through_toml(name):
     assert from_toml(to_toml(preset(name)), preset("forest"), "x.toml") == preset(name)
 
 
 @given(st.data())
-def test_toml_brings_any_values_back(data):
+def test_values_round_trip_through_toml(data):
     spec = data.draw(st.sampled_from(NUMBERS))
     lowest, highest = spec.minimum, spec.maximum
     value = (
@@ -213,7 +213,7 @@ def test_toml_brings_any_values_back(data):
     assert assign(preset("forest"), [f"{spec.name}={value!r}"]) == chosen
 
 
-def test_toml_may_leave_things_out_and_write_lengths_as_whole_numbers():
+def test_toml_may_omit_values_and_write_lengths_as_integers():
     chosen = from_toml("[clustering]\neps = 1\n", preset("paper"), "x.toml")
     assert chosen.changes_from(preset("paper")) == {"clustering.eps": 1.0}
     assert from_toml("", preset("paper"), "x.toml") == preset("paper")
@@ -240,7 +240,7 @@ def test_toml_may_leave_things_out_and_write_lengths_as_whole_numbers():
     ],
     ids=lambda text: repr(text[:28]),
 )
-def test_a_toml_that_does_not_fit_is_one_line_with_the_name_of_the_file(text):
+def test_an_invalid_toml_gives_one_line_with_the_file_name(text):
     with pytest.raises(ParameterError) as caught:
         from_toml(text, preset("forest"), "mine.toml")
     message = str(caught.value)
@@ -266,14 +266,14 @@ def test_a_toml_that_does_not_fit_is_one_line_with_the_name_of_the_file(text):
         ("clustering.epz=1", "clustering.eps"),
     ],
 )
-def test_an_assignment_that_does_not_fit_says_why(text, says):
+def test_an_invalid_assignment_gives_the_reason(text, says):
     with pytest.raises(ParameterError) as caught:
         assign(preset("forest"), [text])
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_assignments_are_laid_over_one_another():
+def test_later_assignments_override_earlier_ones():
     chosen = assign(
         preset("forest"),
         ["clustering.eps=0.3", " clustering.eps = 0.4 ", "acquisition.deskew=false", "slam.particles=7"],
@@ -283,7 +283,7 @@ def test_assignments_are_laid_over_one_another():
     assert chosen.slam.particles == 7
 
 
-def test_the_table_has_a_row_a_parameter_and_a_column_a_preset():
+def test_the_table_has_a_row_per_parameter_and_a_column_per_preset():
     table = markdown_table({name: preset(name) for name in PRESETS}).splitlines()
     assert len(table) == 2 + len(SPECS)
     assert len({line.count("|") for line in table}) == 1

@@ -1,4 +1,4 @@
-"""Poses form groups; angles wrap; quaternions come back."""
+"""Poses form groups, angles are wrapped, and quaternions and Euler angles are inverted."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_wrapped_angle_is_the_same_direction_in_one_turn(angle):
     assert np.sin(wrapped) == pytest.approx(np.sin(angle), abs=1e-12)
 
 
-def test_the_turn_is_half_open_to_the_last_bit():
+def test_the_range_of_wrapped_angles_is_half_open_to_the_last_bit():
     edge = np.array([np.pi, -np.pi, np.nextafter(-np.pi, -4.0), np.nextafter(np.pi, 4.0)])
     wrapped = wrap_angle(edge)
     assert np.all((wrapped >= -np.pi) & (wrapped < np.pi)), wrapped
@@ -85,7 +85,7 @@ def test_half_turns_have_a_quaternion(axis):
 
 
 @pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 0]])
-def test_a_quaternion_that_is_none_is_refused(bad):
+def test_an_invalid_quaternion_raises(bad):
     with pytest.raises(ValueError, match="quaternion"):
         Pose3.from_quaternion(np.zeros(3), bad)
 
@@ -100,7 +100,7 @@ def test_angles_are_those_of_rotations_about_the_axes():
 
 
 @given(poses2, poses2, st.floats(0.0, 1.0))
-def test_interpolation_meets_its_ends_and_turns_the_shorter_way(a, b, fraction):
+def test_interpolation_includes_its_ends_and_turns_the_shorter_way(a, b, fraction):
     _same2(interpolate(a, b, 0.0), a)
     _same2(interpolate(a, b, 1.0), b)
     turn = abs(float(wrap_angle(b.yaw - a.yaw)))

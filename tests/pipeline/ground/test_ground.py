@@ -1,4 +1,4 @@
-"""Heights above planes of any slope, and trunks that do not become terrain."""
+"""Ground of one scan: heights above planes of any slope, trunks, hedges and ghost echoes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _rings(slope_deg, uphill, *, field=np.pi):
 
 
 @given(st.floats(0.0, 34.0), st.floats(-3.1, 3.1))
-def test_the_ground_of_any_plane_stays_out_of_the_band(slope, uphill):
+def test_ground_returns_of_any_plane_are_below_the_height_band(slope, uphill):
     points = _rings(slope, uphill)
     above = height_above(points, find_terrain(points, FOREST))
     near = np.hypot(points[:, 0], points[:, 1]) < 10.0
@@ -53,7 +53,7 @@ def test_a_point_over_a_plane_has_its_height(slope, height):
 
 
 @given(st.floats(0.0, 20.0), st.floats(-3.1, 3.1))
-def test_ground_is_known_for_ground_and_places_have_the_heights_of_points(slope, uphill):
+def test_a_plane_is_recognised_as_ground_and_heights_of_places_equal_those_of_points(slope, uphill):
     points = _rings(slope, uphill)
     terrain = find_terrain(points, FOREST)
     assert shows_ground(terrain)
@@ -95,14 +95,14 @@ def test_a_trunk_does_not_become_terrain(slope, lowest):
     assert len(stays) > 0.9 * np.count_nonzero((z >= 0.3) & (z <= 2.0))
 
 
-def test_a_return_from_below_the_ground_does_not_dig_a_hole():
+def test_a_return_below_the_ground_does_not_lower_the_surface():
     ground = _rings(0.0, 0.0)
     ghost = np.array([[4.2, 0.1, -2.5]], np.float32)
     terrain = find_terrain(np.concatenate([ground, ghost]), FOREST)
     np.testing.assert_allclose(height_above(ground, terrain), 0.0, atol=1e-5)
 
 
-def test_the_terrain_never_rises_steeper_than_it_may():
+def test_the_terrain_is_not_steeper_than_the_maximum_slope():
     wall = np.array(
         [[x, y, z] for x in (5.0,) for y in np.arange(-2, 2, 0.1) for z in np.arange(0.5, 3, 0.1)]
     )
@@ -112,14 +112,14 @@ def test_the_terrain_never_rises_steeper_than_it_may():
 
 
 @pytest.mark.parametrize("points", [[], [[3.0, 0.0, -0.8]], [[0.0, 0.0, 1.0]] * 10])
-def test_next_to_nothing_gives_finite_heights(points):
+def test_few_points_give_finite_heights(points):
     cloud = np.array(points, np.float32).reshape(-1, 3)
     above = height_above(cloud, find_terrain(cloud, FOREST))
     assert above.shape == (len(cloud),)
     assert np.all(np.isfinite(above))
 
 
-def test_both_ends_of_the_band_belong_to_it():
+def test_the_height_band_includes_its_limits():
     points = np.arange(15, dtype=np.float32).reshape(5, 3)
     height = np.array([0.29, 0.3, 1.0, 2.0, 2.01], np.float32)
     p = FOREST.model_copy(update={"height_min": float(np.float32(0.3)), "height_max": 2.0})

@@ -1,4 +1,4 @@
-"""The height map: planes come out as they are, from any side, and going back leaves nothing behind."""
+"""Terrain map: planes are reproduced from any pose, states are immutable, memory is bounded."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _poses(uphill, n):
 
 
 @pytest.mark.parametrize("slope", [0.0, 8.0, 15.0])
-def test_a_plane_that_was_driven_up_is_a_plane(slope):
+def test_a_plane_is_reproduced_along_the_path(slope):
     uphill = 0.7
     record = _driven(slope, uphill, _poses(uphill, 25)).record()
     middle = (record.place + 0.5) * record.cell
@@ -44,14 +44,14 @@ def test_a_plane_that_was_driven_up_is_a_plane(slope):
     assert 15 <= record.views.max() <= 25
 
 
-def test_height_is_asked_for_at_any_place():
+def test_heights_at_places_use_known_neighbours():
     mapper = _driven(0.0, 0.0, _poses(0.0, 3))
     heights = mapper.heights(np.array([[3.2, 0.1], [500.0, 0.0]]))
     assert heights[0] == pytest.approx(0.0, abs=1e-4)
     assert np.isnan(heights[1])
 
 
-def test_a_state_is_not_changed_by_what_comes_after_it():
+def test_later_scans_do_not_change_a_state():
     poses = _poses(0.0, 12)
     mapper = _driven(10.0, 0.0, poses[:6])
     state = mapper.state
@@ -86,7 +86,7 @@ def test_memory_is_bounded(monkeypatch):
     assert max(i for i, _ in state.tiles) * terrain_map.TILE > 130.0  # what was seen last is kept
 
 
-def test_a_sensor_that_comes_back_higher_by_mistake_finds_its_height_again():
+def test_a_wrong_sensor_height_is_corrected_at_known_cells():
     mapper = _driven(0.0, 0.0, _poses(0.0, 5))
     points = _rings(0.0, 0.0) - np.array([0.0, 0.0, 0.3], np.float32)  # it stands on a log
     mapper.add(find_terrain(points, FOREST), Pose2(), OFFSET)

@@ -1,4 +1,4 @@
-"""A moving, tilted robot that scans a still world gives the still world."""
+"""De-skewing and levelling: a moving, tilted robot in a static world reproduces this world."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_tilted_robot_gives_the_upright_world(seed, roll, pitch):
     np.testing.assert_allclose(points + offset, world, atol=1e-5)
 
 
-def test_without_a_known_tilt_or_the_wish_nothing_is_turned():
+def test_without_a_tilt_or_with_levelling_off_points_are_not_rotated():
     world = _world(1)
     still = scan(1, _seen(world, [Pose3.identity()] * len(world)))
     unknown, _ = acquire(Step(0, still, None, 0.3, 0.2, tilt_known=False), MOUNTING, FOREST)
@@ -53,7 +53,7 @@ def test_without_a_known_tilt_or_the_wish_nothing_is_turned():
 
 
 @given(st.integers(0, 999), st.floats(-3.0, 3.0), st.floats(-0.5, 0.5))
-def test_driving_straight_leaves_no_trace_in_the_scan(seed, forward, left):
+def test_translation_is_compensated(seed, forward, left):
     world = _world(seed)
     dt = np.random.default_rng(seed).integers(-50_000_000, 100_000_000, len(world))
     poses = [Pose3(np.eye(3), np.array([forward, left, 0.0]) * t * 1e-9) for t in dt]
@@ -63,7 +63,7 @@ def test_driving_straight_leaves_no_trace_in_the_scan(seed, forward, left):
 
 
 @given(st.integers(0, 999), st.floats(-2.0, 2.0))
-def test_turning_on_the_spot_leaves_no_trace_in_the_scan(seed, turn):
+def test_rotation_is_compensated(seed, turn):
     world = _world(seed)
     dt = np.random.default_rng(seed).integers(-100_000_000, 100_000_000, len(world))
     poses = [Pose3.from_euler(np.zeros(3), 0.0, 0.0, turn * t * 1e-9) for t in dt]
@@ -72,7 +72,7 @@ def test_turning_on_the_spot_leaves_no_trace_in_the_scan(seed, turn):
     np.testing.assert_allclose(points + offset, world, atol=1e-4)
 
 
-def test_driving_a_curve_while_tilted_is_undone_to_millimetres():
+def test_a_curve_with_tilt_is_compensated_to_millimetres():
     world, turn, speed = _world(3), 0.6, 1.0
     dt = np.linspace(0, 100_000_000, len(world)).astype(np.int64)
     t = dt * 1e-9
@@ -93,7 +93,7 @@ def test_deskewing_can_be_switched_off():
     np.testing.assert_array_equal(acquire(step, Pose3.identity(), off)[0], [[3, 0, 0]])
 
 
-def test_both_ends_of_the_range_belong_to_it_and_nan_to_nothing():
+def test_range_limits_are_inclusive_and_nan_is_removed():
     p = FOREST.model_copy(update={"range_min": 0.5, "range_max": 40.0})
     rows = [[0.5, 0, 0], [0, 40, 0], [0, 0, 0.49], [0, 0, 40.01], [np.nan, 1, 1], [np.inf, 1, 1], [0, 0, 0]]
     points, _ = acquire(Step(0, scan(1, rows), None), Pose3.identity(), p)
@@ -101,7 +101,7 @@ def test_both_ends_of_the_range_belong_to_it_and_nan_to_nothing():
 
 
 @given(st.integers(0, 999), st.floats(0.0, 3.0))
-def test_each_return_is_near_or_taken_or_out_of_reach(seed, nearest):
+def test_each_return_is_either_near_or_used_or_out_of_range(seed, nearest):
     rng = np.random.default_rng(seed)
     rows = rng.uniform(-3.0, 3.0, (60, 3)).astype(np.float32)
     rows[::7] = np.nan
@@ -117,7 +117,7 @@ def test_each_return_is_near_or_taken_or_out_of_reach(seed, nearest):
     np.testing.assert_allclose(near, whole[(chosen < nearest) & (chosen >= HOUSING)], atol=1e-6)
 
 
-def test_the_robot_itself_does_not_move_by_its_own_speed():
+def test_near_returns_are_not_deskewed():
     step = Step(0, scan(1, [[0.3, 0, 0], [0, 0, 0]], [100_000_000] * 2), None, twist=(2.0, 0.0, 0.0))
     np.testing.assert_allclose(acquire_near(step, Pose3.identity(), FOREST), [[0.3, 0, 0]])
 

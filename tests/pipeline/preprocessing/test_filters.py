@@ -1,4 +1,4 @@
-"""The pass-through box and the voxel grid against plain numpy."""
+"""Pass-through box and voxel grid against NumPy."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ def test_voxels_of_a_whole_scan_are_the_means_of_cubes():
         np.testing.assert_allclose(voxel_grid(points, p), _means_of_cubes(points, size), atol=1e-5)
 
 
-def test_cubes_meet_at_zero_and_do_not_mirror_there():
+def test_voxels_are_not_mirrored_at_zero():
     p = FOREST.model_copy(update={"voxel_size": 1.0})
     points = np.array([[-0.25, 0.5, 0.5], [0.25, 0.5, 0.5], [0.75, 0.5, 0.5]], np.float32)
     np.testing.assert_allclose(voxel_grid(points, p), [[-0.25, 0.5, 0.5], [0.5, 0.5, 0.5]])
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9])
-def test_no_size_and_cubes_too_small_to_count_change_nothing(size):
+def test_a_size_of_zero_or_a_tiny_size_returns_the_points(size):
     p = FOREST.model_copy(update={"voxel_size": size})
     points = np.array([[1, 2, 3], [1, 2, 3], [-4, 5, 6]], np.float32)
     np.testing.assert_array_equal(voxel_grid(points, p), points)
 
 
-def test_no_points_stay_no_points():
+def test_an_empty_cloud_stays_empty():
     empty = np.zeros((0, 3), np.float32)
     assert voxel_grid(empty, FOREST).shape == (0, 3)
     assert pass_through(empty, FOREST).shape == (0, 3)
@@ -77,7 +77,7 @@ def test_a_thousand_equal_points_are_one():
 
 
 @given(clouds)
-def test_the_box_keeps_what_numpy_keeps_in_its_order(points):
+def test_the_box_equals_a_numpy_mask(points):
     p = FOREST.model_copy(
         update={"x_min": -1.0, "x_max": 0.5, "y_min": 0.0, "y_max": 2.0, "z_min": -2.0, "z_max": 1.5}
     )
@@ -95,7 +95,7 @@ def test_a_point_on_a_face_belongs_to_the_box_whatever_float32_makes_of_it(bound
     assert len(pass_through(point, q)) == 1
 
 
-def test_the_input_is_left_alone():
+def test_the_input_is_not_modified():
     points = np.random.default_rng(0).uniform(-1, 1, (50, 3)).astype(np.float32)
     before = points.copy()
     pass_through(points, FOREST)

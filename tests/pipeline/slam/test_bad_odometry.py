@@ -1,4 +1,4 @@
-"""SLAM with odometry that is missing, stuck or jumping: said, survived, and with few false trees."""
+"""SLAM with odometry that is missing, stuck or jumping: reported, compensated, and with few false trees."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_a_flip_of_the_heading_leaves_the_map_as_it_was():
     assert false_trees(slam) <= 1
 
 
-def test_wheels_that_are_stuck_are_overruled_by_the_trees():
+def test_the_motion_of_stuck_wheels_is_determined_by_trees():
     truth, told = wheels(KNOWN + AFTER)
     told = [p if k < KNOWN else told[KNOWN - 1] for k, p in enumerate(told)]
     slam, rows, _ = driven(told, truth)
@@ -116,7 +116,7 @@ def test_wheels_that_are_stuck_are_overruled_by_the_trees():
     assert false_trees(slam) == 0
 
 
-def test_odometry_that_ends_is_weak_until_the_trees_have_led_for_long():
+def test_missing_odometry_is_weak_until_trees_determined_the_motion_for_long():
     truth, told = wheels(KNOWN + AFTER)
     slam, rows, _ = driven(told, truth, missing=range(KNOWN, KNOWN + AFTER))
     begun = next(k for k, (_, health, _, _) in enumerate(rows) if "no odometry" in health.doubt)
@@ -130,7 +130,7 @@ def test_odometry_that_ends_is_weak_until_the_trees_have_led_for_long():
 
 
 @pytest.mark.parametrize("seen_trees", [0, 2])
-def test_where_no_trees_lead_a_missing_odometry_stays_weak(seen_trees):
+def test_missing_odometry_stays_weak_without_trees(seen_trees):
     slam, states = FastSlam(FOREST, 0), []
     for k in range(60):
         motion = Motion(Pose2(), (0.05, 0.02), "there is no odometry") if k >= 10 else Pose2()
@@ -159,7 +159,7 @@ def test_a_gap_of_sixty_seconds_without_anything_is_bridged():
 
 
 @pytest.mark.parametrize("bad", ["NaN", "back in time", "twice"])
-def test_readings_that_make_no_sense_are_left_out_and_counted(bad):
+def test_invalid_readings_are_skipped_and_counted(bad):
     truth, told = wheels(KNOWN)
     records: list[Any] = []
     for k, pose in enumerate(told):
@@ -186,7 +186,7 @@ def measured(x, y, yaw=0.0, sigma=(0.05, 0.05, 0.02), stamp_ns=0):
     return PoseMeasurement(stamp_ns, Pose2(x, y, yaw), np.diag(np.square(sigma)))
 
 
-def test_a_measured_pose_corrects_as_the_textbook_says():
+def test_a_measured_pose_gives_the_kalman_update():
     from filterpy.kalman import update
 
     rng = np.random.default_rng(0)
@@ -203,7 +203,7 @@ def test_a_measured_pose_corrects_as_the_textbook_says():
 
 
 @pytest.mark.parametrize("method", ["fastslam1", "fastslam2"])
-def test_a_drift_is_bound_by_a_measured_pose(method):
+def test_a_measured_pose_bounds_the_drift(method):
     """Where no tree stands the odometry drifts; another source says where the robot is."""
     errors = {}
     for helped in (False, True):
@@ -230,7 +230,7 @@ def test_a_drift_is_bound_by_a_measured_pose(method):
     ],
     ids=["negative", "NaN", "zero", "2 x 2", "not symmetric"],
 )
-def test_a_measured_pose_with_a_bad_covariance_is_left_out_and_counted(covariance):
+def test_a_measured_pose_with_an_invalid_covariance_is_skipped_and_counted(covariance):
     losses = Counter[str]()
     bad = PoseMeasurement(0, Pose2(), covariance)
     (step,) = steps([bad, scan(0)], losses=losses)
@@ -239,7 +239,7 @@ def test_a_measured_pose_with_a_bad_covariance_is_left_out_and_counted(covarianc
     assert any("positive definite" in text for text in step.warnings)
 
 
-def test_a_measured_pose_goes_with_the_scan_of_its_time():
+def test_a_measured_pose_is_used_at_the_scan_of_its_time():
     poses = [measured(float(k), 0.0, stamp_ns=k * 1000 * MS) for k in range(3)]
     records = [poses[0], scan(10 * MS), poses[1], scan(500 * MS), scan(1020 * MS), poses[2], scan(2000 * MS)]
     assert [s.measured and s.measured.T_map_base.x for s in steps(records, odometry="static")] == [

@@ -1,4 +1,4 @@
-"""The best particle: one hypothesis is followed while the particles are apart."""
+"""Choice of the best particle: one hypothesis is kept while the particles are apart."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.pipeline.strategies import detections, seeds
 
 
 @given(seeds, st.floats(0.1, 3.0))
-def test_where_particles_lie_apart_one_is_followed_until_it_dies(seed, power):
+def test_while_particles_are_apart_the_best_one_is_kept_until_it_is_not_resampled(seed, power):
     random = np.random.default_rng(seed)
     weights, offset = normalised(power * random.standard_normal(40)), float(random.uniform())
     near, far = random.normal(0.0, 0.2, (40, 3)), random.normal(0.0, 8.0, (40, 3))
@@ -31,7 +31,7 @@ def test_where_particles_lie_apart_one_is_followed_until_it_dies(seed, power):
     assert chosen == (7 if 7 in ancestors else weights.argmax())
 
 
-def test_a_pose_that_is_told_where_particles_lie_apart_is_one_of_them():
+def test_while_particles_are_apart_the_reported_pose_is_that_of_a_particle():
     from pipeline.slam import FastSlam
     from tests.pipeline.strategies import NOTHING_SEEN
 

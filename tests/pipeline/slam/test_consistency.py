@@ -1,4 +1,4 @@
-"""Sigmas that can be believed: what views of a tree share, what particles no longer show, and the outcome."""
+"""Consistency of reported covariances: shared errors of views, lost spread of particles, simulated runs."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def joined(own, shared, R, B, x, z):
 
 
 @given(seeds, st.floats(-1.0, 1.0))
-def test_the_told_covariance_bounds_the_true_one_whatever_the_correlation(seed, r):
+def test_the_fused_covariance_bounds_the_true_one_for_any_correlation(seed, r):
     rng = np.random.default_rng(seed)
     own, shared, R, B = spd(rng, 2), spd(rng, 2, 3.0), spd(rng, 2), spd(rng, 2, 3.0)
     _, told, part, K = joined(own, shared, R, B, np.zeros(2), np.zeros(2))
@@ -63,7 +63,7 @@ def test_without_a_shared_part_it_is_the_kalman_filter(seed):
 
 
 @given(*[st.floats(1e-4, 1.0)] * 4)
-def test_the_weight_makes_the_variance_least(own, shared, R, B):
+def test_the_weight_minimises_the_variance(own, shared, R, B):
     def variance(w):
         return 1.0 / (1.0 / (own + shared / w) + 1.0 / (R + B / (1.0 - w)))
 
@@ -71,7 +71,7 @@ def test_the_weight_makes_the_variance_least(own, shared, R, B):
     assert variance(weight(own, shared, R, B)) <= best * (1.0 + 1e-9)
 
 
-def test_many_views_from_one_doubtful_pose_average_out_their_noise_alone():
+def test_views_from_one_uncertain_pose_average_out_only_their_own_noise():
     t = Tracker(preset("forest").tracking)
     for k in range(400):
         track(t, k, Pose2(), POSE, detections([[5.0, 0.0]], sigma=0.05))
@@ -79,7 +79,7 @@ def test_many_views_from_one_doubtful_pose_average_out_their_noise_alone():
     np.testing.assert_allclose(P, np.eye(2) * (0.1**2 + 0.05**2 / 400), rtol=1e-6, atol=1e-9)
 
 
-def test_a_view_from_a_sure_pose_takes_over_from_doubtful_ones():
+def test_a_view_from_a_certain_pose_outweighs_uncertain_ones():
     t = Tracker(preset("forest").tracking)
     for k in range(50):
         track(t, k, Pose2(0.1, 0.0, 0.0), POSE, detections([[5.0, 0.0]], sigma=0.02))
@@ -94,7 +94,7 @@ def test_a_view_from_a_sure_pose_takes_over_from_doubtful_ones():
 
 
 @given(seeds)
-def test_the_larger_of_two_covariances_is_as_large_as_both(seed):
+def test_the_result_of_at_least_bounds_both_covariances(seed):
     rng = np.random.default_rng(seed)
     A, B = spd(rng, 3), spd(rng, 3)
     both = at_least(A, B)
@@ -104,12 +104,12 @@ def test_the_larger_of_two_covariances_is_as_large_as_both(seed):
     np.testing.assert_allclose(at_least(A, 2.0 * A), 2.0 * A, atol=1e-7)
 
 
-def test_an_error_of_the_heading_moves_what_lies_far_from_where_it_was_made():
+def test_a_transported_heading_error_displaces_distant_poses():
     C = transported_covariance(np.diag([0.0, 0.0, 0.01**2]), 20.0, 0.0)
     np.testing.assert_allclose(np.sqrt(np.diag(C)), [0.0, 0.2, 0.01])
 
 
-def test_what_the_particles_forgot_is_remembered_where_the_landmarks_stand():
+def test_the_covariance_at_known_landmarks_is_that_of_their_reference_pose():
     wide, thin = np.eye(3) * 0.04, np.eye(3) * 1e-4
     here = np.zeros(3)
     memory = FrameUncertainty().with_reference(0, 0, here, wide)
@@ -127,7 +127,7 @@ def test_what_the_particles_forgot_is_remembered_where_the_landmarks_stand():
 
 
 @given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))
-def test_what_is_larger_by_sampling_noise_alone_counts_for_nothing_and_by_much_for_all(seed, n_eff):
+def test_an_excess_below_the_sampling_noise_is_ignored_and_a_large_one_is_kept(seed, n_eff):
     rng = np.random.default_rng(seed)
     A, noise = spd(rng, 3), 4.0 / np.sqrt(n_eff)
     np.testing.assert_allclose(at_least(A, A * (1.0 + 0.9 * noise), noise), A, rtol=1e-6, atol=1e-9)
@@ -137,8 +137,8 @@ def test_what_is_larger_by_sampling_noise_alone_counts_for_nothing_and_by_much_f
     assert np.linalg.eigvalsh(both - at_least(A, A * (1.0 + 50.0 * noise), noise)).min() > 0.0
 
 
-def test_keeping_the_larger_of_two_noisy_covariances_again_and_again_makes_none_larger():
-    """A hundred marks of one unchanging covariance, each of them and each spread taken from particles."""
+def test_repeated_bounds_by_noisy_covariances_do_not_grow():
+    """A hundred bounds of one covariance, each estimated from particles."""
     rng, n = np.random.default_rng(0), 80
     kept = np.eye(3)
     for _ in range(100):
@@ -147,7 +147,7 @@ def test_keeping_the_larger_of_two_noisy_covariances_again_and_again_makes_none_
     assert np.trace(kept) / 3.0 < 1.25
 
 
-def test_a_spread_along_a_line_may_be_as_long_as_a_forest():
+def test_a_degenerate_spread_of_kilometres_is_accepted():
     rng = np.random.default_rng(0)
     for _ in range(50):
         away = rng.normal(size=3) * [1e3, 1e3, 1.0]
@@ -157,7 +157,7 @@ def test_a_spread_along_a_line_may_be_as_long_as_a_forest():
         assert np.linalg.eigvalsh(both - line).min() > -1e-6
 
 
-def test_a_robot_that_heads_backwards_makes_no_marks_while_it_stands():
+def test_a_standing_robot_at_the_seam_of_angles_adds_no_reference_poses():
     memory = FrameUncertainty()
     for k in range(10):
         yaw = (np.pi - 0.001) * (-1.0) ** k
@@ -165,7 +165,7 @@ def test_a_robot_that_heads_backwards_makes_no_marks_while_it_stands():
     assert len(memory.serial) == 1
 
 
-def test_marks_stand_apart():
+def test_reference_poses_have_a_minimum_distance():
     memory = FrameUncertainty()
     for k in range(100):
         memory = memory.with_reference(k, k, np.array([0.1 * k, 0.0, 0.0]), np.eye(3))
@@ -176,7 +176,7 @@ def test_marks_stand_apart():
 # --- the outcome ----------------------------------------------------------------------------------
 
 
-def test_normalised_errors_of_simulated_runs_are_those_of_honest_sigmas():
+def test_normalised_errors_of_simulated_runs_are_consistent():
     errors = Errors()
     for seed in range(100, 108):
         one_run(seed, 60, errors)
@@ -186,7 +186,7 @@ def test_normalised_errors_of_simulated_runs_are_those_of_honest_sigmas():
     assert 0.7 < np.mean(errors.innovations) < 1.3
 
 
-def test_straight_on_past_few_trees_sigmas_stay_honest_and_no_loop_is_seen():
+def test_a_straight_drive_past_few_trees_stays_consistent_without_loops():
     errors = Errors()
     for seed in range(200, 205):
         one_run(seed, 60, errors, STRAIGHT)

@@ -47,7 +47,9 @@ def mapped(place: Place, trouble: Trouble, seed: int) -> tuple[Float, list[str],
 
 @pytest.mark.parametrize("jitter", [0.0, 0.15])
 @pytest.mark.parametrize(("stride", "pitch"), [(0.1, 2.0), (0.3, 3.0), (0.3, 4.0)])
-def test_rows_of_trees_overrule_no_honest_odometry(stride: float, pitch: float, jitter: float) -> None:
+def test_rows_of_trees_do_not_contradict_a_correct_odometry(
+    stride: float, pitch: float, jitter: float
+) -> None:
     place = Plantation(Pose2(stride), 0.0, pitch=pitch, jitter=jitter)
     error, warnings, false = mapped(place, Trouble(), 1)
     assert error.max() < 0.2
@@ -56,7 +58,7 @@ def test_rows_of_trees_overrule_no_honest_odometry(stride: float, pitch: float, 
 
 
 @pytest.mark.parametrize("pitch", [2.0, 3.0])
-def test_wheels_that_are_stuck_are_told_between_rows_of_trees(pitch: float) -> None:
+def test_stuck_wheels_are_detected_between_rows_of_trees(pitch: float) -> None:
     place = Plantation(Pose2(0.1), 0.0, pitch=pitch)
     error, warnings, false = mapped(place, TROUBLES["stuck"], 2)
     assert len([w for w in warnings if "it is stuck" in w]) > KNOWN

@@ -1,4 +1,4 @@
-"""Random numbers of a scan: the same for the same seed and scan, and for no other."""
+"""Random numbers of a scan: determined by the seed and the number of the scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A motion that all trees tell alike: recovered in closed form, and not seen where there is none."""
+"""Rigid-shift test and slip detection: recovered in closed form, and no detection without a motion."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SURE = Noise(0.03, np.radians(0.4), np.radians(2.0))
 
 
 def scene(seed, trees=14):
-    """Landmarks around the origin, no two nearer than two metres."""
+    """Return landmarks around the origin with a distance of two metres or more, and the random generator."""
     rng = np.random.default_rng(seed)
     places: list[np.ndarray] = []
     while len(places) < trees:
@@ -28,7 +28,7 @@ def scene(seed, trees=14):
     return np.array(places), rng
 
 
-def asked(
+def shift_test(
     known, seen, *, pose=(0.0, 0.0, 0.0), position=0.0, heading=0.0, distrust=0.0, familiar=1.0, well=None
 ):
     """Return the results of `estimate_rigid_shift` but the second, with circular covariances: whether the
@@ -45,12 +45,12 @@ def asked(
 
 
 @given(seeds, st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.02, 0.02), st.floats(-3.0, 3.0))
-def test_a_small_motion_of_all_is_recovered(seed, x, y, turn, yaw):
+def test_a_rigid_motion_is_recovered(seed, x, y, turn, yaw):
     known, _ = scene(seed)
     before = Pose2(2.0, -1.0, yaw)
     true = Pose2(before.x + x, before.y + y, yaw + turn)
     known = before.apply(known)
-    moved, place, C = asked(known, true.inverse().apply(known), pose=before.as_array())
+    moved, place, C = shift_test(known, true.inverse().apply(known), pose=before.as_array())
     way = np.sqrt(x * x + y * y + (5.0 * turn) ** 2)
     assert moved or way < 0.1
     assert not moved or way > 0.04
@@ -63,120 +63,120 @@ def test_a_small_motion_of_all_is_recovered(seed, x, y, turn, yaw):
 
 
 @given(seeds)
-def test_trees_that_stand_where_they_should_tell_nothing(seed):
+def test_noise_is_no_motion(seed):
     known, rng = scene(seed)
-    assert not asked(known, known + rng.normal(0.0, SIGMA, known.shape))[0]
+    assert not shift_test(known, known + rng.normal(0.0, SIGMA, known.shape))[0]
 
 
 @given(seeds, st.integers(1, 3))
-def test_some_that_do_not_agree_are_left_out(seed, others):
+def test_outliers_are_removed(seed, others):
     known, rng = scene(seed)
     true = Pose2(0.2, 0.1, 0.01)
     seen = true.inverse().apply(known) + rng.normal(0.0, 0.3 * SIGMA, known.shape)
     seen[:others] += np.array([0.3, -0.5])
-    moved, place, _ = asked(known, seen)
+    moved, place, _ = shift_test(known, seen)
     assert moved
     np.testing.assert_allclose(place, true.as_array(), atol=0.05)
 
 
-def test_its_sigmas_are_those_of_the_fit():
+def test_the_covariance_is_consistent():
     """Normalised error squared of 300 fits: three degrees of freedom."""
     true, squares = Pose2(0.25, -0.1, 0.015), []
     for seed in range(300):
         known, rng = scene(seed)
         noise = rng.normal(0.0, SIGMA * np.sqrt(2.0), known.shape)
-        moved, place, C = asked(known, true.inverse().apply(known) + noise)
+        moved, place, C = shift_test(known, true.inverse().apply(known) + noise)
         if moved:
             error = place - true.as_array()
             squares.append(error @ np.linalg.solve(C, error))
-    assert len(squares) > 295, "a tree far out may stand by chance"
+    assert len(squares) > 295, "a distant tree may agree with the odometry by chance"
     assert 2.0 < np.mean(squares) < 3.5
 
 
 @pytest.mark.parametrize("pairs", range(FEWEST))
-def test_few_trees_tell_nothing(pairs):
+def test_too_few_pairs_give_no_motion(pairs):
     known, _ = scene(3)
-    assert not asked(known[:pairs], known[:pairs] - [0.3, 0.0])[0]
+    assert not shift_test(known[:pairs], known[:pairs] - [0.3, 0.0])[0]
 
 
-def test_what_the_odometry_can_err_by_is_no_news():
+def test_a_motion_within_the_odometry_noise_is_not_significant():
     known, _ = scene(4)
     seen = known - [0.3, 0.0]
-    assert asked(known, seen)[0]
-    assert not asked(known, seen, position=0.3**2)[0]
+    assert shift_test(known, seen)[0]
+    assert not shift_test(known, seen, position=0.3**2)[0]
 
 
-def test_of_an_odometry_that_was_wrong_less_is_believed():
+def test_distrust_lowers_the_limit():
     known, _ = scene(5)
     seen = known - [0.048, 0.0]
-    assert not asked(known, seen)[0]
-    assert asked(known, seen, distrust=1.0)[0]
+    assert not shift_test(known, seen)[0]
+    assert shift_test(known, seen, distrust=1.0)[0]
 
 
-def test_two_halves_that_move_apart_are_no_motion_of_the_robot():
+def test_opposite_motions_are_rejected():
     known, _ = scene(6)
     seen = known.copy()
     seen[::2, 0] += 0.35
     seen[1::2, 0] -= 0.35
-    assert not asked(known, seen)[0]
+    assert not shift_test(known, seen)[0]
 
 
 @pytest.mark.parametrize(("well", "familiar"), [(MANY - 1, 0.2), (FEWEST - 1, 1.0)])
-def test_what_was_not_there_for_long_must_be_many(well, familiar):
-    """People who walk side by side are seen anew where they come."""
+def test_new_landmarks_need_more_pairs(well, familiar):
+    """People who walk side by side are new landmarks."""
     known, _ = scene(12, trees=MANY)
     first = np.arange(MANY) < well
-    assert not asked(known[1:], known[1:] - [0.3, 0.0], familiar=familiar, well=first[1:])[0]
-    assert asked(known, known - [0.3, 0.0], familiar=familiar, well=first)[0]
-    assert asked(known[1:], known[1:] - [0.3, 0.0])[0]
+    assert not shift_test(known[1:], known[1:] - [0.3, 0.0], familiar=familiar, well=first[1:])[0]
+    assert shift_test(known, known - [0.3, 0.0], familiar=familiar, well=first)[0]
+    assert shift_test(known[1:], known[1:] - [0.3, 0.0])[0]
 
 
 @pytest.mark.parametrize("pairs", range(FEWEST, SEVERAL))
-def test_a_few_well_known_ones_tell_only_of_an_odometry_that_was_wrong(pairs):
-    """Else they are people who stood for long, and walk off: that is said, and nothing moved."""
+def test_few_known_landmarks_count_only_after_a_fault_of_the_odometry(pairs):
+    """Otherwise they may be people who stood for long and walk off: a message is given, and nothing moves."""
     known, _ = scene(16, trees=pairs)
     seen = known - [0.3, 0.0]
-    assert not asked(known, seen)[0]
-    assert asked(known, seen, distrust=0.5)[0]
+    assert not shift_test(known, seen)[0]
+    assert shift_test(known, seen, distrust=0.5)[0]
     known, seen = known[:FEWEST], seen[:FEWEST]
-    told = told_of([0.0, 0.0, 0.0], known, seen)
-    assert not told.slipped
-    assert told.unsure
-    np.testing.assert_array_equal(told.motion, 0.0)
-    assert slip_message(told.motion, told.slipped, told.unsure) == UNSURE
-    again = told_of([0.0, 0.0, 0.0], known, seen, distrust=0.5)
+    result = tree_motion([0.0, 0.0, 0.0], known, seen)
+    assert not result.slipped
+    assert result.unsure
+    np.testing.assert_array_equal(result.motion, 0.0)
+    assert slip_message(result.motion, result.slipped, result.unsure) == UNSURE
+    again = tree_motion([0.0, 0.0, 0.0], known, seen, distrust=0.5)
     assert again.slipped
     assert not again.unsure
 
 
 @pytest.mark.parametrize("moving", [SEVERAL, MANY, 15])
-def test_one_tree_that_stands_beside_is_enough(moving):
+def test_one_pair_that_agrees_with_the_odometry_refutes_the_motion(moving):
     known, _ = scene(13, trees=moving + 1)
     seen = known - [0.3, 0.0]
-    assert asked(known[1:], seen[1:])[0]
+    assert shift_test(known[1:], seen[1:])[0]
     seen[0] = known[0]
-    assert not asked(known, seen)[0]
+    assert not shift_test(known, seen)[0]
 
 
-def test_a_tree_beside_people_who_stroll_counts_though_it_fits_their_motion_too():
+def test_a_tree_within_the_gate_of_slow_people_refutes_their_motion():
     known, _ = scene(17, trees=SEVERAL + 1)
     seen = known - [0.09, 0.0]
-    assert asked(known, seen)[0]
+    assert shift_test(known, seen)[0]
     seen[0] = known[0]
     assert AGREE * SIGMA * np.sqrt(2.0) > 0.09
-    assert not asked(known, seen)[0]
+    assert not shift_test(known, seen)[0]
 
 
-def test_what_is_seen_beside_and_known_to_nobody_counts_where_it_could_be_known():
+def test_unmatched_detections_count_against_the_motion_if_landmarks_are_expected():
     known, rng = scene(14, trees=SEVERAL + 8)
     seen = known - [0.3, 0.0]
     others = seen[:SEVERAL] + rng.uniform(0.9, 1.1, (SEVERAL, 2))
-    assert asked(known[:SEVERAL], np.concatenate([seen[:SEVERAL], others]))[0], "no more are known"
-    assert not asked(known, np.concatenate([seen[:FEWEST], others[:5]]))[0]
+    assert shift_test(known[:SEVERAL], np.concatenate([seen[:SEVERAL], others]))[0], "no more are known"
+    assert not shift_test(known, np.concatenate([seen[:FEWEST], others[:5]]))[0]
 
 
-def told_of(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0, distrust=0.0):
-    """`motion_by_trees` of a robot at the origin; all landmarks were seen ten times."""
+def tree_motion(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0, distrust=0.0):
+    """Return `motion_by_trees` for a robot at the origin; all landmarks have ten hits."""
     rows = np.array([SIGMA**2, 0.0, SIGMA**2])
     return motion_by_trees(
         np.zeros(3), np.array(motion), covariance * np.eye(3), driven,
@@ -187,43 +187,43 @@ def told_of(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0, dist
 
 
 @pytest.mark.parametrize("true", [Pose2(0.1), Pose2(0.3, 0.0, 0.02), Pose2(3.0, 2.0, 0.1), Pose2(-6.0, 1.0)])
-def test_stuck_wheels_are_put_right_over_any_way(true):
+def test_the_motion_of_stuck_wheels_is_recovered_at_any_distance(true):
     known, _ = scene(7)
-    told = told_of([0.0, 0.0, 0.0], known, true.inverse().apply(known))
-    assert told.slipped
-    np.testing.assert_allclose(told.motion, true.as_array(), atol=0.15)
-    assert slip_message(np.zeros(3), told.slipped, False) == STUCK
-    assert slip_message(np.array([0.1, 0.0, 0.0]), told.slipped, False) == SLIPPED
+    result = tree_motion([0.0, 0.0, 0.0], known, true.inverse().apply(known))
+    assert result.slipped
+    np.testing.assert_allclose(result.motion, true.as_array(), atol=0.15)
+    assert slip_message(np.zeros(3), result.slipped, False) == STUCK
+    assert slip_message(np.array([0.1, 0.0, 0.0]), result.slipped, False) == SLIPPED
     assert slip_message(np.zeros(3), False, False) == ""
 
 
-def test_a_motion_that_is_not_known_is_told_by_trees_that_agree_with_it():
-    """A gap may have moved the robot by metres: that it has not is as good to know."""
+def test_matching_trees_reduce_the_covariance_of_a_doubtful_motion():
+    """The robot may have moved by metres during a gap; matching trees show that it has not."""
     known, _ = scene(8)
-    told = told_of([0.1, 0.0, 0.0], known, Pose2(0.1).inverse().apply(known), covariance=4.0)
-    assert not told.slipped
-    assert told.covariance[0, 0] < 0.2**2
+    result = tree_motion([0.1, 0.0, 0.0], known, Pose2(0.1).inverse().apply(known), covariance=4.0)
+    assert not result.slipped
+    assert result.covariance[0, 0] < 0.2**2
 
 
-def test_after_a_way_without_trees_less_contradicts_the_odometry():
+def test_distance_without_trees_raises_the_limit():
     known, _ = scene(9)
     seen = Pose2(0.35).inverse().apply(known)
-    assert told_of([0.0, 0.0, 0.0], known, seen).slipped
-    assert not told_of([0.0, 0.0, 0.0], known, seen, alone=20.0).slipped
-    assert not told_of([0.0, 0.0, 0.0], known, seen, driven=20.0).slipped, "there and back"
+    assert tree_motion([0.0, 0.0, 0.0], known, seen).slipped
+    assert not tree_motion([0.0, 0.0, 0.0], known, seen, alone=20.0).slipped
+    assert not tree_motion([0.0, 0.0, 0.0], known, seen, driven=20.0).slipped, "there and back"
 
 
-def test_of_another_place_nothing_is_told():
+def test_another_place_gives_no_motion():
     known, _ = scene(10, trees=30)
     elsewhere, _ = scene(11)
-    told = told_of([0.0, 0.0, 0.0], known, elsewhere)
-    assert not told.slipped
-    np.testing.assert_array_equal(told.motion, 0.0)
+    result = tree_motion([0.0, 0.0, 0.0], known, elsewhere)
+    assert not result.slipped
+    np.testing.assert_array_equal(result.motion, 0.0)
 
 
-def test_half_that_goes_by_far_while_some_stand_is_none_of_the_robot():
+def test_a_large_motion_of_some_detections_is_rejected():
     known, _ = scene(15, trees=12)
     seen = known - [3.0, 1.0]
-    assert told_of([0.0, 0.0, 0.0], known, seen).slipped
+    assert tree_motion([0.0, 0.0, 0.0], known, seen).slipped
     seen[:3] = known[:3]
-    assert not told_of([0.0, 0.0, 0.0], known, seen).slipped
+    assert not tree_motion([0.0, 0.0, 0.0], known, seen).slipped

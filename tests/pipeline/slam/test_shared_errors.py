@@ -1,4 +1,4 @@
-"""What all poses of another source err by alike: estimated, told honestly, and no longer counted anew."""
+"""Shared errors of measured poses: estimated, reported consistently, and not averaged out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SEEN = 9.0
 
 
 def shared_at(x, y):
-    """See PoseMeasurement.shared, of a frame that was found around the origin."""
+    """Return `PoseMeasurement.shared` at a position, for a frame that was aligned around the origin."""
     return np.array([[SHIFT, 0.0, -y * TURN, 0.0], [0.0, SHIFT, x * TURN, 0.0], [0.0, 0.0, 0.0, HEADING]])
 
 
@@ -35,15 +35,17 @@ def spd(rng, n):
 
 
 def drive(seed, strides, trees=None, *, poses=True, heading=True, bias=0.0, blind=()):
-    """Of each scan the pose's normalised error squared, its error and its sigma [m]; and the filter.
+    """Return the normalised error squared, the error [m] and the sigma [m] of each scan, shape (N, 3); and
+    the filter.
 
     Args:
-        strides: The true motion to each scan but the first.
-        trees: Where they stand, shape (N, 2); None for nothing.
-        poses: Whether another source tells where the robot is.
-        heading: Whether it tells the heading too, as GNSS does not.
-        bias: What the odometry turns too much [rad/m].
-        blind: Numbers of scans that see no tree.
+        seed: Seed of all errors.
+        strides: True motion to each scan but the first.
+        trees: Positions of trees, shape (N, 2); None for none.
+        poses: Whether another source measures the pose.
+        heading: Whether it also measures the heading, unlike GNSS.
+        bias: Error of the odometry heading [rad/m].
+        blind: Numbers of the scans without detections.
     """
     rng = np.random.default_rng([11, seed])
     slam, truth, rows = FastSlam(FOREST, seed), Pose2(), []
@@ -75,21 +77,21 @@ def drive(seed, strides, trees=None, *, poses=True, heading=True, bias=0.0, blin
     return np.array(rows), slam
 
 
-def test_sigmas_of_a_pose_that_a_source_tells_again_and_again_are_honest():
-    """Sixteen runs: three sigma of the mean of chi-square; counted anew with each pose it was 45."""
+def test_repeated_poses_of_one_source_are_consistent():
+    """Sixteen runs: three sigma of the mean of chi-square; with independent errors the value was 45."""
     nees = np.mean([drive(seed, AWAY)[0][STEPS // 2 :, 0] for seed in range(16)], axis=0)
     assert 1.3 < np.mean(nees) < 4.9
 
 
-def test_a_drift_is_bound_by_what_the_source_errs_by():
+def test_the_drift_is_bounded_by_the_error_of_the_source():
     alone = np.mean([drive(seed, AWAY, poses=False)[0][-1, 1] for seed in range(8)])
     with_it, told = np.mean([drive(seed, AWAY)[0][-1, 1:] for seed in range(8)], axis=0)
     assert with_it < 0.5 * alone
     assert told < 2.0
 
 
-def test_among_trees_that_are_known_better_the_poses_do_not_pull_and_sigmas_stay_honest():
-    """Counted anew with each pose the figure was 7.5, and the error 0.14 m in place of 0.10 m."""
+def test_poses_do_not_degrade_a_pose_among_better_known_trees():
+    """With independent errors the value was 7.5, and the error 0.14 m instead of 0.10 m."""
     rows = []
     for seed in range(6):
         trees = RING.trees(np.random.default_rng([7, seed]))
@@ -99,16 +101,16 @@ def test_among_trees_that_are_known_better_the_poses_do_not_pull_and_sigmas_stay
     assert np.sqrt(np.square(error).mean()) < 0.12
 
 
-def test_a_heading_that_drifts_for_long_leaves_the_told_sigma_near_the_error():
-    """600 m on a circle: where the covariance followed the odometry alone it turned away from the path, and
-    the figure was 26 in place of 3.5."""
+def test_a_long_drift_of_the_heading_stays_consistent():
+    """600 m on a circle: when the covariance followed only the odometry, it turned away from the path, and
+    the value was 26 instead of 3.5."""
     ring = (Pose2(1.0, 0.0, 1.0 / 60.0),) * 600
     nees = [drive(seed, ring, heading=False, bias=np.radians(0.05))[0][450:, 0].mean() for seed in range(4)]
     assert np.mean(nees) < 6.0
 
 
-def test_a_scan_without_trees_leaves_the_place_as_well_known_as_the_way_since():
-    """It had been told as badly as the other source knows it, and well again a scan later."""
+def test_a_scan_without_trees_keeps_the_covariance_by_trees():
+    """Before, the sigma rose to that of the other source and fell again one scan later."""
     along = np.stack(np.meshgrid(np.arange(-8.0, 40.0, 4.0), [-5.0, -2.0, 2.0, 5.0]), axis=-1)
     rows, _ = drive(0, (Pose2(0.25),) * 60, along.reshape(-1, 2) + 0.3, blind=(40, 50))
     sigma = dict(enumerate(rows[:, 2], start=1))
@@ -117,7 +119,7 @@ def test_a_scan_without_trees_leaves_the_place_as_well_known_as_the_way_since():
 
 
 @given(seeds)
-def test_a_particle_learns_what_the_joint_gaussian_of_pose_and_errors_says(seed):
+def test_the_update_of_a_particle_equals_the_joint_gaussian(seed):
     rng = np.random.default_rng(seed)
     P, E, own, H = spd(rng, 3), spd(rng, SHARED), spd(rng, 3), rng.normal(size=(3, SHARED))
     mu, e, z = rng.normal(0.0, 0.3, 3), rng.normal(0.0, 0.3, SHARED), rng.normal(0.0, 0.3, 3)
@@ -149,7 +151,7 @@ def test_an_inverse_by_cofactors_is_the_inverse(seed):
     assert det == pytest.approx(np.linalg.det(S))
 
 
-def test_poses_of_one_source_never_make_it_known_better_than_its_frame():
+def test_poses_of_one_source_do_not_reduce_its_shared_error():
     shared = SharedErrors.begun_at(2, np.zeros(3), np.diag([1e4, 1e4, 1.0]))
     H = shared_at(0.0, 0.0)
     for k in range(1000):
@@ -160,7 +162,7 @@ def test_poses_of_one_source_never_make_it_known_better_than_its_frame():
     assert by_both.joint[0, 0] < 0.6 * shared.joint[0, 0], "another source errs by something else"
 
 
-def test_a_gate_asks_for_what_the_source_is_known_to_err_by():
+def test_the_estimated_shared_error_is_subtracted_for_the_gate():
     H = shared_at(0.0, 0.0)
     z = PoseMeasurement(0, Pose2(1.0, 0.0, 0.0), np.diag(OWN**2) + H @ H.T, shared=H)
     begun = SharedErrors.begun_at(2, np.zeros(3), np.eye(3))
@@ -173,7 +175,7 @@ def test_a_gate_asks_for_what_the_source_is_known_to_err_by():
     assert seen.covariance[0, 0] == pytest.approx(OWN[0] ** 2 + 0.01 * SHIFT**2)
 
 
-def test_particles_that_are_drawn_keep_their_own_errors_and_share_no_memory():
+def test_resampled_particles_keep_independent_copies_of_their_errors():
     rng = np.random.default_rng(0)
     begun = SharedErrors.begun_at(5, np.zeros(3), np.eye(3))
     begun.mean[:] = rng.normal(size=begun.mean.shape)
@@ -187,7 +189,7 @@ def test_particles_that_are_drawn_keep_their_own_errors_and_share_no_memory():
     assert drawn.covariance[1].flags.c_contiguous
 
 
-def test_from_a_copy_it_goes_on_to_the_same_bytes_and_a_placed_robot_begins_anew():
+def test_a_copied_state_continues_identically_and_placing_resets_the_errors():
     _, slam = drive(4, AWAY)
     state = slam.state.copy()
     again = FastSlam(slam.parameters, 4)

@@ -49,7 +49,7 @@ def worst(told):
 @pytest.mark.parametrize("trees", [0, 1, 2])
 @pytest.mark.parametrize("people", [4, 5])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_people_who_walk_together_carry_no_robot_away(seed, people, trees, stride):
+def test_people_who_walk_together_do_not_move_the_pose(seed, people, trees, stride):
     for sigma in SIGMA:
         for free in (NOTHING_SEEN, ALL_FREE):
             told = walked(seed, people, trees, sigma=sigma, stride=stride, free=free)
@@ -84,7 +84,7 @@ def left_by(seed, people, trees, *, speed, stride=0.0, dropouts=0.0):
 @pytest.mark.parametrize("speed", [1.0, WALK])
 @pytest.mark.parametrize(("trees", "dropouts"), [(0, 0.0), (2, 0.6), (3, 0.3), (3, 0.6)])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_people_who_were_known_and_walk_off_carry_no_robot_away(seed, trees, dropouts, speed):
+def test_known_people_who_walk_off_do_not_move_the_pose(seed, trees, dropouts, speed):
     for stride in (0.0, STRIDE):
         assert worst(left_by(seed, 5, trees, speed=speed, stride=stride, dropouts=dropouts)) <= 0.1
 

@@ -1,4 +1,4 @@
-"""A tree's column makes that track a tree which stands at its axis, not whatever is near and seen often."""
+"""Assignment of a tree column to the track at its axis, against distance and number of hits."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ def told(*tracks: tuple[float, int]):
 
 @pytest.mark.parametrize("own", [(0.0, 0), (0.0, 1), (0.05, 3), (0.07, 240), (0.15, 240)])
 @pytest.mark.parametrize("beside", [(0.43, 290), (0.4, 3000)])
-def test_branches_beside_a_stem_that_are_seen_more_often_are_not_it(own, beside):
+def test_branches_near_a_stem_with_more_hits_do_not_get_its_column(own, beside):
     assert told(beside, own) == [Verdict.OTHER, Verdict.TREE]
     assert told(own, beside) == [Verdict.TREE, Verdict.OTHER]
 
 
-def test_of_two_pieces_of_one_trunk_the_one_with_more_hits_is_it():
+def test_of_two_parts_of_a_trunk_the_one_with_more_hits_gets_the_column():
     assert told((0.05, 2), (0.12, 200)) == [Verdict.OTHER, Verdict.TREE]
     assert told((0.1, 200), (0.1, 2)) == [Verdict.TREE, Verdict.OTHER]
 
 
-def test_what_stands_alone_within_reach_is_it_however_far():
+def test_a_single_track_within_reach_gets_the_column():
     assert told((REACH - 0.01, 3)) == [Verdict.TREE]
     assert told((REACH + 0.01, 3))[1:] == [Verdict.TREE], "the column begins a track of its own"
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.44), st.integers(0, 600)), min_size=1, max_size=6))
-def test_none_that_is_both_nearer_and_seen_more_often_is_left_for_another(tracks):
+def test_a_track_that_is_nearer_and_has_more_hits_is_preferred(tracks):
     verdicts = told(*tracks)
     (chosen,) = [k for k, verdict in enumerate(verdicts) if verdict is Verdict.TREE]
     away, hits = tracks[chosen]
@@ -67,10 +67,10 @@ def between(verdict: Verdict, away: float, hits: int = 3):
 
 
 @pytest.mark.parametrize("verdict", [Verdict.BUSH, Verdict.PERSON, Verdict.POLE, Verdict.OTHER])
-def test_hits_make_no_tree_where_the_column_is_known_to_be_none(verdict):
+def test_hits_do_not_confirm_a_track_at_a_column_of_another_class(verdict):
     assert between(verdict, REACH - 0.01) == (int(verdict), False)
     assert between(verdict, REACH + 0.01) == (-1, True), "of a place where nothing is known hits tell"
 
 
-def test_what_comes_beside_a_tree_is_no_second_one_until_it_is_judged():
+def test_a_new_track_next_to_a_tree_is_not_confirmed_before_classification():
     assert between(Verdict.TREE, 0.3) == (int(Verdict.OTHER), False)

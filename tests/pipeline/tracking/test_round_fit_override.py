@@ -1,4 +1,4 @@
-"""Round fits from most sides overrule votes for what is not round, and no others."""
+"""Circle fits from most sides overrule votes for classes that are not round, and no other classes."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ def test_a_trunk_among_shrubs_is_a_tree_when_it_is_round_from_most_sides():
 @pytest.mark.parametrize(
     "poor", [track(sides=SIDES - 1), track(fits=FITS - 1), track(off=REACH + 0.01), TrackTable.empty()]
 )
-def test_without_enough_round_fits_the_votes_stand(poor):
+def test_without_enough_circle_fits_the_votes_decide(poor):
     assert verdict(column(tree=0.3), poor) is Verdict.BUSH
 
 
 @pytest.mark.parametrize("kind", ["pole", "person"])
-def test_what_is_round_too_is_told_by_the_votes(kind):
+def test_votes_for_another_round_class_decide(kind):
     for tree in (0.2, 0.39):
         assert (
             verdict(column(Verdict[kind.upper()], tree=tree, **{kind: 0.4}), track()) is Verdict[kind.upper()]
@@ -74,7 +74,7 @@ def test_what_is_round_too_is_told_by_the_votes(kind):
 
 
 @pytest.mark.parametrize("rule", [Verdict.MOVING, Verdict.TOO_FEW_POINTS])
-def test_what_a_rule_refused_stays_refused(rule):
+def test_a_class_by_a_rule_is_not_changed(rule):
     assert verdict(column(rule, tree=0.39), track()) is rule
 
 
@@ -86,13 +86,13 @@ def rays(columns, met, passed):
 
 
 @pytest.mark.parametrize(("met", "passed"), [(0, 10), (2, 8), (29, 71)])
-def test_what_ends_below_a_crown_is_too_low_however_round(met, passed):
+def test_a_round_column_that_ends_below_a_crown_is_too_low(met, passed):
     """Somebody under a tree: votes between a tree and a bush, circles from all sides, and free air above."""
     assert verdict(rays(column(tree=0.3), met, passed), track()) is Verdict.TOO_LOW
 
 
 @pytest.mark.parametrize(("met", "passed"), [(0, 9), (30, 70), (10, 0)])
-def test_what_goes_on_or_was_hardly_seen_stays_as_it_was(met, passed):
+def test_a_column_that_continues_or_has_few_rays_keeps_its_class(met, passed):
     assert verdict(rays(column(tree=0.3), met, passed), track()) is Verdict.TREE
 
 
@@ -100,19 +100,19 @@ def test_what_goes_on_or_was_hardly_seen_stays_as_it_was(met, passed):
     ("votes", "kind"),
     [({"tree": 0.03}, "bush"), ({"tree": 0.1, "person": 0.5}, "person"), ({"tree": 0.5}, "tree")],
 )
-def test_what_the_votes_alone_decide_is_not_asked_how_high_it_is(votes, kind):
+def test_the_height_rule_does_not_apply_to_classes_by_votes(votes, kind):
     assert verdict(rays(column(**votes), 0, 50), track()) is Verdict[kind.upper()]
 
 
 @given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.05, 1.0))
-def test_no_tree_is_lost_and_more_votes_for_a_tree_never_harm(tree, more, needed):
+def test_trees_stay_trees_and_the_result_is_monotonic_in_their_votes(tree, more, needed):
     low, high = sorted((tree, more))
     assert verdict(column(Verdict.TREE, tree=low), track(), needed) is Verdict.TREE
     told = [verdict(column(tree=part), track(), needed) is Verdict.TREE for part in (low, high)]
     assert told[1] or not told[0]
 
 
-def test_the_tracker_shows_the_tree_and_says_so_of_the_column():
+def test_the_tracker_reports_the_tree_and_the_class_of_its_column():
     tracker = Tracker(FOREST.tracking)
     tracker.tracks = track()
     columns = tracker.classify(1, column(tree=0.3), FOREST.classification)

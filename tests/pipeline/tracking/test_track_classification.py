@@ -1,4 +1,4 @@
-"""Judging: trees that judge a scene saw neither it nor a copy of it."""
+"""Leave-one-out training: a scene is classified by trees that saw neither it nor a copy of it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def scene(name: str, label: list[int], thick: list[float], *, pasted: bool = Fal
 
 
 @pytest.mark.parametrize("own", [False, True])
-def test_copies_of_the_scene_that_is_judged_stay_out_of_training(own):
+def test_copies_of_the_left_out_scene_are_not_used_for_training(own):
     """Copies of a say that its thick trees are poles, which turns its verdict when they are learned from."""
     real = [scene(name, [TREE] * N + [POLE] * N, [0.2] * N + [0.05] * N) for name in ("parks/a", "parks/b")]
     said = scene(name_of_copy("parks/b", 0), [TREE] * N + [POLE] * N, [0.2] * N + [0.05] * N, pasted=True)

@@ -1,4 +1,4 @@
-"""Trees: one Kalman filter each, numbers that stay, identity by landmarks, and what was seen of a trunk."""
+"""Tracker: Kalman filter, numbers, identity by landmarks, merging, diameter and observed sides."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_model_is_constant_velocity_with_white_acceleration():
     np.testing.assert_allclose(process_noise(0.5, 0.3), 0.09 * G @ G.T)
 
 
-def test_a_still_tree_is_the_mean_of_its_views():
+def test_without_noise_of_the_velocity_the_state_is_the_mean_of_the_views():
     rng = np.random.default_rng(0)
     t = tracker()
     views = np.array([3.0, 1.0]) + rng.normal(0, 0.05, (40, 2))
@@ -209,7 +209,7 @@ def test_two_trees_farther_apart_than_the_radius_stay_two():
     assert trees.number.tolist() == [1, 2]
 
 
-def test_of_three_in_a_heap_one_is_left():
+def test_three_tracks_within_the_radius_are_merged_to_one():
     t = tracker(proximity_radius=0.4)
     trees = show(t, 0, [[5.0, 0.0], [5.0, 0.3], [5.2, 0.15]])
     assert trees.number.tolist() == [1]
@@ -226,7 +226,7 @@ def test_a_tree_whose_detection_is_beyond_the_gate_restarts_at_its_landmark():
 
 
 @given(seeds)
-def test_fusing_is_the_best_of_two_independent_positions(seed):
+def test_fused_position_is_the_weighted_mean_of_independent_positions(seed):
     rng = np.random.default_rng(seed)
     P, Q = np.zeros((4, 4)), np.zeros((4, 4))
     for C in (P, Q):
@@ -242,7 +242,7 @@ def test_fusing_is_the_best_of_two_independent_positions(seed):
 # --- what is known of a tree ----------------------------------------------------------------------
 
 
-def test_the_pose_turns_and_moves_positions_and_covariances():
+def test_positions_and_covariances_are_transformed_by_the_pose():
     t = tracker()
     pose = Pose2(10.0, -3.0, 0.7)
     trees = show(t, 0, [[4.0, 1.0]], pose=pose)
@@ -250,14 +250,14 @@ def test_the_pose_turns_and_moves_positions_and_covariances():
     np.testing.assert_allclose(t.tracks.P[0, :2, :2], np.eye(2) * 0.03**2, atol=1e-12)
 
 
-def test_an_unsure_heading_makes_far_trees_unsure_across():
+def test_heading_variance_grows_across_the_ray_with_distance():
     t = tracker()
     show(t, 0, [[10.0, 0.0]], pose_covariance=np.diag([0.0, 0.0, 0.01**2]), sigma=0.01)
     np.testing.assert_allclose(np.diag(t.tracks.P[0])[:2], [1e-4, 1e-4 + 0.1**2], rtol=1e-9)
 
 
 @pytest.mark.parametrize("breast_height", [1.3, 1.0])
-def test_a_diameter_is_told_for_breast_height(breast_height):
+def test_diameters_refer_to_breast_height(breast_height):
     t = tracker(dbh_arc_min=0.0, breast_height=breast_height)
     seen = detections([[5.0, 0.0]], radius=0.2)
     for k, height in enumerate((0.7, 1.0, 1.6, np.nan)):
@@ -317,7 +317,7 @@ def sectors(bearing, arc):
     return {k for k in range(64) if bits >> k & 1}
 
 
-def test_sectors_that_were_wholly_seen_are_kept():
+def test_completely_observed_sectors_are_set():
     assert sectors(STEP, 2 * STEP) == {0, 1}
     assert sectors(STEP, 1.9 * STEP) == set()
     assert sectors(0.0, 2 * STEP) == {SECTORS - 1, 0}
@@ -367,7 +367,7 @@ def test_views_from_one_place_cover_no_more_than_one_can_show(distance, bearing,
     assert np.isnan(trees.dbh[0])
 
 
-def test_a_view_without_a_circle_shows_what_the_others_say():
+def test_a_view_without_a_circle_uses_the_radius_of_other_views():
     def covered(*radii: float):
         t = tracker()
         for k, radius in enumerate(radii):
