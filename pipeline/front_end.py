@@ -104,8 +104,8 @@ def updates_columns(index: int, every: int) -> bool:
 
 
 def updates_terrain(index: int, every: int) -> bool:
-    """Whether a scan updates the terrain map: midway between two scans that update the columns, so that the
-    two costs do not fall on one scan."""
+    """Return whether scan `index` updates the terrain map: each of the first FIRST_SCANS, then one of
+    `every`, midway between two scans that update the columns, so that no scan has both costs."""
     return index < FIRST_SCANS or index % every == every // 2
 
 
@@ -127,7 +127,13 @@ def segment(
 
 
 def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_timer) -> DetectionResult:
-    """Return the verdicts on the clusters of a scan, and the clusters that are trees as detections."""
+    """Return the verdicts on the clusters of a scan, and the clusters that are trees as detections.
+
+    Args:
+        scan: The segmented scan.
+        parameters: Rules of the verdicts and sigmas of the detections.
+        timer: See `segment`.
+    """
     with timer("detection"):
         clusters = classify_clusters(scan.clusters, parameters)
         found = detections(clusters, scan.sensor_offset, parameters)

@@ -78,7 +78,7 @@ class Parameters(BaseModel):
         }
 
     def changes_from(self, other: Parameters) -> dict[str, Value]:
-        """Return the values, by dotted name, that differ from another set."""
+        """Return the values of this set, by dotted name, that differ from those of another set."""
         others = other.flat()
         return {name: value for name, value in self.flat().items() if others[name] != value}
 
@@ -211,7 +211,8 @@ def field_specs() -> tuple[FieldSpec, ...]:
 
 
 def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
-    """Return the description of one parameter."""
+    """Return the description of the parameter `name` of the stage `stage_name`, whose declaration is in
+    `stage_model`."""
     field = stage_model.model_fields[name]
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     bounds = {type(m).__name__: m for m in field.metadata}

@@ -10,7 +10,14 @@ from pipeline.config.declaration import Stage, choice, count, name, number
 
 
 def _require_less(stage: Stage, stage_name: str, *pairs: tuple[str, str]) -> None:
-    """Raise a ValueError that names both parameters unless the first of each pair is the smaller."""
+    """Raise a ValueError that names both parameters and their values if the first of a pair is not less than
+    the second.
+
+    Args:
+        stage: The parameters of the stage.
+        stage_name: Name of the stage in dotted names.
+        pairs: Names of the lower and the upper parameter.
+    """
     for low, high in pairs:
         if getattr(stage, low) >= getattr(stage, high):
             raise ValueError(

@@ -77,7 +77,7 @@ def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
 
 @compiled_within
 def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
-    """Put row j of `mean`, x, y first [m], into its cell, at the begin of the chain; see `fill`."""
+    """Put row j of `mean`, x, y first [m], into its cell, at the start of the chain; see `fill`."""
     at = cell_of(int(np.floor(scale * mean[j, 0])), int(np.floor(scale * mean[j, 1])))
     cells.cell[j] = at
     cells.following[j] = cells.head[at]

@@ -56,7 +56,7 @@ class Pose2:
         return np.array([[c, -s], [s, c]])
 
     def as_array(self) -> Float:
-        """Return `[x, y, yaw]`, shape (3,)."""
+        """Return x, y [m], yaw [rad], shape (3,)."""
         return np.array([self.x, self.y, self.yaw])
 
 
@@ -69,7 +69,7 @@ class Pose3:
 
     @classmethod
     def identity(cls) -> Pose3:
-        """Return the identity."""
+        """Return the pose without rotation and translation."""
         return cls(np.eye(3), np.zeros(3))
 
     @classmethod
@@ -156,13 +156,13 @@ class Pose3:
         return -q if q[0] < 0 else q
 
     def planar(self) -> Pose2:
-        """Return the planar pose: x, y and the heading of the x axis."""
+        """Return the planar pose: x, y and yaw; z, roll and pitch are dropped."""
         return Pose2(float(self.t[0]), float(self.t[1]), self.euler()[2])
 
 
 def interpolate(a: Pose2, b: Pose2, fraction: float) -> Pose2:
-    """Return the pose at a fraction of the way from a (0) to b (1): linear in x and y, and in yaw along the
-    shorter turn."""
+    """Return the pose at a fraction between a (0) and b (1): linear in x and y, and in yaw along the shorter
+    turn."""
     turn = float(wrap_angle(b.yaw - a.yaw))
     return Pose2(
         a.x + fraction * (b.x - a.x),

@@ -85,7 +85,8 @@ def _cell_of(points: Float32) -> tuple[Int32, int]:
 
 @compiled
 def _comes_first(points: Float32, i: int, other: int) -> bool:
-    """Return whether point i precedes another of equal height, independently of the order of the points."""
+    """Return whether point i is first of two points of equal height, by x and then by y, so that the result
+    does not depend on the order of the points. `other` is the row of the second point."""
     x, y = points[i, X], points[i, Y]
     return bool(x < points[other, X] or (x == points[other, X] and y < points[other, Y]))
 
@@ -287,7 +288,8 @@ def smooth_surface(height: Float, weight: Float, plane: Float) -> tuple[Float, B
 
 @compiled
 def _couplings(rings: int) -> tuple[Float, Float]:
-    """Return the stiffness between a node and the next node outwards, and the next node around, per ring."""
+    """Return the stiffness of the membrane between neighbouring nodes along a ray (from ring k to k + 1) and
+    along a circle, each of shape (rings,): STIFFNESS times width by length of the connection."""
     along, across = np.zeros(rings), np.zeros(rings)
     for k in range(rings):
         wide = ring_distance(k + 0.5) * 2.0 * np.pi / SECTORS
@@ -301,8 +303,13 @@ def _couplings(rings: int) -> tuple[Float, Float]:
 
 @compiled
 def _solve_rays(h: Float, w: Float, wz: Float, along: Float, across: Float) -> None:
-    """Solve the membrane along each ray by the Thomas algorithm, with the neighbouring rays fixed, in
-    place."""
+    """Solve the membrane along each ray by the Thomas algorithm, with the neighbouring rays fixed.
+
+    Args:
+        h: Heights above the trend, shape (SECTORS, rings) [m]; changed in place.
+        w, wz: Weights of the candidates, and weights times heights, same shape.
+        along, across: Results of `_couplings`.
+    """
     sectors, rings = h.shape
     upper, right = np.empty(rings), np.empty(rings)
     for s in range(sectors):
@@ -323,7 +330,8 @@ def _solve_rays(h: Float, w: Float, wz: Float, along: Float, across: Float) -> N
 
 @compiled
 def _solve_circles(h: Float, w: Float, wz: Float, along: Float, across: Float) -> None:
-    """Solve the membrane around all circles at once, in place; the seam uses the previous values."""
+    """Solve the membrane along all circles, with the neighbouring rings fixed, in place. At the seam the
+    previous heights are used. The arguments are those of `_solve_rays`."""
     sectors, rings = h.shape
     upper, right = np.empty((sectors, rings)), np.empty((sectors, rings))
     for s in range(sectors):

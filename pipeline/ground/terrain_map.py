@@ -91,8 +91,15 @@ Tile = tuple[int, int]
 
 
 def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -> dict[Tile, Float32]:
-    """Return the tiles after a correction of the path: each cell moves by whole cells with the nearest scan,
-    and cells that meet are averaged by their weights."""
+    """Return the tiles after a correction of the path.
+
+    Each cell moves by whole cells, rigidly with the nearest scan of the path before the correction. Cells
+    that coincide afterwards are averaged by their weights.
+
+    Args:
+        tiles: Cells by tile index, see HeightMapState.
+        correction: Path before and after.
+    """
     from scipy.spatial import cKDTree
 
     keys = np.array(list(tiles), np.int64).reshape(-1, 2)
@@ -215,12 +222,17 @@ class HeightMapper:
         self.state = HeightMapState(tiles, z, scans, _record(tiles) if due else old.record)
 
     def correct(self, correction: PathCorrection) -> None:
-        """Move the terrain with a corrected path, see `corrected_tiles`."""
+        """Move the terrain with a corrected path, in place, and publish it.
+
+        Args:
+            correction: Path before and after; each cell moves with the nearest scan of the path before.
+        """
         tiles = corrected_tiles(self.state.tiles, correction)
         self.state = replace(self.state, tiles=tiles, record=_record(tiles))
 
     def record(self) -> HeightMap:
-        """Return the current map."""
+        """Return the map of all tiles at this time. `state.record` is the map that was last published, which
+        may be some scans old."""
         return _record(self.state.tiles)
 
     def heights(self, places: Float) -> Float:
@@ -313,7 +325,7 @@ class PackedHeightMap:
 
     @classmethod
     def of(cls, state: HeightMapState) -> PackedHeightMap:
-        """Return the arrays of a state."""
+        """Return the state as plain arrays, which are copies except for the published map."""
         cells = np.zeros((len(state.tiles), SIDE, SIDE, COLUMNS), np.float32)
         for n, tile in enumerate(state.tiles.values()):
             cells[n] = tile

@@ -62,7 +62,8 @@ def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Fl
 
 
 def _level_rotation(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
-    """Return R_level_lidar and the position of the sensor in the level base frame, shape (3,) [m]."""
+    """Return R_level_lidar, shape (3, 3), and the position of the sensor in the level base frame, shape (3,)
+    [m]. Without levelling or a known tilt, the level frame has the axes of the base."""
     level = parameters.level == "imu" and step.tilt_known
     R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
     return R_level_base @ T_base_lidar.R, R_level_base @ T_base_lidar.t
@@ -71,7 +72,9 @@ def _level_rotation(step: Step, T_base_lidar: Pose3, parameters: Acquisition) ->
 def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, float]:
     """Return the velocity of the base at a scan: forward, left [m/s], yaw rate [rad/s].
 
-    The yaw rate is that of the gyroscope if it is available and enabled.
+    Args:
+        step: Scan with the velocity by odometry and, if available, the yaw rate of a gyroscope.
+        parameters: `gyro` selects the yaw rate of the gyroscope if it is available.
     """
     if parameters.gyro and step.turn_rate is not None:
         return (step.twist[0], step.twist[1], step.turn_rate)
@@ -80,7 +83,7 @@ def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, fl
 
 @compiled
 def _rows_in_range(points: Float32, least: float, below: float) -> Int32:
-    """Return the rows of the points with `least` <= range < `below`."""
+    """Return the rows, int32, of the points with `least` <= range < `below` [m]."""
     rows = np.empty(points.shape[0], np.int32)
     n = 0
     for i in range(points.shape[0]):

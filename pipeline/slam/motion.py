@@ -249,8 +249,9 @@ def stepped(
     `compound`.
 
     Args:
-        motion, covariance: The motion, shapes (3,) and (3, 3).
-        x, y, yaw: Step [m, m, rad].
+        motion: x, y [m], yaw [rad], shape (3,).
+        covariance: Its covariance, shape (3, 3).
+        x, y, yaw: Step in the frame in which the motion ends [m, m, rad].
         position: Variance of x and of y of the step [m^2].
         heading: Variance of its yaw [rad^2].
     """
@@ -315,12 +316,11 @@ def inverted(S: Float) -> tuple[Float, float]:
 
 @compiled
 def moved_poses(pose: Float, motion: Float) -> Float:
-    """Return poses after one common motion, each applied in the frame of its pose: pose * motion, shape (P,
-    3).
+    """Return poses after one common motion, T_map_after = T_map_pose T_motion for each row, shape (P, 3).
 
     Args:
         pose: x, y [m], yaw [rad] of each pose, shape (P, 3).
-        motion: x, y [m], yaw [rad], shape (3,).
+        motion: x, y [m], yaw [rad] in the frame of each pose, shape (3,).
     """
     moved = np.empty_like(pose)
     for p in range(pose.shape[0]):

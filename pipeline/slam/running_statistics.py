@@ -203,6 +203,6 @@ def _strange_scans(recent: RunningStatistics, scan: ScanStatistics, here: bool) 
 
 
 def _exponential_mean(mean: float, value: float, newest: float) -> float:
-    """Return the mean after a new value of the weight `newest`; unchanged if that is 0, for then the value
-    may be NaN."""
+    """Return the exponential running mean after a new value: mean + newest (value - mean). With the weight
+    `newest` 0 the mean is unchanged, even if the value is NaN."""
     return mean + newest * (value - mean) if newest else mean

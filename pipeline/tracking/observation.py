@@ -126,12 +126,12 @@ def seen_sides(from_bearing: float, arc: float) -> np.int64:
 
 
 class FigureLimits(NamedTuple):
-    """Limits for the attributes of the tree table.
+    """Parameters of the attributes in the tree table, see `Tracking`.
 
     Attributes:
-        hits_to_confirm: Minimum number of detections of a tree without a voxel column.
+        hits_to_confirm: Minimum number of detections of a tree without a class of a voxel column.
         dbh_arc_min: Minimum observed arc for a diameter [rad].
-        out_of_round: Out-of-roundness, the sigma of a DBH relative to the DBH.
+        out_of_round: Lower bound of the DBH sigma, as a fraction of the DBH.
         taper_sigma: Standard deviation of the taper, change of the diameter per height [m/m].
     """
 
@@ -186,8 +186,14 @@ def sides_of(bits: int) -> int:
 
 @compiled_within
 def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) -> bool:
-    """Return whether a track is a tree: by the class of its voxel column if it has one, else by enough hits
-    that outnumber the misses."""
+    """Return whether a track is a tree: by the class of its voxel column if it has one, else by its hits.
+
+    Args:
+        verdict: Class of the voxel column, see `Verdict`; -1 without a class.
+        hits: Number of detections; at least `limits.hits_to_confirm` are required.
+        score: Hits less misses; must be positive.
+        limits: See FigureLimits.
+    """
     if verdict >= 0:
         return bool(verdict == Verdict.TREE)
     return bool(hits >= limits.hits_to_confirm and score > 0.0)
@@ -195,14 +201,21 @@ def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) ->
 
 @compiled_within
 def diameter(tracks: Rows, t: int, coverage: float, limits: FigureLimits) -> tuple[float, float]:
-    """Return DBH and its sigma [m] of the tree of a row, NaN where too little of it was seen.
+    """Return DBH [m] and its standard deviation [m] of the tree in row t; both NaN with fewer than
+    DBH_OBSERVATIONS radii or an observed arc below `limits.dbh_arc_min`.
 
     For a diameter D of n views at distances r, with a mean distance |h| from breast height:
 
-        sigma^2 = 4 (sigma_views^2 / n + (EDGE r + UNEVEN)^2) + (out_of_round D)^2 + (taper_sigma |h|)^2
+    sigma^2 = 4 (sigma_views^2 / n + (EDGE r + UNEVEN)^2) + (out_of_round D)^2 + (taper_sigma |h|)^2
 
     The last three terms do not shrink with n: all views share the edges, the shape and the foot of the tree.
-    The weights by height also widen sigma_views, so the sigma is rather too large.
+    The weights by height also widen sigma_views, so that the sigma is conservative.
+
+    Args:
+        tracks: The tracks.
+        t: Row.
+        coverage: Observed arc [rad].
+        limits: See FigureLimits.
     """
     if not (tracks.radii[t] >= DBH_OBSERVATIONS and coverage >= limits.dbh_arc_min - 1e-9):
         return np.nan, np.nan

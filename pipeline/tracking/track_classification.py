@@ -109,7 +109,13 @@ def confirm_round(
 
 @compiled_within
 def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
-    """Return whether only the votes reject a column that is a tree if it is round."""
+    """Return whether a column becomes a tree because its track is round; see `confirm_round`.
+
+    Args:
+        votes: Shares of the votes of the column, shape (6,).
+        verdict: Class of the column; only a class by votes other than tree can change.
+        tree_share: See `confirm_round`.
+    """
     voted, below, most = False, 0.0, 0.0
     for k in range(_KINDS.shape[0]):
         voted = voted or (verdict == _KINDS[k] and k != TREE_VOTES)
@@ -156,10 +162,19 @@ def _take_classes(
     verdict: Int32,
     due_reach: float,
 ) -> None:
-    """Give each track the class of the nearest column, except for trees, see `_assign_trees`.
+    """Give each track the class of the nearest column, in place.
 
-    A track without a column keeps its class. A tree near a column of another class takes that class. A track
-    without class whose column is overdue, or which is out of sight, is no tree: its hits do not confirm it.
+    A column within REACH decides; its class tree becomes other, since `_assign_trees` assigns the trees
+    afterwards. A tree without a column within REACH takes the class of a column within NEIGHBOUR unless that
+    is tree. A track without class gets the class other if its column is overdue (`_is_due`) or it is out of
+    sight (`_is_out_of_sight`), so that its hits do not confirm it. Any other track keeps its class.
+
+    Args:
+        tracks: The tracks.
+        scan: Pose of the robot.
+        cells, scale: Grid of the columns for searches within NEIGHBOUR.
+        axis, verdict: Axes and classes of the columns.
+        due_reach: Distance within which a column is expected [m].
     """
     for t in range(tracks.verdict.shape[0]):
         x, y, known = tracks.x[t, 0], tracks.x[t, 1], tracks.verdict[t]
@@ -178,9 +193,11 @@ def _take_classes(
 
 @compiled
 def classify_new(tracks: Rows, axis: Float, verdict: Int32) -> None:
-    """Give tracks without class the class of the column at their positions, in place.
+    """Give tracks with detections and without class the class of the nearest column within REACH, in place.
 
-    Between two scans that update the columns, the hits would confirm a track next to a column of no tree.
+    It is called between two scans that update the columns; otherwise the hits would confirm a track at a
+    column of another class. A track at a column of class tree gets the class other, because another track is
+    the tree of that column.
 
     Args:
         tracks: The tracks.
@@ -222,12 +239,16 @@ def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
 
 @compiled
 def _assign_trees(tracks: Rows, axis: Float, trees: Int) -> Int:
-    """Make a tree of one track of each tree column, the likeliest free one in reach, best columns first.
+    """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
+    to the axis.
+
+    Columns are assigned in their order. Each takes the track within REACH that is most likely (see
+    `_likeliest`) and not assigned yet.
 
     Args:
         tracks: The tracks, changed in place.
         axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
-        trees: Rows of the tree columns, best first.
+        trees: Rows of the tree columns, those with most votes first.
 
     Returns:
         Rows of the columns without a track.
@@ -258,12 +279,12 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int) -> Int:
 
 @compiled_within
 def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
-    """Return the free track in reach of an axis with the largest likelihood by hits and distance d, the first
-    row of equals, -1 for none:
+    """Return the row of the most likely track within REACH of an axis x, y [m] that is not taken; -1 for
+    none.
 
-    (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2))
-
-    Hits without distance would prefer branches near a stem, which were seen earlier and as often.
+    The likelihood of a track with the distance d is (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2)); of equal ones
+    the lowest row is returned. Hits without the distance would prefer branches near a stem, which are
+    observed earlier and as often.
     """
     u, v = first_of_four(x, y, scale)
     most, best = 0.0, np.int64(-1)

@@ -151,7 +151,7 @@ class Tracker:
         classify_new(self.tracks.as_rows(), columns.axis, columns.verdict)
 
     def trees(self) -> Trees:
-        """Return the map (Table 2); its columns are copies."""
+        """Return the attributes of all trees, confirmed or not (Table 2); the columns are copies."""
         t, p = self.tracks, self.parameters
         limits = FigureLimits(p.hits_to_confirm, np.radians(p.dbh_arc_min), p.out_of_round, p.taper_sigma)
         coverage, dbh, dbh_sigma, eccentricity, confirmed = table_figures(t.as_rows(), limits)
@@ -174,7 +174,15 @@ class Tracker:
     def _follow(
         self, stamp_ns: int, estimate: PoseEstimate, landmarks: Landmarks, gate: float, distance_max: float
     ) -> ScanPose:
-        """Let the trees follow the landmarks, and remove trees without landmark and column."""
+        """Assign the trees to the landmarks, remove trees without landmark and column, and return the pose of
+        the robot.
+
+        Args:
+            stamp_ns: Time of the scan [ns].
+            estimate: Pose by SLAM.
+            landmarks: Landmarks of SLAM.
+            gate, distance_max: Maximum distances between a tree and a new landmark [sigma, m], see `follow`.
+        """
         relative = estimate.covariance if estimate.relative is None else estimate.relative
         self._scan = ScanPose(stamp_ns, estimate.T_map_base.as_array(), estimate.covariance, relative)
         kept = follow(
