@@ -11,7 +11,8 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import wrapped
 
-# Landmarks count by their hits, so that trees begun at a wrong place do not soon outvote the map.
+# Maximum hits by which a landmark is weighted. Weights by hits prevent new landmarks at a wrong pose from
+# outvoting the map soon.
 HITS_MAX = 20.0
 
 # m, m, rad; added to the sigmas of the odometry, which are zero while the robot stands.
@@ -48,7 +49,7 @@ def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> floa
 
     Args:
         by_trees, by_odometry: x, y [m], yaw [rad].
-        covariance: Of the odometry, shape (3, 3); an odometry that stands still has SIGMA_FLOOR.
+        covariance: Covariance of the odometry, shape (3, 3); SIGMA_FLOOR squared is added to its diagonal.
     """
     P, d, square = covariance.copy(), by_trees - by_odometry, 0.0
     d[2] = wrapped(d[2])
