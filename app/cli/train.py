@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 HELP = "train the random forest that classifies trees"
 SCENES = "stand,slope,dense"
 SEEDS = "11,12,13,14,15,16,17,18"
-STREETS, FIRST_STREET = 80, 200  # and the seed of the first
+STREETS, WILD_STANDS, FIRST = 80, 24, 200  # numbers of scenes, and the seed of the first of each kind
+COPIES = 48
 REACH = 25.0  # m, of labelled scans
 
 
@@ -55,6 +56,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--streets", type=int, default=STREETS, help=f"number of simulated streets (default: {STREETS})"
+    )
+    parser.add_argument(
+        "--wild", type=int, default=WILD_STANDS, help=f"number of stands of sim:wild (default: {WILD_STANDS})"
+    )
+    parser.add_argument(
+        "--copies", type=int, default=COPIES, help=f"copies of each one-way scene (default: {COPIES})"
     )
     parser.add_argument("--every", type=int, default=4, help="use every N-th simulated scan (default: 4)")
     parser.add_argument(
@@ -105,13 +112,14 @@ def _look_for(arguments: argparse.Namespace) -> None:
 
 def _scenes(arguments: argparse.Namespace) -> list[str]:
     """Description of the training data for the JSON file."""
-    from app.training.augmentation import COPIES
-
     stands = [name for name in arguments.scenes.split(",") if name]
     names = [f"sim:{name}, seeds {arguments.seeds}, every second one furnished" for name in stands]
-    copied = [f"{folder.name}, {COPIES} copies with things pasted in" for folder in _one_way(arguments)]
+    copied = [
+        f"{folder.name}, {arguments.copies} copies with things pasted in" for folder in _one_way(arguments)
+    ]
     labelled = [folder.name for folder in arguments.labelled]
-    return [*names, f"{arguments.streets} streets and parks", *labelled, *copied]
+    wild = f"sim:wild, {arguments.wild} seeds from {FIRST}"
+    return [*names, wild, f"{arguments.streets} streets and parks", *labelled, *copied]
 
 
 def _examples(arguments: argparse.Namespace) -> list[Examples]:
@@ -130,7 +138,11 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
             uri, furnished = f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}", n % 2 == 1
             make = partial(stand_examples, uri, forest, arguments.every, furnished=furnished)
             found += stored_or_computed(arguments.examples, stand_name(uri, furnished), make)
-    for seed in range(FIRST_STREET, FIRST_STREET + arguments.streets):
+    for seed in range(FIRST, FIRST + arguments.wild):
+        uri = f"sim:wild?seed={seed}&odometry=exact"
+        make = partial(stand_examples, uri, forest, arguments.every)
+        found += stored_or_computed(arguments.examples, uri, make)
+    for seed in range(FIRST, FIRST + arguments.streets):
         # Parks seen by a forward-looking sensor also serve the sensors that see all around.
         for one_way in (False, True):
             make = partial(street_examples, seed, one_way, forest, REACH)
@@ -149,7 +161,9 @@ def _pasted(arguments: argparse.Namespace) -> list[Examples]:
 
     kept = None if arguments.examples is None else arguments.examples / FOLDER
     forest = preset("forest")
-    return [e for folder in _one_way(arguments) for e in copies(folder, kept, forest, REACH)]
+    return [
+        e for folder in _one_way(arguments) for e in copies(folder, kept, forest, REACH, arguments.copies)
+    ]
 
 
 def _one_way(arguments: argparse.Namespace) -> list[Path]:

@@ -17,6 +17,7 @@ import numpy as np
 from app.training.examples import POLE, TREE, UNKNOWN, UPRIGHT, Examples
 from pipeline.classification.features import NAMES, RAYS
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FREE_END, ONE_WAY, ends_in_free_air
+from pipeline.simulation.scenarios import SCHEME, WILD
 from pipeline.types.records import Bool, Float, Float32, Int
 
 PRIOR = 3.0  # weight of the previous class shares of a leaf, in objects
@@ -35,6 +36,7 @@ class ForestSettings:
         figures: Share of the features that is tried at each split.
         same, other, simulated: Weight of an example of a real scene of this kind of sensor, of a real scene
             of the other kind, and of a simulated scene.
+        wild: Weight of an example of a stand of `sim:wild` that this kind of sensor sees.
         tree: Weight of trees, chosen so that the same share of votes separates trees best for both kinds of
             sensor.
         upright: Weight of poles and persons, which are few and difficult.
@@ -50,26 +52,63 @@ class ForestSettings:
     same: float
     other: float
     simulated: float
+    wild: float
     tree: float
     upright: float
     rays: bool
 
 
 # A sensor that looks one way sees a trunk from one side and no higher than its field of view. Trained on
-# simulated # parks too, it finds fewer real trees, and four real parks are too few to learn from rays (see
-# docs/trunks.md).
+# simulated parks too, it finds fewer real trees, and four real parks are too few to learn from rays.
+# The stands of `sim:wild` add stems in undergrowth, of which parks have none (see docs/trunks.md).
 SETTINGS = {
     ALL_AROUND: ForestSettings(
-        "best", 40, 18, 6, 150, 0.3, same=5.0, other=1.0, simulated=1.0, tree=0.67, upright=2.0, rays=True
+        "best",
+        40,
+        18,
+        6,
+        150,
+        0.3,
+        same=5.0,
+        other=1.0,
+        simulated=1.0,
+        wild=0.3,
+        tree=0.67,
+        upright=2.0,
+        rays=True,
     ),
     ONE_WAY: ForestSettings(
-        "extra", 80, 9, 8, None, 0.3, same=1.0, other=1.0, simulated=0.0, tree=1.75, upright=1.0, rays=False
+        "extra",
+        80,
+        9,
+        8,
+        None,
+        0.3,
+        same=1.0,
+        other=1.0,
+        simulated=0.0,
+        wild=0.05,
+        tree=1.75,
+        upright=1.0,
+        rays=False,
     ),
 }
 # The forest that separates poles from trees that end in free air. It is trained on augmented scans only;
-# there all # poles together have `upright` times the weight of all trees (see `fit_free_end`).
+# there all poles together have `upright` times the weight of all trees (see `fit_free_end`).
 FREE_END_SETTINGS = ForestSettings(
-    "extra", 60, 8, 15, None, 0.3, same=0.0, other=0.0, simulated=1.0, tree=1.0, upright=1.5, rays=False
+    "extra",
+    60,
+    8,
+    15,
+    None,
+    0.3,
+    same=0.0,
+    other=0.0,
+    simulated=1.0,
+    wild=0.0,
+    tree=1.0,
+    upright=1.5,
+    rays=False,
 )
 
 
@@ -162,9 +201,10 @@ def can_fit(examples: list[Examples], kind: str) -> bool:
 
 def _weight(examples: Examples, kind: str) -> float:
     settings = SETTINGS[kind]
+    is_same = examples.all_around == (kind == ALL_AROUND)
     if examples.simulated:
-        return settings.simulated
-    return settings.same if examples.all_around == (kind == ALL_AROUND) else settings.other
+        return settings.wild if is_same and f"{SCHEME}{WILD}" in examples.scene else settings.simulated
+    return settings.same if is_same else settings.other
 
 
 def _shares(tree: Any, figures: Float32, label: Int, weight: Float) -> Float:  # noqa: ANN401

@@ -28,7 +28,7 @@ DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 PARKS = (("00",), ("02",), ("03",), ("04", "07"), ("06",))
 STREET = DATA / "semantickitti" / "000000.bin"
 TRAINING_SEEDS = range(3)
-STAND_SEEDS, STREET_SEEDS, EVERY = range(11, 17), range(200, 240), 4
+STAND_SEEDS, STREET_SEEDS, WILD_SEEDS, EVERY = range(11, 17), range(200, 240), range(200, 224), 4
 REACH = 25.0  # m
 COPIES = 8  # of each park scene with pasted things; `stemmap train` makes 48
 RESAMPLES = 10_000
@@ -161,6 +161,9 @@ def _training_examples() -> tuple[list[Examples], list[Examples]]:
     for uri, furnished in _stands():
         make = partial(stand_examples, uri, p, EVERY, furnished=furnished)
         found += stored_or_computed(kept, stand_name(uri, furnished), make)
+    for seed in WILD_SEEDS:
+        uri = f"sim:wild?seed={seed}&odometry=exact"
+        found += stored_or_computed(kept, uri, partial(stand_examples, uri, p, EVERY))
     for seed in STREET_SEEDS:
         for one_way in (False, True):
             make = partial(street_examples, seed, one_way, p, REACH)
