@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.geometry.gaussian import Pose, expected_spread, rotated
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_within
-from pipeline.slam.particle_maps import ROOM, Maps
+from pipeline.slam.particle_maps import ABSENT, ROOM, Maps
 from pipeline.types.records import Bool, Int
 
 
@@ -52,7 +52,8 @@ def relative_positions(maps: Maps, slots: Int, pose: Float, best: int) -> tuple[
             x, y = c * dx + s * dy, c * dy - s * dx
             relative[p, n, 0], relative[p, n, 1] = x, y
             x, y = x - relative[best, n, 0], y - relative[best, n, 1]
-            apart[n] = max(apart[n], x * x + y * y)
+            if maps.mean[b, o, 0] < ABSENT:
+                apart[n] = max(apart[n], x * x + y * y)
     return relative, np.sqrt(apart)
 
 

@@ -13,7 +13,7 @@ from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.candidate_pairs import Pairs
-from pipeline.slam.particle_maps import ROOM, Maps, own_block
+from pipeline.slam.particle_maps import ABSENT, ROOM, Maps, own_block
 from pipeline.slam.particle_update import NEW, OPEN, Rules
 from pipeline.slam.scan_statistics import HITS_MAX
 from pipeline.types.records import Bool, Int
@@ -110,7 +110,8 @@ def update_positions(
                 maps.mean[b, o, 1] += gain[k, 2] * y0 + gain[k, 3] * y1
             if begun[d] >= 0:
                 b, o = own_block(maps, p, begun[d] // ROOM), begun[d] % ROOM
-                maps.mean[b, o, 0], maps.mean[b, o, 1] = x, y
+                # A particle that recognises another landmark does not get the new one.
+                maps.mean[b, o, 0], maps.mean[b, o, 1] = (x, y) if k < 0 else (ABSENT, ABSENT)
 
 
 @compiled
@@ -210,6 +211,10 @@ def _merge(maps: Maps, j: int, k: int) -> None:
     for p in range(maps.block.shape[0]):
         b, o = own_block(maps, p, j // ROOM), j % ROOM
         other = maps.mean[maps.block[p, k // ROOM], k % ROOM]
+        if other[0] >= ABSENT:
+            continue
+        if maps.mean[b, o, 0] >= ABSENT:
+            maps.mean[b, o] = other
         y0, y1 = other[0] - maps.mean[b, o, 0], other[1] - maps.mean[b, o, 1]
         maps.mean[b, o, 0] += k00 * y0 + k01 * y1
         maps.mean[b, o, 1] += k10 * y0 + k11 * y1

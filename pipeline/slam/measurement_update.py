@@ -101,11 +101,11 @@ def use_scan(
         reach = max(reach, np.hypot(centre[d, 0], centre[d, 1]) + rules.distance_max)
     slots, _ = slots_near(maps, best, moved[best, 0], moved[best, 1], reach)
     relative, apart = relative_positions(maps, slots, moved, best)
-    pairs = candidate_pairs(
-        centre, R, relative[best], apart, rotated_rows(maps.covariance[slots], -moved[best, 2]),
-        maps.hits[slots] >= rules.hits_to_weigh, Q, rules.distance_max,
-    )  # fmt: skip
-    scan, gains = scan_for(centre, R, Q, len(pairs.row), len(slots)), gains_for(D)
+    covariance = rotated_rows(maps.covariance[slots], -moved[best, 2])
+    well_known = maps.hits[slots] >= rules.hits_to_weigh
+    pairs = candidate_pairs(centre, R, relative[best], apart, covariance, well_known, Q, rules.distance_max)
+    scan = scan_for(centre, R, Q, covariance, well_known.astype(np.int32), len(pairs.row), len(slots))
+    gains = gains_for(D)
     pair_of, statistics, after = np.empty((P, D), np.int64), np.empty((P, STATISTICS)), moved.copy()
     choose_clear_pairs(best, relative[best], scan, pairs, rules, pair_of)
     scan.order[:] = np.argsort(scan.best)

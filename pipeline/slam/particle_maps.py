@@ -17,6 +17,7 @@ from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.types.records import Float32, Int, Int32
 
 ROOM = 16  # landmarks per block, 256 bytes: four lines of the cache
+ABSENT = 1e9  # m; position of a landmark that a particle does not have, out of reach of any scan
 
 
 class EarlierMaps(NamedTuple):
@@ -217,17 +218,6 @@ def is_sound(maps: Maps, particles: int) -> bool:
 
 
 @compiled
-def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
-    """Return the landmarks of one particle, copied; the columns of MapColumns."""
-    slots = np.flatnonzero(maps.hits)
-    mean = np.empty((len(slots), 2))
-    for n in range(len(slots)):
-        b, o = maps.block[p, slots[n] // ROOM], slots[n] % ROOM
-        mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
-    return mean, maps.covariance[slots], maps.hits[slots], maps.score[slots], maps.birth[slots]
-
-
-@compiled
 def slots_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Int, Float]:
     """Return the landmarks of one particle within a distance of a place: slots, shape (L,), and their
     positions, shape (L, 2) [m]."""
@@ -241,6 +231,13 @@ def slots_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[In
             slots[n], mean[n, 0], mean[n, 1] = j, u, v
             n += 1
     return slots[:n], mean[:n]
+
+
+@compiled
+def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
+    """Return the landmarks of one particle, copied; the columns of MapColumns."""
+    slots, mean = slots_near(maps, p, 0.0, 0.0, 0.5 * ABSENT)
+    return mean, maps.covariance[slots], maps.hits[slots], maps.score[slots], maps.birth[slots]
 
 
 @compiled_within

@@ -19,7 +19,8 @@ from pipeline.geometry.gaussian import Pose, corrected, draw, expected_spread
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.slam.candidate_pairs import Pairs
-from pipeline.types.records import Bool, Int
+from pipeline.slam.joint_association import CHOICES, MOST, Doubts, choose_jointly, doubts_for
+from pipeline.types.records import Bool, Int, Int32
 
 LIKELY = 6.0  # of -2 log likelihood, a likelihood ratio of 20: a choice with a smaller lead is ambiguous
 # Statistics of a scan by particle: columns of `statistics`.
@@ -61,6 +62,8 @@ class Scan(NamedTuple):
         centre: Detections in the base frame, shape (D, 2) [m].
         R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
         P: Covariance of the motion in the body frame, shape (3, 3).
+        covariance: Of the landmarks in the body frame, xx, xy, yy, shape (L, 3) [m^2].
+        well_known: 1 for landmarks that weigh, else 0, int32, shape (L,).
         order: Detections in the order of correction, int64, shape (D,).
         residual: Innovation of each pair at the prior pose, shape (K, 2) [m].
         cost: -2 log likelihood of each pair, infinite outside the gate, shape (K,).
@@ -68,11 +71,14 @@ class Scan(NamedTuple):
         rivals: The two least costs of each landmark, shape (L, 2).
         taken: Which landmarks are associated, shape (L,).
         mu, posterior: Pose and its covariance, shapes (1, 3) and (3, 3).
+        doubts: For detections that are decided together.
     """
 
     centre: Float
     R: Float
     P: Float
+    covariance: Float
+    well_known: Int32
     order: Int
     residual: Float
     cost: Float
@@ -81,6 +87,7 @@ class Scan(NamedTuple):
     taken: Bool
     mu: Float
     posterior: Float
+    doubts: Doubts
 
 
 class Gains(NamedTuple):
@@ -101,12 +108,16 @@ class Gains(NamedTuple):
 
 
 @compiled
-def scan_for(centre: Float, R: Float, P: Float, pairs: int, landmarks: int) -> Scan:
+def scan_for(
+    centre: Float, R: Float, P: Float, covariance: Float, well_known: Int32, pairs: int, landmarks: int
+) -> Scan:
     """Return a scan with memory for a number of pairs and landmarks."""
     D = centre.shape[0]
     return Scan(
-        centre, R, P, np.arange(D), np.empty((pairs, 2)), np.empty(pairs), np.empty(D),
+        centre, R, P, covariance, well_known,
+        np.arange(D), np.empty((pairs, 2)), np.empty(pairs), np.empty(D),
         np.empty((landmarks, 2)), np.empty(landmarks, np.bool_), np.empty((1, 3)), np.empty((3, 3)),
+        doubts_for(),
     )  # fmt: skip
 
 
@@ -138,8 +149,8 @@ def update_particle(
     """Associate the detections with landmarks, one to one, correct and draw the pose; returns the log
     likelihood.
 
-    Detections with one likely landmark correct the pose, in the order of the scan. The others are associated
-    by falling likelihood at the corrected pose and do not correct it, since a wrong choice would bend it.
+    Detections with one likely landmark correct the pose, in the order of the scan. Of the others, the surest
+    are decided together (see `joint_association`), and the rest by falling likelihood.
 
     Args:
         p: Row of the particle.
@@ -161,16 +172,31 @@ def update_particle(
         at, innovation, log_det, recognised = _corrected_by_pairs(
             p, scan, pairs, rules, gains, keep_gains, pair_of
         )
+    levels, level = _open_levels(p, scan, pairs, pair_of), 0
+    if levels > 0:
+        choose_jointly(
+            at, scan.centre, scan.R, relative, scan.covariance, scan.well_known, rules.gate * rules.gate, 1,
+            scan.taken, levels, scan.doubts,
+        )  # fmt: skip
     while True:
-        k, d, cost, square = _next_pair(p, at, scan, pairs, rules, pair_of)
-        if k < 0:
-            break
+        if level < levels:
+            k, d, cost, square = _chosen_pair(level, at, scan, pairs)
+            level += 1
+            if k < 0 or square > rules.gate * rules.gate:
+                pair_of[p, d] = NEW
+                continue
+        else:
+            k, d, cost, square = _next_pair(p, at, scan, pairs, rules, pair_of)
+            if k < 0:
+                break
         pair_of[p, d] = k
         scan.taken[pairs.row[k]] = True
         if pairs.weighs[k]:
             innovation += square
             log_det += cost - square
             recognised += 1.0
+            r0, r1, S0, S1, S2 = _innovation(at, d, k, scan, pairs)
+            at = corrected(at, scan.centre[d, 0], scan.centre[d, 1], S0, S1, S2, r0, r1)
     # A new tree is as likely as one at the gate, or particles that recognise nothing would win.
     price = 0.0
     for d in range(scan.centre.shape[0]):
@@ -323,6 +349,43 @@ def _innovation(
     x, y = scan.centre[d, 0], scan.centre[d, 1]
     S0, S1, S2 = expected_spread(at, 1.0, 0.0, x, y, pairs.spread, k)
     return scan.residual[k, 0] - at.x + y * at.yaw, scan.residual[k, 1] - at.y - x * at.yaw, S0, S1, S2
+
+
+@compiled_within
+def _open_levels(p: int, scan: Scan, pairs: Pairs, pair_of: Int) -> int:
+    """Fill the levels of the joint search with the first OPEN detections and their likeliest free landmarks;
+    returns the number of levels."""
+    doubts, levels = scan.doubts, 0
+    for d in scan.order:
+        if pair_of[p, d] != OPEN or levels == MOST:
+            continue
+        n, last = 0, -np.inf
+        while n < CHOICES:
+            least, likeliest = np.inf, NEW
+            for k in range(pairs.first[d], pairs.first[d + 1]):
+                if last < scan.cost[k] < least and not scan.taken[pairs.row[k]]:
+                    least, likeliest = scan.cost[k], k
+            if likeliest < 0:
+                break
+            doubts.landmark[levels, n], last = pairs.row[likeliest], least
+            n += 1
+        if n > 0:
+            doubts.detection[levels], doubts.choices[levels] = d, n
+            levels += 1
+    return levels
+
+
+@compiled_within
+def _chosen_pair(level: int, at: Pose, scan: Scan, pairs: Pairs) -> tuple[int, int, float, float]:
+    """Return what `_next_pair` returns for the choice of a level of the joint search."""
+    d, j = scan.doubts.detection[level], scan.doubts.best[level]
+    for k in range(pairs.first[d], pairs.first[d + 1]):
+        if pairs.row[k] == j:
+            r0, r1, S0, S1, S2 = _innovation(at, d, k, scan, pairs)
+            det = S0 * S2 - S1 * S1
+            square = (S2 * r0 * r0 - 2.0 * S1 * r0 * r1 + S0 * r1 * r1) / det
+            return k, d, square + np.log(det), square
+    return NEW, d, 0.0, 0.0
 
 
 @compiled_within

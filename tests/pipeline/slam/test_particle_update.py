@@ -55,7 +55,8 @@ def updated(given_, well=None, noise=None, copies=1):
     pairs = candidate_pairs(
         centre, R, landmarks, np.zeros(len(landmarks)), covariance, well, P, RULES.distance_max
     )
-    scan, gains = scan_for(centre, R, P, len(pairs.row), len(landmarks)), gains_for(len(centre))
+    scan = scan_for(centre, R, P, covariance, well.astype(np.int32), len(pairs.row), len(landmarks))
+    gains = gains_for(len(centre))
     pose, pair_of = np.zeros((copies, 3)), np.empty((copies, len(centre)), np.int64)
     statistics = np.empty((copies, STATISTICS))
     noise = np.zeros((copies, 3)) if noise is None else noise
