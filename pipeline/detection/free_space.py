@@ -12,7 +12,7 @@ from pipeline.types.records import Bool, Float32
 
 BINS = 360  # sectors of about one degree
 BEHIND = 1.0  # m; a return this far behind the position of a tree shows that the tree is absent
-FIELD = 10  # bins; a direction with returns within this distance on both sides is inside the field of view
+FIELD = 10  # bins; a direction without a return within this distance may be outside of the field of view
 
 
 @compiled
@@ -21,8 +21,8 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
     [m].
 
     The free distance is the distance to the nearest filtered point; infinite without a point; and 0 where the
-    scan has no return in the neighbourhood on one side, since that direction may be outside of the field of
-    view: beyond the edge of a sensor that looks one way, nothing was seen to be free.
+    direction may be outside of the field of view: without a return in the neighbourhood, or in the largest
+    gap between returns, which is not observed by a sensor that looks one way.
 
     Args:
         raw: The scan before the filters, float32, shape (N, 3) [m], level sensor frame.
@@ -37,12 +37,18 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
         x, y = filtered[i, 0] + sensor_offset[0], filtered[i, 1] + sensor_offset[1]
         k = direction_bin(x, y, BINS)
         free[k] = min(free[k], np.sqrt(x * x + y * y))
+    length, largest, end = 0, 0, 0
+    for k in range(2 * BINS):  # twice around, because a gap may contain the first bin
+        length = 0 if looked[k % BINS] else min(length + 1, BINS)
+        if length > largest:
+            largest, end = length, k
+    for k in range(end - largest + 1, end + 1):
+        free[k % BINS] = 0.0
     for k in range(BINS):
-        left, right = False, False
-        for j in range(FIELD + 1):
-            left = left or looked[(k + j) % BINS]
-            right = right or looked[k - j]
-        if not (left and right):
+        near = False
+        for j in range(-FIELD, FIELD + 1):
+            near = near or looked[(k + j) % BINS]
+        if not near:
             free[k] = 0.0
     # The edge of a trunk may be in either of two bins; the minimum over neighbouring bins is conservative.
     safe = free.copy()

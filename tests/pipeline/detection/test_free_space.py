@@ -111,12 +111,15 @@ def test_the_free_distance_is_that_of_the_nearest_point_by_direction(seed, sprea
     raw = random.normal(0.0, spread, (300, 3)).astype(np.float32)
     raw[:60, :2] = np.round(raw[:60, :2])  # on the axes, on the diagonals, at the origin
     sensor = np.array([0.25, -0.5, 1.0]) * float(random.integers(0, 2))
-    nearest, left, right = np.full(BINS, np.inf), np.zeros(BINS, bool), np.zeros(BINS, bool)
+    nearest, near, looked = np.full(BINS, np.inf), np.zeros(BINS, bool), np.zeros(BINS, bool)
     for x, y in raw[:, :2] + sensor[:2]:
         k = direction_bin(x, y, BINS)
-        left[[(k - j) % BINS for j in range(FIELD + 1)]] = True
-        right[[(k + j) % BINS for j in range(FIELD + 1)]] = True
+        near[[(k + j) % BINS for j in range(-FIELD, FIELD + 1)]] = True
+        looked[k] = True
         nearest[k] = min(nearest[k], np.hypot(x, y))
-    free = np.where(left & right, nearest, 0.0)
+    bins = np.flatnonzero(looked)
+    gap = int(np.argmax(np.diff(bins, append=bins[0] + BINS)))
+    near[(np.arange(bins[gap] + 1, bins[gap] + np.diff(bins, append=bins[0] + BINS)[gap])) % BINS] = False
+    free = np.where(near, nearest, 0.0)
     wanted = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
     np.testing.assert_allclose(clear_range(raw, raw, sensor), wanted)
