@@ -22,7 +22,6 @@ from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.best_particle import are_apart, best_after_resampling, select_best
 from pipeline.slam.frame_uncertainty import NOISE, FrameUncertainty, at_least
 from pipeline.slam.keyframe_graph import (
-    REVISIT_DISTANCE,
     Keyframe,
     KeyframeGraph,
     ScanDetections,
@@ -42,7 +41,6 @@ from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import shared_map, take_ancestors
 from pipeline.slam.particle_update import AMBIGUOUS, INNOVATION, RECOGNISED, Rules
 from pipeline.slam.pose_quality import is_lost, pose_health
-from pipeline.slam.poses import composed, inverse
 from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.running_statistics import OdometryDoubt, RunningStatistics, update_statistics
@@ -194,7 +192,8 @@ class FastSlam:
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        graph = graph.without_revisits(state.distance - REVISIT_DISTANCE)
+        # Since the robot left the place, the path may have drifted, and associations may be wrong.
+        graph = graph.without_revisits(graph.distance_at(loop.first))
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance)
         solution = graph.solve(new_loop=True)
         if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
@@ -202,7 +201,7 @@ class FastSlam:
         moved = corrected_landmarks(state.map_of(state.best), graph, solution, path)
         names = same_trees(moved, graph.first_birth_after(loop.first))
         graph = replace(graph.renamed(*names), pose=solution.pose)
-        again = graph.solve(new_loop=True)
+        again = graph.solve()
         return self._corrected(index, graph, again or solution, loop.covariance, names)
 
     def _corrected(
@@ -382,10 +381,9 @@ class FastSlam:
         Keyframe for `first_birth`."""
         birth, centre, R = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
         if scans:
-            path = state.genealogy.path_since(state.best, scans[0].scan)
-            T_map_base = path[[s.scan - scans[0].scan for s in scans]]
-            T_keyframe_map = inverse(path[-1:]).repeat(len(scans), axis=0)
-            birth, centre, R = combined(scans, composed(T_keyframe_map, T_map_base))
+            weights = normalised(state.log_weight)
+            T_keyframe_base = state.genealogy.mean_motion_from(np.array([s.scan for s in scans]), weights)
+            birth, centre, R = combined(scans, T_keyframe_base)
         return Keyframe(
             max(len(state.genealogy) - 1, 0), first_birth, state.distance, state.keyframe_motion,
             state.keyframe_covariance, birth, centre, R,

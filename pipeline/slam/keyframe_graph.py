@@ -26,8 +26,9 @@ Sparse = Any  # scipy.sparse.csc_matrix, or its factors; scipy has no types
 #: Scale of the Cauchy kernel [sigma]: 95 % of the efficiency of least squares for Gaussian errors (Holland,
 #: Welsch 1977).
 CAUCHY = 2.385
-#: Stems of one keyframe in the graph, the nearest first; bounds the cost of a keyframe.
-STEMS_MAX = 24
+#: Stems of one keyframe in the graph; bounds the cost of a keyframe.
+STEMS_MAX = 64
+GOLDEN = 0.6180339887498949  # golden ratio; its multiples modulo 1 order the stems evenly and reproducibly
 #: Keyframes of the graph; beyond it every second one is dropped, which bounds the cost of a solution.
 KEYFRAMES_MAX = 2000
 #: m of path without a view of a stem; a view after it is a revisit.
@@ -36,8 +37,8 @@ REVISIT_DISTANCE = 30.0
 #: of a run together cost a bounded multiple of the last one.
 GROWTH, GROWTH_MIN = 0.1, 5
 MOTION_SIGMA_MIN = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad; lower bound, for a robot that does not move
-CONVERGED = 1e-3  # relative decrease of the cost; a smaller one ends the iteration
-ITERATIONS_MAX = 20
+CONVERGED = 1e-5  # relative decrease of the cost; a smaller one ends the iteration
+ITERATIONS_MAX = 50
 DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the solver fails
 FIXED = 1e8  # 1/m^2, 1/rad^2; information that holds the first pose, which is the frame of the map
 REGULAR = 1e-9  # 1/m^2, 1/rad^2; information of a pose or stem that nothing observes
@@ -54,7 +55,7 @@ class Keyframe:
         distance: Distance driven until here [m].
         motion: x, y [m], yaw [rad] since the keyframe before, shape (3,).
         covariance: Covariance of `motion`, shape (3, 3); infinite where no odometry connects the two.
-        birth: int64, shape (D,), ascending by distance: landmarks that were detected.
+        birth: int64, shape (D,): landmarks that were detected.
         centre: Their positions in the frame of the base, shape (D, 2) [m].
         R: Covariances of the positions xx, xy, yy, shape (D, 3) [m^2].
     """
@@ -83,12 +84,16 @@ class ScanDetections:
 def combined(scans: tuple[ScanDetections, ...], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
     """Return the weighted means of detections of the same landmark over several scans.
 
+    Of more than STEMS_MAX landmarks those with the smallest value of a hash are taken. All keyframes use the
+    same hash, so that a stem which one keyframe takes is taken by the others as well, as far as they see it
+    (bottom-k sampling; Broder 1997), near and far.
+
     Args:
         scans: The scans.
         T_keyframe_base: Pose of each scan with respect to the keyframe, shape (S, 3).
 
     Returns:
-        Birth numbers, positions and covariances of the landmarks, the nearest first; see Keyframe.
+        Birth numbers, positions and covariances of the landmarks; see Keyframe.
     """
     count = [len(s.birth) for s in scans]
     pose = np.repeat(T_keyframe_base, count, axis=0)
@@ -102,8 +107,8 @@ def combined(scans: tuple[ScanDetections, ...], T_keyframe_base: Float) -> tuple
     # The covariance of a weighted mean of independent errors.
     square = np.column_stack([np.bincount(of, weight**2 * R[:, a], len(names)) for a in range(3)])
     spread = square / (total**2)[:, None]
-    near = np.argsort(np.hypot(mean[:, 0], mean[:, 1]), kind="stable")[:STEMS_MAX]
-    return names[near], mean[near], spread[near]
+    taken = np.argsort(names * GOLDEN % 1.0, kind="stable")[:STEMS_MAX]
+    return names[taken], mean[taken], spread[taken]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -211,6 +216,10 @@ class KeyframeGraph:
         row = int(np.searchsorted(self.scans, scan, side="right"))
         return self.keyframes[min(row, len(self.keyframes) - 1)].first_birth
 
+    def distance_at(self, scan: int) -> float:
+        """Return the distance driven until the first keyframe at a scan or after it [m]."""
+        return self.keyframes[min(int(np.searchsorted(self.scans, scan)), len(self.keyframes) - 1)].distance
+
     def solved_by(self, solution: Solution) -> KeyframeGraph:
         """Return the graph at its solution."""
         return replace(self, pose=solution.pose, revisits=0, solved=len(self.keyframes))
@@ -238,8 +247,8 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
     def without_revisits(self, distance: float) -> KeyframeGraph:
-        """Return the graph without the associations of a wrong pose: keyframes from a distance driven [m] on
-        lose the detections of landmarks that were begun more than REVISIT_DISTANCE before it."""
+        """Return the graph without associations by a path that had drifted: keyframes from a distance driven
+        [m] on lose the detections of landmarks that were begun more than REVISIT_DISTANCE before it."""
         recent = [k.first_birth for k in self.keyframes if k.distance >= distance - REVISIT_DISTANCE]
 
         def cleaned(keyframe: Keyframe) -> Keyframe:
@@ -272,7 +281,7 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(kept), pose=self.pose[rows], solved=solved)
 
     def solve(self, *, new_loop: bool = False) -> Solution | None:
-        """Return the minimum; None without convergence.
+        """Return the minimum next to the present poses; None without convergence.
 
         Args:
             new_loop: Whether the last loop was just added. The Cauchy kernel has no slope far from the

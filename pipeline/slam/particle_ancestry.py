@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.geometry.poses import Float
+from pipeline.geometry.poses import Float, wrap_angle
+from pipeline.slam.poses import composed, inverse
 from pipeline.types.records import Float32, Int
 
 RECENT_POSES = 300_000  # poses of all particles that are kept, so that later scans can select among them
@@ -109,12 +110,35 @@ class Genealogy:
         """Return the path of particle `leaf` of the newest scan, x, y [m], yaw [rad], shape (N, 3)."""
         return np.concatenate([*self.settled, _walk(self.recent, leaf)])
 
-    def path_since(self, leaf: int, scan: int) -> Float:
-        """Return the path of particle `leaf` from a scan on; only the scans whose ancestors are kept."""
-        first = scan - BLOCK * len(self.settled)
-        if first < 0:
-            return self.path(leaf)[scan:]
-        return _walk(self.recent[first:], leaf)
+    def mean_motion_from(self, scans: Int, weights: Float) -> Float:
+        """Return the poses of the base at some scans relative to its pose at the newest scan, as means over
+        the particles, x, y [m], yaw [rad], shape (S, 3).
+
+        A single particle would add the noise of its random numbers (Rao-Blackwell).
+
+        Args:
+            scans: Numbers of the scans, int64, shape (S,).
+            weights: Weights of the particles after the newest scan, shape (P,).
+        """
+        settled = BLOCK * len(self.settled)
+        leaf = np.arange(len(weights))
+        T_newest_map, means = np.zeros((len(weights), 3)), np.zeros((len(scans), 3))
+        wanted = {int(scan): k for k, scan in enumerate(scans)}
+        for scan in range(len(self) - 1, min(wanted, default=len(self)) - 1, -1):
+            if scan >= settled:
+                generation = self.recent[scan - settled]
+                leaf = leaf if generation.ancestors is None else generation.ancestors[leaf]
+                pose = generation.pose[leaf].astype(np.float64)
+            else:
+                pose = np.tile(self.settled[scan // BLOCK][scan % BLOCK], (len(weights), 1))
+            if scan == len(self) - 1:
+                T_newest_map = inverse(pose)
+            if scan in wanted:
+                motion = composed(T_newest_map, pose)
+                turn = wrap_angle(motion[:, 2] - motion[0, 2])
+                means[wanted[scan], :2] = weights @ motion[:, :2]
+                means[wanted[scan], 2] = wrap_angle(motion[0, 2] + weights @ turn)
+        return means
 
 
 def _founders_after(

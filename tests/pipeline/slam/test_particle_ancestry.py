@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.geometry.poses import Pose2
 from pipeline.slam.particle_ancestry import BLOCK, RECENT_POSES, Genealogy
 from tests.pipeline.strategies import seeds
 
@@ -54,3 +55,25 @@ def test_a_long_past_is_settled_and_stays():
 def test_nothing_has_no_path():
     assert Genealogy().path(0).shape == (0, 3)
     assert Genealogy().redrawn(np.zeros(4, np.int64)).path(0).shape == (0, 3)
+
+
+@given(seeds)
+def test_the_mean_motion_is_that_of_the_surviving_particles(seed):
+    rng = np.random.default_rng(seed)
+    particles = 6
+    genealogy, paths = grown(rng, particles, 8)
+    weights = rng.dirichlet(np.ones(particles))
+    scans = np.array([2, 5, 7])
+    wanted = np.zeros((3, 2))
+    for path, weight in zip(paths, weights, strict=True):
+        last = Pose2(*path[-1]).inverse()
+        wanted += weight * np.array([(last @ Pose2(*path[k])).as_array()[:2] for k in scans])
+    mean = genealogy.mean_motion_from(scans, weights)
+    np.testing.assert_allclose(mean[:, :2], wanted, atol=1e-5)
+    np.testing.assert_allclose(mean[2], 0.0, atol=1e-6)
+
+
+def test_the_mean_motion_reaches_back_before_the_scans_with_ancestors():
+    path = np.column_stack([0.1 * np.arange(BLOCK + 40), np.zeros(BLOCK + 40), np.zeros(BLOCK + 40)])
+    mean = Genealogy.of_path(path, 3).mean_motion_from(np.array([BLOCK - 10, BLOCK + 30]), np.full(3, 1 / 3))
+    np.testing.assert_allclose(mean[:, 0], [-4.9, -0.9], atol=1e-4)
