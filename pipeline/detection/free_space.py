@@ -12,6 +12,9 @@ from pipeline.types.records import Bool, Float32
 
 BINS = 360  # sectors of about one degree
 BEHIND = 1.0  # m; a return this far behind the position of a tree shows that the tree is absent
+# Share of the directions outside of the largest gap that have a return. Sparser returns, for example of a
+# planar laser in the open, do not show the edges of the field of view.
+DENSE = 0.9
 FIELD = 10  # bins; a direction without a return within this distance may be outside of the field of view
 
 
@@ -22,7 +25,7 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
 
     The free distance is the distance to the nearest filtered point; infinite without a point; and 0 where the
     direction may be outside of the field of view: without a return in the neighbourhood, or in the largest
-    gap between returns, which is not observed by a sensor that looks one way.
+    gap between dense returns, which a sensor that looks one way does not observe.
 
     Args:
         raw: The scan before the filters, float32, shape (N, 3) [m], level sensor frame.
@@ -42,8 +45,9 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
         length = 0 if looked[k % BINS] else min(length + 1, BINS)
         if length > largest:
             largest, end = length, k
-    for k in range(end - largest + 1, end + 1):
-        free[k % BINS] = 0.0
+    if np.count_nonzero(looked) >= DENSE * (BINS - largest):
+        for k in range(end - largest + 1, end + 1):
+            free[k % BINS] = 0.0
     for k in range(BINS):
         near = False
         for j in range(-FIELD, FIELD + 1):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.detection.free_space import BINS, FIELD, clear_range, in_free_view
+from pipeline.detection.free_space import BINS, DENSE, FIELD, clear_range, in_free_view
 from pipeline.geometry.azimuth_bins import direction_bin
 from tests.pipeline.strategies import seeds
 
@@ -60,6 +60,12 @@ def test_beyond_the_edge_of_the_field_of_view_nothing_is_free():
     for side in (-1.0, 1.0):
         assert free_at(side * (half - 0.03), 5.0, ahead, nothing)
         assert not free_at(side * (half + 0.05), 5.0, ahead, nothing), "no beam went there"
+
+
+def test_sparse_returns_do_not_show_the_edges_of_the_field_of_view():
+    half = np.radians(35.0)
+    sparse = circle(20.0, np.linspace(-half, half, 15))
+    assert free_at(half + 0.05, 5.0, sparse, np.zeros((0, 3), np.float32))
 
 
 def test_a_gap_between_returns_is_inside_the_field_of_view():
@@ -119,7 +125,9 @@ def test_the_free_distance_is_that_of_the_nearest_point_by_direction(seed, sprea
         nearest[k] = min(nearest[k], np.hypot(x, y))
     bins = np.flatnonzero(looked)
     gap = int(np.argmax(np.diff(bins, append=bins[0] + BINS)))
-    near[(np.arange(bins[gap] + 1, bins[gap] + np.diff(bins, append=bins[0] + BINS)[gap])) % BINS] = False
+    width = np.diff(bins, append=bins[0] + BINS)[gap]
+    if len(bins) >= DENSE * (BINS - width + 1):
+        near[np.arange(bins[gap] + 1, bins[gap] + width) % BINS] = False
     free = np.where(near, nearest, 0.0)
     wanted = np.minimum(free, np.minimum(np.roll(free, 1), np.roll(free, -1)))
     np.testing.assert_allclose(clear_range(raw, raw, sensor), wanted)
