@@ -25,7 +25,7 @@ RENAMED = {
 # Choices of earlier versions and their replacement: a graph of keyframes now always corrects FastSLAM.
 RENAMED_CHOICES = {("slam.method", "graph"): "fastslam2"}
 # Parameters of earlier versions that no longer exist; their values are ignored.
-REMOVED = frozenset({"tracking.gate", "tracking.distance_max", "tracking.misses_per_hit", "slam.miss_weight"})
+REMOVED = frozenset({"tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"})
 
 
 class RenamedParameterWarning(FutureWarning):

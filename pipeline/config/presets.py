@@ -83,6 +83,7 @@ _LASER2D: dict[str, object] = {
     "slam.distance_max": 4.0,
     "slam.view_range": 35.0,
     "slam.weight_power": 0.3,
+    "slam.miss_weight": 1.0,
     "tracking.hits_to_confirm": 5,
     "slam.update_distance": 0.5,
     "relocalisation.method": "none",

@@ -325,6 +325,15 @@ class Slam(Stage):
     misses_per_hit: int = count(
         3, "Misses per hit", "", 1, 100, "Misses that cancel one hit; a landmark without hits is removed."
     )
+    miss_weight: float = number(
+        0.0,
+        "Weight of a miss",
+        "",
+        0.0,
+        5.0,
+        0.05,
+        "Subtracted from the log weight of a particle for each well-known landmark that is missed.",
+    )
     weight_power: float = number(
         0.1,
         "Weight power",

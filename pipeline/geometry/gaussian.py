@@ -13,6 +13,8 @@ import numpy as np
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 
+SMALL_TURN = 0.02  # rad; below it the series of sine and cosine is exact to 1e-10
+
 
 class Pose(NamedTuple):
     """A Gaussian pose as scalars.
@@ -31,6 +33,22 @@ class Pose(NamedTuple):
     yy: float
     yt: float
     tt: float
+
+
+@compiled_borrowing
+def pose_of(mu: Float, P: Float) -> Pose:
+    """Return a pose by its mean, shape (3,), and covariance, shape (3, 3)."""
+    return Pose(mu[0], mu[1], mu[2], P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
+
+
+@compiled_borrowing
+def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
+    """Write a pose into arrays, the inverse of `pose_of`."""
+    mu[0], mu[1], mu[2] = pose.x, pose.y, pose.yaw
+    P[0, 0], P[1, 1], P[2, 2] = pose.xx, pose.yy, pose.tt
+    P[0, 1] = P[1, 0] = pose.xy
+    P[0, 2] = P[2, 0] = pose.xt
+    P[1, 2] = P[2, 1] = pose.yt
 
 
 @compiled
@@ -167,6 +185,16 @@ def corrected(
         pose.yt - (k10 * a2 + k11 * b2),
         pose.tt - (k20 * a2 + k21 * b2),
     )
+
+
+@compiled_within
+def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
+    """Return cosine and sine of a yaw by those before a small turn."""
+    if abs(by) > SMALL_TURN:
+        return np.cos(yaw), np.sin(yaw)
+    b2 = by * by
+    cos, sin = 1.0 - b2 * (0.5 - b2 / 24.0), by * (1.0 - b2 / 6.0)
+    return c * cos - s * sin, s * cos + c * sin
 
 
 @compiled_within

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 
+Bool = NDArray[np.bool_]
 Int32 = NDArray[np.int32]
 
 SIDE = 32  # cells per side; the plane is folded into these cells, because a search covers fewer
@@ -94,6 +95,29 @@ def take_out(cells: Cells, j: int) -> None:
     while cells.following[before] != j:
         before = cells.following[before]
     cells.following[before] = cells.following[j]
+
+
+@compiled_within
+def clear(cells: Cells, known: int) -> None:
+    """Empty the cells of a number of positions."""
+    for j in range(known):
+        cells.head[cells.cell[j]] = -1
+
+
+@compiled_within
+def holds_unseen(
+    cells: Cells, mean: Float, seen: Bool, x: float, y: float, radius2: float, scale: float
+) -> bool:
+    """Return whether a position that was not seen is within a radius (given as its square) of x, y."""
+    u, v = first_of_four(x, y, scale)
+    for quarter in range(4):
+        at = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+        while at >= 0:
+            dx, dy = mean[at, 0] - x, mean[at, 1] - y
+            if not seen[at] and dx * dx + dy * dy <= radius2:
+                return True
+            at = cells.following[at]
+    return False
 
 
 @compiled_within

@@ -10,7 +10,7 @@ from pipeline.geometry.gaussian import in_map, rows_of
 from pipeline.geometry.hash_grid import Cells, cell_of, cells_for, fill, first_of_four, per_metre
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
-from pipeline.slam.landmarks import SCORE_MAX
+from pipeline.slam.particle_update import SCORE_MAX
 from pipeline.types.records import Detections, Float32, Int, Int32, Landmarks, PoseEstimate
 
 

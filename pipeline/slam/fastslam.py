@@ -35,16 +35,16 @@ from pipeline.slam.loop_correction import (
     joined,
     same_trees,
 )
-from pipeline.slam.measurement_update import FOUND, MISSED, ODOMETRY, against_slip, estimated, use_scan
+from pipeline.slam.measurement_update import against_slip, estimated, use_scan
 from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrapped
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import shared_map, take_ancestors
-from pipeline.slam.particle_update import AMBIGUOUS, INNOVATION, RECOGNISED, Rules
+from pipeline.slam.particle_update import Rules
 from pipeline.slam.pose_quality import is_lost, pose_health
 from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.running_statistics import OdometryDoubt, RunningStatistics, update_statistics
-from pipeline.slam.scan_statistics import ScanStatistics, disagreement
+from pipeline.slam.scan_statistics import ScanStatistics, disagreement, named_statistics
 from pipeline.slam.shared_errors import SharedErrors
 from pipeline.slam.slip_detection import TreeMotion
 from pipeline.slam.state import SlamState
@@ -113,10 +113,11 @@ class FastSlam:
         health = pose_health(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
+        # A survivor of the resampling keeps its row, so that row `best` is still that of the best particle.
         if births is None:
             landmark_of = births_of(detections, estimate, self.landmarks())
         else:
-            landmark_of = births
+            landmark_of = births[state.best]
             self.state = self._with_keyframe(state, detections, landmark_of)
         return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
 
@@ -262,7 +263,7 @@ class FastSlam:
         )
 
     def reset_health(self) -> None:
-        """Discard the statistics of recent scans, by which the health is pose_health."""
+        """Discard the statistics of recent scans, by which the health is judged."""
         self.state = replace(self.state, recent=RunningStatistics(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
@@ -308,8 +309,8 @@ class FastSlam:
         doubted: OdometryDoubt,
         rules: Rules,
     ) -> tuple[SlamState, ScanStatistics, Float, Int]:
-        """Return the state after a scan, its statistics, the weights, shape (P,), and the birth of the
-        landmark of each detection, shape (D,)."""
+        """Return the state after a scan, the statistics of the scan, the weights, and the births of the
+        landmarks that each particle associates with the detections, shape (P, D)."""
         found = len(centre)
         motion, covariance, recent = trees.motion, trees.covariance, state.recent
         if trees.slipped:
@@ -318,22 +319,13 @@ class FastSlam:
         keyframe_motion, keyframe_covariance = compounded(
             state.keyframe_motion, state.keyframe_covariance, motion[0], motion[1], motion[2], covariance
         )
-        maps, weights, mean, births = use_scan(
-            state.pose, state.log_weight, state.maps, state.best, motion, covariance, noise, centre, R,
-            clear_range, state.detections, rules, shared.for_particles(measured),
+        maps, weights, mean, odometry, births = use_scan(
+            state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
+            state.detections, rules, shared.for_particles(measured),
         )  # fmt: skip
         if trees.slipped:
-            mean[ODOMETRY] = disagreement(motion, state.motion, state.motion_covariance)
-        known = float(mean[RECOGNISED])
-        scan = ScanStatistics(
-            detections=found,
-            recognised=known,
-            ambiguous=float(mean[AMBIGUOUS]),
-            found=float(mean[FOUND]),
-            missed=float(mean[MISSED]),
-            innovation=float(mean[INNOVATION]) / (2.0 * known) if known > 0.5 else math.nan,
-            odometry=float(mean[ODOMETRY]),
-        )
+            odometry = disagreement(motion, state.motion, state.motion_covariance)
+        scan = named_statistics(mean, odometry, found)
         state = replace(
             state,
             maps=maps,
@@ -363,8 +355,10 @@ class FastSlam:
         if len(detections.cluster) and (
             not scans or state.distance - scans[-1].distance >= spacing / SCANS_MAX
         ):
-            scan, R = len(state.genealogy) - 1, rows_of(detections.covariance)
-            scans = (*scans, ScanDetections(scan, state.distance, birth, detections.centre, R))
+            scan, known = len(state.genealogy) - 1, birth >= 0  # -1: undecided between two landmarks
+            R = rows_of(detections.covariance)[known]
+            shown = ScanDetections(scan, state.distance, birth[known], detections.centre[known], R)
+            scans = (*scans, shown)
         if graph.keyframes and state.distance - graph.keyframes[-1].distance < spacing:
             return state if scans is state.since_keyframe else replace(state, since_keyframe=scans)
         keyframe = self._keyframe(state, scans, state.detections - len(detections.cluster))
@@ -436,6 +430,7 @@ def rules_of(p: Slam) -> Rules:
         hits_to_weigh=p.hits_to_weigh,
         view_range=p.view_range,
         miss=1.0 / p.misses_per_hit,
+        miss_weight=p.miss_weight,
         weight_power=p.weight_power,
         looks=p.independent_views_max,
         merge_gate=p.merge_gate,

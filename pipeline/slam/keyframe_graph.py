@@ -203,6 +203,8 @@ class KeyframeGraph:
             T_map_base: Pose of the newest keyframe, found by the trees around the anchor.
             covariance: Covariance of x, y [m], yaw [rad] of this pose, axes of the map, shape (3, 3).
         """
+        if len(self.keyframes) < 2:
+            return self
         row = max(int(np.searchsorted(self.scans[:-1], anchor, side="right")) - 1, 0)
         pose = self.pose[row]
         motion = composed(inverse(pose[None]), T_map_base.as_array()[None])[0]

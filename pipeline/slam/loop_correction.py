@@ -46,7 +46,7 @@ def corrected_path(path: Float, graph: KeyframeGraph, solution: Solution) -> Flo
     since = composed(inverse(before[keyframe]), path)
     motions = np.concatenate([np.full((1, 3), np.nan), composed(inverse(before[:-1]), before[1:])])
     motions[[not np.isfinite(k.covariance).all() for k in graph.keyframes]] = np.nan
-    return interpolated(solution.pose, motions, keyframe, since)
+    return interpolated(solution.pose, motions, scans, keyframe, since)
 
 
 def corrected_landmarks(

@@ -124,20 +124,18 @@ class Genealogy:
         leaf = np.arange(len(weights))
         T_newest_map, means = np.zeros((len(weights), 3)), np.zeros((len(scans), 3))
         wanted = {int(scan): k for k, scan in enumerate(scans)}
-        for scan in range(len(self) - 1, min(wanted, default=len(self)) - 1, -1):
-            if scan >= settled:
-                generation = self.recent[scan - settled]
-                leaf = leaf if generation.ancestors is None else generation.ancestors[leaf]
-                pose = generation.pose[leaf].astype(np.float64)
-            else:
-                pose = np.tile(self.settled[scan // BLOCK][scan % BLOCK], (len(weights), 1))
+        for scan in range(len(self) - 1, max(min(wanted, default=len(self)), settled) - 1, -1):
+            generation = self.recent[scan - settled]
+            leaf = leaf if generation.ancestors is None else generation.ancestors[leaf]
             if scan == len(self) - 1:
-                T_newest_map = inverse(pose)
+                T_newest_map = inverse(generation.pose[leaf].astype(np.float64))
             if scan in wanted:
-                motion = composed(T_newest_map, pose)
-                turn = wrap_angle(motion[:, 2] - motion[0, 2])
-                means[wanted[scan], :2] = weights @ motion[:, :2]
-                means[wanted[scan], 2] = wrap_angle(motion[0, 2] + weights @ turn)
+                poses = generation.pose[leaf].astype(np.float64)
+                means[wanted[scan]] = _mean(composed(T_newest_map, poses), weights)
+        for scan, k in wanted.items():
+            if scan < settled:
+                pose = self.settled[scan // BLOCK][scan % BLOCK]
+                means[k] = _mean(composed(T_newest_map, np.tile(pose, (len(weights), 1))), weights)
         return means
 
 
@@ -149,6 +147,13 @@ def _founders_after(
     if scans % FOUNDED == 0:
         newer, older = np.arange(particles), newer
     return (newer, older) if ancestors is None else (newer[ancestors], older[ancestors])
+
+
+def _mean(poses: Float, weights: Float) -> Float:
+    """Return the weighted mean of similar poses, shape (P, 3)."""
+    turn = wrap_angle(poses[:, 2] - poses[0, 2])
+    yaw = float(wrap_angle(poses[0, 2] + weights @ turn))
+    return np.array([*(weights @ poses[:, :2]), yaw])
 
 
 def _walk(generations: Sequence[Generation], leaf: int) -> Float:

@@ -1,9 +1,8 @@
-"""The maps of all particles: positions by particle, and what the data association decides in common.
+"""The maps of all particles in one pool of small blocks that particles share until one writes.
 
-The particles share the data association of a scan up to ambiguous detections, so hits, misses and
-covariance of a landmark are the same in all maps (the covariance of a Kalman filter depends on no measured
-value). Only the positions differ. They are in one pool of small blocks that particles share until one of
-them writes, so that the cost of resampling does not grow with what is out of sight.
+Resampling copies a row of block numbers and no landmark, so its cost does not grow with what is out of
+sight; a block is copied when a particle changes a landmark in it that another particle holds too. The
+bounding box of each block says without a look at its landmarks whether any can be in reach.
 """
 
 from __future__ import annotations
@@ -16,12 +15,24 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.types.records import Float32, Int, Int32
 
-ROOM = 16  # landmarks per block, 256 bytes: four lines of the cache
-ABSENT = 1e9  # m; position of a landmark that a particle does not have, out of reach of any scan
+ROOM = 16  # landmarks a block: begun one after another, they stand near to one another
 
 
-class EarlierMaps(NamedTuple):
-    """Maps of version 0.1.0, in which each particle had slots, hits and covariances of its own."""
+class Maps(NamedTuple):
+    """Maps of P particles, K blocks each, in a pool of N blocks with room for ROOM landmarks.
+
+    Attributes:
+        block: int32, shape (P, K): rows of the pool, -1 for none yet; places: int32, shape (P,): how many
+            in use, those of removed landmarks too.
+        mean: shape (N, ROOM, 2) [m]; covariance: shape (N, ROOM, 3) [m^2]: xx, xy, yy.
+        hits: int32, shape (N, ROOM): 0 where no landmark is; score: float32, shape (N, ROOM): hits less
+            misses, the existence.
+        birth: int64, shape (N, ROOM): serial number of the detection that began the landmark; landmarks
+            of two particles with the same birth are the same tree.
+        box: shape (N, 4): least x, y and greatest x, y of what was ever in a block [m].
+        owners: int32, shape (N,): how many particles hold it.
+        free: int32, shape (N,), rows that nobody holds, the first `free_count[0]` are valid.
+    """
 
     block: Int32
     places: Int32
@@ -35,65 +46,6 @@ class EarlierMaps(NamedTuple):
     free: Int32
     free_count: Int
 
-    def upgraded(self) -> Maps:
-        """Return maps with the landmarks of the first particle. Each other particle keeps its positions of
-        those that it has too, by their births.
-
-        Raises:
-            ValueError: The columns do not fit.
-        """
-        try:
-            known = [self._of(p) for p in range(len(self.block))]
-        except IndexError:
-            raise ValueError("the particles' maps do not fit") from None
-        maps = shared_map(len(known), known[0])
-        maps = with_room(maps, 0, maps.block.size)
-        slot = {int(birth): j for j, birth in enumerate(known[0].birth)}
-        for p, other in enumerate(known):
-            for birth, mean in zip(other.birth.tolist(), other.mean, strict=True):
-                j = slot.get(birth)
-                if j is not None:
-                    maps.mean[own_block(maps, p, j // ROOM), j % ROOM] = mean
-        return maps
-
-    def _of(self, p: int) -> MapColumns:
-        slots = np.arange(self.places[p])
-        rows = self.block[p, slots // ROOM], slots % ROOM
-        used = self.hits[rows] > 0
-        return MapColumns(*(column[rows][used] for column in (
-            self.mean, self.covariance, self.hits, self.score, self.birth
-        )))  # fmt: skip
-
-
-class Maps(NamedTuple):
-    """Maps of P particles with K blocks of ROOM slots each; a slot is the same landmark in all maps.
-
-    Attributes:
-        block: Row of the pool for each block of each particle, -1 for none yet, int32, shape (P, K).
-        mean: Pool of positions, shape (N, ROOM, 2) [m].
-        owners: Number of particles that use a row of the pool, int32, shape (N,).
-        free: Unused rows of the pool, int32, shape (N,); the first `free_count[0]` are valid.
-        covariance: xx, xy, yy of each slot, shape (K * ROOM, 3) [m^2].
-        hits: Number of detections, 0 for a slot without landmark, int32, shape (K * ROOM,).
-        score: Hits less misses, float32, shape (K * ROOM,).
-        birth: Serial number of the first detection, int64, shape (K * ROOM,).
-    """
-
-    block: Int32
-    mean: Float
-    owners: Int32
-    free: Int32
-    free_count: Int
-    covariance: Float
-    hits: Int32
-    score: Float32
-    birth: Int
-
-    @staticmethod
-    def earlier() -> type[EarlierMaps]:
-        """Return the type of maps in files of version 0.1.0; see io.checkpoints.codec."""
-        return EarlierMaps
-
 
 class MapColumns(NamedTuple):
     """The landmarks of one particle as columns of length L; see Maps."""
@@ -106,152 +58,255 @@ class MapColumns(NamedTuple):
 
 
 def empty_maps(particles: int) -> Maps:
-    """Return maps without landmarks."""
-    return shared_map(
-        particles,
-        MapColumns(
-            np.zeros((0, 2)),
-            np.zeros((0, 3)),
-            np.zeros(0, np.int32),
-            np.zeros(0, np.float32),
-            np.zeros(0, np.int64),
-        ),
-    )
+    """No landmark in any map."""
+    return _with_pool(np.full((particles, 1), -1, np.int32), np.zeros(particles, np.int32), 0)
 
 
 def shared_map(particles: int, columns: MapColumns) -> Maps:
-    """Return maps that all have the same landmarks."""
-    K = max(-(-len(columns.hits) // ROOM), 1)
+    """The same landmarks in every map, held once."""
+    n = len(columns.hits)
+    k = max(-(-n // ROOM), 1)
+    maps = _with_pool(
+        np.tile(np.arange(k, dtype=np.int32), (particles, 1)), np.full(particles, n, np.int32), k
+    )
+    for name, column in zip(MapColumns._fields, columns, strict=True):
+        flat = getattr(maps, name)
+        flat.reshape(k * ROOM, *flat.shape[2:])[:n] = column
+    maps.owners[:] = particles
+    for b in range(k):
+        place = columns.mean[b * ROOM : (b + 1) * ROOM]
+        if len(place):
+            maps.box[b] = [*place.min(axis=0), *place.max(axis=0)]
+    return maps
 
-    def filled(column: np.ndarray) -> np.ndarray:
-        padded = np.zeros((K * ROOM, *column.shape[1:]), column.dtype)
-        padded[: len(column)] = column
-        return padded
 
+def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
+    nowhere = np.tile([np.inf, np.inf, -np.inf, -np.inf], (rows, 1))
     return Maps(
-        block=np.tile(np.arange(K, dtype=np.int32), (particles, 1)),
-        mean=filled(columns.mean).reshape(K, ROOM, 2),
-        owners=np.full(K, particles, np.int32),
-        free=np.zeros(K, np.int32),
+        block=block,
+        places=places,
+        mean=np.zeros((rows, ROOM, 2)),
+        covariance=np.zeros((rows, ROOM, 3)),
+        hits=np.zeros((rows, ROOM), np.int32),
+        score=np.zeros((rows, ROOM), np.float32),
+        birth=np.zeros((rows, ROOM), np.int64),
+        box=nowhere,
+        owners=np.zeros(rows, np.int32),
+        free=np.zeros(rows, np.int32),
         free_count=np.zeros(1, np.int64),
-        covariance=filled(columns.covariance),
-        hits=filled(columns.hits),
-        score=filled(columns.score),
-        birth=filled(columns.birth),
     )
 
 
 @compiled
 def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
-    """Return the maps with free slots for a number of landmarks, and free rows in the pool."""
-    P, K = maps.block.shape
-    slots, used = len(maps.hits), 0
-    for j in range(slots):
-        used += maps.hits[j] > 0
-    if used + landmarks > slots:
-        more = max((used + landmarks - slots + ROOM - 1) // ROOM, K)
-        block = np.full((P, K + more), -1, np.int32)
-        block[:, :K] = maps.block
-        maps = Maps(
-            block, maps.mean, maps.owners, maps.free, maps.free_count,
-            np.concatenate((maps.covariance, np.zeros((more * ROOM, 3)))),
-            np.concatenate((maps.hits, np.zeros(more * ROOM, np.int32))),
-            np.concatenate((maps.score, np.zeros(more * ROOM, np.float32))),
-            np.concatenate((maps.birth, np.zeros(more * ROOM, np.int64))),
-        )  # fmt: skip
-    n, count = len(maps.owners), maps.free_count[0]
-    if rows <= count:
-        return maps
-    more = max(rows - count, n // 2)
-    free = np.zeros(n + more, np.int32)
-    free[:count] = maps.free[:count]
-    free[count : count + more] = np.arange(n, n + more)
+    """The same maps with places for so many landmarks more each, and so many free rows in the pool."""
+    particles, k = maps.block.shape
+    places = landmarks
+    for p in range(particles):
+        places = max(places, maps.places[p] + landmarks)
+    block = maps.block
+    if places > k * ROOM:
+        block = np.full((particles, max((places + ROOM - 1) // ROOM, 2 * k)), -1, np.int32)
+        for p in range(particles):
+            for i in range(k):
+                block[p, i] = maps.block[p, i]
+    n, free = len(maps.owners), maps.free_count[0]
+    if rows <= free:
+        return _with_block(maps, block)
+    more = max(rows - free, n // 2)
+    grown = Maps(
+        block,
+        maps.places,
+        np.zeros((n + more, ROOM, 2)),
+        np.zeros((n + more, ROOM, 3)),
+        np.zeros((n + more, ROOM), np.int32),
+        np.zeros((n + more, ROOM), np.float32),
+        np.zeros((n + more, ROOM), np.int64),
+        np.empty((n + more, 4)),
+        np.zeros(n + more, np.int32),
+        np.zeros(n + more, np.int32),
+        np.array([free + more]),
+    )
+    for b in range(n):
+        _copy_row(maps, b, grown, b)
+        grown.owners[b] = maps.owners[b]
+    for b in range(n, n + more):
+        grown.box[b, 0] = grown.box[b, 1] = np.inf
+        grown.box[b, 2] = grown.box[b, 3] = -np.inf
+        grown.free[free + b - n] = b
+    for i in range(free):
+        grown.free[i] = maps.free[i]
+    return grown
+
+
+@compiled_within
+def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
+    """Row b of the pool into row n of another one or of the same; written out, for a copy of slices brings
+    its errors' words along, which take seconds to compile."""
+    for o in range(ROOM):
+        other.mean[n, o, 0], other.mean[n, o, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+        for a in range(3):
+            other.covariance[n, o, a] = maps.covariance[b, o, a]
+        other.hits[n, o], other.score[n, o] = maps.hits[b, o], maps.score[b, o]
+        other.birth[n, o] = maps.birth[b, o]
+    for a in range(4):
+        other.box[n, a] = maps.box[b, a]
+
+
+@compiled
+def _with_block(maps: Maps, block: Int32) -> Maps:
     return Maps(
-        maps.block,
-        np.concatenate((maps.mean, np.zeros((more, ROOM, 2)))),
-        np.concatenate((maps.owners, np.zeros(more, np.int32))),
-        free,
-        np.array([count + more]),
-        maps.covariance, maps.hits, maps.score, maps.birth,
+        block, maps.places, maps.mean, maps.covariance, maps.hits, maps.score, maps.birth, maps.box,
+        maps.owners, maps.free, maps.free_count,
     )  # fmt: skip
 
 
 def taken(maps: Maps, rows: Int) -> Maps:
-    """Return the maps of redrawn particles: particle k gets the map of particle rows[k]. The pool is new and
-    has no free rows; its order depends only on the maps, so that a saved state has the same bytes."""
-    slots = np.flatnonzero(maps.hits)
-    K = max(int(slots.max(initial=-1)) // ROOM + 1, 1)
-    names, first, inverse = np.unique(maps.block[rows, :K], return_index=True, return_inverse=True)
-    rank = np.empty(len(names), np.int32)
-    order = np.argsort(first)
-    rank[order] = np.arange(len(names))
-    block = rank[inverse.reshape(len(rows), K)]
+    """Maps of particles drawn anew, one of each row, in a pool of their own without free rows.
+
+    The pool's rows stand in the order in which the particles name them: where they lay before, which
+    hangs on what was freed when, does not show, and a saved state has the same bytes whoever saved it.
+    """
+    block = maps.block[rows, : max(-(-int(maps.places[rows].max(initial=0)) // ROOM), 1)]
+    names, first = np.unique(block[block >= 0], return_index=True)
+    held = names[np.argsort(first)]
+    row_of = np.full(len(maps.owners) + 1, -1, np.int32)  # the last one stands for -1
+    row_of[held] = np.arange(len(held))
+    block = row_of[block]
+    kept = {
+        name: getattr(maps, name)[held] for name in ("mean", "covariance", "hits", "score", "birth", "box")
+    }
     return maps._replace(
+        **kept,
         block=block,
-        mean=maps.mean[names[order]],
-        owners=np.bincount(block.ravel(), minlength=len(names)).astype(np.int32),
-        free=np.zeros(len(names), np.int32),
+        places=maps.places[rows],
+        owners=np.bincount(block[block >= 0], minlength=len(held)).astype(np.int32),
+        free=np.zeros(len(held), np.int32),
         free_count=np.zeros(1, np.int64),
-        **{name: getattr(maps, name)[: K * ROOM].copy() for name in ("covariance", "hits", "score", "birth")},
     )
 
 
 def is_sound(maps: Maps, particles: int) -> bool:
-    """Return whether maps that come from a file fit a number of particles and their own pool."""
-    if maps.block.ndim != 2 or maps.block.shape[0] != particles:
+    """Whether maps that come from a file fit so many particles and their own pool."""
+    template = _with_pool(maps.block, maps.places, len(maps.owners))
+    if any(getattr(maps, name).shape != getattr(template, name).shape for name in Maps._fields):
         return False
-    slots, rows, free = maps.block.shape[1] * ROOM, len(maps.owners), int(maps.free_count.sum())
-    shapes = {
-        "mean": (rows, ROOM, 2), "owners": (rows,), "free": (rows,), "free_count": (1,),
-        "covariance": (slots, 3), "hits": (slots,), "score": (slots,), "birth": (slots,),
-    }  # fmt: skip
-    if any(getattr(maps, name).shape != shape for name, shape in shapes.items()):
+    if maps.block.ndim != 2 or maps.block.shape[:1] != (particles,) or maps.places.shape != (particles,):
         return False
-    if not (maps.block.min(initial=0) >= -1 and maps.block.max(initial=-1) < rows and 0 <= free <= rows):
+    rows, free = len(maps.owners), int(maps.free_count[0])
+    if not (maps.block.min(initial=-1) >= -1 and maps.block.max(initial=-1) < rows and 0 <= free <= rows):
         return False
     held = np.bincount(maps.block[maps.block >= 0], minlength=rows)
+    needed = np.arange(maps.block.shape[1]) * ROOM < maps.places[:, None]
     return (
-        not np.any(maps.block[:, np.flatnonzero(maps.hits) // ROOM] < 0)
+        bool(np.all((maps.places >= 0) & (maps.places <= maps.block.shape[1] * ROOM)))
+        and not np.any(maps.block[needed] < 0)
         and np.array_equal(held, maps.owners)
         and np.array_equal(np.sort(maps.free[:free]), np.flatnonzero(held == 0))
     )
 
 
 @compiled
-def slots_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Int, Float]:
-    """Return the landmarks of one particle within a distance of a place: slots, shape (L,), and their
-    positions, shape (L, 2) [m]."""
-    slots, mean, n = np.empty(len(maps.hits), np.int64), np.empty((len(maps.hits), 2)), 0
-    for j in range(len(maps.hits)):
-        if maps.hits[j] == 0:
-            continue
-        b = maps.block[p, j // ROOM]
-        u, v = maps.mean[b, j % ROOM, 0], maps.mean[b, j % ROOM, 1]
-        if (u - x) * (u - x) + (v - y) * (v - y) < reach * reach:
-            slots[n], mean[n, 0], mean[n, 1] = j, u, v
+def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
+    """The landmarks of one particle, copied; the columns of MapColumns."""
+    places = maps.places[p]
+    mean, covariance = np.empty((places, 2)), np.empty((places, 3))
+    hits, score = np.empty(places, np.int32), np.empty(places, np.float32)
+    birth = np.empty(places, np.int64)
+    n = 0
+    for i in range(places):
+        b, o = maps.block[p, i // ROOM], i % ROOM
+        if maps.hits[b, o] > 0:
+            mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+            for a in range(3):
+                covariance[n, a] = maps.covariance[b, o, a]
+            hits[n], score[n], birth[n] = maps.hits[b, o], maps.score[b, o], maps.birth[b, o]
             n += 1
-    return slots[:n], mean[:n]
+    return mean[:n], covariance[:n], hits[:n], score[:n], birth[:n]
 
 
 @compiled
-def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
-    """Return the landmarks of one particle, copied; the columns of MapColumns."""
-    slots, mean = slots_near(maps, p, 0.0, 0.0, 0.5 * ABSENT)
-    return mean, maps.covariance[slots], maps.hits[slots], maps.score[slots], maps.birth[slots]
+def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32]:
+    """The landmarks of one particle within a reach of a place: mean, shape (L, 2) [m], covariance xx, xy, yy,
+    shape (L, 3) [m^2], and hits, shape (L,)."""
+    places = maps.places[p]
+    mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
+    n = 0
+    for k in range((maps.places[p] + ROOM - 1) // ROOM):
+        b = maps.block[p, k]
+        dx = max(maps.box[b, 0] - x, 0.0, x - maps.box[b, 2])
+        dy = max(maps.box[b, 1] - y, 0.0, y - maps.box[b, 3])
+        if not dx * dx + dy * dy < reach * reach:
+            continue
+        for o in range(min(ROOM, maps.places[p] - k * ROOM)):
+            dx, dy = maps.mean[b, o, 0] - x, maps.mean[b, o, 1] - y
+            if maps.hits[b, o] > 0 and dx * dx + dy * dy < reach * reach:
+                mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
+                for a in range(3):
+                    covariance[n, a] = maps.covariance[b, o, a]
+                hits[n] = maps.hits[b, o]
+                n += 1
+    return mean[:n], covariance[:n], hits[:n]
+
+
+@compiled
+def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[Int32, Int32, int]:
+    """The blocks of each particle that may hold landmarks in reach of its pose.
+
+    Args:
+        pose: shape (P, 3); reach: [m].
+        fresh: Landmarks that each particle may begin.
+
+    Returns:
+        int32, shape (P, K), ascending, the first of each row valid; int32, shape (P,), how many; and how
+        many free rows of the pool all of that may take.
+    """
+    near = np.empty(maps.block.shape, np.int32)
+    length = np.empty(pose.shape[0], np.int32)
+    shared = _fill_in_reach(maps, pose, reach, near, length)
+    return near, length, pose.shape[0] * (fresh // ROOM + 2) + shared
+
+
+@compiled_borrowing
+def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: Int32) -> int:
+    """Fill what `blocks_in_reach` gives; returns how many of those blocks other particles hold too."""
+    shared = 0
+    for p in range(pose.shape[0]):
+        n = 0
+        for k in range((maps.places[p] + ROOM - 1) // ROOM):
+            b = maps.block[p, k]
+            dx = max(maps.box[b, 0] - pose[p, 0], 0.0, pose[p, 0] - maps.box[b, 2])
+            dy = max(maps.box[b, 1] - pose[p, 1], 0.0, pose[p, 1] - maps.box[b, 3])
+            if dx * dx + dy * dy <= reach * reach:
+                near[p, n] = k
+                n += 1
+                shared += maps.owners[b] > 1
+        length[p] = n
+    return shared
+
+
+@compiled_within
+def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
+    """Let the bounding box of row b of the pool hold these places too."""
+    maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x_min), min(maps.box[b, 1], y_min)
+    maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x_max), max(maps.box[b, 3], y_max)
 
 
 @compiled_within
 def own_block(maps: Maps, p: int, k: int) -> int:
-    """Return the row of block k of particle p for writing; it is copied before if others share it."""
+    """The row of block k of particle p, for it to write in: copied before if others hold it too."""
     b = maps.block[p, k]
     if b >= 0 and maps.owners[b] == 1:
         return int(b)
     maps.free_count[0] -= 1
     n = maps.free[maps.free_count[0]]
-    for o in range(ROOM):
-        for a in range(2):
-            maps.mean[n, o, a] = maps.mean[b, o, a] if b >= 0 else 0.0
-    if b >= 0:
+    if b < 0:
+        for o in range(ROOM):
+            maps.hits[n, o] = 0
+        maps.box[n, 0] = maps.box[n, 1] = np.inf
+        maps.box[n, 2] = maps.box[n, 3] = -np.inf
+    else:
+        _copy_row(maps, b, maps, n)
         maps.owners[b] -= 1
     maps.owners[n] = 1
     maps.block[p, k] = n
@@ -260,7 +315,7 @@ def own_block(maps: Maps, p: int, k: int) -> int:
 
 @compiled_borrowing
 def take_ancestors(ancestors: Int, pose: Float, maps: Maps) -> None:
-    """Give each particle pose and map of its ancestor, in place; blocks are shared until one writes.
+    """Make each particle its ancestor's twin, in place: their blocks are shared until one of them writes.
 
     Needs ancestors[ancestors] == ancestors, so that no particle is read after it was overwritten.
     """
@@ -282,3 +337,4 @@ def take_ancestors(ancestors: Int, pose: Float, maps: Maps) -> None:
                     maps.free[maps.free_count[0]] = old
                     maps.free_count[0] += 1
             maps.block[i, k] = new
+        maps.places[i] = maps.places[a]

@@ -31,7 +31,7 @@ def inverse(a: Float) -> Float:
     return np.column_stack([-c * a[:, 0] - s * a[:, 1], s * a[:, 0] - c * a[:, 1], wrap_angle(-a[:, 2])])
 
 
-def interpolated(keyframes: Float, motions: Float, keyframe: Int, since: Float) -> Float:
+def interpolated(keyframes: Float, motions: Float, scans: Int, keyframe: Int, since: Float) -> Float:
     """Return the pose of each scan between corrected keyframes, x, y [m], yaw [rad], shape (N, 3).
 
     Each pose is its keyframe composed with the odometry since then. The remaining difference to the next
@@ -41,7 +41,8 @@ def interpolated(keyframes: Float, motions: Float, keyframe: Int, since: Float) 
         keyframes: Corrected poses, shape (K, 3).
         motions: Motion by odometry from keyframe k - 1 to k, shape (K, 3); NaN without odometry, then nothing
             is distributed.
-        keyframe: Row of the last keyframe before or at each scan, int64, shape (N,), ascending.
+        scans: Scan of each keyframe, int64, shape (K,), ascending.
+        keyframe: Row of the last keyframe before or at each scan, int64, shape (N,); 0 before the first one.
         since: Motion by odometry from that keyframe to the scan, shape (N, 3).
     """
     lacking = np.zeros_like(keyframes)
@@ -49,8 +50,8 @@ def interpolated(keyframes: Float, motions: Float, keyframe: Int, since: Float) 
         between = composed(inverse(keyframes[:-1]), keyframes[1:])
         lacking[:-1] = composed(inverse(motions[1:]), between)
     lacking[np.isnan(lacking).any(axis=1)] = 0.0
-    first = np.searchsorted(keyframe, np.arange(len(keyframes) + 1))
-    part = (np.arange(len(keyframe)) - first[keyframe]) / (first[keyframe + 1] - first[keyframe])
+    after = np.maximum(np.arange(len(keyframe)) - scans[keyframe], 0)
+    part = after / np.diff(scans, append=len(keyframe))[keyframe]
     return composed(composed(keyframes[keyframe], since), part[:, None] * lacking[keyframe])
 
 

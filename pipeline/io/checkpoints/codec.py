@@ -26,9 +26,6 @@ NOT_SAVED = "not saved"  # in the metadata of a field that is not saved and gets
 # In the metadata of a field that files of an earlier version lack: a function of the other fields that
 # returns its value, or None for its default.
 ADDED = "added"
-# Method of a NamedTuple that returns its type in files of an earlier version; that has another number of
-# columns, and a method `upgraded` that returns the present type.
-EARLIER = "earlier"
 _ALIGN = 8
 _hints = cache(typing.get_type_hints)
 
@@ -143,9 +140,6 @@ def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN
         return tree
     if isinstance(kind, type) and issubclass(kind, tuple):  # a NamedTuple, saved as a row
         hints = _hints(kind)
-        earlier = getattr(kind, EARLIER, None)
-        if earlier is not None and len(tree) == len(_hints(earlier())):
-            return _decoded(earlier(), tree, blob, name).upgraded()
         return kind(*_tuple(tuple(hints.values()), tree, blob, name))
     if is_dataclass(kind):
         return _record(kind, tree, blob, name)

@@ -1,4 +1,4 @@
-"""Candidate pairs: all that any particle may associate, with the covariances of the textbook."""
+"""Cells and pairs: what is found by them is what a look at every landmark finds."""
 
 from __future__ import annotations
 
@@ -7,66 +7,81 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.slam.candidate_pairs import candidate_pairs, relative_positions, rotated_rows
-from pipeline.slam.particle_maps import MapColumns, own_block, shared_map, with_room
-from tests.pipeline.strategies import seeds
+from pipeline.geometry.gaussian import Pose, expected_spread, pose_of
+from pipeline.geometry.hash_grid import cells_for, clear, fill, holds_unseen, per_metre
+from pipeline.slam.candidate_pairs import likely_pairs, room_for
+
+SEEDS = st.integers(0, 2**32 - 1)
 
 
-def full(rows):
-    return np.array([[rows[0], rows[1]], [rows[1], rows[2]]])
+@given(SEEDS, st.sampled_from([0.05, 1.0, 4.0, 20.0]))
+def test_cells_find_who_stands_near(seed: int, radius: float) -> None:
+    random = np.random.default_rng(seed)
+    mean = random.uniform(-60.0, 60.0, (80, 2))
+    mean[40:] = mean[:40] + random.normal(0.0, radius, (40, 2))
+    seen = random.uniform(size=80) < 0.5
+    cells, scale = cells_for(80), per_metre(radius)
+    fill(cells, mean, 80, scale)
+    for x, y in mean[:20]:
+        wanted = np.any(~seen & (np.hypot(mean[:, 0] - x, mean[:, 1] - y) <= radius))
+        assert holds_unseen(cells, mean, seen, x, y, radius**2, scale) == wanted
+    clear(cells, 80)
+    assert np.all(cells.head == -1)
 
 
-def rotation(angle):
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+@pytest.mark.parametrize("distance_max", [0.5, 1.0, 4.0])
+@given(seed=SEEDS)
+def test_pairs_are_all_within_the_gate_and_sorted(seed: int, distance_max: float) -> None:
+    random = np.random.default_rng(seed)
+    mean = random.uniform(-12.0, 12.0, (60, 2))
+    covariance = np.tile([0.02, 0.0, 0.03], (60, 1)) * random.uniform(0.1, 5.0, (60, 1))
+    mu, spread = (
+        np.array([*random.normal(0.0, 1.0, 2), random.uniform(-3.0, 3.0)]),
+        np.diag([0.01, 0.02, 1e-4]),
+    )
+    pose = pose_of(mu, spread)
+    c, s = np.cos(mu[2]), np.sin(mu[2])
+    centre = (mean[:30] + random.normal(0.0, 0.3, (30, 2)) - mu[:2]) @ np.array([[c, -s], [s, c]])
+    R = np.tile([0.004, 0.001, 0.002], (30, 1))
+    cells, room = cells_for(60), room_for(30, 60)
+    scale, gate2 = per_metre(distance_max), 9.0
+    fill(cells, mean, 60, scale)
+    found: dict[tuple[int, int], float] = {}
+    for _ in range(2):  # the second time in the turns of the first
+        n = likely_pairs(pose, c, s, centre, R, mean, covariance, cells, scale, gate2, distance_max, room)
+        found = {
+            (int(d), int(j)): cost
+            for d, j, cost in zip(room.detection[:n], room.landmark[:n], room.cost[:n], strict=True)
+        }
+        assert found == pytest.approx(_all_pairs(pose, centre, R, mean, covariance, gate2, distance_max))
+        assert np.all(np.diff(room.cost[room.order[:n]]) >= 0.0)
+        assert sorted(room.turn) == list(range(30))
+        assert np.all(room.landmark_of == -1)
+    for d in range(30):
+        costs = sorted(cost for (one, _), cost in found.items() if one == d)
+        assert [room.best[d], room.second[d]] == [*costs, np.inf, np.inf][:2]
 
 
-@given(seeds, st.integers(1, 40))
-def test_landmarks_in_the_body_frame_are_those_of_each_particle(seed, landmarks):
-    rng = np.random.default_rng(seed)
-    mean = rng.normal(0.0, 9.0, (landmarks, 2))
-    ones = np.ones(landmarks, np.int32)
-    columns = MapColumns(mean, np.ones((landmarks, 3)), ones, ones.astype(np.float32), np.arange(landmarks))
-    maps = with_room(shared_map(4, columns), 0, 100)
-    moved = rng.integers(0, landmarks)
-    maps.mean[own_block(maps, 2, moved // 16), moved % 16] += [0.5, -0.2]
-    pose = rng.normal(0.0, 1.0, (4, 3))
-    relative, apart = relative_positions(maps, np.arange(landmarks), pose, 1)
-    for p in range(4):
-        own = mean.copy()
-        if p == 2:
-            own[moved] += [0.5, -0.2]
-        np.testing.assert_allclose(relative[p], (own - pose[p, :2]) @ rotation(pose[p, 2]), atol=1e-9)
-    np.testing.assert_allclose(apart, np.hypot(*(relative - relative[1]).T).max(axis=1), atol=1e-9)
-
-
-@pytest.mark.parametrize("distance_max", [0.5, 4.0])
-@given(seed=seeds)
-def test_pairs_are_all_within_reach_of_any_particle(seed, distance_max):
-    rng = np.random.default_rng(seed)
-    relative = rng.uniform(-9.0, 9.0, (6, 30, 2))[:1] + rng.normal(0.0, 0.3, (6, 30, 2))
-    apart = np.hypot(*(relative - relative[0]).T).max(axis=1)
-    covariance = np.tile([0.02, 0.003, 0.03], (30, 1)) * rng.uniform(0.1, 5.0, (30, 1))
-    centre, R = rng.uniform(-9.0, 9.0, (20, 2)), np.tile([0.004, 0.001, 0.002], (20, 1))
-    A = rng.normal(size=(3, 3)) * [[0.3], [0.3], [0.05]]
-    P = A @ A.T
-    pairs = candidate_pairs(centre, R, relative[0], apart, covariance, np.ones(30, np.bool_), P, distance_max)
-    detection = np.repeat(np.arange(20), np.diff(pairs.first))
-    found = set(zip(detection.tolist(), pairs.row.tolist(), strict=True))
-    near = np.hypot(*(relative[:, None] - centre[:, None]).transpose(3, 0, 1, 2)) <= distance_max
-    assert found >= set(map(tuple, np.argwhere(near.any(axis=0)).tolist()))
-    for d, k in zip(detection, range(len(pairs.row)), strict=True):
-        own = full(R[d]) + full(covariance[pairs.row[k]])
-        J = np.array([[1.0, 0.0, -centre[d, 1]], [0.0, 1.0, centre[d, 0]]])
-        S = own + J @ P @ J.T
-        np.testing.assert_allclose(full(pairs.spread[k]), own)
-        np.testing.assert_allclose(full(pairs.gate[k]), np.linalg.inv(S), rtol=1e-6)
-        assert pairs.log_det[k] == pytest.approx(np.linalg.slogdet(S)[1], abs=1e-9)
-
-
-@given(seeds, st.floats(-7.0, 7.0))
-def test_rotated_covariances_are_those_of_the_rotated_axes(seed, angle):
-    rows = np.array([[0.4, 0.1, 0.2]]) * np.random.default_rng(seed).uniform(0.1, 3.0, (5, 1))
-    for before, after in zip(rows, rotated_rows(rows, angle), strict=True):
-        np.testing.assert_allclose(
-            full(after), rotation(angle) @ full(before) @ rotation(angle).T, atol=1e-12
-        )
+def _all_pairs(
+    pose: Pose,
+    centre: np.ndarray,
+    R: np.ndarray,
+    mean: np.ndarray,
+    covariance: np.ndarray,
+    gate2: float,
+    distance_max: float,
+) -> dict[tuple[int, int], float]:
+    """By the equations, every detection with every landmark."""
+    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
+    pairs = {}
+    for d, (x, y) in enumerate(centre):
+        away = np.array([c * x - s * y, s * x + c * y])
+        xx, xy, yy = expected_spread(pose, c, s, away[0], away[1], R, d)
+        for j, at in enumerate(mean):
+            S0, S1, S2 = np.array([xx, xy, yy]) + covariance[j]
+            S = np.array([[S0, S1], [S1, S2]])
+            off = at - away - [pose.x, pose.y]
+            d2 = off @ np.linalg.solve(S, off)
+            if off @ off <= distance_max**2 and d2 <= gate2:
+                pairs[d, j] = d2 + np.log(np.linalg.det(S))
+    return pairs

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam import FastSlam
-from pipeline.slam.landmarks import VARIANCE_MIN, kalman_gain
+from pipeline.slam.landmarks import VARIANCE_MIN, kalman_update
 from pipeline.slam.motion import compound, moved_poses, noise_of, step_variances
 from pipeline.slam.particle_maps import ROOM, own_block, take_ancestors, with_room
 from pipeline.slam.resampling import low_variance_ancestors, normalised
@@ -131,9 +131,9 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
     m, z = rng.normal(size=2), rng.normal(size=2)
     wanted_m, wanted_P = update(m.copy(), _full(Sigma), z, R=_full(R), H=np.eye(2))
     precision = np.linalg.inv(np.linalg.inv(_full(Sigma)) + np.linalg.inv(_full(R)))
-    rows = np.stack([Sigma, Sigma])
-    gain = kalman_gain(rows, 1, R[0], R[1], R[2], 1e9)
-    told_m, told = m + np.reshape(gain, (2, 2)) @ (z - m), rows[1]
+    rows_m, rows = np.stack([m, m]), np.stack([Sigma, Sigma])
+    kalman_update(rows_m, rows, 1, z[0], z[1], R[0], R[1], R[2], 1e9)
+    told_m, told = rows_m[1], rows[1]
     np.testing.assert_array_equal(rows[0], Sigma)
     np.testing.assert_allclose(told_m, wanted_m, atol=1e-9)
     wanted = np.array([max(wanted_P[0, 0], VARIANCE_MIN), wanted_P[0, 1], max(wanted_P[1, 1], VARIANCE_MIN)])
@@ -143,9 +143,9 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
 
 @given(covariances, covariances, st.integers(1, 400))
 def test_a_landmark_s_covariance_stays_positive(Sigma, R, times):
-    rows = Sigma[None].copy()
+    m, rows = np.zeros((1, 2)), Sigma[None].copy()
     for _ in range(times):
-        kalman_gain(rows, 0, R[0], R[1], R[2], 1e9)
+        kalman_update(m, rows, 0, 0.0, 0.0, R[0], R[1], R[2], 1e9)
     P = rows[0]
     assert np.all(np.linalg.eigvalsh(_full(P)) > 0)
     assert min(P[0], P[2]) >= VARIANCE_MIN
@@ -304,7 +304,7 @@ def test_what_particles_share_changes_nothing_of_what_they_learn():
     for k in range(2, 12):
         maps = with_room(shared.state.copy().maps, 0, 5000)
         for p in range(100):
-            for b in np.unique(np.flatnonzero(maps.hits) // ROOM):
+            for b in range(-(-maps.places[p] // ROOM)):
                 own_block(maps, p, b)
         apart.state = replace(shared.state.copy(), maps=maps)
         scan = detections(TREES + rng.normal(0, 0.03, TREES.shape) - [0.2 * (k - 1), 0.0])
@@ -362,7 +362,7 @@ def test_another_number_of_particles_keeps_the_belief(before, after):
     changed = state.with_particles(after)
     if before == after:
         return
-    assert len(changed.pose) == len(changed.maps.block) == after
+    assert len(changed.pose) == len(changed.maps.places) == after
     for row, weight in enumerate(weights):
         drawn = np.count_nonzero((changed.pose == state.pose[row]).all(axis=1))
         assert np.floor(after * weight - 1e-9) <= drawn <= np.ceil(after * weight + 1e-9)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 
 from pipeline.config import preset
-from pipeline.geometry.gaussian import Pose
+from pipeline.geometry.gaussian import pose_of
 from pipeline.geometry.poses import Pose2
 from pipeline.slam import FastSlam
 from pipeline.slam.joint_association import CHOICES, MOST, choose_jointly, doubts_for
@@ -40,10 +40,6 @@ def filled(scene_, n, choices, rng):
         doubts.detection[i], doubts.choices[i] = i, choices
         doubts.landmark[i, :choices] = rng.permutation(trees)[:choices]
     return doubts
-
-
-def pose_of(mu, P):
-    return Pose(mu[0], mu[1], mu[2], P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
 
 
 def full(rows):

@@ -1,4 +1,4 @@
-"""Quality of the pose: its figures in simulated drives, and the state that follows from them."""
+"""The health of SLAM: honest figures, and a word that follows them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,14 @@ from pipeline.slam.running_statistics import (
     RunningStatistics,
     update_statistics,
 )
-from pipeline.slam.scan_statistics import ScanStatistics, disagreement
+from pipeline.slam.scan_statistics import (
+    INNOVATION,
+    RECOGNISED,
+    SHIFT,
+    STATISTICS,
+    ScanStatistics,
+    average_statistics,
+)
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam
@@ -38,35 +45,33 @@ WORLD = np.stack(np.meshgrid(np.arange(-12.0, 13.0, 4.0), [-3.0, 3.0]), axis=-1)
 
 
 def seen(pose, sigma=0.02, rng=None, reach=9.0):
-    """Return detections of the trees of the world from a pose, with Gaussian errors if `rng` is given."""
+    """Detections of the world's trees from a pose."""
     centre = pose.inverse().apply(WORLD)
     centre = centre[np.hypot(*centre.T) < reach]
     return detections(centre + (rng.normal(0, sigma, centre.shape) if rng else 0.0), sigma=sigma)
 
 
 def driven(slam, scans, rng, start=0, at=0.0, step=0.05):
-    """Return the health of each scan of a straight drive and the last position [m]."""
-    healths = []
+    """The health of each scan of a straight drive with honest errors."""
+    told = []
     for k in range(start, start + scans):
         at += step if k else 0.0
-        healths.append(
-            slam.process(k, Pose2(step if k else 0.0), seen(Pose2(at), rng=rng), NOTHING_SEEN).health
-        )
-    return healths, at
+        told.append(slam.process(k, Pose2(step if k else 0.0), seen(Pose2(at), rng=rng), NOTHING_SEEN).health)
+    return told, at
 
 
-def test_an_undisturbed_drive_is_good_with_consistent_figures():
-    healths, _ = driven(FastSlam(FOREST, 0), 60, np.random.default_rng(0))
-    assert {h.state for h in healths} == {"good"}
-    assert all(h.reason == "" for h in healths)
-    assert 0.4 < np.nanmean([h.innovation for h in healths]) < 1.6
-    assert healths[-1].recognised == pytest.approx(healths[-1].detections, abs=0.5)
-    assert healths[-1].sigma_xy < 0.05
-    assert 1 <= healths[-1].ancestors <= 100
-    assert healths[-1].n_eff >= 1.0
+def test_an_honest_drive_is_good_with_figures_near_what_they_should_be():
+    told, _ = driven(FastSlam(FOREST, 0), 60, np.random.default_rng(0))
+    assert {h.state for h in told} == {"good"}
+    assert all(h.reason == "" for h in told)
+    assert 0.4 < np.nanmean([h.innovation for h in told]) < 1.6
+    assert told[-1].recognised == pytest.approx(told[-1].detections, abs=0.5)
+    assert told[-1].sigma_xy < 0.05
+    assert 1 <= told[-1].ancestors <= 100
+    assert told[-1].n_eff >= 1.0
 
 
-def test_covariances_that_are_too_small_increase_the_innovation():
+def test_errors_that_were_told_too_small_show_in_the_innovation():
     rng = np.random.default_rng(0)
     slam, word = FastSlam(FOREST, 0), []
     for k in range(60):
@@ -76,7 +81,7 @@ def test_covariances_that_are_too_small_increase_the_innovation():
     assert np.nanmean([h.innovation for h in word[20:]]) > 1.5
 
 
-def test_wheel_slip_increases_the_deviation_from_the_odometry():
+def test_wheels_that_slip_show_in_the_odometry():
     rng = np.random.default_rng(0)
     slam = FastSlam(FOREST, 0)
     honest, at = driven(slam, 30, rng)
@@ -107,15 +112,15 @@ def test_a_kidnapped_robot_is_lost():
     assert next(h for h in words if h.state == "lost").reason
 
 
-def test_a_drive_without_known_trees_is_weak():
+def test_driving_where_nothing_is_known_is_weak():
     rng = np.random.default_rng(0)
     slam = FastSlam(FOREST, 0)
     driven(slam, 30, rng)
     empty = [slam.process(k, Pose2(0.5), detections([]), NOTHING_SEEN).health for k in range(30, 42)]
-    health = empty[-1]
-    assert health.state == "weak"
-    assert "only odometry" in health.reason
-    assert np.isnan(health.innovation)
+    told = empty[-1]
+    assert told.state == "weak"
+    assert "only odometry" in told.reason
+    assert np.isnan(told.innovation)
 
 
 @pytest.mark.parametrize(
@@ -132,13 +137,24 @@ def test_a_drive_without_known_trees_is_weak():
         (RunningStatistics(ambiguous=0.9), 0.1, "", "weak"),
     ],
 )
-def test_state_and_reason_by_running_statistics(recent, sigma, doubt, state):
+def test_the_word_and_its_reason(recent, sigma, doubt, state):
     health = pose_health(recent, ScanStatistics(), 50.0, 20, np.diag([sigma**2, sigma**2, 0.01**2]), doubt)
     assert health.state == state
     assert bool(health.reason) == (state != "good")
 
 
-def test_a_scan_without_detections_keeps_the_running_means():
+@given(seeds)
+def test_what_the_particles_tell_is_weighted(seed):
+    rng = np.random.default_rng(seed)
+    told = rng.uniform(1.0, 2.0, (8, STATISTICS))
+    alone = np.eye(8)[3]
+    scan = average_statistics(told, alone, 5, np.eye(3))
+    assert scan.recognised == pytest.approx(told[3, RECOGNISED])
+    assert scan.innovation == pytest.approx(told[3, INNOVATION] / (2 * told[3, RECOGNISED]))
+    assert scan.odometry == pytest.approx(np.linalg.norm(told[3, SHIFT]), rel=1e-3)
+
+
+def test_a_scan_that_says_nothing_leaves_the_means():
     recent = RunningStatistics(innovation=2.0, found=0.4, ambiguous=0.3, mapped=True)
     after = update_statistics(recent, ScanStatistics(), 1.0)
     assert (after.innovation, after.found, after.ambiguous) == (2.0, 0.4, 0.3)
@@ -146,15 +162,15 @@ def test_a_scan_without_detections_keeps_the_running_means():
 
 
 @pytest.mark.parametrize(("trees", "state"), [(MANY - 1, "weak"), (MANY, "good")])
-def test_only_many_trees_are_trusted_against_an_odometry(trees, state):
-    """A smaller group may be people."""
+def test_trees_that_contradict_an_odometry_for_long_must_be_many(trees, state):
+    """Fewer may be people."""
     recent, scan = RunningStatistics(mapped=True), ScanStatistics(detections=trees, recognised=float(trees))
     for _ in range(2 * TREE_MOTION_SCANS):
         recent = update_statistics(recent, scan, 0.0, OdometryDoubt(contradicted=True))
     assert pose_health(recent, scan, 50.0, 20, np.zeros((3, 3)), "stuck").state == state
 
 
-def test_the_pose_is_good_after_trees_determined_the_motion_for_long():
+def test_trees_that_led_for_long_make_a_doubted_odometry_good():
     recent, states = RunningStatistics(mapped=True), []
     for _ in range(TREE_MOTION_SCANS + 5):
         recent = update_statistics(
@@ -171,10 +187,10 @@ def test_the_pose_is_good_after_trees_determined_the_motion_for_long():
         word = pose_health(
             recent, ScanStatistics(), 50.0, 20, np.zeros((3, 3)), "no odometry" if k % 2 else ""
         ).state
-        assert word == "good", "an intermittent doubt does not restart the counter"
+        assert word == "good", "a doubt that comes and goes does not begin anew"
     for _ in range(TREE_MOTION_MAX):
         recent = update_statistics(recent, ScanStatistics(detections=6, recognised=5.0), 0.1)
-    assert recent.led == 0, "the counter decays without a doubt"
+    assert recent.led == 0, "another doubt is another one"
 
 
 CHANCE = ScanStatistics(detections=12, recognised=1.0, found=20.0, missed=200.0)
@@ -191,8 +207,10 @@ CHANCE = ScanStatistics(detections=12, recognised=1.0, found=20.0, missed=200.0)
         (0.3, 0.0, False, 200.0, False),
     ],
 )
-def test_missing_all_trees_of_a_known_place_means_lost(familiar, alone, doubted, missed, lost):
-    """A few trees are recognised by chance."""
+def test_a_known_place_whose_trees_are_all_missed_at_once_is_another_one(
+    familiar, alone, doubted, missed, lost
+):
+    """Some trees are recognised there by chance."""
     recent, states = RunningStatistics(mapped=True, familiar=familiar, alone=alone), []
     for _ in range(STRANGE_LOST):
         recent = update_statistics(recent, replace(CHANCE, missed=missed), 0.2, OdometryDoubt(doubted))
@@ -203,7 +221,7 @@ def test_missing_all_trees_of_a_known_place_means_lost(familiar, alone, doubted,
     assert update_statistics(recent, replace(CHANCE, found=200.0), 0.2).strange == 0
 
 
-def test_new_trees_at_another_place_do_not_end_the_lost_state():
+def test_the_trees_of_another_place_do_not_soon_make_it_the_known_one():
     assert preset("forest").slam.hits_to_weigh < STRANGE_LOST
     recent = RunningStatistics(mapped=True, familiar=0.9)
     for hits in (0, 0, 0, 3, 4):
@@ -214,7 +232,7 @@ def test_new_trees_at_another_place_do_not_end_the_lost_state():
     assert is_lost(recent)
 
 
-def test_distinct_ancestors_equal_those_of_the_resampling_history():
+def test_distinct_ancestors_are_those_of_the_generations():
     rng = np.random.default_rng(0)
     genealogy, came_from = Genealogy(), []
     for k in range(3 * FOUNDED + 7):
@@ -226,14 +244,3 @@ def test_distinct_ancestors_equal_those_of_the_resampling_history():
         rows = ancestors[rows]
     assert genealogy.distinct_ancestors == len(set(rows.tolist()))
     assert Genealogy().distinct_ancestors == 0
-
-
-@given(seeds)
-def test_the_disagreement_with_the_odometry_is_a_mahalanobis_distance(seed):
-    rng = np.random.default_rng(seed)
-    A = rng.normal(size=(3, 3))
-    P = A @ A.T + 0.1 * np.eye(3)
-    trees, odometry = rng.normal(0.0, 0.5, (2, 3))
-    apart = trees - odometry
-    wanted = np.sqrt(apart @ np.linalg.solve(P, apart))
-    assert disagreement(trees, odometry, P) == pytest.approx(wanted, rel=1e-4)
