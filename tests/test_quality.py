@@ -24,7 +24,9 @@ def flaws(spec: FieldSpec) -> list[str]:
     """Rules for the name, the title and the description of a parameter that it breaks."""
     rules = {
         "its name is no dotted name": re.fullmatch(r"[a-z]+\.[a-zA-Z][a-z0-9_]*", spec.name) is not None,
-        "its description does not begin a sentence": spec.doc[0].isupper() or spec.doc[0].isdigit(),
+        "its description begins neither a sentence nor with a choice": spec.doc[0].isupper()
+        or spec.doc[0].isdigit()
+        or spec.doc.partition(":")[0] in spec.choices,
         "its description has no full stop": spec.doc.endswith("."),
         "its title ends with a full stop": not spec.title.endswith("."),
         "its title is too long for a slider": len(spec.title) <= 30,

@@ -15,6 +15,7 @@ from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.slam import SlamState
 from pipeline.slam.association import associate
 from pipeline.slam.frame_uncertainty import FrameUncertainty, transported_covariance
+from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
 from pipeline.tracking.observation import SECTORS
@@ -154,6 +155,10 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
         maps=shared_map(P, landmarks),
         detections=a.detections + b.detections,
         genealogy=Genealogy.of_path(path, P),
+        graph=KeyframeGraph(),  # no odometry connects the two runs
+        since_keyframe=(),
+        keyframe_motion=np.zeros(3),
+        keyframe_covariance=np.zeros((3, 3)),
     )
 
 

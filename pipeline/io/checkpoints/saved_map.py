@@ -166,24 +166,30 @@ def _check_graph(slam: SlamState, scans: int) -> None:
     for numbers in (graph.scans, np.array([s.scan for s in slam.since_keyframe], np.int64)):
         if len(numbers) and not (0 <= numbers[0] <= numbers[-1] < scans and np.all(np.diff(numbers) > 0)):
             raise ValueError("the keyframes are out of order")
-    _check_finite(graph.pose, slam.keyframe_motion)
+    _check_finite(graph.pose, slam.keyframe_motion, np.array(slam.distance))
     parts: list[Keyframe | ScanDetections] = [*graph.keyframes, *slam.since_keyframe]
     for part in parts:
         D = len(part.birth)
         if not (part.birth.shape == (D,) and part.centre.shape == (D, 2) and part.R.shape == (D, 3)):
             raise ValueError("the detections of a keyframe do not fit")
+        if np.any(part.birth < 0):
+            raise ValueError("a detection of a keyframe has no landmark")
         xx, xy, yy = part.R.T
-        if not np.isfinite(part.distance) or not np.all((xx > 0.0) & (xx * yy > xy * xy)):
+        positive = np.all((xx > 0.0) & (yy > 0.0)) and np.all(np.abs(xy) < np.sqrt(xx) * np.sqrt(yy))
+        if not np.isfinite(part.distance) or not positive:
             raise ValueError("a covariance of a keyframe is not positive definite")
         _check_finite(part.centre, part.R)
     edges: list[Keyframe | LoopEdge] = [*graph.keyframes, *graph.loops]
     for edge in edges:
         if edge.motion.shape != (3,) or edge.covariance.shape != (3, 3):
             raise ValueError("a motion between keyframes has another shape")
-        known = np.isfinite(edge.covariance).all()
-        if not np.isfinite(edge.motion).all() or (known and np.linalg.eigvalsh(edge.covariance)[0] < -1e-9):
-            raise ValueError("a motion between keyframes is not finite")
-    if any(not np.isin(e.scans, graph.scans).all() or np.isinf(e.covariance).any() for e in graph.loops):
+        C = edge.covariance
+        if np.isfinite(C).all() and not (np.allclose(C, C.T) and np.linalg.eigvalsh(C)[0] > -1e-9):
+            raise ValueError("the covariance of a motion between keyframes is not positive definite")
+        _check_finite(edge.motion)
+    for loop in graph.loops:
+        _check_finite(loop.covariance)
+    if any(not np.isin(loop.scans, graph.scans).all() for loop in graph.loops):
         raise ValueError("a loop has no keyframe")
 
 

@@ -38,11 +38,13 @@ def test_stems_are_found_in_a_cloud_without_ground_returns(slope):
     x, y = rng.uniform(0.0, 15.0, (2, 60_000))
     parts.append(np.column_stack([x, y, hill(x, y, slope) + rng.uniform(7.0, 10.0, len(x))]))
     m = map_plot(Made(np.concatenate(parts)), FOREST)
-    thick = PLACES[PLACES[:, 2] > 0.09]  # a thin stem without branches counts as a pole
+    thick = PLACES[PLACES[:, 2] > 0.09]  # a thin stem without branches may count as a pole
     row, away = errors(m.trees.position, thick)
-    assert len(m.trees.number) == len(thick)
+    assert len(thick) <= len(m.trees.number) <= len(PLACES)
     assert away.max() < 0.03
     assert np.abs(m.trees.dbh[row] - 2.0 * thick[:, 2]).max() < 0.012
+    to_stem = np.hypot(*(m.trees.position[:, None] - PLACES[:, :2]).transpose(2, 0, 1)).min(axis=1)
+    assert to_stem.max() < 0.03
 
 
 def test_lean_and_taper_are_told():

@@ -190,7 +190,7 @@ def _with_maps(state, **changes: Any):
         lambda s: replace(s, placed=-1),
         lambda s: replace(s, placed=13),
         lambda s: replace(s, next_number=0),
-        lambda s: _with_maps(s, places=s.slam.maps.places + 10_000),
+        lambda s: _with_maps(s, hits=s.slam.maps.hits[:-1]),
         lambda s: _with_maps(s, block=s.slam.maps.block + 1),
         lambda s: _with_maps(s, owners=s.slam.maps.owners + 1),
         lambda s: _with(s, best=100),
