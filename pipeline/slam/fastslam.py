@@ -22,6 +22,7 @@ from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.best_particle import are_apart, best_after_resampling, select_best
 from pipeline.slam.frame_uncertainty import NOISE, FrameUncertainty, at_least
 from pipeline.slam.keyframe_graph import (
+    REVISIT_DISTANCE,
     Keyframe,
     KeyframeGraph,
     ScanDetections,
@@ -193,8 +194,8 @@ class FastSlam:
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        # Since the robot left the place, the path may have drifted, and associations may be wrong.
-        graph = graph.without_revisits(graph.distance_at(loop.first))
+        # Just before the loop, associations by the drifted path may be wrong.
+        graph = graph.without_revisits(state.distance - REVISIT_DISTANCE)
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance)
         solution = graph.solve(new_loop=True)
         if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:

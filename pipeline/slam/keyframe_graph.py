@@ -218,10 +218,6 @@ class KeyframeGraph:
         row = int(np.searchsorted(self.scans, scan, side="right"))
         return self.keyframes[min(row, len(self.keyframes) - 1)].first_birth
 
-    def distance_at(self, scan: int) -> float:
-        """Return the distance driven until the first keyframe at a scan or after it [m]."""
-        return self.keyframes[min(int(np.searchsorted(self.scans, scan)), len(self.keyframes) - 1)].distance
-
     def solved_by(self, solution: Solution) -> KeyframeGraph:
         """Return the graph at its solution."""
         return replace(self, pose=solution.pose, revisits=0, solved=len(self.keyframes))
