@@ -119,11 +119,11 @@ def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
     [m]."""
     gain = np.zeros(viewed.shape[0])
     for k in range(gain.shape[0]):
-        told = 0
+        highest = 0
         for s in range(1, met.shape[1]):
             if met[k, s] + passed[k, s] > 0:
-                told = s
-        gain[k] = max(viewed[k] - figures[k, _LOOKED], told * SLICE - figures[k, _RAYS])
+                highest = s
+        gain[k] = max(viewed[k] - figures[k, _LOOKED], highest * SLICE - figures[k, _RAYS])
     return gain
 
 

@@ -392,9 +392,9 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
         # The width prior holds where the middle of the returns is the middle of the trunk; if one side is
         # hidden, the returns do not determine the width.
         beside = half.c * p[1] - half.s * p[0] - half.across
-        told = 1.0 / (least * least + beside * beside)
-        H[4, 4] += told
-        g[4] += told * (p[4] - width)
+        weight = 1.0 / (least * least + beside * beside)
+        H[4, 4] += weight
+        g[4] += weight * (p[4] - width)
         factorise(H, L)
         solve(L, g, step)
         gain = 0.0  # squared length of the step in units of its sigma

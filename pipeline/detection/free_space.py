@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing
-from pipeline.types.records import Bool, Float32
+from pipeline.jit import compiled
+from pipeline.types.records import Float32
 
 BINS = 360  # sectors of about one degree
 BEHIND = 1.0  # m; a return this far behind the position of a tree shows that the tree is absent
@@ -81,33 +81,3 @@ def directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
         turn = ((1.0 + side if x >= 0.0 else behind) + 1.0) * 0.25
         bins[i] = min(np.int32(turn * BINS), last)  # never negative, so that truncation rounds down
     return bins
-
-
-@compiled
-def in_free_view(place: Float, pose: Float, clear_range: Float, view_range: float) -> Bool:
-    """Return whether a tree at each place would have been visible to the scan, shape (N,).
-
-    Args:
-        place: Positions in the map frame, shape (N, 2) [m].
-        pose: x, y [m] and yaw [rad] of the base in the map frame, shape (3,).
-        clear_range: Free distance by direction, as returned by `clear_range`.
-        view_range: Farther places are never in free view [m].
-    """
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    free = np.zeros(place.shape[0], np.bool_)
-    for i in range(place.shape[0]):
-        free[i] = is_in_free_view(place[i], pose, c, s, clear_range, view_range)
-    return free
-
-
-@compiled_borrowing
-def is_in_free_view(
-    place: Float, pose: Float, c: float, s: float, clear_range: Float, view_range: float
-) -> bool:
-    """Return whether a tree at one place would have been visible; c and s are cosine and sine of the yaw."""
-    dx, dy = place[0] - pose[0], place[1] - pose[1]
-    reach = np.sqrt(dx * dx + dy * dy)
-    if reach > view_range:
-        return False
-    k = direction_bin(c * dx + s * dy, c * dy - s * dx, BINS)
-    return bool(clear_range[k] > reach + BEHIND)

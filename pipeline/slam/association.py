@@ -39,11 +39,17 @@ def births_of(detections: Detections, estimate: PoseEstimate, landmarks: Landmar
 
 
 class _Pairs(NamedTuple):
-    """The squared Mahalanobis distance of each pair and the determinant of its covariance, its landmark and
-    its detection; and how many there are of each detection."""
+    """Candidate pairs of detections and landmarks.
+
+    Attributes:
+        squared: Squared Mahalanobis distance of each pair.
+        cost: Determinant of its covariance; becomes its -2 log likelihood where detections compete.
+        landmark, detection: Its rows, int64.
+        of_detection: Number of pairs of each detection, int64, shape (D,).
+    """
 
     squared: Float
-    beside: Float
+    cost: Float
     landmark: Int
     detection: Int
     of_detection: Int
@@ -53,16 +59,19 @@ class _Pairs(NamedTuple):
 def associate(
     centre: Float, R: Float, mean: Float, covariance: Float, gate: float, distance_max: float
 ) -> tuple[Int, Float]:
-    """The landmark of each detection, -1 for none: pairs by falling likelihood, each used once.
+    """Associate detections with landmarks one to one, most likely pairs first.
 
     Args:
-        centre: Detections, shape (D, 2) [m]; R: their covariances xx, xy, yy, shape (D, 3).
-        mean: Landmarks in the same frame, shape (M, 2) [m]; covariance: likewise, shape (M, 3).
-        gate: Largest Mahalanobis distance [sigma].
-        distance_max: Largest distance [m].
+        centre: Detections, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        mean: Landmarks in the same frame, shape (M, 2) [m].
+        covariance: Their covariances xx, xy, yy, shape (M, 3) [m^2].
+        gate: Maximum Mahalanobis distance [sigma].
+        distance_max: Maximum distance [m].
 
     Returns:
-        landmark row and squared Mahalanobis distance of each detection, shape (D,).
+        Row of the landmark of each detection, -1 for none, int64, shape (D,), and its squared Mahalanobis
+        distance, shape (D,).
     """
     detections = centre.shape[0]
     landmark_of = np.full(detections, -1, np.int64)
@@ -77,9 +86,9 @@ def associate(
     clear = _is_one_to_one(pairs, n)
     if not clear:
         for k in range(n):
-            pairs.beside[k] = pairs.squared[k] + np.log(pairs.beside[k])
+            pairs.cost[k] = pairs.squared[k] + np.log(pairs.cost[k])
     taken = np.zeros(mean.shape[0], np.bool_)
-    for k in np.arange(n) if clear else np.argsort(pairs.beside[:n], kind="mergesort"):
+    for k in np.arange(n) if clear else np.argsort(pairs.cost[:n], kind="mergesort"):
         d, j = pairs.detection[k], pairs.landmark[k]
         if landmark_of[d] < 0 and not taken[j]:
             landmark_of[d] = j
@@ -90,7 +99,7 @@ def associate(
 
 @compiled_borrowing
 def _count_pairs(cells: Cells, scale: float, centre: Float, mean: Float, distance_max: float) -> int:
-    """How many landmarks and detections lie within reach of one another."""
+    """Return the number of pairs of a landmark and a detection within `distance_max` [m]."""
     n = 0
     for j in range(mean.shape[0]):
         u, v = first_of_four(mean[j, 0], mean[j, 1], scale)
@@ -115,8 +124,8 @@ def _add_pairs(
     gate: float,
     distance_max: float,
 ) -> int:
-    """Fill in the pairs within the gate, landmark by landmark and in the order of the detections: of pairs
-    that cost the same the first one counts. Returns how many there are."""
+    """Fill `pairs` with those within the gate, in ascending order of landmark and detection; return their
+    number. Of pairs with equal cost the first one is preferred."""
     n = 0
     for j in range(mean.shape[0]):
         first = n
@@ -132,10 +141,10 @@ def _add_pairs(
                 if y0 * y0 + y1 * y1 <= distance_max * distance_max and not d2 > gate * gate:
                     at = n
                     while at > first and pairs.detection[at - 1] > d:
-                        pairs.squared[at], pairs.beside[at] = pairs.squared[at - 1], pairs.beside[at - 1]
+                        pairs.squared[at], pairs.cost[at] = pairs.squared[at - 1], pairs.cost[at - 1]
                         pairs.detection[at] = pairs.detection[at - 1]
                         at -= 1
-                    pairs.squared[at], pairs.beside[at], pairs.detection[at] = d2, det, d
+                    pairs.squared[at], pairs.cost[at], pairs.detection[at] = d2, det, d
                     pairs.of_detection[d] += 1
                     pairs.landmark[n] = j
                     n += 1
@@ -145,7 +154,7 @@ def _add_pairs(
 
 @compiled_borrowing
 def _is_one_to_one(pairs: _Pairs, n: int) -> bool:
-    """Whether no landmark and no detection has a choice."""
+    """Return whether each landmark and each detection is in at most one pair."""
     clear = True
     for d in range(pairs.of_detection.shape[0]):
         clear = clear and pairs.of_detection[d] <= 1

@@ -1,6 +1,6 @@
-"""Which landmark each detection may be of, for one particle: pairs within the gate, the likeliest first.
+"""Candidate pairs of detections and landmarks of one particle: those within the gate, most likely first.
 
-The kernels run for each particle of each scan, so they take no memory of their own.
+The kernels run for each particle of each scan and allocate no memory.
 """
 
 from __future__ import annotations
@@ -13,24 +13,27 @@ from pipeline.geometry.gaussian import Pose, expected_spread
 from pipeline.geometry.hash_grid import Cells, cell_of, first_of_four
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
-from pipeline.slam.joint_association import CHOICES, MOST, Doubts, doubts_for
+from pipeline.slam.joint_association import CHOICES, MOST, JointSearch, search_for
 from pipeline.types.records import Bool, Int
 
-FEW = 64  # rows
-LIKELY = 6.0  # of -2 log likelihood: a second choice that is less than this behind makes a doubt
+FEW = 64  # rows that are sorted by insertion
+LIKELY = 6.0  # difference in -2 log likelihood below which a second pair makes a detection ambiguous
 
 
 class Room(NamedTuple):
-    """Memory for the pairs of one particle, taken once a scan.
+    """Work arrays for the pairs of one particle, allocated once per scan.
 
     Attributes:
-        detection, landmark: int64, shape (pairs,); cost: shape (pairs,); order: int64, shape (pairs,).
-        best, second: shape (D,): costs of the likeliest landmarks of each detection.
-        landmark_of: int64, shape (D,), -1 for none.
-        turn: int64, shape (D,): the detections in the order in which the last particle took them.
-        taken: shape (L,).
-        doubt: shape (D,): which detections have a close choice; claimed: int64, shape (L,): the row of
-            `order` with the likeliest pair of a landmark; doubts: for those that are decided together.
+        detection, landmark: Rows of each pair, int64, shape (pairs,).
+        cost: -2 log likelihood of each pair up to a constant, shape (pairs,).
+        order: Pairs in ascending cost, int64, shape (pairs,).
+        best, second: The two lowest costs of each detection, shape (D,); infinite without such a pair.
+        landmark_of: Landmark of each detection, -1 for none, int64, shape (D,).
+        sequence: Detections in the order in which their pairs are collected, int64, shape (D,).
+        taken: Whether a landmark has a detection, shape (L,).
+        ambiguous: Whether a detection is decided together with others, shape (D,).
+        claimed: Pair of each landmark with the lowest cost, int64, shape (L,).
+        search: Work arrays of the joint decision.
     """
 
     detection: Int
@@ -40,16 +43,16 @@ class Room(NamedTuple):
     best: Float
     second: Float
     landmark_of: Int
-    turn: Int
+    sequence: Int
     taken: Bool
-    doubt: Bool
+    ambiguous: Bool
     claimed: Int
-    doubts: Doubts
+    search: JointSearch
 
 
 @compiled
 def room_for(detections: int, landmarks: int) -> Room:
-    """Room for every pair; the detections take their turns by number."""
+    """Return work arrays with space for all pairs, with the detections in ascending sequence."""
     pairs = detections * landmarks
     return Room(
         np.empty(pairs, np.int64),
@@ -63,7 +66,7 @@ def room_for(detections: int, landmarks: int) -> Room:
         np.empty(landmarks, np.bool_),
         np.empty(detections, np.bool_),
         np.empty(landmarks, np.int64),
-        doubts_for(),
+        search_for(),
     )
 
 
@@ -82,18 +85,23 @@ def likely_pairs(
     distance_max: float,
     room: Room,
 ) -> int:
-    """Fill the pairs within the gate, their costs and order, and the best costs of each detection; how many.
+    """Collect the pairs within the gate in `room`, sorted by cost; return their number.
 
     Args:
-        pose: Before the scan; c, s: cosine and sine of its yaw.
-        centre: shape (D, 2) [m], base frame; R: xx, xy, yy, shape (D, 3).
-        mean, covariance: Of the landmarks; cells: which hold them, `scale` a metre.
-        gate2: Square of the largest Mahalanobis distance; distance_max: largest distance [m].
-        room: Its `turn` has every detection once; the order of the pairs and of the turns is left in it.
+        pose: Pose before the scan.
+        c, s: Cosine and sine of its yaw.
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        mean, covariance: Landmarks, see Maps.
+        cells: Hash grid of the landmarks.
+        scale: Cells per metre.
+        gate2: Square of the maximum Mahalanobis distance.
+        distance_max: Maximum distance [m].
+        room: Work arrays; `sequence` holds each detection once and is sorted for the next particle.
     """
     pairs = 0
     for i in range(centre.shape[0]):
-        d = room.turn[i]
+        d = room.sequence[i]
         room.landmark_of[d] = -1
         best = second = np.inf
         ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
@@ -122,21 +130,22 @@ def likely_pairs(
                     pairs += 1
         room.best[d], room.second[d] = best, second
     _sort(room.cost, room.order, pairs)
-    _remember_turns(room, pairs, centre.shape[0])
+    _sort_sequence(room, pairs, centre.shape[0])
     return pairs
 
 
 @compiled_within
-def find_doubts(pairs: int, found: int, room: Room) -> int:
-    """Mark the detections with a close choice and free all landmarks of the pairs; returns how many.
+def find_ambiguous(pairs: int, found: int, room: Room) -> int:
+    """Mark the ambiguous detections and reset `taken` of all landmarks of the pairs; return the number of
+    ambiguous detections.
 
-    The choice is close where a second landmark is nearly as likely, and where two detections would have one
-    landmark nearly alike.
+    A detection is ambiguous if a second landmark is nearly as likely (LIKELY), or another detection is nearly
+    as likely for the same landmark.
     """
-    doubtful = 0
+    count = 0
     for d in range(found):
-        room.doubt[d] = room.second[d] - room.best[d] < LIKELY
-        doubtful += room.doubt[d]
+        room.ambiguous[d] = room.second[d] - room.best[d] < LIKELY
+        count += room.ambiguous[d]
     for i in range(pairs):
         room.taken[room.landmark[i]] = False
     for i in range(pairs):
@@ -148,41 +157,41 @@ def find_doubts(pairs: int, found: int, room: Room) -> int:
             continue
         first = room.claimed[j]
         if room.cost[k] - room.cost[first] < LIKELY:
-            doubtful += 2 - room.doubt[d] - room.doubt[room.detection[first]]
-            room.doubt[d] = room.doubt[room.detection[first]] = True
+            count += 2 - room.ambiguous[d] - room.ambiguous[room.detection[first]]
+            room.ambiguous[d] = room.ambiguous[room.detection[first]] = True
     for i in range(pairs):
         room.taken[room.landmark[i]] = False
-    return doubtful
+    return count
 
 
 @compiled_borrowing
-def gather_doubts(pairs: int, room: Room) -> int:
-    """Fill the levels of the search with the surest of the doubtful detections and the free landmarks that
-    each may be of; returns how many levels."""
-    doubts, n = room.doubts, 0
+def fill_levels(pairs: int, room: Room) -> int:
+    """Fill the levels of the search with at most MOST ambiguous detections, lowest cost first, and the free
+    landmarks of their pairs; return the number of levels."""
+    search, n = room.search, 0
     for i in range(pairs):
         k = room.order[i]
         d, j = room.detection[k], room.landmark[k]
-        if not room.doubt[d] or room.taken[j]:
+        if not room.ambiguous[d] or room.taken[j]:
             continue
         level = 0
-        while level < n and doubts.detection[level] != d:
+        while level < n and search.detection[level] != d:
             level += 1
         if level == MOST:
             continue
         if level == n:
-            doubts.detection[n], doubts.choices[n] = d, 0
+            search.detection[n], search.choices[n] = d, 0
             n += 1
-        if doubts.choices[level] < CHOICES:
-            doubts.landmark[level, doubts.choices[level]] = j
-            doubts.choices[level] += 1
+        if search.choices[level] < CHOICES:
+            search.landmark[level, search.choices[level]] = j
+            search.choices[level] += 1
     return n
 
 
 @compiled_within
 def _sort(cost: Float, order: Int, n: int) -> None:
-    """Order the first n rows by cost, equal ones by row: Shell's sort, which needs no memory. Few rows that
-    stand nearly in order, as they do after the first particle, want its last pass alone."""
+    """Sort the first n rows of `order` by cost, then by row (Shell sort, in place). Up to FEW rows, which are
+    nearly sorted after the first particle, are sorted by its last pass."""
     gap = n // 2 if n > FEW else min(n, 1)
     while gap > 0:
         for i in range(gap, n):
@@ -199,17 +208,18 @@ def _sort(cost: Float, order: Int, n: int) -> None:
 
 
 @compiled_within
-def _remember_turns(room: Room, pairs: int, found: int) -> None:
-    """Let the next particle, which sees much the same, take the detections as this one sorted them."""
+def _sort_sequence(room: Room, pairs: int, found: int) -> None:
+    """Write the detections in the order of their best pairs into `room.sequence`, since the costs of the next
+    particle have nearly the same order; `landmark_of` becomes -1."""
     n = 0
     for i in range(pairs):
         d = room.detection[room.order[i]]
         if room.landmark_of[d] == -1:
             room.landmark_of[d] = -2
-            room.turn[n] = d
+            room.sequence[n] = d
             n += 1
     for d in range(found):
         if room.landmark_of[d] == -1:
-            room.turn[n] = d
+            room.sequence[n] = d
             n += 1
         room.landmark_of[d] = -1

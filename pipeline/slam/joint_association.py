@@ -1,14 +1,13 @@
-"""Detections that could each be of more than one landmark are decided together, for one particle.
+"""Joint data association of the ambiguous detections of one particle.
 
-Taken one by one the likeliest pair may be a wrong one, where trees stand closer than the pose is known: it
-then bends the pose, and its neighbour finds nothing. The pairs of one scan share the error of the pose, so
-what they say together tells (joint compatibility; Neira, Tardos 2001). Branch and bound over all one-to-one
-choices finds the likeliest, the log likelihood being taken pair by pair,
+Where trees are closer to each other than the pose is known, the most likely pair of a detection may be wrong;
+it then shifts the pose, and the next detection has no landmark. The pairs of one scan share the error of the
+pose, so that only one assignment explains all of them (joint compatibility; Neira, Tardos 2001). Branch and
+bound over all one-to-one assignments finds the most likely one, with
 
--2 log p(z | choice) = sum_i d_i^2 + log |S_i|,  d_i and S_i given the pairs before i,
+-2 log p(z | assignment) = sum_i d_i^2 + log |S_i|,  d_i and S_i given the pairs before i,
 
-and a detection of no landmark counting like one at the gate. Only doubtful detections get here, a few at
-a time.
+where a detection without landmark counts like a pair at the gate. The search is limited to MOST detections.
 """
 
 from __future__ import annotations
@@ -22,23 +21,26 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing
 from pipeline.types.records import Bool, Int, Int32
 
-MOST = 8  # detections at a time
-CHOICES = 4  # landmarks a detection, the likeliest
-MOST_STEPS = 512  # of the search; then the best so far holds, which is never worse than the first descent
+MOST = 8  # maximum number of detections
+CHOICES = 4  # maximum number of landmarks per detection
+MOST_STEPS = 512  # maximum number of steps; then the best assignment so far is the result
 
 
-class Doubts(NamedTuple):
-    """Memory for the search, taken once a scan; rows are levels, a doubtful detection each.
+class JointSearch(NamedTuple):
+    """Work arrays of the search, allocated once per scan. Each level is one ambiguous detection; costs are
+    -2 log likelihoods.
 
     Attributes:
-        detection: int64, shape (MOST,), the surest first; choices: int64, shape (MOST,), how many landmarks
-            it has.
-        landmark: int64, shape (MOST, CHOICES), the likeliest first, judged alone.
-        new: shape (MOST,), what no landmark costs; least: shape (MOST + 1,), what this level and those
-            behind it cost at the least.
-        cost: shape (MOST + 1,), and pose: shape (MOST + 1, 9), before each level.
-        next: int64, shape (MOST,), the choice to be tried; chosen, best: int64, shape (MOST,), landmark
-            or -1.
+        detection: Detection of each level, lowest cost first, int64, shape (MOST,).
+        choices: Number of its landmarks, int64, shape (MOST,).
+        landmark: Its landmarks, lowest cost first, int64, shape (MOST, CHOICES).
+        new: Cost of a detection without landmark, shape (MOST,).
+        least: Lower bound of the cost of this level and all later ones, shape (MOST + 1,).
+        cost: Cost of all earlier levels, shape (MOST + 1,).
+        pose: Pose before each level, see `_write_pose`, shape (MOST + 1, 9).
+        next: Next choice of each level, int64, shape (MOST,).
+        chosen: Landmark of each level in the present assignment, -1 for none, int64, shape (MOST,).
+        best: The same in the best assignment, int64, shape (MOST,).
     """
 
     detection: Int
@@ -54,9 +56,9 @@ class Doubts(NamedTuple):
 
 
 @compiled
-def doubts_for() -> Doubts:
-    """Room for one search."""
-    return Doubts(
+def search_for() -> JointSearch:
+    """Return work arrays for a search."""
+    return JointSearch(
         np.empty(MOST, np.int64),
         np.empty(MOST, np.int64),
         np.empty((MOST, CHOICES), np.int64),
@@ -74,8 +76,8 @@ def doubts_for() -> Doubts:
 def innovation(
     pose: Pose, c: float, s: float, centre: Float, R: Float, d: int, mean: Float, covariance: Float, j: int
 ) -> tuple[float, float, float, float, float, float, float]:
-    """Detection d as landmark j: where it lies from the robot, ax and ay, the innovation y0 and y1, and its
-    covariance S as xx, xy, yy, all in the frame of the map."""
+    """Return ax, ay, y0, y1, S0, S1, S2 for detection d and landmark j, in the frame of the map: vector from
+    the robot to the detection [m], innovation [m], and its covariance xx, xy, yy [m^2]."""
     ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
     S0, S1, S2 = expected_spread(pose, c, s, ax, ay, R, d)
     return (
@@ -101,51 +103,54 @@ def choose_jointly(
     hits_to_weigh: int,
     taken: Bool,
     n: int,
-    doubts: Doubts,
+    search: JointSearch,
 ) -> float:
-    """Fill `best` of the first n levels, whose detections and landmarks stand in `doubts`; -2 log likelihood.
+    """Find the most likely assignment; return its -2 log likelihood.
 
     Args:
-        pose: By the odometry and the pairs that were taken before.
-        centre, R, mean, covariance, hits, gate2, hits_to_weigh: See `proposal.recognise`.
-        taken: shape (L,): landmarks that are none of the choices; as it was when this returns.
+        pose: Pose by the odometry and the pairs that were accepted before.
+        centre, R, mean, covariance, hits, hits_to_weigh: See `proposal.recognise`.
+        gate2: Square of the maximum Mahalanobis distance.
+        taken: Landmarks that are no choices, shape (L,); unchanged on return.
+        n: Number of levels.
+        search: Work arrays with `detection`, `choices` and `landmark` of n levels; `best` is filled.
     """
-    _price(pose, centre, R, covariance, gate2, n, doubts)
+    _fill_bounds(pose, centre, R, covariance, gate2, n, search)
     least, steps, level = np.inf, 0, 0
     for i in range(n):
-        doubts.best[i] = -1
-    _keep(pose, doubts.pose, 0)
-    doubts.cost[0], doubts.next[0], doubts.chosen[0] = 0.0, 0, -1
+        search.best[i] = -1
+    _write_pose(pose, search.pose, 0)
+    search.cost[0], search.next[0], search.chosen[0] = 0.0, 0, -1
     while level >= 0:
         if level == n:
-            least = doubts.cost[n]
+            least = search.cost[n]
             for i in range(n):
-                doubts.best[i] = doubts.chosen[i]
+                search.best[i] = search.chosen[i]
             level -= 1
             continue
-        if doubts.chosen[level] >= 0:
-            taken[doubts.chosen[level]] = False
-            doubts.chosen[level] = -1
-        choice = doubts.next[level]
-        if choice > doubts.choices[level]:
+        if search.chosen[level] >= 0:
+            taken[search.chosen[level]] = False
+            search.chosen[level] = -1
+        choice = search.next[level]
+        if choice > search.choices[level]:
             level -= 1
             continue
-        doubts.next[level] += 1
+        search.next[level] += 1
         if steps >= MOST_STEPS and least < np.inf:
-            doubts.next[level] = CHOICES + 1
+            search.next[level] = CHOICES + 1
             continue
-        if _descended(
-            level, choice, centre, R, mean, covariance, hits, gate2, hits_to_weigh, taken, least, doubts
+        if _accept(
+            level, choice, centre, R, mean, covariance, hits, gate2, hits_to_weigh, taken, least, search
         ):
             steps += 1
             level += 1
             if level < n:
-                doubts.next[level], doubts.chosen[level] = 0, -1
+                search.next[level], search.chosen[level] = 0, -1
     return float(least)
 
 
 @compiled_borrowing
-def _descended(
+def _accept(
     level: int,
     choice: int,
     centre: Float,
@@ -157,74 +162,77 @@ def _descended(
     hits_to_weigh: int,
     taken: Bool,
     least: float,
-    doubts: Doubts,
+    search: JointSearch,
 ) -> bool:
-    """Take a choice of a level and prepare the next one; not where it is forbidden or cannot be the best."""
-    pose = _kept(doubts.pose, level)
-    if choice == doubts.choices[level]:
-        cost = doubts.cost[level] + doubts.new[level]
-        if not cost + doubts.least[level + 1] < least:
+    """Accept a choice of a level and write cost and pose of the next level; return False if the landmark is
+    taken, the pair is outside the gate, or the cost cannot fall below `least`."""
+    pose = _read_pose(search.pose, level)
+    if choice == search.choices[level]:
+        cost = search.cost[level] + search.new[level]
+        if not cost + search.least[level + 1] < least:
             return False
     else:
-        j = doubts.landmark[level, choice]
+        j = search.landmark[level, choice]
         if taken[j]:
             return False
         c, s = np.cos(pose.yaw), np.sin(pose.yaw)
-        d = doubts.detection[level]
+        d = search.detection[level]
         ax, ay, y0, y1, S0, S1, S2 = innovation(pose, c, s, centre, R, d, mean, covariance, j)
         det = S0 * S2 - S1 * S1
         d2 = (S2 * y0 * y0 - 2.0 * S1 * y0 * y1 + S0 * y1 * y1) / det
-        cost = doubts.cost[level] + d2 + np.log(det)
-        if not (d2 <= gate2 and cost + doubts.least[level + 1] < least):
+        cost = search.cost[level] + d2 + np.log(det)
+        if not (d2 <= gate2 and cost + search.least[level + 1] < least):
             return False
         taken[j] = True
-        doubts.chosen[level] = j
+        search.chosen[level] = j
         if hits[j] >= hits_to_weigh:
             pose = corrected(pose, ax, ay, S0, S1, S2, y0, y1)
-    doubts.cost[level + 1] = cost
-    _keep(pose, doubts.pose, level + 1)
+    search.cost[level + 1] = cost
+    _write_pose(pose, search.pose, level + 1)
     return True
 
 
 @compiled_borrowing
-def _price(
-    pose: Pose, centre: Float, R: Float, covariance: Float, gate2: float, n: int, doubts: Doubts
+def _fill_bounds(
+    pose: Pose, centre: Float, R: Float, covariance: Float, gate2: float, n: int, search: JointSearch
 ) -> None:
-    """What each level costs without a landmark, and at the least: with a pose that is known exactly."""
+    """Fill `new` and `least` of the first n levels. The lower bounds hold for a pose without covariance."""
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
-    doubts.least[n] = 0.0
+    search.least[n] = 0.0
     for i in range(n - 1, -1, -1):
-        d = doubts.detection[i]
+        d = search.detection[i]
         ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
         S0, S1, S2 = expected_spread(pose, c, s, ax, ay, R, d)
-        doubts.new[i] = gate2 + np.log(S0 * S2 - S1 * S1)
-        # The matrices turn by little with the pose; what is left without a turn bounds the determinant.
+        search.new[i] = gate2 + np.log(S0 * S2 - S1 * S1)
+        # The pose may turn during the search; the bound of the determinant holds for all angles.
         R0, R1, R2 = rotated(R, d, c, s)
-        lowest = doubts.new[i]
-        for k in range(doubts.choices[i]):
-            j = doubts.landmark[i, k]
+        lowest = search.new[i]
+        for k in range(search.choices[i]):
+            j = search.landmark[i, k]
             lowest = min(lowest, _log_det_least(R0, R1, R2, covariance, j))
-        doubts.least[i] = doubts.least[i + 1] + lowest
+        search.least[i] = search.least[i + 1] + lowest
 
 
 @compiled_borrowing
 def _log_det_least(R0: float, R1: float, R2: float, covariance: Float, j: int) -> float:
-    """Lower bound of log |C R C^T + Sigma_j| over all turns C: |A + B|^(1/2) >= |A|^(1/2) + |B|^(1/2)
-    (Minkowski), whose determinants no turn changes."""
+    """Return a lower bound of log |C R C^T + Sigma_j| over all rotations C: |A + B|^(1/2) >= |A|^(1/2) +
+    |B|^(1/2) (Minkowski), where rotations do not change |A| and |B|."""
     Sigma = covariance[j, 0] * covariance[j, 2] - covariance[j, 1] * covariance[j, 1]
     both = np.sqrt(max(R0 * R2 - R1 * R1, 0.0)) + np.sqrt(max(Sigma, 0.0))
     return float(2.0 * np.log(both))
 
 
 @compiled_borrowing
-def _keep(pose: Pose, rows: Float, i: int) -> None:
+def _write_pose(pose: Pose, rows: Float, i: int) -> None:
+    """Write mean and covariance of a pose into row i, shape (9,), in the order of the fields of `Pose`."""
     rows[i, 0], rows[i, 1], rows[i, 2] = pose.x, pose.y, pose.yaw
     rows[i, 3], rows[i, 4], rows[i, 5] = pose.xx, pose.xy, pose.xt
     rows[i, 6], rows[i, 7], rows[i, 8] = pose.yy, pose.yt, pose.tt
 
 
 @compiled_borrowing
-def _kept(rows: Float, i: int) -> Pose:
+def _read_pose(rows: Float, i: int) -> Pose:
+    """Return the pose of row i, see `_write_pose`."""
     return Pose(
         rows[i, 0], rows[i, 1], rows[i, 2],
         rows[i, 3], rows[i, 4], rows[i, 5],

@@ -1,4 +1,4 @@
-"""The landmarks of one particle: sharpened, joined where two stand for one tree, and given up."""
+"""Update and merging of the landmarks of one particle."""
 
 from __future__ import annotations
 
@@ -9,16 +9,23 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled_within
 from pipeline.types.records import Bool, Float32, Int, Int32
 
-VARIANCE_MIN = 1e-4  # m^2; views of one trunk share an error of about a centimetre
+VARIANCE_MIN = 1e-4  # m^2; all views of a trunk share an error of about one centimetre
 
 
 @compiled_within
 def kalman_update(
     m: Float, Sigma: Float, j: int, z0: float, z1: float, R0: float, R1: float, R2: float, looks: float
 ) -> None:
-    """m[j], Sigma[j] of a resting landmark after measuring its position z with covariance R (xx, xy, yy).
+    """Update a static landmark with a measured position, in place.
 
-    Successive views of a trunk share their error, so Sigma never falls below R / looks.
+    Args:
+        m: Positions of the landmarks, shape (L, 2) [m]; row j is updated.
+        Sigma: Their covariances xx, xy, yy, shape (L, 3) [m^2]; row j is updated.
+        j: Row of the landmark.
+        z0, z1: Measured position [m].
+        R0, R1, R2: Covariance xx, xy, yy of the measurement [m^2].
+        looks: Maximum number of independent views. Successive views of a trunk share their error, so that the
+            variances never fall below those of R divided by this number.
     """
     S0, S1, S2 = Sigma[j, 0], Sigma[j, 1], Sigma[j, 2]
     a, b, d = S0 + R0, S1 + R1, S2 + R2  # S = Sigma + R, H = I
@@ -47,11 +54,18 @@ def merge_duplicates(
     cells: Cells,
     scale: float,
 ) -> None:
-    """Join each landmark that was seen with those nearby that were not, where both may be one tree.
+    """Merge each landmark that was seen with those within the gate that were not seen, in place.
 
-    Two that this scan sees are two. Of two that are one the older keeps its birth; the other one is
-    left without score, to be removed. Only the first `known` rows are asked; the cells hold them, `scale`
-    a metre, at least those that were not seen where they are now.
+    The lower birth number remains; the other row gets the score 0 and is removed later. Landmarks that are
+    both seen in this scan are never merged.
+
+    Args:
+        mean, covariance, hits, score, birth: Landmarks, see Maps.
+        known: Number of leading rows that are examined.
+        seen: Whether a landmark was detected in this scan, shape (L,).
+        gate: Maximum Mahalanobis distance [sigma].
+        cells: Hash grid of these rows; the position of those that were not seen is up to date.
+        scale: Cells per metre.
     """
     gate2 = gate * gate
     largest = 0.0

@@ -1,4 +1,4 @@
-"""One scan in compiled code: all particles learn from it, and what they say of the pose."""
+"""Measurement update of all particles with one scan, and the estimate of the pose, in compiled code."""
 
 from __future__ import annotations
 
@@ -31,12 +31,16 @@ def against_slip(
     R: Float,
     rules: Rules,
 ) -> TreeMotion:
-    """What the scan tells of the motion by the map of the best particle: see `slip.motion_by_trees`.
+    """Return the motion by odometry, corrected with the map of the best particle, see `motion_by_trees`. With
+    fewer than FEWEST_PAIRS detections it is the odometry.
 
     Args:
-        pose: shape (P, 3) before the motion; maps: of the particles; best: which one is asked.
+        pose: Poses before the motion, shape (P, 3).
+        maps: Maps of the particles.
+        best: Row of the best particle.
         motion, motion_covariance, centre, R, rules: See `particle_update.observe`.
-        driven, wheels: How far the odometry may be wrong, see drift_variances.
+        driven: Path length since the last used scan [m], see `drift_variances`.
+        wheels: Trust in the odometry.
     """
     if centre.shape[0] < FEWEST_PAIRS:
         return TreeMotion(False, motion.copy(), motion_covariance.copy(), False)
@@ -63,11 +67,13 @@ def use_scan(
     rules: Rules,
     measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, float, Int]:
-    """Update every particle in place; the arguments are those of `particle_update.observe`.
+    """Update poses, log weights and maps of all particles in place.
+
+    The arguments are those of `particle_update.observe`.
 
     Returns:
-        The maps, in which room was made; the weights, shape (P,); what `mean_statistics` gives; and the
-        births of the associated landmarks, shape (P, D).
+        Maps, grown where they had no space for new landmarks; normalised weights, shape (P,); both results of
+        `mean_statistics`; and births of the associated landmarks, int64, shape (P, D).
     """
     found = centre.shape[0]
     reach = 0.0
@@ -79,16 +85,16 @@ def use_scan(
     maps = with_room(maps, found, rows)
     landmarks = lengths.max() * ROOM + found
     near, room = near_for(landmarks), room_for(found, landmarks)
-    told = np.zeros((pose.shape[0], STATISTICS))
+    statistics = np.zeros((pose.shape[0], STATISTICS))
     births = np.empty((pose.shape[0], found), np.int64)
     observe(
         pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
-        clear_range, reach, first_birth, rules, near, room, told, measured, births, np.empty(3),
+        clear_range, reach, first_birth, rules, near, room, statistics, measured, births, np.empty(3),
         np.zeros((3, 3)),
     )  # fmt: skip
     log_weight -= log_weight.max()
     weights = normalised(log_weight)
-    mean, odometry = mean_statistics(told, weights, motion_covariance)
+    mean, odometry = mean_statistics(statistics, weights, motion_covariance)
     return maps, weights, mean, odometry, births
 
 
@@ -96,7 +102,8 @@ def use_scan(
 def estimated(
     pose: Float, weights: Float, motion: Float, motion_covariance: Float
 ) -> tuple[Float, Float, Float, float]:
-    """The particles now, shape (P, 3), their mean and covariance (see `weighted_pose`), and N_eff."""
+    """Return the poses after a motion, shape (P, 3), their mean and covariance (see `weighted_pose`), and the
+    effective number of particles."""
     particles = moved_poses(pose, motion)
     mean, covariance = weighted_pose(particles, weights, motion, motion_covariance)
     return particles, mean, covariance, 1.0 / (weights * weights).sum()

@@ -1,8 +1,8 @@
-"""The maps of all particles in one pool of small blocks that particles share until one writes.
+"""Maps of all particles in one pool of small blocks, which particles share until one of them writes.
 
-Resampling copies a row of block numbers and no landmark, so its cost does not grow with what is out of
-sight; a block is copied when a particle changes a landmark in it that another particle holds too. The
-bounding box of each block says without a look at its landmarks whether any can be in reach.
+Resampling copies rows of block numbers but no landmarks, so that its cost does not depend on the size of the
+map. A shared block is copied before a particle changes a landmark in it. The bounding box of a block excludes
+blocks out of reach without a test of their landmarks.
 """
 
 from __future__ import annotations
@@ -15,23 +15,25 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.types.records import Float32, Int, Int32
 
-ROOM = 16  # landmarks a block: begun one after another, they stand near to one another
+ROOM = 16  # landmarks per block; landmarks with successive births are near each other
 
 
 class Maps(NamedTuple):
-    """Maps of P particles, K blocks each, in a pool of N blocks with room for ROOM landmarks.
+    """Maps of P particles with K blocks each, in a pool of N blocks for ROOM landmarks each.
 
     Attributes:
-        block: int32, shape (P, K): rows of the pool, -1 for none yet; places: int32, shape (P,): how many
-            in use, those of removed landmarks too.
-        mean: shape (N, ROOM, 2) [m]; covariance: shape (N, ROOM, 3) [m^2]: xx, xy, yy.
-        hits: int32, shape (N, ROOM): 0 where no landmark is; score: float32, shape (N, ROOM): hits less
-            misses, the existence.
-        birth: int64, shape (N, ROOM): serial number of the detection that began the landmark; landmarks
-            of two particles with the same birth are the same tree.
-        box: shape (N, 4): least x, y and greatest x, y of what was ever in a block [m].
-        owners: int32, shape (N,): how many particles hold it.
-        free: int32, shape (N,), rows that nobody holds, the first `free_count[0]` are valid.
+        block: Row of the pool of each block, -1 for an unused block, int32, shape (P, K).
+        places: Number of used places per particle, including those of removed landmarks, int32, shape (P,).
+        mean: Positions, shape (N, ROOM, 2) [m].
+        covariance: Covariances xx, xy, yy, shape (N, ROOM, 3) [m^2].
+        hits: Number of detections, 0 for a place without landmark, int32, shape (N, ROOM).
+        score: Hits less weighted misses, float32, shape (N, ROOM); a landmark without score is removed.
+        birth: Serial number of the first detection of the landmark, int64, shape (N, ROOM). Landmarks of
+            different particles with the same birth are the same tree.
+        box: Minimum x, y and maximum x, y of all positions ever written to the block, shape (N, 4) [m].
+        owners: Number of particles that use the block, int32, shape (N,).
+        free: Unused rows of the pool, of which the first `free_count[0]` are valid, int32, shape (N,).
+        free_count: Their number, int64, shape (1,).
     """
 
     block: Int32
@@ -48,7 +50,7 @@ class Maps(NamedTuple):
 
 
 class MapColumns(NamedTuple):
-    """The landmarks of one particle as columns of length L; see Maps."""
+    """Landmarks of one particle, as columns of length L; see Maps."""
 
     mean: Float
     covariance: Float
@@ -58,12 +60,12 @@ class MapColumns(NamedTuple):
 
 
 def empty_maps(particles: int) -> Maps:
-    """No landmark in any map."""
+    """Return maps without landmarks."""
     return _with_pool(np.full((particles, 1), -1, np.int32), np.zeros(particles, np.int32), 0)
 
 
 def shared_map(particles: int, columns: MapColumns) -> Maps:
-    """The same landmarks in every map, held once."""
+    """Return maps that all have the same landmarks, in shared blocks."""
     n = len(columns.hits)
     k = max(-(-n // ROOM), 1)
     maps = _with_pool(
@@ -81,6 +83,7 @@ def shared_map(particles: int, columns: MapColumns) -> Maps:
 
 
 def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
+    """Return maps with these blocks and an empty pool of a number of rows."""
     nowhere = np.tile([np.inf, np.inf, -np.inf, -np.inf], (rows, 1))
     return Maps(
         block=block,
@@ -99,7 +102,8 @@ def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
 
 @compiled
 def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
-    """The same maps with places for so many landmarks more each, and so many free rows in the pool."""
+    """Return the maps with space for a number of further landmarks per particle and at least a number of free
+    rows in the pool."""
     particles, k = maps.block.shape
     places = landmarks
     for p in range(particles):
@@ -141,8 +145,8 @@ def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
 
 @compiled_within
 def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
-    """Row b of the pool into row n of another one or of the same; written out, for a copy of slices brings
-    its errors' words along, which take seconds to compile."""
+    """Copy row b of the pool to row n of the pool of `other`, which may be the same. Loops compile faster
+    than slices."""
     for o in range(ROOM):
         other.mean[n, o, 0], other.mean[n, o, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
         for a in range(3):
@@ -155,6 +159,7 @@ def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
 
 @compiled
 def _with_block(maps: Maps, block: Int32) -> Maps:
+    """Return the maps with another array of blocks."""
     return Maps(
         block, maps.places, maps.mean, maps.covariance, maps.hits, maps.score, maps.birth, maps.box,
         maps.owners, maps.free, maps.free_count,
@@ -162,15 +167,15 @@ def _with_block(maps: Maps, block: Int32) -> Maps:
 
 
 def taken(maps: Maps, rows: Int) -> Maps:
-    """Maps of particles drawn anew, one of each row, in a pool of their own without free rows.
+    """Return a copy of the maps of the particles in `rows`, int64, shape (P,), which may repeat.
 
-    The pool's rows stand in the order in which the particles name them: where they lay before, which
-    hangs on what was freed when, does not show, and a saved state has the same bytes whoever saved it.
+    The new pool has no free rows. Its rows are in the order in which particles use them, so that the bytes of
+    a saved state do not depend on the history of the pool.
     """
     block = maps.block[rows, : max(-(-int(maps.places[rows].max(initial=0)) // ROOM), 1)]
     names, first = np.unique(block[block >= 0], return_index=True)
     held = names[np.argsort(first)]
-    row_of = np.full(len(maps.owners) + 1, -1, np.int32)  # the last one stands for -1
+    row_of = np.full(len(maps.owners) + 1, -1, np.int32)  # the last entry is that of -1
     row_of[held] = np.arange(len(held))
     block = row_of[block]
     kept = {
@@ -187,7 +192,8 @@ def taken(maps: Maps, rows: Int) -> Maps:
 
 
 def is_sound(maps: Maps, particles: int) -> bool:
-    """Whether maps that come from a file fit so many particles and their own pool."""
+    """Return whether maps from a file are consistent: shapes, number of particles, indices and numbers of
+    owners."""
     template = _with_pool(maps.block, maps.places, len(maps.owners))
     if any(getattr(maps, name).shape != getattr(template, name).shape for name in Maps._fields):
         return False
@@ -208,7 +214,7 @@ def is_sound(maps: Maps, particles: int) -> bool:
 
 @compiled
 def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
-    """The landmarks of one particle, copied; the columns of MapColumns."""
+    """Return copies of the landmarks of particle p: the columns of `MapColumns`."""
     places = maps.places[p]
     mean, covariance = np.empty((places, 2)), np.empty((places, 3))
     hits, score = np.empty(places, np.int32), np.empty(places, np.float32)
@@ -227,8 +233,8 @@ def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
 
 @compiled
 def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32]:
-    """The landmarks of one particle within a reach of a place: mean, shape (L, 2) [m], covariance xx, xy, yy,
-    shape (L, 3) [m^2], and hits, shape (L,)."""
+    """Return the landmarks of particle p within `reach` [m] of x, y [m]: positions, shape (L, 2) [m];
+    covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, shape (L,)."""
     places = maps.places[p]
     mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
     n = 0
@@ -251,15 +257,17 @@ def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Fl
 
 @compiled
 def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[Int32, Int32, int]:
-    """The blocks of each particle that may hold landmarks in reach of its pose.
+    """Return the blocks of each particle that may contain landmarks in reach of its pose.
 
     Args:
-        pose: shape (P, 3); reach: [m].
-        fresh: Landmarks that each particle may begin.
+        maps: Maps.
+        pose: Poses, shape (P, 3).
+        reach: Distance from the pose [m].
+        fresh: Maximum number of new landmarks per particle.
 
     Returns:
-        int32, shape (P, K), ascending, the first of each row valid; int32, shape (P,), how many; and how
-        many free rows of the pool all of that may take.
+        Columns of `Maps.block`, ascending, int32, shape (P, K); number of valid entries per row, int32, shape
+        (P,); and the number of free rows of the pool that the update may need.
     """
     near = np.empty(maps.block.shape, np.int32)
     length = np.empty(pose.shape[0], np.int32)
@@ -269,7 +277,7 @@ def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[
 
 @compiled_borrowing
 def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: Int32) -> int:
-    """Fill what `blocks_in_reach` gives; returns how many of those blocks other particles hold too."""
+    """Fill the first two results of `blocks_in_reach`; return the number of shared blocks among them."""
     shared = 0
     for p in range(pose.shape[0]):
         n = 0
@@ -287,14 +295,15 @@ def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: I
 
 @compiled_within
 def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
-    """Let the bounding box of row b of the pool hold these places too."""
+    """Extend the bounding box of row b of the pool by another box."""
     maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x_min), min(maps.box[b, 1], y_min)
     maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x_max), max(maps.box[b, 3], y_max)
 
 
 @compiled_within
 def own_block(maps: Maps, p: int, k: int) -> int:
-    """The row of block k of particle p, for it to write in: copied before if others hold it too."""
+    """Return the row of the pool of block k of particle p for writing. A shared or unused block gets a free
+    row first."""
     b = maps.block[p, k]
     if b >= 0 and maps.owners[b] == 1:
         return int(b)
@@ -315,9 +324,13 @@ def own_block(maps: Maps, p: int, k: int) -> int:
 
 @compiled_borrowing
 def take_ancestors(ancestors: Int, pose: Float, maps: Maps) -> None:
-    """Make each particle its ancestor's twin, in place: their blocks are shared until one of them writes.
+    """Replace each particle by its ancestor, in place; their blocks are shared.
 
-    Needs ancestors[ancestors] == ancestors, so that no particle is read after it was overwritten.
+    Args:
+        ancestors: Row of the ancestor of each particle, int64, shape (P,). An ancestor must be its own
+            ancestor, so that no particle is read after it was overwritten.
+        pose: Poses, shape (P, 3).
+        maps: Maps.
     """
     for i in range(ancestors.shape[0]):
         a = ancestors[i]

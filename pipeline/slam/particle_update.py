@@ -1,4 +1,4 @@
-"""What every particle learns from the detections of one scan: pose, landmarks, weight (Eq. 7)."""
+"""Update of pose, landmarks and weight (Eq. 7) of each particle with the detections of one scan."""
 
 from __future__ import annotations
 
@@ -20,23 +20,26 @@ from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.shared_errors import MeasuredPose, correct_by_measured, update_shared_errors
 from pipeline.types.records import Bool, Float32, Int, Int32
 
-SCORE_MAX = 20.0  # so that a tree that was felled vanishes in finite time
+SCORE_MAX = 20.0  # upper limit of a score, so that a felled tree is removed after finitely many misses
 SHIFT_X, SHIFT_Y, SHIFT_YAW = range(SHIFT.start, SHIFT.stop)
 
 
 class Rules(NamedTuple):
-    """The numbers by which a scan is judged.
+    """Parameters of the measurement update, see `Slam`.
 
     Attributes:
-        use_proposal: FastSLAM 2.0; else the pose was drawn before the scan is looked at.
-        gate: Largest Mahalanobis distance of an association [sigma].
-        distance_max: Largest distance of an association [m].
-        hits_to_weigh: Landmarks seen fewer times do not weigh.
-        view_range: Landmarks nearer than this can be missed [m].
-        miss: What one miss takes from the score; miss_weight: from the log weight.
-        weight_power: Power of a scan's likelihood in the weights.
-        looks: A landmark is never known better than by so many independent looks.
-        merge_gate: Two landmarks nearer than this are one [sigma].
+        use_proposal: Whether detections correct the pose before it is drawn (FastSLAM 2.0); otherwise it is
+            drawn from the odometry (FastSLAM 1.0).
+        gate: Maximum Mahalanobis distance of an association [sigma].
+        distance_max: Maximum distance of an association [m].
+        hits_to_weigh: Minimum hits of a landmark that affects pose and weight.
+        view_range: Maximum distance of a landmark that can be missed [m].
+        miss: Decrease of the score of a landmark by one miss.
+        miss_weight: Decrease of the log weight by one miss.
+        weight_power: Exponent of the likelihood of a scan in the weights.
+        looks: Maximum number of independent views: the variance of a landmark never falls below that of a
+            detection divided by it.
+        merge_gate: Maximum Mahalanobis distance of two landmarks that are merged [sigma].
     """
 
     use_proposal: bool
@@ -52,14 +55,15 @@ class Rules(NamedTuple):
 
 
 class Near(NamedTuple):
-    """The landmarks of one particle in reach, as columns of its own that are written back when changed.
+    """Work arrays with copies of the landmarks of one particle in reach; changed rows are written back.
 
     Attributes:
-        block, place: int32, shape (L,): where each one is kept.
+        block, place: Block of the particle and place in it, int32, shape (L,).
         mean, covariance, hits, score, birth: As in Maps, shape (L, ...).
-        seen, changed: shape (L,).
-        free: int32, shape (L, 2): block and place of places without a landmark.
-        cells: Those known before the scan, by where they stood then.
+        seen: Whether the landmark was detected in this scan, shape (L,).
+        changed: Whether the row differs from the map, shape (L,).
+        free: Block and place of unused places, int32, shape (L, 2).
+        cells: Hash grid of the landmarks known before the scan, at their positions before it.
     """
 
     block: Int32
@@ -77,7 +81,7 @@ class Near(NamedTuple):
 
 @compiled
 def near_for(landmarks: int) -> Near:
-    """Columns with room for so many landmarks."""
+    """Return work arrays for a number of landmarks."""
     n = landmarks
     return Near(
         np.empty(n, np.int32),
@@ -96,7 +100,8 @@ def near_for(landmarks: int) -> Near:
 
 @compiled
 def predict(pose: Float, motion: Float, covariance: Float, noise: Float, use_proposal: bool) -> Float:
-    """The poses after the motion, shape (P, 3); drawn from its covariance where there is no proposal."""
+    """Return the poses after a motion, shape (P, 3); without `use_proposal` they are drawn from its
+    covariance, see `Rules`."""
     P = np.empty((3, 3))
     mu = np.empty(3)
     moved = np.empty_like(pose)
@@ -131,28 +136,34 @@ def observe(
     rules: Rules,
     near: Near,
     room: Room,
-    told: Float,
+    statistics: Float,
     measured: MeasuredPose,
     births: Int,
     mu: Float,
     P: Float,
 ) -> None:
-    """Update every particle in place.
+    """Update all particles in place.
 
     Args:
-        pose: Before the motion, shape (P, 3), becomes the pose after the scan; moved: see `predict`.
-        near_blocks, near_lengths: See `blocks_in_reach`; the pool has the rows that it asked for.
-        motion, motion_covariance: Since the last observation, in the frame of each particle.
+        pose: Poses before the motion, shape (P, 3); become the poses after the scan.
+        moved: Poses after the motion, see `predict`.
+        log_weight: Log weights, shape (P,).
+        maps: Maps of the particles; the pool has the free rows that `blocks_in_reach` requires.
+        near_blocks, near_lengths: First two results of `blocks_in_reach`.
+        motion, motion_covariance: Motion since the last used scan in the frame of each particle, shapes (3,)
+            and (3, 3).
         noise: Standard normal numbers, shape (P, 3).
-        centre: Detections in the base frame, shape (D, 2) [m]; R: their covariance xx, xy, yy, (D, 3).
-        clear_range: See FastSlam.process.
-        reach: Landmarks farther than this are left alone [m].
-        first_birth: Serial number of the first of the detections.
-        near, room: Memory for the landmarks in reach and for pairs.
-        told: shape (P, STATISTICS), filled: what each particle tells of the scan (see health).
-        measured: The pose by another source; what its poses err by alike is learned.
-        births: shape (P, D), filled: birth of the landmark that each particle associates with each detection.
-        mu, P: Memory for a pose, shape (3,), and its covariance, shape (3, 3), zeros.
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        clear_range: Free range per direction [m], see `FastSlam.process`.
+        reach: Distance beyond which landmarks are not used [m].
+        first_birth: Birth number of the first detection.
+        rules: Parameters.
+        near, room: Work arrays for the landmarks in reach and for pairs.
+        statistics: Statistics of the scan by particle, shape (P, STATISTICS); filled.
+        measured: Pose measured by another source; its shared errors are updated.
+        births: Birth of the landmark of each detection, int64, shape (P, D); filled.
+        mu, P: Work arrays for a pose, shape (3,), and its covariance, shape (3, 3), zeros.
     """
     scale = per_metre(rules.distance_max)
     farthest = _farthest_missed(clear_range, rules.view_range)
@@ -168,9 +179,9 @@ def observe(
         fill(near.cells, near.mean, known, scale)
         likelihood = recognise(
             mu, P, centre, R, near.mean, near.covariance, near.hits, near.cells, scale,
-            rules.gate, rules.distance_max, rules.hits_to_weigh, room, told, p,
+            rules.gate, rules.distance_max, rules.hits_to_weigh, room, statistics, p,
         )  # fmt: skip
-        _shift(x, y, yaw, before_c, before_s, motion, mu, told, p)
+        _shift(x, y, yaw, before_c, before_s, motion, mu, statistics, p)
         if rules.use_proposal:
             draw(mu, P, noise, p, pose)
         else:
@@ -181,7 +192,7 @@ def observe(
         all_near = _learn(
             pose, p, c, s, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules
         )
-        missed = _miss(pose, p, c, s, near, known, clear_range, farthest, rules, told)
+        missed = _miss(pose, p, c, s, near, known, clear_range, farthest, rules, statistics)
         log_weight[p] += rules.weight_power * (likelihood - rules.miss_weight * missed)
         merge_duplicates(
             near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen,
@@ -198,7 +209,8 @@ def observe(
 def _gather(
     maps: Maps, p: int, near_blocks: Int32, blocks: int, mu: Float, reach: float, near: Near
 ) -> tuple[int, int]:
-    """Fill `near` with the landmarks of a particle in reach; how many, and how many free places."""
+    """Fill `near` with the landmarks of particle p within `reach` [m] of the pose mu; return their number and
+    the number of unused places."""
     n, free = 0, 0
     count = maps.places[p]
     for i in range(blocks):
@@ -243,8 +255,15 @@ def _learn(
     first_birth: int,
     rules: Rules,
 ) -> int:
-    """Sharpen the landmarks of one particle that were seen, marking them, and begin new ones behind them;
-    returns how many rows of `near` there are then. c, s: cosine and sine of the particle's yaw."""
+    """Update the landmarks of particle p that were detected and append new ones; return the number of rows of
+    `near` then.
+
+    Args:
+        c, s: Cosine and sine of the yaw of the particle.
+        known: Number of landmarks in `near`.
+        free: Number of unused places in `near.free`.
+        landmark_of: Row of `near` of each detection, -1 for none, int64, shape (D,).
+    """
     n = known
     for d in range(centre.shape[0]):
         z0 = pose[p, 0] + c * centre[d, 0] - s * centre[d, 1]
@@ -272,7 +291,7 @@ def _learn(
 
 @compiled_borrowing
 def _farthest_missed(clear_range: Float, view_range: float) -> float:
-    """Square of the distance beyond which no landmark can be missed in any direction [m^2]."""
+    """Return the square of the distance beyond which no landmark can be missed in any direction [m^2]."""
     free = 0.0
     for k in range(clear_range.shape[0]):
         if clear_range[k] - BEHIND > free:
@@ -291,10 +310,16 @@ def _miss(
     clear_range: Float,
     farthest: float,
     rules: Rules,
-    told: Float,
+    statistics: Float,
 ) -> float:
-    """Take from the score of landmarks in free view that were not seen; returns how many well known ones
-    there are. c, s: cosine and sine of the particle's yaw; farthest: see `_farthest_missed`."""
+    """Decrease the score of the landmarks in free view that were not detected; return the number of
+    well-known ones among them.
+
+    Args:
+        c, s: Cosine and sine of the yaw of the particle.
+        known: Number of landmarks known before the scan.
+        farthest: Result of `_farthest_missed`.
+    """
     missed = 0.0
     if farthest == 0.0:
         return missed
@@ -310,14 +335,14 @@ def _miss(
             near.score[j] -= rules.miss
             near.changed[j] = True
             if near.hits[j] >= rules.hits_to_weigh:
-                told[p, MISSED] += min(float(near.hits[j]), MOST_HITS)
+                statistics[p, MISSED] += min(float(near.hits[j]), MOST_HITS)
                 missed += 1.0
     return missed
 
 
 @compiled_within
 def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
-    """Keep what changed; a landmark without score leaves its place free."""
+    """Write changed landmarks back to the map; the place of a landmark without score becomes unused."""
     k, b = -1, 0
     x_min = y_min = np.inf
     x_max = y_max = -np.inf
@@ -325,7 +350,7 @@ def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
         gone = near.score[j] <= 0.0
         if not (near.changed[j] or gone):
             continue
-        if near.block[j] != k:  # rows of one block stand together
+        if near.block[j] != k:  # rows of one block are adjacent
             if k >= 0:
                 widen(maps, b, x_min, y_min, x_max, y_max)
                 x_min = y_min = np.inf
@@ -348,8 +373,8 @@ def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
 
 @compiled_within
 def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
-    """P = C covariance C^T with the rotation C about z; written out, for the library's product of such
-    small matrices costs more than all else here."""
+    """Write C covariance C^T into P, where C is the rotation about z by the angle with cosine c and sine s;
+    both matrices have the shape (3, 3)."""
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     P[0, 0] = c * c * xx - 2.0 * c * s * xy + s * s * yy
     P[0, 1] = P[1, 0] = c * s * (xx - yy) + (c * c - s * s) * xy
@@ -361,11 +386,12 @@ def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
 
 @compiled_within
 def _shift(
-    x: float, y: float, yaw: float, c: float, s: float, motion: Float, mu: Float, told: Float, p: int
+    x: float, y: float, yaw: float, c: float, s: float, motion: Float, mu: Float, statistics: Float, p: int
 ) -> None:
-    """How far the scan moved a pose from where the odometry had it, in the frame of its covariance."""
+    """Write the SHIFT columns of row p: deviation of the pose mu from the pose x, y, yaw plus the motion, in
+    the frame of that pose (c, s: cosine and sine of its yaw)."""
     dx, dy = mu[0] - x, mu[1] - y
-    told[p, SHIFT_X] = c * dx + s * dy - motion[0]
-    told[p, SHIFT_Y] = c * dy - s * dx - motion[1]
+    statistics[p, SHIFT_X] = c * dx + s * dy - motion[0]
+    statistics[p, SHIFT_Y] = c * dy - s * dx - motion[1]
     turn = mu[2] - yaw - motion[2]
-    told[p, SHIFT_YAW] = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+    statistics[p, SHIFT_YAW] = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))

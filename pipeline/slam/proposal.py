@@ -1,9 +1,9 @@
-"""Where one particle stands after a scan: association and proposal in one pass.
+"""Data association and proposal distribution of one particle, in one pass.
 
-FastSLAM 2.0 (Montemerlo et al. 2003) draws the pose from what odometry and scan say together:
-each recognised landmark corrects the Gaussian of the pose before the next one is looked for, so
-that the sure ones help to decide the doubtful ones. FastSLAM 1.0 is the same with a pose that was
-drawn from the odometry alone and has no spread left.
+FastSLAM 2.0 (Montemerlo et al. 2003) draws the pose from the Gaussian of odometry and scan together: each
+recognised landmark corrects this Gaussian before the next one is associated, so that unambiguous detections
+help to decide ambiguous ones. FastSLAM 1.0 is the same with a pose that was drawn from the odometry and has
+no covariance.
 """
 
 from __future__ import annotations
@@ -14,10 +14,9 @@ from pipeline.geometry.gaussian import Pose, corrected, expected_spread, keep_po
 from pipeline.geometry.hash_grid import Cells
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled_within
-from pipeline.slam.candidate_pairs import LIKELY, Room, find_doubts, gather_doubts, likely_pairs
+from pipeline.slam.candidate_pairs import LIKELY, Room, fill_levels, find_ambiguous, likely_pairs
 from pipeline.slam.joint_association import choose_jointly
-from pipeline.slam.scan_statistics import AMBIGUOUS as DOUBTFUL
-from pipeline.slam.scan_statistics import FOUND, INNOVATION, MOST_HITS, RECOGNISED
+from pipeline.slam.scan_statistics import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
 from pipeline.types.records import Int, Int32
 
 
@@ -36,51 +35,53 @@ def recognise(
     distance_max: float,
     hits_to_weigh: int,
     room: Room,
-    told: Float,
+    statistics: Float,
     p: int,
 ) -> float:
-    """Find the landmark of each detection, one to one, correct the pose, and weigh.
+    """Associate detections with landmarks one to one, correct the pose, and return the log likelihood.
 
-    Pairs are taken by falling likelihood, first those of detections with one likely landmark; each
-    one is judged with the pose that the pairs before it left. Close choices are decided together
-    (see joint_choice).
+    Pairs are accepted in the order of their likelihood, first those of detections with one likely landmark;
+    each pair is tested with the pose that the pairs before it corrected. Ambiguous detections are decided
+    together, see `choose_jointly`.
 
     Args:
-        mu, P: The pose before the scan and its covariance; corrected in place.
-        centre: shape (D, 2) [m], base frame; R: xx, xy, yy, shape (D, 3).
-        mean, covariance, hits: Their first rows are the landmarks in reach of this particle.
-        cells: Hold them, `scale` a metre.
-        gate: Largest Mahalanobis distance [sigma]; distance_max: largest distance [m].
-        hits_to_weigh: Landmarks seen fewer times neither correct nor weigh.
-        room: Its `landmark_of` is filled.
-        told: Row p is filled as far as the detections say (see health).
-
-    Returns:
-        Log likelihood of the detections.
+        mu, P: Pose before the scan, shape (3,), and its covariance, shape (3, 3); corrected in place.
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        mean, covariance, hits: Landmarks of this particle, see Maps; rows that are not in `cells` are
+            ignored.
+        cells: Hash grid of the landmarks.
+        scale: Cells per metre.
+        gate: Maximum Mahalanobis distance [sigma].
+        distance_max: Maximum distance [m].
+        hits_to_weigh: Minimum hits of a landmark that affects pose and likelihood.
+        room: Work arrays; `landmark_of` is filled.
+        statistics: Statistics of the scan by particle; row p is filled, except MISSED and SHIFT.
+        p: Row of the particle.
     """
     gate2 = gate * gate
     pose = pose_of(mu, P)
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
     pairs = likely_pairs(pose, c, s, centre, R, mean, covariance, cells, scale, gate2, distance_max, room)
-    doubtful = find_doubts(pairs, centre.shape[0], room)
+    ambiguous = find_ambiguous(pairs, centre.shape[0], room)
     log_likelihood, product = 0.0, 1.0
-    for turn in range(3 if doubtful > 0 else 1):  # the sure ones, those decided together, the rest
+    for turn in range(3 if ambiguous > 0 else 1):  # unambiguous detections, joint decisions, the others
         n = pairs
         if turn == 1:
-            n = gather_doubts(pairs, room)
+            n = fill_levels(pairs, room)
             choose_jointly(
-                pose, centre, R, mean, covariance, hits, gate2, hits_to_weigh, room.taken, n, room.doubts
+                pose, centre, R, mean, covariance, hits, gate2, hits_to_weigh, room.taken, n, room.search
             )
         for i in range(n):
             if turn == 1:
-                d, j = room.doubts.detection[i], room.doubts.best[i]
-                room.doubt[d] = False
+                d, j = room.search.detection[i], room.search.best[i]
+                room.ambiguous[d] = False
                 if j < 0:
                     continue
             else:
                 k = room.order[i]
                 d, j = room.detection[k], room.landmark[k]
-                if room.landmark_of[d] >= 0 or room.taken[j] or room.doubt[d] != (turn == 2):
+                if room.landmark_of[d] >= 0 or room.taken[j] or room.ambiguous[d] != (turn == 2):
                     continue
             ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
             S0, S1, S2 = expected_spread(pose, c, s, ax, ay, R, d)
@@ -98,23 +99,23 @@ def recognise(
                 if product < 1e-100 or product > 1e100:
                     log_likelihood -= 0.5 * np.log(product)
                     product = 1.0
-                told[p, INNOVATION] += d2
-                told[p, RECOGNISED] += 1.0
-                told[p, FOUND] += min(float(hits[j]), MOST_HITS)
+                statistics[p, INNOVATION] += d2
+                statistics[p, RECOGNISED] += 1.0
+                statistics[p, FOUND] += min(float(hits[j]), MOST_HITS)
                 before = pose.yaw
                 pose = corrected(pose, ax, ay, S0, S1, S2, y0, y1)
                 c, s = turned(c, s, pose.yaw - before, pose.yaw)
     log_likelihood -= 0.5 * np.log(product)
     for d in range(centre.shape[0]):
         if room.second[d] - room.best[d] < LIKELY:
-            told[p, DOUBTFUL] += 1.0
+            statistics[p, AMBIGUOUS] += 1.0
     keep_pose(pose, mu, P)
-    price = _price_of_new(pose, centre, R, hits, room.landmark_of, hits_to_weigh, gate2)
-    return float(log_likelihood) - price
+    cost = _cost_of_new(pose, centre, R, hits, room.landmark_of, hits_to_weigh, gate2)
+    return float(log_likelihood) - cost
 
 
 @compiled_within
-def _price_of_new(
+def _cost_of_new(
     pose: Pose,
     centre: Float,
     R: Float,
@@ -123,14 +124,16 @@ def _price_of_new(
     hits_to_weigh: int,
     gate2: float,
 ) -> float:
-    """What detections of no well known landmark take from the log likelihood: a new tree is as likely as
-    one at the gate, else particles that recognise nothing win."""
-    c, s, price = 0.0, 0.0, 0.0
+    """Return the decrease of the log likelihood by detections without a well-known landmark. Each counts like
+    a pair at the gate; otherwise particles that recognise nothing would get the largest weights."""
+    c, s, cost = 0.0, 0.0, 0.0
     for d in range(centre.shape[0]):
         if landmark_of[d] < 0 or hits[landmark_of[d]] < hits_to_weigh:
-            if c == 0.0 and s == 0.0:  # most particles know all that they see, and need neither
+            if (
+                c == 0.0 and s == 0.0
+            ):  # computed at the first such detection, because most particles have none
                 c, s = np.cos(pose.yaw), np.sin(pose.yaw)
             ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
             S0, S1, S2 = expected_spread(pose, c, s, ax, ay, R, d)
-            price += 0.5 * (gate2 + np.log(S0 * S2 - S1 * S1))
-    return price
+            cost += 0.5 * (gate2 + np.log(S0 * S2 - S1 * S1))
+    return cost

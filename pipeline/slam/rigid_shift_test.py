@@ -103,8 +103,8 @@ def estimate_rigid_shift(
         for j in range(3):
             square += motion[i] * S_inv[i, j] * motion[j]
         place[i] += motion[i]
-    told, enough = square > beyond * beyond, agree >= SEVERAL or trust.distrust > 0.0
-    return told and enough, told and not enough, place, N_inv
+    significant, enough = square > beyond * beyond, agree >= SEVERAL or trust.distrust > 0.0
+    return significant and enough, significant and not enough, place, N_inv
 
 
 @compiled

@@ -108,10 +108,10 @@ def update_statistics(
         driven: Distance since the scan before [m].
         doubted: Doubts about the odometry at this scan.
     """
-    expected, told = scan.found + scan.missed, math.isfinite(scan.innovation)
+    expected, is_measured = scan.found + scan.missed, math.isfinite(scan.innovation)
     strange = _strange_scans(recent, scan, any(doubted) or recent.alone + driven < NEARBY)
     return RunningStatistics(
-        innovation=_exponential_mean(recent.innovation, scan.innovation, FADING if told else 0),
+        innovation=_exponential_mean(recent.innovation, scan.innovation, FADING if is_measured else 0),
         found=_exponential_mean(
             recent.found, scan.found / max(expected, 1e-9), FADING_FOUND if expected > 0 else 0
         ),
@@ -187,18 +187,22 @@ def _strange_scans(recent: RunningStatistics, scan: ScanStatistics, here: bool) 
             were seen within the last NEARBY metres, or the odometry is doubted.
     """
     before = recent.strange
-    told = scan.detections >= FEWEST and scan.missed >= STRANGE_MISSED
+    misses_trees = scan.detections >= FEWEST and scan.missed >= STRANGE_MISSED
     share = scan.found / max(scan.found + scan.missed, 1e-9)
     if scan.recognised < 0.5 and scan.found == 0.0:
-        return before + 1 if told else before
+        return before + 1 if misses_trees else before
     if before:
         # The recognised trees have no more hits than trees begun since the first strange scan, and more trees
         # than one are missed: a single one may have fallen.
         young = scan.found <= (min(before, STRANGE_LOST) + 2) * scan.recognised
         young = young and max(recent.missed, scan.missed) >= FEWEST * STRANGE_MISSED
-        return before + 1 if told and (young or share < STILL_BY_CHANCE) else 0
+        return before + 1 if misses_trees and (young or share < STILL_BY_CHANCE) else 0
     return int(
-        told and here and recent.familiar >= FAMILIAR and scan.missed >= EXPECTED and share < BY_CHANCE
+        misses_trees
+        and here
+        and recent.familiar >= FAMILIAR
+        and scan.missed >= EXPECTED
+        and share < BY_CHANCE
     )
 
 

@@ -47,20 +47,6 @@ class ScanStatistics:
     odometry: float = 0.0
 
 
-def average_statistics(
-    statistics: Float, weights: Float, detections: int, motion_covariance: Float
-) -> ScanStatistics:
-    """Return the weighted mean of the statistics of all particles.
-
-    Args:
-        statistics: shape (P, STATISTICS).
-        weights: Weights with sum 1, shape (P,).
-        detections: Number of detections.
-        motion_covariance: Covariance of the odometry since the scan before, shape (3, 3).
-    """
-    return named_statistics(*mean_statistics(statistics, weights, motion_covariance), detections)
-
-
 def named_statistics(mean: Float, odometry: float, detections: int) -> ScanStatistics:
     """Return the results of `mean_statistics` as a record. The innovation becomes NaN below 0.5 recognised
     landmarks.
@@ -87,7 +73,10 @@ def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float)
     """Return the weighted mean of the columns, shape (STATISTICS,), and the Mahalanobis norm of its SHIFT
     [sigma].
 
-    The arguments are those of `average_statistics`.
+    Args:
+        statistics: Statistics by particle, shape (P, STATISTICS).
+        weights: Weights with sum 1, shape (P,).
+        motion_covariance: Covariance of the odometry since the scan before, shape (3, 3).
     """
     mean = np.zeros(STATISTICS)
     for p in range(statistics.shape[0]):

@@ -108,26 +108,26 @@ def motion_by_trees(
         pose, position, heading, trust, centre, R, known, spread, well_known
     )
     if sure:
-        told = np.zeros((3, 3))
-        told[0, 0] = told[1, 1] = FITTED[0] ** 2 + OWN * OWN * max(fitted[0, 0], fitted[1, 1])
-        told[2, 2] = FITTED[2] ** 2 + OWN * OWN * fitted[2, 2]
-        return TreeMotion(True, _from(before, place), told, False)
+        reduced = np.zeros((3, 3))
+        reduced[0, 0] = reduced[1, 1] = FITTED[0] ** 2 + OWN * OWN * max(fitted[0, 0], fitted[1, 1])
+        reduced[2, 2] = FITTED[2] ** 2 + OWN * OWN * fitted[2, 2]
+        return TreeMotion(True, _from(before, place), reduced, False)
     well = known[well_known]
     sigma = np.sqrt(0.5 * (R[:, 0] + R[:, 2]))
     hits, expected, by_chance = count_matches(pose, centre, sigma, well, position, heading, gate)
-    told = np.zeros((3, 3))
-    told[0, 0], told[1, 1], told[2, 2] = position, position, heading
+    reduced = np.zeros((3, 3))
+    reduced[0, 0], reduced[1, 1], reduced[2, 2] = position, position, heading
     for i in range(3):
-        told[i, i] += SIGMA[i] ** 2
+        reduced[i, i] += SIGMA[i] ** 2
     if expected < FEWEST or hits >= EXPLAINED * expected:
         wide = covariance[0, 0] + covariance[1, 1] > 2.0 * WIDE * WIDE
         if wide and expected >= FEWEST and hits >= CONVINCING * expected:
-            return TreeMotion(False, motion.copy(), told, unsure)  # the doubt is refuted
+            return TreeMotion(False, motion.copy(), reduced, unsure)  # the doubt is refuted
         return TreeMotion(False, motion.copy(), covariance.copy(), unsure)
     agree, sure, place = search_offset(pose, centre, sigma, well)
     if not sure or hits > by_chance + agree // STANDING:
         return TreeMotion(False, motion.copy(), covariance.copy(), unsure)
-    return TreeMotion(True, _from(before, place), told, False)
+    return TreeMotion(True, _from(before, place), reduced, False)
 
 
 @compiled

@@ -76,7 +76,7 @@ def _update_rows(
     for k in range(rows.shape[0]):
         row = rows[k]
         _predict(x[row], P[row], dt[k], acceleration_sigma)
-        _correct(x[row], P[row], z[k], R[k], K, M)
+        correct(x[row], P[row], z[k], R[k], K, M)
 
 
 @compiled_borrowing
@@ -98,10 +98,15 @@ def _predict(x: Float, P: Float, dt: float, acceleration_sigma: float) -> None:
 
 
 @compiled_borrowing
-def _correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
+def correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
     """Replace x by x + K y and P by (I - K H) P (I - K H)^T + K R K^T (Joseph form), in place.
 
-    The Joseph form keeps P symmetric and positive. K, shape (4, 2), and M, shape (4, 4), are work arrays.
+    The Joseph form keeps P symmetric and positive.
+
+    Args:
+        x, P: State, shape (4,), and its covariance, shape (4, 4).
+        z, R: Measured position and its covariance; only the first two rows and columns are used.
+        K, M: Work arrays, shapes (4, 2) and (4, 4).
     """
     y0, y1 = z[0] - x[0], z[1] - x[1]
     S00, S01, S11 = P[0, 0] + R[0, 0], P[0, 1] + R[0, 1], P[1, 1] + R[1, 1]
@@ -118,51 +123,6 @@ def _correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None
             KR0, KR1 = K[a, 0] * R[0, 0] + K[a, 1] * R[1, 0], K[a, 0] * R[0, 1] + K[a, 1] * R[1, 1]
             P[a, b] = M[a, b] - M[a, 0] * K[b, 0] - M[a, 1] * K[b, 1] + KR0 * K[b, 0] + KR1 * K[b, 1]
             P[b, a] = P[a, b]
-
-
-@compiled
-def expected_positions(
-    x: Float, P: Float, shared: Float, hits: Int, stamp_ns: Int, now_ns: int, acceleration_sigma: float
-) -> tuple[Float, Float]:
-    """Return the predicted position of each tree, shape (T, 2) [m], and its covariance xx, xy, yy, shape (T,
-    3).
-
-    The covariance excludes the part that the tree shares with the pose of the robot, since that part does not
-    change their relative position. Of the shared part, 1 / hits is independent in each view and remains.
-
-    Args:
-        x, P: States and covariances, shapes (T, 4) and (T, 4, 4).
-        shared: Part of P from the poses of the robot, shape (T, 2, 2) [m^2].
-        hits: Number of observations, shape (T,).
-        stamp_ns: Time of the last observation [ns], shape (T,).
-        now_ns: Time of the prediction [ns].
-        acceleration_sigma: Standard deviation of the acceleration [m/s^2].
-    """
-    place, spread = np.empty((x.shape[0], 2)), np.empty((x.shape[0], 3))
-    _expect(x, P, shared, hits, stamp_ns, now_ns, acceleration_sigma, place, spread)
-    return place, spread
-
-
-@compiled_borrowing
-def _expect(
-    x: Float,
-    P: Float,
-    shared: Float,
-    hits: Int,
-    stamp_ns: Int,
-    now_ns: int,
-    acceleration_sigma: float,
-    place: Float,
-    spread: Float,
-) -> None:
-    for t in range(x.shape[0]):
-        dt = (now_ns - stamp_ns[t]) * 1e-9
-        noise = 0.25 * dt**4 * acceleration_sigma * acceleration_sigma
-        place[t, 0], place[t, 1] = x[t, 0] + dt * x[t, 2], x[t, 1] + dt * x[t, 3]
-        C, B, part = P[t], shared[t], 1.0 - 1.0 / max(hits[t], 1)
-        spread[t, 0] = C[0, 0] - part * B[0, 0] + dt * (C[0, 2] + C[2, 0]) + dt * dt * C[2, 2] + noise
-        spread[t, 1] = C[0, 1] - part * B[0, 1] + dt * (C[0, 3] + C[2, 1]) + dt * dt * C[2, 3]
-        spread[t, 2] = C[1, 1] - part * B[1, 1] + dt * (C[1, 3] + C[3, 1]) + dt * dt * C[3, 3] + noise
 
 
 def _update_rows_filterpy(

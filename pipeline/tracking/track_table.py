@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.io.checkpoints.codec import ADDED
-from pipeline.jit import compiled, compiled_borrowing
+from pipeline.jit import compiled
+from pipeline.tracking.kalman import correct
 from pipeline.tracking.split_covariance_intersection import split
 from pipeline.types.records import Bool, Int, Verdict
 
@@ -218,30 +219,6 @@ def join(rows: Rows, old: int, young: int) -> None:
         number[old] += number[young]
 
 
-@compiled_borrowing
-def _fill_fused(
-    x: Float, P: Float, other_x: Float, Q: Float, state: Float, K: Float, M: Float, joined: Float
-) -> None:
-    """Write the results of `fuse` into `state` and `joined`; Q is the covariance of the other estimate, K and
-    M are work arrays."""
-    S00, S01 = P[0, 0] + Q[0, 0], P[0, 1] + Q[0, 1]
-    S10, S11 = P[1, 0] + Q[1, 0], P[1, 1] + Q[1, 1]
-    det = S00 * S11 - S01 * S10
-    y0, y1 = other_x[0] - x[0], other_x[1] - x[1]
-    for a in range(4):
-        K[a, 0] = (P[a, 0] * S11 - P[a, 1] * S10) / det
-        K[a, 1] = (P[a, 1] * S00 - P[a, 0] * S01) / det
-        state[a] = x[a] + K[a, 0] * y0 + K[a, 1] * y1
-    for a in range(4):
-        for b in range(4):
-            M[a, b] = P[a, b] - K[a, 0] * P[0, b] - K[a, 1] * P[1, b]
-    for a in range(4):
-        for b in range(a, 4):
-            KQ0, KQ1 = K[a, 0] * Q[0, 0] + K[a, 1] * Q[1, 0], K[a, 0] * Q[0, 1] + K[a, 1] * Q[1, 1]
-            joined[a, b] = M[a, b] - M[a, 0] * K[b, 0] - M[a, 1] * K[b, 1] + KQ0 * K[b, 0] + KQ1 * K[b, 1]
-            joined[b, a] = joined[a, b]
-
-
 @compiled
 def fuse(x: Float, P: Float, other_x: Float, other_P: Float) -> tuple[Float, Float]:
     """Return the first of two independent estimates, corrected by the position of the second (Kalman update).
@@ -253,6 +230,6 @@ def fuse(x: Float, P: Float, other_x: Float, other_P: Float) -> tuple[Float, Flo
     Returns:
         State, shape (4,), and covariance, shape (4, 4).
     """
-    state, joined = np.empty(4), np.empty((4, 4))
-    _fill_fused(x, P, other_x, other_P, state, np.empty((4, 2)), np.empty((4, 4)), joined)
-    return state, joined
+    state, covariance = x.copy(), P.copy()
+    correct(state, covariance, other_x, other_P, np.empty((4, 2)), np.empty((4, 4)))
+    return state, covariance

@@ -139,16 +139,43 @@ def test_voxels_move_and_no_return_is_lost(seed):
         memory.add(points.astype(np.float32), scan, 1 << 12)
     same = corrected_voxels(memory, shifted())
     assert set(same.key[: same.used].tolist()) == set(memory.key[: memory.used].tolist())
-    correction = shifted(dx=2.0, dy=-3 * SIDE, first=20)
-    moved = corrected_voxels(memory, correction)
+    moved = corrected_voxels(memory, shifted(dx=2.0, dy=-3 * SIDE, first=20))
     n, m = memory.used, moved.used
     assert moved.returns[:m].sum() == memory.returns[:n].sum() == moved.tile_returns[: moved.tiles].sum()
-    wanted = memory.mean[:n].astype(np.float64)
-    wanted[:, :2], _ = correction.moved(wanted[:, :2], memory.latest[:n].astype(np.int64))
-    centre = np.average(wanted, axis=0, weights=memory.returns[:n])
-    np.testing.assert_allclose(
-        np.average(moved.mean[:m], axis=0, weights=moved.returns[:m]), centre, atol=1e-3
-    )
+
+
+@given(seeds)
+def test_voxels_move_rigidly_with_the_poses_that_observed_them(seed):
+    """Objects around the first part of the path, which did not move, stay where they are."""
+    random = np.random.default_rng(seed)
+    angle, shift = random.uniform(-3.0, 3.0), random.uniform([195.0, -5.0], [205.0, 5.0])
+    c, s = np.cos(angle), np.sin(angle)
+    rotation = np.array([[c, -s], [s, c]])
+    before = np.column_stack([0.5 * np.arange(60), np.zeros(60), np.zeros(60)])
+    after = before.copy()
+    after[40:, :2] = before[40:, :2] @ rotation.T + shift
+    after[40:, 2] += angle
+    memory, parts = VoxelMap.empty(), []
+    for scans in (range(0, 16), range(50, 60)):  # all points are nearer to their part of the path
+        places = [
+            random.uniform([0.5 * k - 2.9, -2.9, 0.1], [0.5 * k + 2.9, 2.9, 5.9], (40, 3)) for k in scans
+        ]
+        for scan, points in zip(scans, places, strict=True):
+            memory.add(points.astype(np.float32), scan, 1 << 12)
+        parts.append(np.concatenate(places))
+    parts[1][:, :2] = parts[1][:, :2] @ rotation.T + shift
+    corrected = corrected_voxels(memory, PathCorrection(before, after))
+    mean, returns = corrected.mean[: corrected.used], corrected.returns[: corrected.used]
+    is_far = mean[:, 0] > 100.0
+    for rows, points in ((~is_far, parts[0]), (is_far, parts[1])):
+        assert returns[rows].sum() == len(points)
+        centre = np.average(mean[rows], axis=0, weights=returns[rows])
+        np.testing.assert_allclose(centre, points.mean(axis=0), atol=1e-3)
+        spread = np.cov(points.T, bias=True)
+        voxels = np.cov(mean[rows].T, fweights=returns[rows].astype(np.int64), bias=True)
+        np.testing.assert_allclose(voxels, spread, atol=SIDE)
+    kept = set(map(bytes, memory.mean[: memory.used][memory.latest[: memory.used] < 40]))
+    assert set(map(bytes, mean[~is_far])) == kept
 
 
 def test_columns_go_with_their_voxels():

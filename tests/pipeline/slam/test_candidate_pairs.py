@@ -47,7 +47,7 @@ def test_pairs_are_all_within_the_gate_and_sorted(seed: int, distance_max: float
     scale, gate2 = per_metre(distance_max), 9.0
     fill(cells, mean, 60, scale)
     found: dict[tuple[int, int], float] = {}
-    for _ in range(2):  # the second time in the turns of the first
+    for _ in range(2):  # the second time in the sequence of the first
         n = likely_pairs(pose, c, s, centre, R, mean, covariance, cells, scale, gate2, distance_max, room)
         found = {
             (int(d), int(j)): cost
@@ -55,7 +55,7 @@ def test_pairs_are_all_within_the_gate_and_sorted(seed: int, distance_max: float
         }
         assert found == pytest.approx(_all_pairs(pose, centre, R, mean, covariance, gate2, distance_max))
         assert np.all(np.diff(room.cost[room.order[:n]]) >= 0.0)
-        assert sorted(room.turn) == list(range(30))
+        assert sorted(room.sequence) == list(range(30))
         assert np.all(room.landmark_of == -1)
     for d in range(30):
         costs = sorted(cost for (one, _), cost in found.items() if one == d)

@@ -13,7 +13,7 @@ from pipeline.config import preset
 from pipeline.geometry.gaussian import pose_of
 from pipeline.geometry.poses import Pose2
 from pipeline.slam import FastSlam
-from pipeline.slam.joint_association import CHOICES, MOST, choose_jointly, doubts_for
+from pipeline.slam.joint_association import CHOICES, MOST, choose_jointly, search_for
 from tests.pipeline.strategies import NOTHING_SEEN, detections, seeds
 
 GATE2 = 12.25
@@ -35,11 +35,11 @@ def scene(seed, n, trees=6):
 
 def filled(scene_, n, choices, rng):
     """Levels of the search, with random landmarks that are no more likely for standing first."""
-    doubts, trees = doubts_for(), len(scene_[4])
+    search, trees = search_for(), len(scene_[4])
     for i in range(n):
-        doubts.detection[i], doubts.choices[i] = i, choices
-        doubts.landmark[i, :choices] = rng.permutation(trees)[:choices]
-    return doubts
+        search.detection[i], search.choices[i] = i, choices
+        search.landmark[i, :choices] = rng.permutation(trees)[:choices]
+    return search
 
 
 def full(rows):
@@ -77,21 +77,21 @@ def cost_of(choice, mu, P, centre, R, mean, covariance, hits):
     return total
 
 
-def searched(scene_, n, doubts, gate2=GATE2):
+def searched(scene_, n, search, gate2=GATE2):
     mu, P, centre, R, mean, covariance, hits, _ = scene_
     taken = np.zeros(len(mean), np.bool_)
-    cost = choose_jointly(pose_of(mu, P), centre, R, mean, covariance, hits, gate2, WELL, taken, n, doubts)
+    cost = choose_jointly(pose_of(mu, P), centre, R, mean, covariance, hits, gate2, WELL, taken, n, search)
     assert not taken.any()
-    return cost, doubts.best[:n].tolist()
+    return cost, search.best[:n].tolist()
 
 
 @pytest.mark.parametrize(("n", "choices"), [(1, 4), (3, 2), (4, 3)])
 @given(seed=seeds)
 def test_the_choice_is_the_likeliest_of_all(n, choices, seed):
     given_ = scene(seed, n)
-    doubts = filled(given_, n, choices, given_[-1])
-    cost, chosen = searched(given_, n, doubts)
-    all_choices = product(*[[*doubts.landmark[i, :choices].tolist(), -1] for i in range(n)])
+    search = filled(given_, n, choices, given_[-1])
+    cost, chosen = searched(given_, n, search)
+    all_choices = product(*[[*search.landmark[i, :choices].tolist(), -1] for i in range(n)])
     one_to_one = [c for c in all_choices if len({j for j in c if j >= 0}) == sum(j >= 0 for j in c)]
     costs = [cost_of(c, *given_[:7]) for c in one_to_one]
     assert cost == pytest.approx(min(costs), abs=1e-6)
@@ -106,9 +106,9 @@ def test_pair_by_pair_is_the_likelihood_of_all_pairs_together(seed):
     mu, P, centre, R, mean, covariance, hits, _ = given_
     hits[:] = WELL
     P[:] = 1e-4 * P  # so that the place of linearising is no matter
-    doubts = filled(given_, n, 1, np.random.default_rng(seed))
-    doubts.landmark[:n, 0] = np.arange(n)
-    cost, chosen = searched(given_, n, doubts, gate2=1e9)
+    search = filled(given_, n, 1, np.random.default_rng(seed))
+    search.landmark[:n, 0] = np.arange(n)
+    cost, chosen = searched(given_, n, search, gate2=1e9)
     assert chosen == [0, 1, 2]
     y, S = np.zeros(2 * n), np.zeros((2 * n, 2 * n))
     J = []
@@ -124,10 +124,10 @@ def test_pair_by_pair_is_the_likelihood_of_all_pairs_together(seed):
 
 
 @given(seeds)
-def test_many_doubts_end_and_are_never_worse_than_no_landmark_at_all(seed):
+def test_many_ambiguous_detections_end_and_are_never_worse_than_no_landmark_at_all(seed):
     given_ = scene(seed, MOST, trees=MOST)
-    doubts = filled(given_, MOST, CHOICES, given_[-1])
-    cost, chosen = searched(given_, MOST, doubts)
+    search = filled(given_, MOST, CHOICES, given_[-1])
+    cost, chosen = searched(given_, MOST, search)
     known = [j for j in chosen if j >= 0]
     assert len(set(known)) == len(known)
     assert cost <= cost_of([-1] * MOST, *given_[:7]) + 1e-6

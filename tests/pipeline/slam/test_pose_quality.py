@@ -36,7 +36,8 @@ from pipeline.slam.scan_statistics import (
     SHIFT,
     STATISTICS,
     ScanStatistics,
-    average_statistics,
+    mean_statistics,
+    named_statistics,
 )
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
@@ -144,14 +145,14 @@ def test_the_word_and_its_reason(recent, sigma, doubt, state):
 
 
 @given(seeds)
-def test_what_the_particles_tell_is_weighted(seed):
+def test_the_statistics_of_particles_are_averaged_by_weight(seed):
     rng = np.random.default_rng(seed)
-    told = rng.uniform(1.0, 2.0, (8, STATISTICS))
-    alone = np.eye(8)[3]
-    scan = average_statistics(told, alone, 5, np.eye(3))
-    assert scan.recognised == pytest.approx(told[3, RECOGNISED])
-    assert scan.innovation == pytest.approx(told[3, INNOVATION] / (2 * told[3, RECOGNISED]))
-    assert scan.odometry == pytest.approx(np.linalg.norm(told[3, SHIFT]), rel=1e-3)
+    statistics = rng.uniform(1.0, 2.0, (8, STATISTICS))
+    third_only = np.eye(8)[3]
+    scan = named_statistics(*mean_statistics(statistics, third_only, np.eye(3)), 5)
+    assert scan.recognised == pytest.approx(statistics[3, RECOGNISED])
+    assert scan.innovation == pytest.approx(statistics[3, INNOVATION] / (2 * statistics[3, RECOGNISED]))
+    assert scan.odometry == pytest.approx(np.linalg.norm(statistics[3, SHIFT]), rel=1e-3)
 
 
 def test_a_scan_that_says_nothing_leaves_the_means():
