@@ -29,9 +29,9 @@ from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.batch.run_folder import FinishedRun
-    from app.tuning.sweep.jobs import PreparedRun, SweepPlan
-    from app.tuning.sweep.report import Comparison
-    from app.tuning.sweep.sweep import SweepResult, Workers
+    from app.tuning.report import Comparison
+    from app.tuning.sweep import PreparedRun, SweepPlan, SweepResult
+    from app.tuning.workers import Workers
     from pipeline.config import Parameters
     from pipeline.config.model import Value
     from pipeline.evaluation import MapScores
@@ -245,7 +245,7 @@ def distances(arguments: argparse.Namespace) -> list[str]:
 
 def run_grid(arguments: argparse.Namespace) -> int:
     """Compare all sets on all runs; return the exit code."""
-    from app.tuning.sweep.grid import combinations, read_axes
+    from app.tuning.grid import combinations, read_axes
 
     sets = combinations(read_axes(arguments.param_grid))
     arguments.assignments = [*arguments.assignments, *distances(arguments)]
@@ -259,8 +259,8 @@ def run_grid(arguments: argparse.Namespace) -> int:
     if not runs:
         return 1
 
-    from app.tuning.sweep.jobs import plan_jobs
-    from app.tuning.sweep.report import compare_results
+    from app.tuning.report import compare_results
+    from app.tuning.sweep import plan_jobs
 
     plan = plan_jobs(runs, sets, lambda run, changes: _base(arguments, run, changes))
     numbers = list(plan.jobs)
@@ -272,7 +272,7 @@ def run_grid(arguments: argparse.Namespace) -> int:
 def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
     """Return the runs that can be scored, and the number of the others, which are reported."""
     from app.sources.request import SourceRequest, mount_of_degrees
-    from app.tuning.sweep.jobs import prepare_run
+    from app.tuning.sweep import prepare_run
 
     runs, refused = [], 0
     for number, name in enumerate(arguments.runs):
@@ -294,7 +294,7 @@ def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
 
 def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Value]) -> Parameters:
     """Return the parameters that a set changes: the preset of the set or of the run, and the flags."""
-    from app.tuning.sweep.grid import PRESET
+    from app.tuning.grid import PRESET
     from pipeline.config import preset
 
     suits = str(changes.get(PRESET, run.preset))
@@ -306,7 +306,7 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
     from tqdm import tqdm
 
     from app.common.environment import from_environment
-    from app.tuning.sweep.sweep import ResultStore, sweep
+    from app.tuning.sweep import ResultStore, sweep
 
     folder = from_environment().folder
     kept = ResultStore(arguments.keep or (folder and folder / "results"))
@@ -321,7 +321,7 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
 
 @contextlib.contextmanager
 def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
-    from app.tuning.sweep.sweep import DaskWorkers, Processes
+    from app.tuning.workers import DaskWorkers, Processes
 
     workers: Workers
     if arguments.dask is not None:
@@ -340,7 +340,7 @@ def _print_comparison(
 ) -> int:
     """Print the comparison; returns the exit code."""
     from app.common.text import count
-    from app.tuning.sweep.report import files, json_text, lines
+    from app.tuning.report import files, json_text, lines
 
     if arguments.json:
         print(json_text(comparison), end="")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -102,24 +103,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
 @compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
     """Search and write the best set; return the exit code."""
-    from app.tuning.search import Search
+    from app.tuning.search import Search, search_processes
     from app.worker.numba_warmup import compile_ahead
 
     plan = _plan(arguments)
     compile_ahead()
-    search: Search | None = None
-    try:
-        search = Search(plan)
-        stopped, lost = _search(search, arguments.workers)
-        return _finish(search, arguments, stopped=stopped, lost=lost)
-    finally:
-        if search is not None:
-            search.close()
+    with (
+        closing(search_processes(plan, arguments.workers)) as workers,
+        closing(Search(plan, workers)) as search,
+    ):
+        stopped = _search(search)
+        return _finish(search, arguments, stopped=stopped)
 
 
 def _plan(arguments: argparse.Namespace) -> Plan:
     from app.robot.address import is_live
+    from app.sources.request import SourceRequest
     from app.tuning.plan import SENSIBLE, Plan, axes_of
+    from app.tuning.scoring import open_run
 
     for uri in (*arguments.runs, *arguments.held_out):
         if is_live(uri):
@@ -128,7 +129,8 @@ def _plan(arguments: argparse.Namespace) -> Plan:
                 where=uri,
                 remedy="Record it, and name the recording",
             )
-    preset_name, parameters = chosen_parameters(arguments, _suggested(arguments.runs[0]))
+    with closing(open_run(SourceRequest(arguments.runs[0]))) as first:
+        preset_name, parameters = chosen_parameters(arguments, first.preset)
     if not arguments.out.absolute().parent.is_dir():
         raise StemmapError("the folder for --out does not exist", where=str(arguments.out.absolute().parent))
     return Plan(
@@ -146,22 +148,10 @@ def _plan(arguments: argparse.Namespace) -> Plan:
     )
 
 
-def _suggested(uri: str) -> str:
-    """Return the preset that suits a run."""
-    from contextlib import closing
-
-    from pipeline.io.readers import open_source
-    from pipeline.io.readers.clouds import is_cloud
-
-    if is_cloud(uri):
-        return "forest"
-    with closing(open_source(uri)) as opened:
-        return opened.description.preset
-
-
 def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
     from app.sources.request import SourceRequest
-    from app.tuning.plan import PlannedRun, TruthTable
+    from app.tuning.jobs import TruthTable
+    from app.tuning.plan import PlannedRun
     from pipeline.io.ground_truth import read_truth_trees
 
     uris = [*arguments.runs, *arguments.held_out]
@@ -227,41 +217,30 @@ def _storage(arguments: argparse.Namespace) -> str:
     return str(address)
 
 
-def _search(search: Search, number: int) -> tuple[bool, int]:
-    """Make the trials. Return whether the search stopped before the last one, and the number of lost
-    processes."""
+def _search(search: Search) -> bool:
+    """Make the trials; return whether the search stopped before the last one."""
     import time
 
-    from app.tuning.search import SearchWorkers
-
-    plan = search.plan
-    workers: SearchWorkers | None = None
-    bar = _SearchProgress(plan)
-    since, before = time.monotonic(), 0
+    plan, bar = search.plan, _SearchProgress(search.plan)
+    since_s, before = time.monotonic(), 0
     try:
-        bar.begin(search.begin(), search)
-        workers = SearchWorkers(plan, number - 1)
-        since, before = time.monotonic(), len(search.trials())
-        while not plan.seconds or time.monotonic() - since < plan.seconds:
-            workers.watch()
-            trial = search.step()
+        while search.start is None:
+            search.advance()
+        bar.begin(search.start, search)
+        since_s, before = time.monotonic(), len(search.trials())
+        while not search.is_complete and not 0.0 < plan.seconds < time.monotonic() - since_s:
+            search.advance()
             bar.show(search)
-            if trial is None:
-                if not search.is_under_way:
-                    return False, workers.lost
-                time.sleep(0.1)
-        return len(search.trials()) < plan.trials, workers.lost
+        return not search.is_complete
     except KeyboardInterrupt:
-        if not search.trials():
+        if not search.trials() or search.start is None:
             raise
-        return True, workers.lost if workers else 0
+        return True
     finally:
-        if workers is not None:
-            workers.close()
-        bar.close(len(search.trials()) - before, time.monotonic() - since)
+        bar.close(len(search.trials()) - before, time.monotonic() - since_s)
 
 
-def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool, lost: int) -> int:
+def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool) -> int:
     from datetime import date
 
     from app.common.text import count
@@ -278,11 +257,9 @@ def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool, los
     for line in lines_of(plan, result):
         print(line)
     print(f"written to {arguments.out}; use it with --config {arguments.out}")
-    if lost:
-        print(
-            f"warning: {count(lost, 'process', 'processes')} ended early and were restarted",
-            file=sys.stderr,
-        )
+    for reason, times in sorted(search.lost.items()):
+        lost = count(times, "process", "processes")
+        print(f"warning: {lost} ended early and were restarted: {reason}", file=sys.stderr)
     if warning := warning_of(result):
         print(f"warning: {warning}", file=sys.stderr)
     if stopped:

@@ -30,7 +30,7 @@ from app.explain.client import WorkerClient
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
-from app.tuning.sweep.sensitivity import Sensitivity, question_of
+from app.tuning.sensitivity import Sensitivity, question_of
 from app.worker.map_changes import MapChanges
 from app.worker.outbox import joined
 from app.worker.protocol import (

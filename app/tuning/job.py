@@ -1,19 +1,16 @@
 """The parameter search of the page: its process, its state, and what the browsers show of it.
 
 A search maps the open run and other runs of the list in a child process, with the true trees and parameters
-at its start. A stopped search can continue from its journal. Process and journal are removed when the run is
-closed, another search begins or stemmap ends.
+at its start. A stopped search can continue with its trials, which are removed when the run is closed or
+another search begins.
 """
 
 from __future__ import annotations
 
 import asyncio
-import shutil
-import weakref
 from collections.abc import Callable, Sequence
 from datetime import date
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -25,13 +22,14 @@ from app.common.timers import cancel
 from app.robot.address import is_live
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.store import AnnotatedSource
-from app.tuning.plan import JOURNAL_FOLDER, GoalName, Plan, PlannedRun, Trial, TruthTable, axes_of, check
-from app.tuning.result import Result, SearchMessage, best_parameters, for_page, toml_of
+from app.tuning.jobs import TruthTable
+from app.tuning.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
+from app.tuning.result import Result, SearchMessage, SearchStart, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
 
-COMMAND = python_module("app.tuning.search", "page")
+COMMAND = python_module("app.tuning.search")
 State = Literal["none", "looking", "searching", "stopping", "done", "failed"]
 _GRACE_S = 3.0
 
@@ -60,8 +58,6 @@ class TuneSearch:
         self.request: SearchRequest | None = None
         self._start: Trial | None = None
         self._trials: dict[int, Trial] = {}
-        # Deletes the journal, at the latest when this process ends.
-        self._folder: weakref.finalize[..., TuneSearch] | None = None
         self._began = False  # whether the process has scored the start
 
     @property
@@ -72,18 +68,13 @@ class TuneSearch:
     @property
     def can_go_on(self) -> bool:
         """Whether the search was stopped before its last trial."""
-        made = len(self._trials)
-        return self._folder is not None and not self.is_under_way and bool(self.plan) and made < self._wanted
-
-    @property
-    def _wanted(self) -> int:
-        return 0 if self.plan is None else self.plan.trials
+        return self.plan is not None and not self.is_under_way and len(self._trials) < self.plan.trials
 
     async def start(self, plan: Plan, request: SearchRequest | None = None) -> None:
         """Start a search. A stopped search is removed.
 
         Args:
-            plan: The search; its storage is set here.
+            plan: The search.
             request: The request from which the plan was made.
 
         Raises:
@@ -92,13 +83,10 @@ class TuneSearch:
         self._check_idle()
         async with self._turn:
             self._forget()
-            folder = _folder()
-            self._folder = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-            plan = msgspec.structs.replace(plan, storage=str(folder / "journal"))
             await self._run(plan, request)
 
     async def go_on(self, now: Plan) -> None:
-        """Continue the stopped search from its journal.
+        """Continue the stopped search with its trials.
 
         Args:
             now: The plan that the same request gives now.
@@ -138,7 +126,7 @@ class TuneSearch:
         self._began = False
         self._task = asyncio.create_task(self._listen(process), name="search")
         self._task.add_done_callback(lambda _: self.show())  # from now on it can continue
-        await process.send(plan)
+        await process.send(SearchStart(plan, tuple(self._made())))
         self.show()
 
     def found(self) -> tuple[str, Parameters, str]:
@@ -171,9 +159,6 @@ class TuneSearch:
         self._state, self._error = "none", ""
         self.plan = self.result = self._start = self.request = None
         self._trials = {}
-        if self._folder is not None:
-            self._folder()
-            self._folder = None
 
     def _made(self) -> list[Trial]:
         return [self._trials[number] for number in sorted(self._trials)]
@@ -208,14 +193,6 @@ class TuneSearch:
 
     def _fail(self, why: str) -> None:
         self._state, self._error = "failed", why
-
-
-def _folder() -> Path:
-    """Make a folder for a journal."""
-    try:
-        return Path(mkdtemp(prefix=JOURNAL_FOLDER))
-    except OSError as error:
-        raise StemmapError(f"the trials cannot be kept: {error.strerror}") from None
 
 
 _MOST_TRIALS = 5000
@@ -382,7 +359,7 @@ def check_same(stopped: Plan, now: Plan) -> None:
             raise StemmapError(
                 "true trees were edited since the search began", where=new.source.uri, remedy=remedy
             )
-    if msgspec.structs.replace(stopped, storage="", preset=now.preset) != now:
+    if msgspec.structs.replace(stopped, preset=now.preset) != now:
         raise StemmapError(
             "the runs were opened in another way since the search began", remedy="Search again"
         )

@@ -10,10 +10,10 @@ from itertools import product
 from typing import Any, Literal
 
 import msgspec
-import numpy as np
 
 from app.common.text import value_text, version
 from app.sources.request import SourceRequest
+from app.tuning.jobs import TruthTable
 from pipeline.config import FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value, validated
 from pipeline.errors import ParameterError
@@ -222,16 +222,16 @@ class SearchAxis(msgspec.Struct, frozen=True):
     high: float = 0.0
     choices: tuple[str | bool, ...] = ()
 
-    def suggest(self, trial: Any) -> None:  # noqa: ANN401 - Optuna has no types
-        """Let a trial of Optuna choose a value, which it stores in its `params` under the name of the
-        axis."""
+    def distribution(self) -> Any:  # noqa: ANN401 - Optuna has no types
+        """Return the distribution of Optuna from which a value is suggested."""
+        from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
         log = self.low > 0.0 and self.high >= _LOG_FROM * self.low
         if self.kind == "choice":
-            trial.suggest_categorical(self.name, self.choices)
-        elif self.kind == "int":
-            trial.suggest_int(self.name, int(self.low), int(self.high), log=log)
-        else:
-            trial.suggest_float(self.name, self.low, self.high, log=log)
+            return CategoricalDistribution(self.choices)
+        if self.kind == "int":
+            return IntDistribution(int(self.low), int(self.high), log=log)
+        return FloatDistribution(self.low, self.high, log=log)
 
     def value_of(self, suggested: Any) -> Value:  # noqa: ANN401
         """Return the parameter value for a value of Optuna: rounded to `_DIGITS` significant digits, within
@@ -389,30 +389,7 @@ def _example(spec: FieldSpec) -> str:
 
 # --- plan and trials --------------------------------------------------------------------------------
 
-FORMAT = 1
-#: Prefix of the folder with the journal of a search of the page.
-JOURNAL_FOLDER = "stemmap-search-"
-
-
-class TruthTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """True trees as columns, for JSON. Lengths are metres; an unknown diameter is None."""
-
-    x: list[float]
-    y: list[float]
-    dbh: list[float | None]
-    kind: list[str]
-
-    @classmethod
-    def of(cls, trees: TruthTrees) -> TruthTable:
-        """Return the table of true trees given as arrays."""
-        dbh = [value if math.isfinite(value) else None for value in trees.dbh.tolist()]
-        return cls(trees.x.tolist(), trees.y.tolist(), dbh, list(trees.kind))
-
-    def trees(self) -> TruthTrees:
-        """Return the true trees as arrays."""
-        dbh = [math.nan if value is None else value for value in self.dbh]
-        x, y, diameter = (np.array(column, np.float64) for column in (self.x, self.y, dbh))
-        return TruthTrees(x, y, diameter, tuple(self.kind))
+FORMAT = 2
 
 
 class PlannedRun(msgspec.Struct, frozen=True):
@@ -442,7 +419,7 @@ class Plan(msgspec.Struct, frozen=True):
         runs: At least one that is not held out.
         axes: The parameters that are searched, with their bounds.
         start: All parameters with which the search begins, by stage. They are the first trial.
-        storage: Path of a journal, or address of a PostgreSQL database.
+        storage: Path of a journal, address of a PostgreSQL database, or "" for the memory.
         preset: Name of the preset from which the parameters come.
         goal, false_max: See `app.tuning.plan.Goal`.
         seed: Random seed of the mapping and of the sampler.
@@ -478,7 +455,7 @@ class Trial(msgspec.Struct, frozen=True):
     """The result of one set of parameters.
 
     Attributes:
-        number: Trials are numbered in the order in which they begin; -1 is the start of the search.
+        number: Trials are numbered in the order in which they end; -1 is the start of the search.
         values: The values that were tried, by parameter name.
         loss: See `Goal.loss`; None where the values contradict one another.
         training, held_out: Scores by run. Held-out runs are scored only for a set that is the best so far.

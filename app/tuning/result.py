@@ -13,6 +13,7 @@ from app.common.text import count, value_text, version
 from app.dashboard.parameters import file_of
 from app.tuning.plan import Goal, Plan, RunScore, Trial, pool
 from pipeline.config import Parameters
+from pipeline.errors import StemmapError
 
 if TYPE_CHECKING:
     from app.tuning.search import Search
@@ -41,6 +42,18 @@ class Result(msgspec.Struct, frozen=True):
     sources: tuple[tuple[str, str, bool], ...]
 
 
+class SearchStart(msgspec.Struct, frozen=True):
+    """Request to a process for a search.
+
+    Attributes:
+        plan: The search.
+        trials: Its trials before it was stopped.
+    """
+
+    plan: Plan
+    trials: tuple[Trial, ...] = ()
+
+
 class SearchMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     """Progress of a search in another process. A message without any field means that the search was stopped
     before it had a score.
@@ -62,15 +75,17 @@ def result_of(search: Search) -> Result:
     """Return the result of the trials so far.
 
     Raises:
-        StoppedError: The search was stopped while a held-out run was scored.
+        StemmapError: The search was stopped before its start was scored.
     """
     from app.tuning.search import importances
 
+    if search.start is None:
+        raise StemmapError("the search was stopped before its first score")
     trials, best = search.trials(), search.best()
     better = best is not None and best.loss is not None and best.loss < (search.start.loss or 0.0)
     return Result(
         search.start,
-        search.with_held_out(best) if better and best is not None else search.start,
+        best if better and best is not None else search.start,
         better,
         len(trials),
         sum(trial.loss is None for trial in trials),

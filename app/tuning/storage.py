@@ -1,24 +1,28 @@
-"""Storage of the trials of a search: a journal, which is a plain file, or a PostgreSQL database."""
+"""Trials of a search: in memory, in a file with one line per trial, or in a PostgreSQL database that several
+machines share."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import TYPE_CHECKING, Any
 
-from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+import msgspec
 
+from app.tuning.plan import Trial
 from pipeline.errors import StemmapError
+from pipeline.io.atomic_files import hold
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection
 
 SERVER = ("postgresql://", "postgresql+psycopg://")
-_SCHEMA = "stemmap_tuning"  # keeps Optuna's tables and their version apart from stemmap's
-_OPENING = 0x73746D70  # number of the advisory lock
 _LARGEST = 1 << 30
-_PART = 1 << 16
 _DIFFERENCES = {
     "format": "another version of stemmap",
     "version": "another version of stemmap",
@@ -29,21 +33,7 @@ _DIFFERENCES = {
     "seed": "another seed",
     "odometry": "another --odometry",
 }
-_IDENTITY = "stemmap"
-
-
-class OtherSearchError(StemmapError):
-    """The journal belongs to another search.
-
-    Args:
-        differs: The difference, as text.
-        where: The journal.
-    """
-
-    def __init__(self, differs: str, where: str) -> None:
-        self.differs = differs
-        remedy = "Name another file with --journal, or delete this one"
-        super().__init__(f"the journal belongs to another search: {differs}", where=where, remedy=remedy)
+_OTHER_FILE = "Name another file with --journal, or delete this one"
 
 
 def is_server(storage: str) -> bool:
@@ -51,256 +41,267 @@ def is_server(storage: str) -> bool:
     return storage.startswith(SERVER)
 
 
-def open_study(storage: str, identity: dict[str, Any]) -> tuple[Any, Any]:
-    """Open or create Optuna's study of a search. Returns the study, with its earlier trials, and its storage.
+def open_trials(storage: str, identity: dict[str, Any], known: Sequence[Trial] = ()) -> Trials:
+    """Open the trials of a search.
+
+    Args:
+        storage: Path of a journal, address of a database, or "" for the memory.
+        identity: All that decides the result of a trial, see `app.tuning.plan.identity`.
+        known: Earlier trials, for the memory.
 
     Raises:
         StemmapError: The storage cannot be written, is damaged, or belongs to another search.
     """
-    import optuna
-
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    backend = _server(storage) if is_server(storage) else _journal(Path(storage), identity)
-    try:
-        study = optuna.create_study(
-            storage=backend, study_name=_name(identity), direction="minimize", load_if_exists=True
-        )
-        if _IDENTITY not in study.user_attrs:
-            study.set_user_attr(_IDENTITY, identity)
-    except StemmapError:
-        raise
-    except OSError as error:
-        raise unwritable(storage, error) from None
-    except Exception as error:  # Optuna raises many kinds for a damaged file or a lost server
-        raise _refused(storage, error) from None
-    return study, backend
+    if is_server(storage):
+        return SharedTrials(storage, identity)
+    return Journal(Path(storage), identity) if storage else Trials(known)
 
 
-def close_storage(backend: Any) -> None:  # noqa: ANN401 - Optuna has no types
-    """Close the connection to a database. A journal needs no closing."""
-    if (engine := getattr(backend, "engine", None)) is not None:
-        backend.remove_session()
-        engine.dispose()
-
-
-def _name(identity: dict[str, Any]) -> str:
-    text = json.dumps(identity, sort_keys=True).encode()
-    return f"stemmap {hashlib.sha256(text).hexdigest()[:16]}"
-
-
-def _journal(path: Path, identity: dict[str, Any]) -> Any:  # noqa: ANN401
-    from optuna.storages import JournalStorage
-
-    try:
-        known = _mended(path)
-        storage = JournalStorage(Journal(str(path)))
-    except OSError as error:
-        raise unwritable(str(path), error) from None
-    except Exception as error:  # a line of JSON that Optuna did not write
-        raise _damaged(path, error) from None
-    if known:
-        _check_same(path, storage, identity)
-    return storage
-
-
-def _mended(path: Path) -> bool:
-    """Return whether the journal exists and is not empty, after the removal of an incomplete last line.
-
-    Raises:
-        StemmapError: The file is not a journal.
-    """
-    if not path.exists() or path.stat().st_size == 0:
-        return False
-    if path.stat().st_size > _LARGEST:
-        raise StemmapError("the journal is larger than 1 GB", where=str(path))
-    with path.open("rb") as file:
-        first = file.readline(1 << 20)
-    try:
-        is_journal = "op_code" in json.loads(first)
-    except (ValueError, TypeError, RecursionError):
-        is_journal = False
-    if not is_journal:
-        raise StemmapError(
-            "this is not the journal of a search", where=str(path), remedy="Name another file with --journal"
-        )
-    cut_half_line(path)
-    return True
-
-
-def _check_same(path: Path, storage: Any, identity: dict[str, Any]) -> None:  # noqa: ANN401
-    import optuna
-
-    try:
-        names = optuna.get_all_study_names(storage)
-        attributes = [optuna.load_study(study_name=name, storage=storage).user_attrs for name in names]
-    except Exception as error:
-        raise _damaged(path, error) from None
-    before = [known[_IDENTITY] for known in attributes if isinstance(known.get(_IDENTITY), dict)]
-    if not before:
-        raise StemmapError(
-            "`stemmap tune` did not write this journal", where=str(path), remedy="Name another with --journal"
-        )
-    plain = json.loads(json.dumps(identity))
-    if plain in before:
-        return
-    theirs = before[-1]
-    differs = dict.fromkeys(_DIFFERENCES[key] for key in _DIFFERENCES if theirs.get(key) != plain[key])
-    raise OtherSearchError(", ".join(differs), str(path))
-
-
-def _server(address: str) -> Any:  # noqa: ANN401
-    from optuna.storages import RDBStorage
-    from sqlalchemy import create_engine, make_url, text
-    from sqlalchemy.exc import ArgumentError
-
-    try:
-        url = make_url(address).set(drivername="postgresql+psycopg")
-    except (ArgumentError, ValueError):
-        raise StemmapError("this is not the address of a database") from None
-    try:
-        engine = create_engine(url, connect_args={"connect_timeout": 5}, isolation_level="AUTOCOMMIT")
-        options = {"connect_timeout": 5, "options": f"-csearch_path={_SCHEMA}"}
-        plain = url.render_as_string(hide_password=False)
-        try:
-            with engine.connect() as connection:
-                # Of several machines that begin at the same time only one makes the tables. The lock ends
-                # with the connection.
-                connection.execute(text(f"SELECT pg_advisory_lock({_OPENING})"))
-                connection.execute(text(f"CREATE SCHEMA IF NOT EXISTS {_SCHEMA}"))
-                return RDBStorage(plain, engine_kwargs={"connect_args": options, "pool_pre_ping": True})
-        finally:
-            engine.dispose()
-    except ImportError:
-        raise StemmapError(
-            "the driver of PostgreSQL is missing", remedy="Install stemmap[postgres]"
-        ) from None
-    except Exception as error:
-        raise _refused(address, error) from None
-
-
-def _refused(storage: str, error: Exception) -> StemmapError:
-    if not is_server(storage):
-        return _damaged(Path(storage), error)
-    from sqlalchemy import make_url
-
-    reason = " ".join(str(getattr(error, "orig", None) or error).split())[:200]
-    where = make_url(storage).render_as_string(hide_password=True)
-    return StemmapError(f"the database cannot be used: {reason}", where=where)
-
-
-def _damaged(path: Path, error: Exception) -> StemmapError:
-    if isinstance(error, StemmapError):
-        return error
-    reason = " ".join(str(error).split())[:120] or type(error).__name__
-    return StemmapError(
-        f"the journal is damaged: {reason}",
-        where=str(path),
-        remedy="Name another with --journal, or delete it",
-    )
-
-
-def unwritable(storage: str, error: OSError) -> StemmapError:
-    """Return the error of trials that cannot be written to a storage."""
-    reason = (error.strerror or str(error)).lower()
-    return StemmapError(f"the trials cannot be kept: {reason}", where=storage)
-
-
-def unreadable(storage: str, error: OSError) -> StemmapError:
-    """Return the error of trials that cannot be read from a storage."""
-    reason = (error.strerror or str(error)).lower()
-    return StemmapError(f"the trials cannot be read: {reason}", where=storage)
-
-
-# --- the journal ------------------------------------------------------------------
-
-
-class Journal(JournalFileBackend):  # type: ignore[misc]
-    """Optuna's journal, without waiting for the disk. It survives a process that is killed; trials that a
-    power cut loses are repeated. A trial writes a dozen lines; waiting for the disk after each line took
-    longer than mapping a short run.
+class Trials:
+    """Trials of a search in memory, by number.
 
     Args:
-        path: Path of the file.
+        known: Earlier trials.
+
+    Attributes:
+        all: The trials.
+        slot: Number of this process among those that share the trials now.
     """
 
-    def __init__(self, path: str) -> None:
-        super().__init__(path, lock_obj=JournalFileOpenLock(path))
-        self._file = Path(path)
+    slot = 0
 
-    def read_logs(self, log_number_from: int) -> Iterator[dict[str, Any]]:
-        """Yield the log entries from number `log_number_from` onwards.
+    def __init__(self, known: Sequence[Trial] = ()) -> None:
+        self.all = list(known)
 
-        Raises:
-            StemmapError: The file cannot be read.
-        """
-        try:
-            yield from super().read_logs(log_number_from)
-        except OSError as error:
-            raise unreadable(str(self._file), error) from None
+    def refresh(self) -> None:
+        """Read the trials that other machines have added."""
 
-    def append_logs(self, logs: list[dict[str, Any]]) -> None:
-        """Append all entries or none.
+    def add(self, trial: Trial, most: int) -> Trial | None:
+        """Store a trial under the next number, and return it with its number.
+
+        Args:
+            trial: The trial.
+            most: Number of trials of the search; where there are so many, nothing is stored and None is
+                returned.
 
         Raises:
-            StemmapError: The file cannot be written, for example on a full disk.
+            StemmapError: It cannot be stored.
         """
-        text = "".join(f"{json.dumps(log, separators=(',', ':'))}\n" for log in logs)
+        if len(self.all) >= most:
+            return None
+        self.all.append(msgspec.structs.replace(trial, number=len(self.all)))
+        return self.all[-1]
+
+    def close(self) -> None:
+        """Close the file or the connection."""
+
+
+class Journal(Trials):
+    """Trials in a file: a line of JSON with the identity of the search, then a line for each trial.
+
+    A line is not waited for on the disk: trials that a power cut loses are repeated. An incomplete last line,
+    which a killed process leaves, is removed.
+
+    Raises:
+        StemmapError: The file cannot be used, is damaged or in use, or belongs to another search.
+    """
+
+    def __init__(self, path: Path, identity: dict[str, Any]) -> None:
+        super().__init__()
+        self._path = path
         try:
-            with _locked(self._file) as file:
-                _cut(file)
-                _append(file, text.encode())
+            self._file = path.open("a+b", buffering=0)
         except OSError as error:
-            raise unwritable(str(self._file), error) from None
+            raise self._unwritable(error) from None
+        try:
+            self._read({"search": json.loads(json.dumps(identity))})
+        except BaseException:
+            self.close()
+            raise
+
+    def add(self, trial: Trial, most: int) -> Trial | None:
+        """Store a trial, see `Trials.add`. On a full disk nothing is written."""
+        added = super().add(trial, most)
+        if added is not None:
+            self._append(added)
+        return added
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _read(self, header: dict[str, Any]) -> None:
+        try:
+            hold(self._file)
+            if self._file.seek(0, os.SEEK_END) > _LARGEST:
+                raise StemmapError("the journal is larger than 1 GB", where=str(self._path))
+            self._file.seek(0)
+            content = self._file.read()
+        except BlockingIOError:
+            raise StemmapError(
+                "another search writes to this journal",
+                where=str(self._path),
+                remedy="Wait until it has ended",
+            ) from None
+        except OSError as error:
+            raise self._unwritable(error) from None
+        end = content.rfind(b"\n") + 1
+        first, *lines = content[: end - 1].split(b"\n") if end else (b"",)
+        if end:
+            self._check_header(first, header)
+        elif not _line(header).startswith(content):
+            raise self._foreign()
+        try:
+            self.all = [msgspec.json.decode(line, type=Trial) for line in lines]
+            if [trial.number for trial in self.all] != list(range(len(lines))):
+                raise ValueError("trials are missing")
+        except (msgspec.MsgspecError, ValueError) as error:
+            raise StemmapError(
+                f"the journal is damaged: {error}", where=str(self._path), remedy=_OTHER_FILE
+            ) from None
+        self._file.truncate(end)
+        if not end:
+            self._append(header)
+
+    def _check_header(self, line: bytes, expected: dict[str, Any]) -> None:
+        try:
+            theirs = msgspec.json.decode(line, type=dict[str, dict[str, Any]])["search"]
+        except (msgspec.MsgspecError, UnicodeDecodeError, KeyError):
+            raise self._foreign() from None
+        own = expected["search"]
+        if theirs != own:
+            differs = dict.fromkeys(_DIFFERENCES[key] for key in _DIFFERENCES if theirs.get(key) != own[key])
+            raise StemmapError(
+                f"the journal belongs to another search: {', '.join(differs)}",
+                where=str(self._path),
+                remedy=_OTHER_FILE,
+            )
+
+    def _append(self, record: object) -> None:
+        begin, rest = self._file.seek(0, os.SEEK_END), memoryview(_line(record))
+        try:
+            while rest:  # a full disk may accept a part
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            self._file.truncate(begin)
+            raise self._unwritable(error) from None
+
+    def _foreign(self) -> StemmapError:
+        return StemmapError("this is not the journal of a search", where=str(self._path), remedy=_OTHER_FILE)
+
+    def _unwritable(self, error: OSError) -> StemmapError:
+        reason = (error.strerror or str(error)).lower()
+        return StemmapError(f"the trials cannot be kept: {reason}", where=str(self._path))
 
 
-def cut_half_line(path: Path) -> None:
-    """Remove an incomplete last line, which a process leaves that is killed while it writes."""
-    with path.open("rb") as file:
-        if _is_whole(file):
-            return
-    with _locked(path) as file:  # checked again: another process may have been writing
-        _cut(file)
+def _line(record: object) -> bytes:
+    return msgspec.json.encode(record) + b"\n"
 
 
-@contextmanager
-def _locked(path: Path) -> Iterator[IO[bytes]]:
-    """Open the file while no other process writes to it."""
-    lock = JournalFileOpenLock(str(path))
-    lock.acquire()
-    try:
-        with path.open("a+b", buffering=0) as file:
-            yield file
-    finally:
-        with suppress(RuntimeError):  # the lock file was deleted
-            lock.release()
+_LOCK = 0x73746D70  # number of the advisory lock
+_TABLES = (
+    "CREATE SCHEMA IF NOT EXISTS stemmap_search",
+    "CREATE TABLE IF NOT EXISTS stemmap_search.trials "
+    "(search text NOT NULL, number integer NOT NULL, trial text NOT NULL, PRIMARY KEY (search, number))",
+)
 
 
-def _is_whole(file: IO[bytes]) -> bool:
-    if not file.seek(0, os.SEEK_END):
-        return True
-    file.seek(-1, os.SEEK_END)
-    return file.read(1) == b"\n"
+class SharedTrials(Trials):
+    """Trials in a table of a PostgreSQL database. Every machine reads the trials of the others.
 
+    Raises:
+        StemmapError: The database cannot be used.
+    """
 
-def _cut(file: IO[bytes]) -> None:
-    end = file.seek(0, os.SEEK_END)
-    if _is_whole(file):
-        return
-    while end:
-        begin = max(end - _PART, 0)
-        file.seek(begin)
-        last = file.read(end - begin).rfind(b"\n")
-        end = begin + last + 1 if last >= 0 else begin
-        if last >= 0:
-            break
-    file.truncate(end)
+    def __init__(self, address: str, identity: dict[str, Any]) -> None:
+        from sqlalchemy import create_engine, make_url, text
+        from sqlalchemy.exc import ArgumentError
 
+        super().__init__()
+        digest = hashlib.sha256(json.dumps(identity, sort_keys=True).encode())
+        self._search = digest.hexdigest()
+        try:
+            url = make_url(address).set(drivername="postgresql+psycopg")
+        except (ArgumentError, ValueError):
+            raise StemmapError("this is not the address of a database") from None
+        self._where = url.render_as_string(hide_password=True)
+        try:
+            self._engine = create_engine(url, connect_args={"connect_timeout": 5}, pool_pre_ping=True)
+            with self._locked() as connection:
+                for statement in _TABLES:
+                    connection.execute(text(statement))
+            # The lock of a slot ends with its connection, also that of a machine that is killed.
+            self._present = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+            take = text("SELECT pg_try_advisory_lock(:lock, :slot)")
+            lock = int.from_bytes(digest.digest()[:4], "big", signed=True)
+            self.slot = next(
+                slot
+                for slot in itertools.count()
+                if self._present.execute(take, {"lock": lock, "slot": slot}).scalar()
+            )
+        except ImportError:
+            raise StemmapError(
+                "the driver of PostgreSQL is missing", remedy="Install stemmap[postgres]"
+            ) from None
+        except Exception as error:
+            raise self._refused(error) from None
+        self.refresh()
 
-def _append(file: IO[bytes], data: bytes) -> None:
-    begin, rest = file.seek(0, os.SEEK_END), memoryview(data)
-    try:
-        while rest:  # a full disk may accept a part
-            rest = rest[file.write(rest) :]
-    except OSError:
-        file.truncate(begin)
-        raise
+    def refresh(self) -> None:
+        """Read the trials that other machines have added.
+
+        Raises:
+            StemmapError: The database cannot be read.
+        """
+        from sqlalchemy.exc import SQLAlchemyError
+
+        try:
+            with self._engine.begin() as connection:
+                self._read(connection)
+        except (SQLAlchemyError, msgspec.MsgspecError) as error:
+            raise self._refused(error) from None
+
+    def add(self, trial: Trial, most: int) -> Trial | None:
+        """Store a trial, see `Trials.add`."""
+        from sqlalchemy import text
+        from sqlalchemy.exc import SQLAlchemyError
+
+        insert = text("INSERT INTO stemmap_search.trials VALUES (:search, :number, :trial)")
+        try:
+            with self._locked() as connection:
+                self._read(connection)
+                added = super().add(trial, most)
+                if added is not None:
+                    values = {"number": added.number, "trial": msgspec.json.encode(added).decode()}
+                    connection.execute(insert, {"search": self._search, **values})
+        except (SQLAlchemyError, msgspec.MsgspecError) as error:
+            raise self._refused(error) from None
+        return added
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._present.close()
+        self._engine.dispose()
+
+    @contextmanager
+    def _locked(self) -> Iterator[Connection]:
+        """Begin a transaction during which no other machine changes the table."""
+        from sqlalchemy import text
+
+        with self._engine.begin() as connection:
+            connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _LOCK})
+            yield connection
+
+    def _read(self, connection: Connection) -> None:
+        from sqlalchemy import text
+
+        select = text(
+            "SELECT trial FROM stemmap_search.trials WHERE search = :search AND number >= :known "
+            "ORDER BY number"
+        )
+        rows = connection.execute(select, {"search": self._search, "known": len(self.all)}).scalars()
+        self.all += [msgspec.json.decode(row, type=Trial) for row in rows]
+
+    def _refused(self, error: Exception) -> StemmapError:
+        reason = " ".join(str(getattr(error, "orig", None) or error).split())[:200]
+        return StemmapError(f"the database cannot be used: {reason}", where=self._where)

@@ -14,7 +14,7 @@ from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.tuning.job import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
 from app.tuning.plan import GOALS, SENSIBLE, Plan
-from app.tuning.sweep.sensitivity import MOST_VALUES
+from app.tuning.sensitivity import MOST_VALUES
 from app.web.responses import Body, Value, Word, json_reply
 from app.web.routes.access import AnyFile, Dash, Deployment
 from app.web.routes.parameters import SaveSet

@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -17,11 +17,13 @@ from app.cli import main
 from app.cli.tune import files_of
 from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
-from app.tuning.plan import Plan, PlannedRun, Trial, TruthTable, axes_of
+from app.tuning.jobs import Job, JobResult, TruthTable
+from app.tuning.plan import Plan, PlannedRun, Trial, axes_of
 from app.tuning.result import result_of
-from app.tuning.search import Search, SearchWorkers, StoppedError
+from app.tuning.search import Search, search_processes
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
+from tests.app.tuning.inline_worker import InlineWorker
 from tests.app.tuning.provenance import provenance_in
 
 RUN, OTHER = "sim:stand?duration=1", "sim:stand?duration=1&seed=3"
@@ -40,23 +42,18 @@ def plan(folder: Path, name: str = "a", **changes: object) -> Plan:
     return msgspec.structs.replace(told, **changes)
 
 
-def exhaust(search: Search) -> None:
-    """Make all trials that are left."""
-    while search.step() is not None:
-        pass
+def exhaust(search: Search, most: int = 1000) -> None:
+    """Make all trials that are left, or so many."""
+    made = 0
+    while not search.is_complete and made < most:
+        made += len(search.advance())
 
 
 def searched(told: Plan, most: int = 1000) -> list[Trial]:
     """The trials of a search, after so many more."""
-    search = Search(told)
-    try:
-        search.begin()
-        for _ in range(most):
-            if search.step() is None:
-                break
+    with closing(InlineWorker()) as worker, closing(Search(told, worker)) as search:
+        exhaust(search, most)
         return search.trials()
-    finally:
-        search.close()
 
 
 @pytest.fixture(scope="module")
@@ -74,17 +71,23 @@ def test_the_start_is_tried_first_and_is_never_better_than_the_best(whole):
 def test_a_stopped_search_goes_on_to_the_same_trials(whole, tmp_path):
     told = plan(tmp_path)
     assert searched(told, 5) == whole[:5]
+
     # Stopped in the middle of a trial, and killed while it wrote.
-    stops: list[bool] = []
-    search = Search(told, stop=lambda: bool(stops))
-    search.begin()
-    stops.append(True)
-    with pytest.raises(StoppedError):
+    def stopped(_job: Job) -> JobResult:
+        raise KeyboardInterrupt
+
+    with closing(Search(told, InlineWorker(stopped))) as search, pytest.raises(KeyboardInterrupt):
         exhaust(search)
-    search.close()
     with Path(told.storage).open("ab") as journal:
-        journal.write(b'{"op_code": 5, "wor')
+        journal.write(b'{"number": 5, "val')
     assert searched(told) == whole
+
+
+def test_a_search_goes_on_from_trials_in_memory(whole, tmp_path):
+    told = plan(tmp_path, storage="")
+    with closing(InlineWorker()) as worker, closing(Search(told, worker, whole[:5])) as search:
+        exhaust(search)
+        assert search.trials() == whole
 
 
 def test_what_a_trial_scores_is_what_map_scores(whole, tmp_path):
@@ -112,7 +115,7 @@ def test_a_journal_of_another_search_is_left_alone(tmp_path):
         ({"start": preset("paper").model_dump()}, "to begin with"),
     ):
         with pytest.raises(StemmapError, match=words):
-            Search(msgspec.structs.replace(told, **changes))
+            Search(msgspec.structs.replace(told, **changes), InlineWorker())
     assert Path(told.storage).read_bytes() == before
 
 
@@ -121,53 +124,61 @@ def test_a_journal_of_another_version_is_told(tmp_path, monkeypatch):
     searched(told)
     monkeypatch.setattr("app.tuning.plan.version", lambda: "9.9.9")
     with pytest.raises(StemmapError, match="another version of stemmap"):
-        Search(told)
+        Search(told, InlineWorker())
 
 
-@pytest.mark.parametrize("text", [b"x_m,y_m\n1,2\n", b'{"op_code": 0}\n{"op_code": "?"}\n', b"\xff\xfe\n"])
+@pytest.mark.parametrize(
+    "text", [b"x_m,y_m\n1,2\n", b'{"op_code": 0}\n{"op_code": "?"}\n', b"\xff\xfe\n", b"\xff\xfe", b"\n"]
+)
 def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
     told = plan(tmp_path)
     Path(told.storage).write_bytes(text)
     with pytest.raises(StemmapError, match="journal"):
-        Search(told)
+        Search(told, InlineWorker())
     assert Path(told.storage).read_bytes() == text
 
 
 def test_sets_that_contradict_themselves_are_counted_and_left_out(tmp_path):
     told = plan(tmp_path, axes=axes_of(["detection.e_min=1..100", "detection.e_max=10..100"]), trials=6)
-    search = Search(told)
-    search.begin()
-    exhaust(search)
-    result = result_of(search)
-    search.close()
+    with closing(InlineWorker()) as worker, closing(Search(told, worker)) as search:
+        exhaust(search)
+        result = result_of(search)
     assert result.made == 6
     assert 0 < result.refused < 6
     preset("forest").replace(dict(result.best.values))  # else it would say what contradicts
 
 
-@pytest.mark.slow  # the process starts and compiles
-def test_a_process_that_is_killed_is_started_again_and_its_trial_made(whole, tmp_path):
-    told = plan(tmp_path, trials=4)
-    search = Search(told)
-    search.begin()
-    helpers = SearchWorkers(told, 1)
-    try:
-        (pid,) = helpers.pids
-        while not search.is_under_way:  # until it makes a trial of its own
-            assert helpers.pids == [pid]
-            time.sleep(0.02)
-        os.kill(pid, signal.SIGKILL)
-        while helpers.pids:
-            time.sleep(0.02)
+def test_a_set_whose_worker_was_lost_is_scored_again_until_too_many_are_lost(whole, tmp_path):
+    lost = ["signal 9, SIGKILL"] * 2
+    with closing(InlineWorker()) as real:
+        worker = InlineWorker(lambda job: lost.pop() if lost else real._scorer.score(job))
+        with closing(Search(plan(tmp_path, trials=2), worker)) as search:
+            exhaust(search)
+            assert search.trials() == whole[:2]
+            assert search.lost == {"signal 9, SIGKILL": 2}
+    dead = InlineWorker(lambda _job: "exit code 1")
+    with (
+        closing(Search(plan(tmp_path, "b"), dead)) as search,
+        pytest.raises(StemmapError, match="exit code 1"),
+    ):
         exhaust(search)
-        helpers.watch()
-        assert helpers.lost == 1
-    finally:
-        helpers.close()
-        search.close()
-    made = search.trials()
-    assert [trial.number for trial in made] == [0, 1, 2, 3]
-    assert made[0] == whole[0]
+
+
+@pytest.mark.slow  # the processes start
+def test_two_processes_make_as_many_trials_and_one_that_is_killed_is_replaced(whole, tmp_path):
+    told = plan(tmp_path, trials=4)
+    with closing(search_processes(told, 2)) as workers, closing(Search(told, workers)) as search:
+        while search.start is None:
+            search.advance()
+        search.advance(0.0)
+        for child in workers._children.values():
+            os.kill(child.pid, signal.SIGKILL)
+            break
+        exhaust(search)
+        made = search.trials()
+        assert [trial.number for trial in made] == [0, 1, 2, 3]
+        assert whole[0].values in [trial.values for trial in made]
+        assert sum(search.lost.values()) <= 1
 
 
 # --- the command ----------------------------------------------------------------------------------

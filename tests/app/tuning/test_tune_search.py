@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-import tempfile
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,9 @@ import pytest_asyncio
 
 from app.sources.request import SourceRequest
 from app.tuning.job import TuneSearch
-from app.tuning.plan import Plan, PlannedRun, RunScore, Trial, TruthTable, axes_of
-from app.tuning.result import Result, SearchMessage
+from app.tuning.jobs import TruthTable
+from app.tuning.plan import Plan, PlannedRun, RunScore, Trial, axes_of
+from app.tuning.result import Result, SearchMessage, SearchStart
 from app.worker.protocol import Open
 from pipeline.config import preset
 from pipeline.errors import StemmapError
@@ -48,10 +48,13 @@ SAID = (
 )
 
 
-def says(*lines: SearchMessage, then: str = "") -> list[str]:
-    """A process that says some lines when it was told a plan."""
+def says(*lines: SearchMessage, then: str = "", hears: Path = Path(os.devnull)) -> list[str]:
+    """A process that says some lines when it was told a plan, which it writes to a file."""
     texts = [_line(line) for line in lines]
-    code = f"import sys, time, os\nsys.stdin.readline()\nfor t in {texts!r}: print(t, flush=True)\n{then}"
+    code = (
+        f"import sys, time, os\nopen({str(hears)!r}, 'w').write(sys.stdin.readline())\n"
+        f"for t in {texts!r}: print(t, flush=True)\n{then}"
+    )
     return [sys.executable, "-c", code]
 
 
@@ -152,24 +155,13 @@ async def test_a_run_that_is_left_while_its_search_is_being_started_has_none(mad
     assert [process.returncode is None for process in made] == [False]
 
 
-async def test_what_a_search_had_on_disk_goes_with_it(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    search = TuneSearch(lambda _: None, says(then="sys.stdin.read()"))
-    await search.start(PLAN)
-    assert list(tmp_path.glob("stemmap-*"))
-    await search.leave()
-    assert not list(tmp_path.glob("stemmap-*"))
-
-
-async def test_a_stopped_search_goes_on_from_its_journal_and_only_with_what_it_began_with():
+async def test_a_stopped_search_goes_on_with_its_trials_and_only_with_what_it_began_with(tmp_path):
     pages: list[dict[str, Any]] = []
     search = TuneSearch(pages.append)
     first = SearchMessage(trials=(msgspec.structs.replace(START, number=0),))
     ended = SearchMessage(result=msgspec.structs.replace(RESULT, better=False, best=START, made=1))
     search._command = says(SAID[0], first, then=f"sys.stdin.readline()\nprint({_line(ended)!r}, flush=True)")
     await search.start(PLAN)
-    assert search.plan is not None
-    journal = Path(search.plan.storage)
     with pytest.raises(StemmapError, match="under way"):
         await search.go_on(PLAN)
     await until(lambda: search.as_plain()["made"] == 1)
@@ -185,20 +177,18 @@ async def test_a_stopped_search_goes_on_from_its_journal_and_only_with_what_it_b
     ):
         with pytest.raises(StemmapError, match=words):
             await search.go_on(msgspec.structs.replace(PLAN, **changed))
-    # The journal knows the first trial, and what was made since.
+    # The process is told the first trial, and repeats it.
     news = SearchMessage(trials=(BEST, msgspec.structs.replace(START, number=2)))
-    search._command = says(msgspec.structs.replace(SAID[0], trials=first.trials), news, SAID[2])
-    assert journal.parent.is_dir()
-    await search.go_on(msgspec.structs.replace(PLAN, storage=""))
-    assert Path(search.plan.storage) == journal
+    heard = tmp_path / "heard"
+    search._command = says(msgspec.structs.replace(SAID[0], trials=first.trials), news, SAID[2], hears=heard)
+    await search.go_on(PLAN)
     await until(lambda: not search.is_under_way)
     told = search.as_plain()
     assert (told["state"], told["made"], told["better"], told["go_on"]) == ("done", 3, True, False)
     assert [number for number, _ in told["points"]] == [0, 1, 2]
     with pytest.raises(StemmapError, match="no stopped search"):
         await search.go_on(PLAN)
-    await search.leave()
-    assert not journal.parent.exists()
+    assert msgspec.json.decode(heard.read_bytes(), type=SearchStart) == SearchStart(PLAN, first.trials)
 
 
 async def test_a_real_search_is_stopped_and_keeps_what_it_found():

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from app.sources.request import SourceRequest
-from app.tuning.plan import TruthTable
-from app.tuning.sweep.jobs import Job, RunWithTruth, code_digest
-from pipeline.config import preset
-from tests.app.tuning.sweep.scores import scores
+import msgspec
 
-__all__ = ["job", "scores"]
+from app.sources.request import SourceRequest
+from app.tuning.jobs import Job, RunWithTruth, TruthTable, code_digest
+from pipeline.config import preset
+from pipeline.evaluation import MapScores
+from tests.app.tuning.scores import scores as plain_scores
+
+
+def scores(f1: float | None, *, found: int = 3, wrong: int = 0) -> MapScores:
+    """Scores that are told apart by their F1."""
+    return msgspec.convert(plain_scores(f1, found=found, wrong=wrong), MapScores)
 
 
 def job(eps: float, *, seed: int = 0, digest: str = "d", particles: int = 100) -> Job:

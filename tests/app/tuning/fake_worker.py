@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from app.common.child_process import ParentConnection, run_child
-from tests.app.tuning.sweep.scores import scores
+from tests.app.tuning.scores import scores
 
 
 def score(job: dict[str, Any], folder: Path) -> dict[str, Any]:
@@ -32,7 +32,7 @@ def score(job: dict[str, Any], folder: Path) -> dict[str, Any]:
             told.write(f"{eps}\n")
     while (folder / "wait").exists():
         time.sleep(0.01)
-    return {"scores": scores(eps), "seconds": 1.0, "looked": True}
+    return {"scores": scores(eps), "scans": 10, "trees": 3, "seconds": 1.0, "looked": True}
 
 
 def work(parent: ParentConnection) -> None:

@@ -16,7 +16,7 @@ import pytest
 import pytest_asyncio
 
 from app.sources.request import SourceRequest
-from app.tuning.sweep.sensitivity import Question, Sensitivity, question_of
+from app.tuning.sensitivity import Question, Sensitivity, question_of
 from app.web.auth import viewer_token
 from app.worker.protocol import Status
 from pipeline.config import preset
@@ -24,7 +24,7 @@ from pipeline.errors import ParameterError, StemmapError
 from pipeline.types.records import TruthTrees
 from tests.app.fakes import opened, truth_trees
 from tests.app.server_for_tests import BEARER, TOKEN, running
-from tests.app.tuning.sweep.jobs import job
+from tests.app.tuning.jobs import job
 
 NAME = "clustering.eps"
 
@@ -52,7 +52,7 @@ class Heard:
 async def asked(tmp_path: Path) -> AsyncIterator[tuple[Sensitivity, Heard]]:
     """On a process that answers each job with its eps, see `fake_worker`."""
     heard = Heard()
-    made = Sensitivity(heard, (sys.executable, "-m", "tests.app.tuning.sweep.fake_worker", str(tmp_path)))
+    made = Sensitivity(heard, (sys.executable, "-m", "tests.app.tuning.fake_worker", str(tmp_path)))
     yield made, heard
     await made.leave()
 
@@ -108,7 +108,7 @@ async def test_who_leaves_the_run_is_told_nothing_of_it_any_more(asked):
 
 async def test_of_many_questions_at_once_only_the_newest_is_worked_at(tmp_path):
     heard, done = Heard(), tmp_path / "done"
-    answer = (sys.executable, "-m", "tests.app.tuning.sweep.fake_worker", str(tmp_path), str(done))
+    answer = (sys.executable, "-m", "tests.app.tuning.fake_worker", str(tmp_path), str(done))
     matters = Sensitivity(heard, answer)
     (tmp_path / "wait").touch()
     matters.ask(question(0.2))

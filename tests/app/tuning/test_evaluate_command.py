@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from app.cli import main
-from app.tuning.sweep.sweep import ResultStore, sweep
+from app.tuning.sweep import ResultStore, sweep
 from pipeline.errors import StemmapError
-from tests.app.tuning.sweep.jobs import job
+from tests.app.tuning.jobs import job
 
 RUN = "sim:paper?duration=1"
 FILES = ("results.csv", "means.csv", "results.json")
@@ -35,7 +35,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_is_known_is_not_computed_again_and_a_run_that_fails_is_said(
     here, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr("app.tuning.sweep.sweep.COMMAND", ("false",))  # nobody who could compute
+    monkeypatch.setattr("app.tuning.workers.COMMAND", ("false",))  # nobody who could compute
     assert evaluate(tmp_path, "--jobs", "1", "--keep", str(here / "keep")) == 3
     told = capsys.readouterr()
     assert "3 stored results used" in told.err
@@ -62,13 +62,13 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 
 def test_a_worker_of_a_cluster_that_is_killed_is_survived_and_counted(tmp_path, cluster):
-    from app.tuning.sweep.sweep import DaskWorkers
-    from tests.app.tuning.sweep.dask_work import dies_once_for_nothing
+    from app.tuning.workers import DaskWorkers
+    from tests.app.tuning.dask_work import dies_once_for_nothing
 
     jobs = [job(0.1), job(0.2, particles=7), job(0.3), job(0.4)]
     with closing(DaskWorkers(cluster, dies_once_for_nothing)) as workers:
         outcome = sweep(jobs, workers, ResultStore(None))
-    assert [answer.scores and answer.scores["f1"] for answer in outcome.answers] == [0.1, 0.2, 0.3, 0.4]
+    assert [answer.scores and answer.scores.f1 for answer in outcome.answers] == [0.1, 0.2, 0.3, 0.4]
     assert (tmp_path / "died").exists()
     assert sum(outcome.lost.values()) == 1
 
@@ -77,9 +77,9 @@ def test_a_worker_of_a_cluster_that_is_killed_is_survived_and_counted(tmp_path, 
 def test_results_of_a_cluster_that_lost_a_worker_are_those_of_a_process_to_the_byte(
     here, tmp_path, cluster, capsys, monkeypatch
 ):
-    from tests.app.tuning.sweep.dask_work import dies_once
+    from tests.app.tuning.dask_work import dies_once
 
-    monkeypatch.setattr("app.tuning.sweep.scoring.score_json", dies_once)
+    monkeypatch.setattr("app.tuning.scoring.score_json", dies_once)
     keep = ("--keep", str(tmp_path / "keep"))
     assert evaluate(tmp_path / "out", "--dask", cluster, *keep) == 3
     assert (tmp_path / "died").exists()
@@ -90,7 +90,7 @@ def test_results_of_a_cluster_that_lost_a_worker_are_those_of_a_process_to_the_b
 
 def test_a_scheduler_that_does_not_answer_is_said():
     pytest.importorskip("distributed", reason="the extra dask is not installed")
-    from app.tuning.sweep.sweep import DaskWorkers
+    from app.tuning.workers import DaskWorkers
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with pytest.raises(StemmapError, match="no Dask scheduler answers"):

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import asdict
 
 import msgspec
 import pytest
 
 from app.cli import main
 from app.sources.request import SourceRequest
-from app.tuning.sweep.jobs import Job, JobResult, PreparedRun, code_digest, prepare_run
-from app.tuning.sweep.scoring import Scorer, score_json
+from app.tuning.jobs import Job, JobResult, code_digest
+from app.tuning.scoring import Scorer, score_json
+from app.tuning.sweep import PreparedRun, prepare_run
 from pipeline.config import preset
 
 RUN = "sim:paper?duration=1"
@@ -39,8 +41,8 @@ def test_scores_are_those_of_mapping(tmp_path, capsys):
     assert main(["map", RUN, "--seed", "3", "--out", str(tmp_path), "--set", "slam.gate=2"]) == 0
     mapped = json.loads((tmp_path / "run.json").read_text())
     assert answer.scores is not None, answer.error
-    assert {k: v for k, v in answer.scores.items() if k not in ("scans", "trees")} == mapped["evaluation"]
-    assert (answer.scores["scans"], answer.scores["trees"]) == (mapped["scans"], mapped["trees"])
+    assert asdict(answer.scores) == mapped["evaluation"]
+    assert (answer.scans, answer.trees) == (mapped["scans"], mapped["trees"])
 
 
 def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_looking_anew():
@@ -94,8 +96,7 @@ def test_truth_far_from_the_path_is_no_score():
     scorer = Scorer()
     answer = scorer.score(Job(asked, preset("forest").model_dump(), code_digest()))
     scorer.close()
-    assert answer.scores is None
-    assert "no ground truth is within 10 m" in answer.error
+    assert "no ground truth is within 10 m" in answer.problem
 
 
 # --- the command ----------------------------------------------------------------------------------

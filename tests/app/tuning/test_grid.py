@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.tuning.sweep.grid import GridAxis, combinations, read_axes, spread, words_of
+from app.tuning.grid import GridAxis, combinations, read_axes, spread, words_of
 from pipeline.config import assign, preset
 from pipeline.errors import ParameterError
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -11,9 +12,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from app.tuning.sweep.jobs import Job, JobResult, code_digest
-from app.tuning.sweep.sweep import MOST_LOSSES, Done, Event, Lost, Processes, ResultStore, sweep
-from tests.app.tuning.sweep.jobs import job, scores
+from app.tuning.jobs import Job, JobResult, code_digest
+from app.tuning.sweep import MOST_LOSSES, ResultStore, sweep
+from app.tuning.workers import Done, Event, Lost, Processes, answered
+from tests.app.tuning.jobs import job, scores
+from tests.app.tuning.scores import scores as plain_scores
 
 NOTHING = ResultStore(None)
 Does = Callable[[str, Job], JobResult | str]
@@ -21,7 +24,7 @@ Does = Callable[[str, Job], JobResult | str]
 
 def fine(_worker: str, asked: Job) -> JobResult:
     """Every job works."""
-    return JobResult(scores(asked.parameters["clustering"]["eps"]), 1.0)
+    return JobResult(scores(asked.parameters["clustering"]["eps"]), seconds=1.0)
 
 
 class InMemory:
@@ -55,7 +58,7 @@ class InMemory:
 @contextmanager
 def processes(count: int, folder: Path) -> Iterator[Processes]:
     """Real processes that cost little, see `fake_worker`."""
-    workers = Processes(count, (sys.executable, "-m", "tests.app.tuning.sweep.fake_worker", str(folder)))
+    workers = Processes(count, (sys.executable, "-m", "tests.app.tuning.fake_worker", str(folder)))
     try:
         yield workers
     finally:
@@ -63,7 +66,7 @@ def processes(count: int, folder: Path) -> Iterator[Processes]:
 
 
 def f1_of(answers: list[JobResult]) -> list[float | None]:
-    return [None if answer.scores is None else answer.scores["f1"] for answer in answers]
+    return [None if answer.scores is None else answer.scores.f1 for answer in answers]
 
 
 def test_answers_come_in_the_order_of_the_jobs_and_like_jobs_are_done_once():
@@ -125,18 +128,21 @@ def test_damaged_and_foreign_files_are_computed_again_and_failures_are_not_kept(
 
 
 @pytest.mark.parametrize(
-    "harm", [{"TA": 3}, {"TA": {"count": None, "of": 4}}, {"f1": "0.5"}, {"f1": [1]}, {"scans": True}, None]
+    "harm",
+    [{"TA": 3}, {"TA": {"count": None, "of": 4}}, {"f1": "0.5"}, {"f1": [1]}, {"spurious": True}, None],
 )
 def test_an_answer_without_the_figures_is_none_wherever_it_comes_from(harm, tmp_path):
-    def odd(worker: str, asked: Job) -> JobResult:
-        told = fine(worker, asked)
-        return told if worker == "b" else JobResult({} if harm is None else {**(told.scores or {}), **harm})
-
-    outcome = sweep([job(0.1)], InMemory(["a", "b"], odd), NOTHING)
-    assert f1_of(outcome.answers) == [0.1]
-    assert outcome.lost == {"it sent an invalid answer": 1}
+    good = plain_scores(0.1)
+    text = json.dumps({"scores": {} if harm is None else {**good, **harm}})
+    assert answered("a", text.encode()) == Lost("a", "it sent an invalid answer")
+    code = f"import sys\nsys.stdin.readline()\nprint({text!r}, flush=True)\nsys.stdin.read()"
+    outcome = sweep([job(0.1)], Processes(1, (sys.executable, "-c", code)), NOTHING)
+    assert outcome.answers[0].scores is None
+    assert [count for reason, count in outcome.lost.items() if "protocol error" in reason] == [MOST_LOSSES]
     kept = ResultStore(tmp_path)
-    kept.put(job(0.1).key(), odd("a", job(0.1)))
+    kept.put(job(0.1).key(), fine("a", job(0.1)))
+    (file,) = tmp_path.rglob("*.json")
+    file.write_text(text)
     outcome = sweep([job(0.1)], InMemory(["b"], fine), kept)
     assert (outcome.known, f1_of(outcome.answers)) == (0, [0.1])
     assert any("1 stored result could not be read" in warning for warning in outcome.warnings)

@@ -13,15 +13,14 @@ from typing import Any
 
 from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.sources.request import SourceRequest
-from app.tuning.plan import TruthTable
-from app.tuning.sweep.jobs import Job, JobResult, RunWithTruth, code_digest
+from app.tuning.jobs import Job, JobResult, RunWithTruth, TruthTable, code_digest
 from app.worker.protocol import Status
 from pipeline.config import Parameters, field_specs
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.types.records import TruthTrees
 
-COMMAND = python_module("app.tuning.sweep.scoring", "--low-priority")
+COMMAND = python_module("app.tuning.scoring", "--low-priority")
 MOST_VALUES = 65
 REMEMBERED = 4096  # answers
 IDLE_S = 120.0  # the process and its cache end after this time without a question
@@ -240,14 +239,14 @@ async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
 def _figures(answer: JobResult) -> dict[str, Any]:
     """Return the scores of a point for the page, with units in the names."""
     s = answer.scores
-    if s is None:
-        return {"error": answer.error}
+    if s is None or answer.problem:
+        return {"error": answer.problem}
     return {
-        "f1": s["f1"],
-        "TA": s["TA"]["count"],
-        "TA_of": s["TA"]["of"],
-        "false": s["FA"]["count"] + s["spurious"],
-        "position_rmse_m": s["position_rmse"],
-        "mean_pair_error_percent": s["mean_pair_error_percent"],
-        "trees": s["trees"],
+        "f1": s.f1,
+        "TA": s.TA.count,
+        "TA_of": s.TA.of,
+        "false": s.FA.count + s.spurious,
+        "position_rmse_m": s.position_rmse,
+        "mean_pair_error_percent": s.mean_pair_error_percent,
+        "trees": answer.trees,
     }

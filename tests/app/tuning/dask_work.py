@@ -8,13 +8,13 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from tests.app.tuning.sweep.scores import scores
+from tests.app.tuning.scores import scores
 
 
 def dies_once(text: bytes) -> bytes:
     """The score; but who is first asked for seven particles is killed, which a file then tells."""
     _die_once(text)
-    from app.tuning.sweep.scoring import score_json
+    from app.tuning.scoring import score_json
 
     return score_json(text)
 

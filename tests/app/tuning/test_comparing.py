@@ -10,8 +10,8 @@ from html.parser import HTMLParser
 
 import pytest
 
-from app.tuning.sweep.jobs import JobResult, PreparedRun, SweepPlan
-from app.tuning.sweep.report import (
+from app.tuning.jobs import JobResult
+from app.tuning.report import (
     CRITERIA,
     Comparison,
     best_of,
@@ -21,8 +21,9 @@ from app.tuning.sweep.report import (
     lines,
     page,
 )
+from app.tuning.sweep import PreparedRun, SweepPlan
 from pipeline.config.model import Value
-from tests.app.tuning.sweep.jobs import job, scores
+from tests.app.tuning.jobs import job, scores
 
 EVIL = "<script>alert(1)</script>\x1b[31m"
 
@@ -35,11 +36,11 @@ def comparison() -> Comparison:
     runs = (PreparedRun("first", job(0.1).run, "forest"), PreparedRun(EVIL, job(0.1).run, "forest"))
     jobs = {(s, r): job(values[s], seed=r) for s in range(3) for r in range(2)}
     answers = {
-        (0, 0): JobResult(scores(0.8, found=3), 2.0, True),
-        (0, 1): JobResult(scores(0.6, found=2), 1.0),
-        (1, 0): JobResult(scores(0.9, found=4, wrong=2), 2.0),
-        (1, 1): JobResult(scores(None, found=4), 2.0),
-        (2, 0): JobResult(scores(1.0), 2.0),
+        (0, 0): JobResult(scores(0.8, found=3), seconds=2.0, looked=True),
+        (0, 1): JobResult(scores(0.6, found=2), seconds=1.0),
+        (1, 0): JobResult(scores(0.9, found=4, wrong=2), seconds=2.0),
+        (1, 1): JobResult(scores(None, found=4), seconds=2.0),
+        (2, 0): JobResult(scores(1.0), seconds=2.0),
         (2, 1): JobResult(None, error="the disk is full", fault="job"),
     }
     return compare_results(SweepPlan(runs, sets, jobs, {}), answers)

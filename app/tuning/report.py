@@ -16,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from app.common.text import count, value_text, version
-from app.tuning.sweep.grid import words_of
-from app.tuning.sweep.jobs import JobResult, SweepPlan
+from app.tuning.grid import words_of
+from app.tuning.jobs import JobResult
+from app.tuning.sweep import SweepPlan
+from pipeline.evaluation import MapScores
 from pipeline.io.atomic_files import write_beside
 
 Figures = dict[str, float | int | None]
@@ -141,19 +143,19 @@ def _row(plan: SweepPlan, answers: dict[tuple[int, int], JobResult], s: int, r: 
     if (s, r) in plan.left_out:
         return Row(s + 1, r + 1, {}, error=plan.left_out[s, r])
     answer = answers[s, r]
-    if answer.scores is None:
-        return Row(s + 1, r + 1, {}, error=answer.error)
-    return Row(s + 1, r + 1, figures(answer.scores), answer.seconds, answer.looked)
+    if answer.scores is None or answer.problem:
+        return Row(s + 1, r + 1, {}, error=answer.problem)
+    return Row(s + 1, r + 1, _figures(answer, answer.scores), answer.seconds, answer.looked)
 
 
-def figures(scores: dict[str, Any]) -> Figures:
+def _figures(answer: JobResult, scores: MapScores) -> Figures:
     """Return the scores of a job by the names in COLUMNS."""
-    columns: Figures = {name: scores[name]["count"] for name in ("TA", "FR", "TR", "FA")}
-    columns["TA_of"], columns["TR_of"] = scores["TA"]["of"], scores["TR"]["of"]
-    for name in COLUMNS:
-        if name not in columns:
-            columns[name] = scores[name.removesuffix("_m")]
-    return columns
+    figures: Figures = {name: getattr(scores, name).count for name in ("TA", "FR", "TR", "FA")}
+    figures |= {"TA_of": scores.TA.of, "TR_of": scores.TR.of, "scans": answer.scans, "trees": answer.trees}
+    return {
+        name: figures[name] if name in figures else getattr(scores, name.removesuffix("_m"))
+        for name in COLUMNS
+    }
 
 
 def _mean(set_number: int, rows: Sequence[Row]) -> Row:
@@ -201,21 +203,6 @@ def figure_words(figures: Figures, name: str, scale: float) -> str:
     if name in ("TA", "TR"):
         return f"{value}/{figures[f'{name}_of']}"
     return str(value) if isinstance(value, int) and scale == 1.0 else f"{scale * value:.2f}"
-
-
-def is_valid(answer: JobResult) -> bool:
-    """Return whether a result is complete: all scores are finite or None, and a failure has a reason."""
-    if answer.scores is None:
-        return bool(answer.error)
-    try:
-        columns = figures(answer.scores)
-    except (KeyError, TypeError):
-        return False
-    if any(columns[name] is None for name in ("TA", "TA_of", "FR", "TR", "TR_of", "FA", "spurious")):
-        return False
-    return math.isfinite(answer.seconds) and all(
-        value is None or (type(value) in (int, float) and math.isfinite(value)) for value in columns.values()
-    )
 
 
 # --- text and tables ---------------------------------------------------------------------------------
@@ -392,7 +379,7 @@ def page(comparison: Comparison) -> str:
     from jinja2 import Environment, PackageLoader
 
     environment = Environment(
-        loader=PackageLoader("app.tuning.sweep", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+        loader=PackageLoader("app.tuning", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     plan, means = comparison.plan, comparison.means
     tables = [

@@ -1,0 +1,121 @@
+"""Jobs: a run with its true trees that is mapped and scored with one parameter set.
+
+Jobs and results are sent to the workers and back as JSON: paths, parameters and scores, never point clouds.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+import pipeline
+from app.batch.summary import far_truth
+from app.common.text import version
+from app.sources.request import SourceRequest
+from pipeline.evaluation import MapScores
+from pipeline.types.records import TruthTrees
+
+#: Reason of a failure: "job" is the same on every worker; "worker" and "version" concern only this worker.
+Fault = Literal["", "job", "worker", "version"]
+
+
+class TruthTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """True trees as columns, for JSON. Lengths are metres; an unknown diameter is None."""
+
+    x: list[float]
+    y: list[float]
+    dbh: list[float | None]
+    kind: list[str]
+
+    @classmethod
+    def of(cls, trees: TruthTrees) -> TruthTable:
+        """Return the table of true trees given as arrays."""
+        dbh = [value if math.isfinite(value) else None for value in trees.dbh.tolist()]
+        return cls(trees.x.tolist(), trees.y.tolist(), dbh, list(trees.kind))
+
+    def trees(self) -> TruthTrees:
+        """Return the true trees as arrays."""
+        dbh = [math.nan if value is None else value for value in self.dbh]
+        x, y, diameter = (np.array(column, np.float64) for column in (self.x, self.y, dbh))
+        return TruthTrees(x, y, diameter, tuple(self.kind))
+
+
+class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A run that is mapped and scored.
+
+    Attributes:
+        source: Source, and how it is mapped. A path is absolute and names the same recording on every worker.
+        digest: SHA-256 of the source, by which a worker recognises another recording.
+        truth: True trees in the frame of the map.
+    """
+
+    source: SourceRequest
+    digest: str
+    truth: TruthTable
+
+
+class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A run with one parameter set.
+
+    Attributes:
+        run: The run.
+        parameters: All values, by stage and name.
+        code: Digest of the code that made the job, see `code_digest`; other code may give other scores.
+    """
+
+    run: RunWithTruth
+    parameters: dict[str, dict[str, Any]]
+    code: str
+
+    def key(self) -> str:
+        """Return a SHA-256 (hex) of all that determines the scores, without the path of the recording."""
+        source = msgspec.structs.replace(self.run.source, uri="")
+        placeless = msgspec.structs.replace(self, run=msgspec.structs.replace(self.run, source=source))
+        return hashlib.sha256(msgspec.json.encode(placeless, order="sorted")).hexdigest()
+
+
+class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The result of a job.
+
+    Attributes:
+        scores: Scores of the map; None after a failure.
+        scans, trees: Number of scans, and of trees in the map.
+        seconds: Computing time [s].
+        looked: Whether the front end ran; False if its cached results were used.
+        error: Reason of the failure.
+        fault: Kind of the failure.
+    """
+
+    scores: MapScores | None
+    scans: int = 0
+    trees: int = 0
+    seconds: float = 0.0
+    looked: bool = False
+    error: str = ""
+    fault: Fault = ""
+
+    @property
+    def problem(self) -> str:
+        """Reason why the scores say nothing, for people: a failure, or no ground truth near the path; empty
+        otherwise."""
+        if self.scores is not None and self.scores.TA.of + self.scores.TR.of == 0:
+            return far_truth(self.scores.reach)
+        return self.error
+
+
+@cache
+def code_digest() -> str:
+    """Return the version and a SHA-256 of the sources of the pipeline."""
+    assert pipeline.__file__ is not None  # noqa: S101 - the package has an __init__.py
+    folder = Path(pipeline.__file__).parent
+    state = hashlib.sha256()
+    for file in sorted(folder.rglob("*")):
+        if file.suffix in (".py", ".json"):
+            state.update(f"{file.relative_to(folder).as_posix()}\0".encode() + file.read_bytes() + b"\0")
+    return f"{version()}+{state.hexdigest()[:16]}"

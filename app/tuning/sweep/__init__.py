@@ -1,1 +1,0 @@
-"""Many runs under many sets of parameters, on processes here or on the workers of a Dask cluster."""
