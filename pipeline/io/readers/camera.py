@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers.base import FileSource
-from pipeline.io.readers.container import Channel, Container, Message, plain_message
+from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import header_stamp
 from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, MessageDecoder
 from pipeline.io.readers.transforms import TransformTree, frame_name
@@ -98,8 +98,7 @@ def find_camera(
         return None, f"there is no CameraInfo for {topic}"
     for message in islice(container.messages({near[0].number}, None, {}), 20):
         try:
-            plain = plain_message(message.payload)
-            info = decoder.decode(channels[message.channel], plain)
+            info = decoder.decode(channels[message.channel], message.payload)
             K = np.asarray(info.k if hasattr(info, "k") else info.K, dtype=np.float64).reshape(3, 3)
             width, height = int(info.width), int(info.height)
         except Exception:  # noqa: S112 - whatever the generated decoders of rosbags raise
@@ -262,10 +261,10 @@ class RecordedPictures:
     def _stamped(self, from_log_ns: int | None) -> Iterator[tuple[int, Message]]:
         """Yield the messages with their times in the order of recording."""
         for message in self._container.messages(self._numbers, from_log_ns, {}) if self._numbers else ():
-            plain = replace(message, payload=plain_message(message.payload))
-            stamp_ns = self._time_of(header_stamp(self._channels[message.channel], plain.payload), plain)
+            stamp = header_stamp(self._channels[message.channel], message.payload)
+            stamp_ns = self._time_of(stamp, message)
             if stamp_ns is not None:
-                yield stamp_ns, plain
+                yield stamp_ns, message
 
 
 class MessageSource(FileSource):

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import bz2
 import heapq
-import io
 import struct
 import zlib
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
-from typing import Protocol
 
 import lz4.frame
 import zstandard
+from mcap.exceptions import McapError
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
@@ -28,6 +28,10 @@ BLOCK_LIMIT = 256 << 20
 #: Most messages of one chunk, and the memory that a message takes besides its payload [bytes].
 MOST_IN_CHUNK, _MESSAGE_BYTES = 1 << 20, 200
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+#: What damaged records raise when they are parsed.
+DAMAGE = (McapError, struct.error, ValueError, KeyError, OverflowError)
+#: A file with more damaged or unknown records has another format, and would take long to read.
+STRANGE_LIMIT = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,16 +66,18 @@ class Message:
     payload: bytes
 
 
-class Container(Protocol):
-    """A recording that can be read from any time. It does not decode messages."""
+class Container:
+    """A recording that can be read from any time. It does not decode messages.
 
-    @property
-    def kind(self) -> str:
-        """Name of the format, e.g. "ROS 2 MCAP"."""
+    Attributes:
+        kind: Name of the format, e.g. "ROS 2 MCAP".
+        channels: All channels.
+        damage: Parts that could not be read when the file was opened, by reason.
+    """
 
-    @property
-    def channels(self) -> list[Channel]:
-        """All channels."""
+    kind: str
+    channels: list[Channel]
+    damage: dict[str, int]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
         """Return a time [ns] from which a few messages of some channels are left to read, the last ones of
@@ -80,10 +86,7 @@ class Container(Protocol):
         Args:
             numbers: Numbers of the channels.
         """
-
-    @property
-    def damage(self) -> dict[str, int]:
-        """Parts that could not be read when the file was opened, by reason."""
+        raise NotImplementedError
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
@@ -95,6 +98,7 @@ class Container(Protocol):
             start_ns: Time of the first message [ns]; None for all.
             losses: Counts the parts that are left out, by reason.
         """
+        raise NotImplementedError
 
     def attachment(self, name: str, limit: int) -> bytes | None:
         """Return the bytes of a file attached to the recording, None when there is none of this name.
@@ -102,9 +106,11 @@ class Container(Protocol):
         Raises:
             SourceError: It is longer than `limit` bytes or damaged.
         """
+        del name, limit
+        return None
 
     def close(self) -> None:
-        """Close the file; safe to call twice."""
+        """Close the files; safe to call twice."""
 
 
 def ros2_type_name(name: str) -> str:
@@ -126,8 +132,8 @@ def damaged(what: str, path: object) -> SourceError:
 # --- compressed blocks -----------------------------------------------------------------------------
 
 
-class UnpackError(Exception):
-    """A block is damaged, too large, or has an unknown compression."""
+class BrokenChunkError(Exception):
+    """A chunk, or the rest of it, cannot be read: it is damaged, too large, or has an unknown compression."""
 
 
 def unpack(block: bytes, compression: str, size: int) -> bytes:
@@ -139,13 +145,13 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
         size: Size by the header.
 
     Raises:
-        UnpackError: The size is larger than BLOCK_LIMIT or wrong, or the compression is unknown.
+        BrokenChunkError: The size is larger than BLOCK_LIMIT or wrong, or the compression is unknown.
     """
     if size > BLOCK_LIMIT:
-        raise UnpackError("a block is too large")
+        raise BrokenChunkError("a block is too large")
     raw = _unpack_up_to(block, compression, size)
     if len(raw) != size:
-        raise UnpackError("a block has another size than in its header")
+        raise BrokenChunkError("a block has another size than in its header")
     return raw
 
 
@@ -162,21 +168,22 @@ def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
                 return bz2.BZ2Decompressor().decompress(block, max_length=limit + 1)
             case "zstd":
                 window = zstandard.ZstdDecompressor(max_window_size=1 << 27)
-                return window.stream_reader(io.BytesIO(block)).read(limit + 1)
+                return window.stream_reader(block).read(limit + 1)
             case _:
-                raise UnpackError(f"unknown compression {compression[:20]!r}")
+                raise BrokenChunkError(f"unknown compression {compression[:20]!r}")
     except (RuntimeError, OSError, EOFError, ValueError, MemoryError, zstandard.ZstdError) as error:
-        raise UnpackError(str(error)) from error
+        raise BrokenChunkError(str(error)) from error
 
 
-def plain_message(payload: bytes) -> bytes:
-    """Return the bytes of a message that a recorder may have compressed; b"" if they are damaged."""
-    if payload[:4] != _ZSTD_MAGIC:
-        return payload
+def plain(message: Message) -> Message:
+    """Return a message of a ROS 2 recorder without its own compression; its payload is b"" if it is
+    damaged."""
+    if message.payload[:4] != _ZSTD_MAGIC:
+        return message
     try:
-        return _unpack_up_to(payload, "zstd", BLOCK_LIMIT)[:BLOCK_LIMIT]
-    except UnpackError:
-        return b""
+        return replace(message, payload=_unpack_up_to(message.payload, "zstd", BLOCK_LIMIT)[:BLOCK_LIMIT])
+    except BrokenChunkError:
+        return replace(message, payload=b"")
 
 
 # --- files of chunks -------------------------------------------------------------------------------
@@ -205,26 +212,20 @@ class Chunk:
     counts: dict[int, int] | None
 
 
-class BrokenChunkError(Exception):
-    """Nothing more of a chunk can be read."""
-
-
-class ChunkedFile:
+class ChunkedFile(Container):
     """A file with messages in compressed chunks, indexed by reading the headers of its records.
 
     The index of the file itself is not needed, so a file that was cut during a recording gives all its whole
-    chunks, and a wrong index does no harm.
-
-    Attributes:
-        damage: Parts that could not be read on opening, by reason.
+    chunks, and a wrong index does no harm. A format reads the records (`_read_index`, `_parse`).
 
     Raises:
-        SourceError: The file cannot be opened, or holds no messages that can be read.
+        SourceError: The file cannot be opened, has another format, or holds no messages that can be read.
     """
 
     def __init__(self, path: Path) -> None:
-        self.damage: dict[str, int] = {}
+        self.damage = {}
         self._path = path
+        self._known: dict[int, Channel] = {}
         self._chunks: list[Chunk] = []
         self._unpacked: tuple[int, bytes] = (-1, b"")  # offset and bytes of the last chunk
         try:
@@ -232,14 +233,25 @@ class ChunkedFile:
         except OSError as error:
             raise SourceError(f"cannot open the file: {error.strerror}", where=str(path)) from error
         try:
-            self._read_index()
-            self._survey_chunks()
+            self._read_index(self._file.seek(0, 2))
+            # Chunks without an index, and those with channels that are not defined elsewhere, are unpacked.
+            self._chunks = [
+                chunk if chunk.counts is not None and chunk.counts.keys() <= self._known.keys()
+                else self._survey(chunk)
+                for chunk in self._chunks
+            ]  # fmt: skip
+            if not self._known:
+                raise damaged("the recording holds no messages that can be read", path)
         except BaseException:
             self.close()
             raise
+        total = Counter[int]()
+        for chunk in self._chunks:
+            total.update(chunk.counts or {})
+        self.channels = [replace(self._known[number], count=total[number]) for number in sorted(self._known)]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of the first message of the last chunk with these channels [ns]."""
+        """Return the start of the last chunk with messages of some channels [ns]."""
         last = max(self._needed(frozenset(numbers), None), key=attrgetter("end_ns"), default=None)
         return 0 if last is None else last.start_ns
 
@@ -254,17 +266,17 @@ class ChunkedFile:
         for chunk in sorted(self._needed(wanted, start_ns), key=attrgetter("start_ns", "offset")):
             while heap and (heap[0][0] <= chunk.start_ns or held > BLOCK_LIMIT):
                 held -= len(heap[0][2].payload) + _MESSAGE_BYTES
-                yield heapq.heappop(heap)[2]
+                yield plain(heapq.heappop(heap)[2])
             try:
                 for message in self._contents(chunk, define=False):
                     if message.channel in wanted and (start_ns is None or message.log_ns >= start_ns):
                         heapq.heappush(heap, (message.log_ns, serial, message))
                         serial += 1
                         held += len(message.payload) + _MESSAGE_BYTES
-            except (UnpackError, BrokenChunkError):
+            except BrokenChunkError:
                 count_loss(losses, "damaged chunks of the recording")
         while heap:
-            yield heapq.heappop(heap)[2]
+            yield plain(heapq.heappop(heap)[2])
 
     def close(self) -> None:
         """Close the file; safe to call twice."""
@@ -272,16 +284,15 @@ class ChunkedFile:
 
     # --- for the formats ---
 
-    def _read_index(self) -> None:
+    def _read_index(self, end: int) -> None:
         """Read the headers of the records: chunks, channels, attachments.
+
+        Args:
+            end: Length of the file.
 
         Raises:
             SourceError: The file has another format.
         """
-        raise NotImplementedError
-
-    def _known_channels(self) -> Collection[int]:
-        """Return the numbers of the channels that are known so far."""
         raise NotImplementedError
 
     def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
@@ -289,7 +300,7 @@ class ChunkedFile:
 
         Raises:
             BrokenChunkError: The rest cannot be read.
-            struct.error, ValueError, KeyError: The same.
+            DAMAGE: The same.
         """
         raise NotImplementedError
 
@@ -302,14 +313,6 @@ class ChunkedFile:
         except OSError as error:
             raise damaged(f"cannot read on: {error.strerror}", self._path) from error
 
-    def _counts(self) -> dict[int, int]:
-        """Return the number of messages by channel."""
-        total: dict[int, int] = {}
-        for chunk in self._chunks:
-            for number, count in (chunk.counts or {}).items():
-                total[number] = total.get(number, 0) + count
-        return total
-
     def _needed(self, wanted: frozenset[int], start_ns: int | None) -> Iterable[Chunk]:
         for chunk in self._chunks:
             if start_ns is not None and chunk.end_ns < start_ns:
@@ -317,11 +320,11 @@ class ChunkedFile:
             if chunk.counts is None or not wanted.isdisjoint(chunk.counts):
                 yield chunk
 
-    def _contents(self, chunk: Chunk, *, define: bool) -> Iterator[Message]:
-        """Yield the messages of a chunk.
+    def _bytes_of(self, chunk: Chunk) -> bytes:
+        """Return the unpacked bytes of a chunk.
 
         Raises:
-            UnpackError, BrokenChunkError: It is damaged.
+            BrokenChunkError: It is damaged.
         """
         if chunk.offset != self._unpacked[0]:
             if chunk.length > BLOCK_LIMIT:
@@ -330,34 +333,33 @@ class ChunkedFile:
             if chunk.crc and zlib.crc32(raw) != chunk.crc:
                 raise BrokenChunkError
             self._unpacked = (chunk.offset, raw)
+        return self._unpacked[1]
+
+    def _contents(self, chunk: Chunk, *, define: bool) -> Iterator[Message]:
+        """Yield the messages of a chunk.
+
+        Raises:
+            BrokenChunkError: It is damaged.
+        """
         try:
-            for number, message in enumerate(self._parse(self._unpacked[1], define=define)):
+            for number, message in enumerate(self._parse(self._bytes_of(chunk), define=define)):
                 if number >= MOST_IN_CHUNK:
                     raise BrokenChunkError
                 yield message
-        except (struct.error, ValueError, KeyError) as error:
+        except DAMAGE as error:
             raise BrokenChunkError from error
 
     def _survey(self, chunk: Chunk) -> Chunk:
         """Return a chunk with the number and times of its messages, which are counted by unpacking it.
         Channels that it defines are added."""
-        counts: dict[int, int] = {}
+        counts = Counter[int]()
         first_ns, last_ns = 2**64, -1
         try:
             for message in self._contents(chunk, define=True):
-                counts[message.channel] = counts.get(message.channel, 0) + 1
+                counts[message.channel] += 1
                 first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
-        except (UnpackError, BrokenChunkError):
+        except BrokenChunkError:
             count_loss(self.damage, "chunks of the recording damaged in part")
         if counts:
             chunk = replace(chunk, start_ns=first_ns, end_ns=last_ns)
         return replace(chunk, counts=counts)
-
-    def _survey_chunks(self) -> None:
-        """Count the messages of the chunks without an index, and of those with channels that are not defined
-        elsewhere."""
-        for index, chunk in enumerate(self._chunks):
-            if chunk.counts is None or not set(chunk.counts) <= set(self._known_channels()):
-                self._chunks[index] = self._survey(chunk)
-        if not self._known_channels():
-            raise damaged("the recording holds no messages that can be read", self._path)

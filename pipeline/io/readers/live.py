@@ -48,10 +48,8 @@ OPENING_LIMIT = 4000
 _TRIES = 5
 
 
-class MessageList:
+class MessageList(Container):
     """Messages in memory as a container."""
-
-    damage: dict[str, int]
 
     def __init__(self, kind: str, channels: Sequence[Channel], messages: Sequence[Message]) -> None:
         self.kind, self.damage = kind, {}
@@ -73,14 +71,6 @@ class MessageList:
         for message in self._messages:
             if message.channel in numbers and (start_ns is None or message.log_ns >= start_ns):
                 yield message
-
-    def attachment(self, name: str, limit: int) -> bytes | None:
-        """Return None: there are no attachments."""
-        del name, limit
-        return None
-
-    def close(self) -> None:
-        """Do nothing: no file is open."""
 
 
 class ArrivalReader:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
-from mcap.exceptions import McapError
+from mcap import records
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
+from mcap.stream_reader import StreamReader
 
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
     BLOCK_LIMIT,
+    DAMAGE,
+    STRANGE_LIMIT,
     BrokenChunkError,
     Channel,
     Chunk,
@@ -23,14 +29,12 @@ from pipeline.io.readers.container import (
 )  # fmt: skip
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, ATTACHMENT, DATA_END = 2, 3, 4, 5, 6, 7, 9, 0x0F
 RECORD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
-CHUNK_HEAD = struct.Struct("<QQQI")
+#: Bytes of the header of a chunk before its packed bytes, without the name of the compression.
+_CHUNK_HEAD = 40
 #: Messages outside of chunks are read in runs of this many bytes.
 LOOSE_RUN = 4 << 20
-#: A file with more records of unknown kinds has another format, and would take long to read.
-STRANGE_LIMIT = 1000
 DEFINITION_LIMIT = 1 << 20
 
 
@@ -43,71 +47,70 @@ class McapFile(ChunkedFile):
 
     kind = "ROS 2 MCAP"
 
-    @property
-    def channels(self) -> list[Channel]:
-        """All channels."""
-        counts, unknown = self._counts(), ("", "", "")
-        channels = []
-        for number, (schema, topic, encoding) in sorted(self._channels.items()):
-            name, form, definition = self._schemas.get(schema, unknown)
-            count = counts.get(number, 0)
-            channels.append(Channel(number, topic, ros2_type_name(name), encoding, definition, form, count))
-        return channels
-
     def attachment(self, name: str, limit: int) -> bytes | None:
         """Return the bytes of an attachment, see `Container.attachment`."""
-        for offset, length in self._attachments:
-            head = self._read(offset + 16, min(length - 16, 4096))
+        for opcode, offset, length in self._further:
+            if opcode != Opcode.ATTACHMENT or _attachment_name(self._read(offset, 4096)) != name:
+                continue
+            raw = self._read(offset, min(length, limit + 4096))
             try:
-                found, after = _text(head, 0)
-                _media, after = _text(head, after)
-                (size,) = struct.unpack_from("<Q", head, after)
-            except (struct.error, ValueError):
-                continue
-            if found != name:
-                continue
-            start = 16 + after + 8
-            if size > limit or start + size + 4 > length:
+                found = records.Attachment.read(ReadDataStream(io.BytesIO(raw)))
+                (crc,) = struct.unpack("<I", raw[-4:])
+            except DAMAGE:
+                found = None
+            if found is None or len(found.data) > limit:
                 raise damaged(f"the attachment {name} is damaged or longer than {limit >> 20} MB", self._path)
-            content = self._read(offset + start, size)
-            (crc,) = struct.unpack("<I", self._read(offset + start + size, 4))
-            if crc and zlib.crc32(self._read(offset, start + size)) != crc:
+            if crc and zlib.crc32(raw[:-4]) != crc:
                 raise damaged(f"the attachment {name} has a wrong checksum", self._path)
-            return content
+            return bytes(found.data)
         return None
+
+    def whole_records(self) -> Iterator[records.McapRecord]:
+        """Yield all definitions, attachments, metadata and messages that can be read; other chunks and
+        records are counted in `damage`."""
+        yield from self._schemas.values()
+        yield from self._definitions.values()
+        for opcode, offset, length in self._further:
+            try:
+                raw = RECORD.pack(opcode, length) + self._read(offset, min(length, BLOCK_LIMIT))
+                yield next(StreamReader(io.BytesIO(raw), skip_magic=True).records)
+            except (*DAMAGE, StopIteration):
+                count_loss(self.damage, "damaged records of the recording")
+        for chunk in self._chunks:
+            try:
+                raw = self._bytes_of(chunk)
+                stream = io.BytesIO(raw)
+                for record in StreamReader(stream, skip_magic=True).records:
+                    yield record
+                    if stream.tell() >= len(raw):
+                        break
+            except (*DAMAGE, BrokenChunkError):
+                count_loss(self.damage, "damaged chunks")
 
     # --- index -------------------------------------------------------------------------------------
 
-    def _known_channels(self) -> Collection[int]:
-        return self._channels
-
-    def _read_index(self) -> None:
-        self._schemas: dict[int, tuple[str, str, str]] = {}  # name, encoding, definition
-        self._channels: dict[int, tuple[int, str, str]] = {}  # schema, topic, encoding
-        self._attachments: list[tuple[int, int]] = []
-        end = self._file.seek(0, 2)
-        if self._read(0, 8) != MAGIC:
+    def _read_index(self, end: int) -> None:
+        self._schemas: dict[int, records.Schema] = {}
+        self._definitions: dict[int, records.Channel] = {}
+        self._further: list[tuple[int, int, int]] = []  # opcode, position and length of other records
+        if self._read(0, len(MAGIC)) != MAGIC:
             raise damaged("not an MCAP file", self._path)
-        at, run, strange, whole = 8, -1, 0, False
+        at, strange, whole = len(MAGIC), 0, False
         while at + RECORD.size <= end:
             opcode, length = RECORD.unpack(self._read(at, RECORD.size))
             body, after = at + RECORD.size, at + RECORD.size + length
             if after > end or opcode == 0 or strange > STRANGE_LIMIT:
                 break
-            if run >= 0 and (opcode != MESSAGE or at - run > LOOSE_RUN):
-                self._add_run(run, at)
-                run = -1
-            if opcode == MESSAGE:
-                run = at if run < 0 else run
-            elif opcode in (FOOTER, DATA_END):
-                whole = True
-                if opcode == FOOTER:
-                    break
-            else:
-                strange += not self._take(opcode, body, length)
+            try:
+                self._take(opcode, body, length)
+                strange += opcode > Opcode.DATA_END
+            except DAMAGE:
+                count_loss(self.damage, "damaged records of the recording")
+                strange += 1
+            whole |= opcode in (Opcode.DATA_END, Opcode.FOOTER)
             at = after
-        if run >= 0:
-            self._add_run(run, at)
+            if opcode == Opcode.FOOTER:
+                break
         if not whole:
             read = self._read_summary(at)
             what = "bytes between damaged records" if read else "bytes at the end of a recording that was cut"
@@ -118,72 +121,84 @@ class McapFile(ChunkedFile):
         try:
             with self._path.open("rb") as file:
                 summary = SeekingReader(file, record_size_limit=BLOCK_LIMIT).get_summary()
-        except (McapError, struct.error, ValueError, OSError, StopIteration, MemoryError):
+        except (*DAMAGE, OSError, StopIteration, MemoryError):
             return 0
         if summary is None:
             return 0
         for schema in summary.schemas.values():
-            text = schema.data[:DEFINITION_LIMIT].decode(errors="replace")
-            self._schemas.setdefault(schema.id, (schema.name, schema.encoding, text))
+            self._schemas.setdefault(schema.id, schema)
         for channel in summary.channels.values():
-            known = (channel.schema_id, channel.topic, channel.message_encoding)
-            self._channels.setdefault(channel.id, known)
-        chunks = sorted((c for c in summary.chunk_indexes if c.chunk_start_offset > after),
-                        key=lambda chunk: chunk.chunk_start_offset)  # fmt: skip
-        for chunk in chunks:
-            self._take(CHUNK, chunk.chunk_start_offset + RECORD.size, chunk.chunk_length - RECORD.size)
-        return chunks[0].chunk_start_offset if chunks else 0
+            if channel.id not in self._known:
+                self._add_channel(channel)
+        starts = sorted((c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes)
+        behind = [(start, length) for start, length in starts if start > after]
+        for start, length in behind:
+            self._take(Opcode.CHUNK, start + RECORD.size, length - RECORD.size)
+        return behind[0][0] if behind else 0
 
-    def _take(self, opcode: int, body: int, length: int) -> bool:
-        """Store the contents of a record; return False if it is damaged or of an unknown kind.
+    def _take(self, opcode: int, body: int, length: int) -> None:
+        """Store the contents of a record.
 
         Args:
             opcode: Kind of the record.
             body: Position of its contents in the file.
             length: Length of its contents [bytes].
+
+        Raises:
+            DAMAGE: It is damaged.
         """
-        try:
-            if opcode in (SCHEMA, CHANNEL):
+        match opcode:
+            case Opcode.SCHEMA | Opcode.CHANNEL:
                 self._define(opcode, self._read(body, min(length, DEFINITION_LIMIT)))
-            elif opcode == CHUNK:
-                self._add_chunk(body, length)
-            elif opcode == MESSAGE_INDEX:
-                self._count(body, length)
-            elif opcode == ATTACHMENT:
-                self._attachments.append((body, length))
-        except (struct.error, ValueError):
-            count_loss(self.damage, "damaged records of the recording")
-            return False
-        return 0 < opcode <= DATA_END
+            case Opcode.CHUNK:
+                head = records.Chunk.read(ReadDataStream(io.BytesIO(self._read(body, min(length, 128)))))
+                before = _CHUNK_HEAD + len(head.compression.encode())
+                self._chunks.append(
+                    Chunk(body + before, length - before, head.message_start_time, head.message_end_time,
+                          head.compression, head.uncompressed_size, head.uncompressed_crc, None)
+                )  # fmt: skip
+            case Opcode.MESSAGE:
+                self._add_loose(body - RECORD.size, body + length)
+            case Opcode.MESSAGE_INDEX:
+                self._count(*struct.unpack("<HI", self._read(body, 6)))
+            case Opcode.ATTACHMENT | Opcode.METADATA:
+                self._further.append((opcode, body, length))
 
     def _define(self, opcode: int, record: bytes) -> None:
-        (number,) = struct.unpack_from("<H", record)
-        if opcode == SCHEMA:
-            name, at = _text(record, 2)
-            encoding, at = _text(record, at)
-            self._schemas[number] = (name, encoding, _text(record, at)[0])
+        stream = ReadDataStream(io.BytesIO(record))
+        if opcode == Opcode.SCHEMA:
+            schema = records.Schema.read(stream)
+            self._schemas[schema.id] = schema
         else:
-            (schema,) = struct.unpack_from("<H", record, 2)
-            topic, at = _text(record, 4)
-            self._channels[number] = (schema, topic, _text(record, at)[0])
+            self._add_channel(records.Channel.read(stream))
 
-    def _add_chunk(self, body: int, length: int) -> None:
-        head = self._read(body, min(length, 128))
-        start_ns, end_ns, size, crc = CHUNK_HEAD.unpack_from(head)
-        compression, at = _text(head, CHUNK_HEAD.size)
-        (packed,) = struct.unpack_from("<Q", head, at)
-        if at + 8 + packed > length:
-            raise ValueError("the chunk is shorter than in its header")
-        self._chunks.append(Chunk(body + at + 8, packed, start_ns, end_ns, compression, size, crc, None))
+    def _add_channel(self, channel: records.Channel) -> None:
+        schema = self._schemas.get(channel.schema_id) or records.Schema(0, b"", "", "")
+        text = schema.data[:DEFINITION_LIMIT].decode(errors="replace")
+        self._definitions[channel.id] = channel
+        self._known[channel.id] = Channel(
+            channel.id, channel.topic, ros2_type_name(schema.name), channel.message_encoding, text,
+            schema.encoding, 0,
+        )  # fmt: skip
 
-    def _add_run(self, start: int, end: int) -> None:
-        """Add the messages between two positions outside of chunks as an uncompressed chunk."""
-        self._chunks.append(self._survey(Chunk(start, end - start, 0, 0, "", end - start, 0, None)))
+    def _add_loose(self, start: int, end: int) -> None:
+        """Add a message between two positions outside of chunks to a run, which is an uncompressed chunk."""
+        last = self._chunks[-1] if self._chunks else None
+        is_run = last is not None and last.offset + last.length == start and last.counts is None
+        if last is not None and is_run and not last.crc and last.length == last.size < LOOSE_RUN:
+            size = end - last.offset
+            self._chunks[-1] = replace(last, length=size, size=size)
+        else:
+            self._chunks.append(Chunk(start, end - start, 0, 0, "", end - start, 0, None))
 
-    def _count(self, body: int, length: int) -> None:
-        """Store the number of messages of a channel in the chunk before, from an index record."""
-        number, size = struct.unpack_from("<HI", self._read(body, 6))
-        if self._chunks and size + 6 <= length:
+    def _count(self, number: int, size: int) -> None:
+        """Store the number of messages of a channel in the chunk before.
+
+        Args:
+            number: Number of the channel.
+            size: Bytes of the entries of its index record.
+        """
+        if self._chunks:
             chunk = self._chunks[-1]
             counts = {**(chunk.counts or {}), **({number: size // 16} if size else {})}
             self._chunks[-1] = replace(chunk, counts=counts)
@@ -197,22 +212,17 @@ class McapFile(ChunkedFile):
             at += RECORD.size
             if at + length > len(raw) or opcode == 0:
                 raise BrokenChunkError
-            if opcode == MESSAGE and length >= MESSAGE_HEAD.size:
+            if opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
                 number, _sequence, log_ns, _publish_ns = MESSAGE_HEAD.unpack_from(raw, at)
                 yield Message(number, log_ns, bytes(view[at + MESSAGE_HEAD.size : at + length]))
-            elif define and opcode in (SCHEMA, CHANNEL):
+            elif define and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._define(opcode, bytes(view[at : at + min(length, DEFINITION_LIMIT)]))
             at += length
 
 
-def _text(record: bytes, at: int) -> tuple[str, int]:
-    """Return a string that begins with its length, and the position after it.
-
-    Args:
-        record: Bytes of a record.
-        at: Position of the length.
-    """
-    (size,) = struct.unpack_from("<I", record, at)
-    if at + 4 + size > len(record):
-        raise ValueError("the text is longer than its record")
-    return record[at + 4 : at + 4 + size].decode(), at + 4 + size
+def _attachment_name(head: bytes) -> str:
+    """Return the name in the first bytes of an attachment, "" if they are damaged."""
+    try:
+        return str(ReadDataStream(io.BytesIO(head[16:])).read_prefixed_string())  # behind two times
+    except DAMAGE:
+        return ""

@@ -14,7 +14,7 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import Camera, MessageSource, RecordedPictures, find_camera
-from pipeline.io.readers.container import Channel, Container, Message, plain_message
+from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.frame_alignment import FrameAlignments
 from pipeline.io.readers.message_time import WINDOW_NS, Clock, Stamped, by_stamp, header_stamp
 from pipeline.io.readers.ros_bags import BagFile, BagFolder, Db3File, bag_files
@@ -159,10 +159,9 @@ class RosSource(MessageSource):
 
     def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Yield the contents of a message with their times."""
-        plain = replace(message, payload=plain_message(message.payload))
         if message.channel in self._moving:
-            return self._transforms(plain, losses)
-        return self._stamped(plain, losses)
+            return self._transforms(message, losses)
+        return self._stamped(message, losses)
 
     def _decoded(self, stamped: Stamped[Message | Odometry], losses: dict[str, int]) -> Iterator[Record]:
         if isinstance(stamped.content, Odometry):
@@ -207,7 +206,7 @@ class RosSource(MessageSource):
     def _clock_offset(self, topic: Topic) -> int | None:
         """Return stamp minus time of recording of the first message of a topic [ns], None without a stamp."""
         for message in islice(self._container.messages(topic.numbers, None, {}), 1):
-            stamp_ns = header_stamp(self._channels[message.channel], plain_message(message.payload))
+            stamp_ns = header_stamp(self._channels[message.channel], message.payload)
             return stamp_ns - message.log_ns if stamp_ns else None
         return None
 
@@ -232,7 +231,7 @@ class RosSource(MessageSource):
 
     def _scan_arrivals(self, log_start: int | None) -> Iterator[Stamped[Message]]:
         for message in self._container.messages(self._topics.scan.numbers, log_start, {}):
-            for arrival in self._stamped(replace(message, payload=plain_message(message.payload)), {}):
+            for arrival in self._stamped(message, {}):
                 if isinstance(arrival.content, Message):
                     yield Stamped(arrival.stamp_ns, arrival.rank, arrival.content)
 
@@ -254,8 +253,7 @@ class RosSource(MessageSource):
         numbers = frozenset[int]() if topic is None else topic.numbers
         for message in islice(self._container.messages(numbers, None, {}), 1 if numbers else 0):
             try:
-                plain = replace(message, payload=plain_message(message.payload))
-                return frame_name(self._records.message(plain).child_frame_id)
+                return frame_name(self._records.message(message).child_frame_id)
             except Exception:  # as in RecordDecoder.record
                 return ""
         return ""

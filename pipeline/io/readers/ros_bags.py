@@ -17,6 +17,8 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
+    DAMAGE,
+    STRANGE_LIMIT,
     BrokenChunkError,
     Channel,
     Chunk,
@@ -24,6 +26,7 @@ from pipeline.io.readers.container import (
     Container,
     Message,
     damaged,
+    plain,
     ros2_type_name,
 )  # fmt: skip
 from pipeline.io.readers.mcap_file import McapFile
@@ -32,7 +35,7 @@ from pipeline.types.records import Int
 MESSAGE_LIMIT = 256 << 20
 
 
-class Db3File:
+class Db3File(Container):
     """A SQLite bag as a container of messages. The file is opened for reading only.
 
     Raises:
@@ -43,7 +46,7 @@ class Db3File:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.damage: dict[str, int] = {}
+        self.damage = {}
         # `immutable` keeps SQLite from writing a journal, which fails on a read-only disk.
         try:
             self._database = sqlite3.connect(f"file:{quote(str(path))}?immutable=1", uri=True)
@@ -78,12 +81,7 @@ class Db3File:
             if payload is None:
                 count_loss(losses, "messages that the database cannot give")
             else:
-                yield Message(int(self._topic[index]), int(self._stamp[index]), payload)
-
-    def attachment(self, name: str, limit: int) -> bytes | None:
-        """Return None: a db3 bag has no attachments."""
-        del name, limit
-        return None
+                yield plain(Message(int(self._topic[index]), int(self._stamp[index]), payload))
 
     def close(self) -> None:
         """Close the database."""
@@ -123,19 +121,10 @@ class Db3File:
         for number, topic, msgtype, encoding in self._database.execute(
             "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
         ):
-            kind, text = definitions.get(msgtype, ("", ""))
+            form, text = definitions.get(msgtype, ("", ""))
             count = int(np.count_nonzero(self._topic == int(number)))
-            channels.append(
-                Channel(
-                    int(number),
-                    str(topic),
-                    ros2_type_name(str(msgtype)),
-                    str(encoding or ""),
-                    text,
-                    kind,
-                    count,
-                )
-            )
+            name = ros2_type_name(str(msgtype))
+            channels.append(Channel(int(number), str(topic), name, str(encoding or ""), text, form, count))
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -181,7 +170,7 @@ def _natural(path: Path) -> tuple[int, str]:
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
 
 
-class BagFolder:
+class BagFolder(Container):
     """The files of a recording as one container of messages.
 
     Args:
@@ -192,7 +181,7 @@ class BagFolder:
     """
 
     def __init__(self, files: list[Path]) -> None:
-        self.damage: dict[str, int] = {}
+        self.damage = {}
         self._parts: list[Container] = []
         for path in files:
             try:
@@ -203,23 +192,12 @@ class BagFolder:
                 count_loss(self.damage, "files of the recording that cannot be read")
         if not self._parts:
             raise SourceError("none of the files of the recording can be read", where=str(files[0].parent))
-        for part in self._parts:
+        self.kind = self._parts[0].kind
+        self.channels = []
+        for index, part in enumerate(self._parts):
+            self.channels += [replace(c, number=c.number + _STRIDE * index) for c in part.channels]
             for reason, count in part.damage.items():
                 count_loss(self.damage, reason, count)
-
-    @property
-    def kind(self) -> str:
-        """Name of the format."""
-        return self._parts[0].kind
-
-    @property
-    def channels(self) -> list[Channel]:
-        """The channels of all files, with unique numbers."""
-        return [
-            replace(channel, number=channel.number + _STRIDE * index)
-            for index, part in enumerate(self._parts)
-            for channel in part.channels
-        ]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
         """Return a time shortly before the end of the last file [ns], see `Container.tail_ns`."""
@@ -259,8 +237,6 @@ def _renumbered(messages: Iterator[Message], index: int) -> Iterator[Message]:
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CONNECTION = 2, 3, 4, 5, 7
 HEADER_LIMIT = 1 << 20
-#: A file with more damaged records has another format, and would take long to read.
-STRANGE_LIMIT = 1000
 LENGTH = struct.Struct("<I")
 Header = dict[bytes, bytes]
 
@@ -274,28 +250,7 @@ class BagFile(ChunkedFile):
 
     kind = "ROS 1 bag"
 
-    @property
-    def channels(self) -> list[Channel]:
-        """All channels (connections)."""
-        counts = self._counts()
-        return [
-            Channel(number, topic, msgtype, "ros1", definition, "ros1msg", counts.get(number, 0))
-            for number, (topic, msgtype, definition) in sorted(self._connections.items())
-        ]
-
-    def attachment(self, name: str, limit: int) -> bytes | None:
-        """Return None: a bag has no attachments."""
-        del name, limit
-        return None
-
-    # --- index -------------------------------------------------------------------------------------
-
-    def _known_channels(self) -> Collection[int]:
-        return self._connections
-
-    def _read_index(self) -> None:
-        self._connections: dict[int, tuple[str, str, str]] = {}  # topic, type, definition
-        end = self._file.seek(0, 2)
+    def _read_index(self, end: int) -> None:
         if self._read(0, len(MAGIC)) != MAGIC:
             raise damaged("not a ROS 1 bag of version 2.0", self._path)
         at, strange = len(MAGIC), 0
@@ -310,7 +265,7 @@ class BagFile(ChunkedFile):
                 break
             try:
                 self._take(_fields(record[:header_size]), body, length)
-            except (struct.error, ValueError, KeyError):
+            except DAMAGE:
                 count_loss(self.damage, "damaged records of the recording")
                 strange += 1
             at = body + length
@@ -335,7 +290,8 @@ class BagFile(ChunkedFile):
         (number,) = LENGTH.unpack(header[b"conn"])
         topic = header.get(b"topic", fields.get(b"topic", b"")).decode()
         msgtype = ros2_type_name(fields[b"type"].decode())
-        self._connections[number] = (topic, msgtype, fields.get(b"message_definition", b"").decode())
+        text = fields.get(b"message_definition", b"").decode()
+        self._known[number] = Channel(number, topic, msgtype, "ros1", text, "ros1msg", 0)
 
     def _count(self, number: int, table: bytes) -> None:
         """Store times and number of messages of a connection in the chunk before, from an index record.
@@ -354,8 +310,6 @@ class BagFile(ChunkedFile):
             first, last = min(first, chunk.start_ns), max(last, chunk.end_ns)
         counts = {**(chunk.counts or {}), number: len(times)}
         self._chunks[-1] = replace(chunk, start_ns=first, end_ns=last, counts=counts)
-
-    # --- chunks ------------------------------------------------------------------------------------
 
     def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
         at = 0

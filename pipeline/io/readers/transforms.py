@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.container import Channel, Container, Message, plain_message
+from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.ros_messages import MessageDecoder
 from pipeline.io.readers.topics import Topic
 
@@ -144,9 +144,8 @@ class Extrinsics:
     def decode(self, message: Message) -> list[Link]:
         """Decode the finite transforms of a message; [] when it is damaged."""
         try:
-            payload = plain_message(message.payload)
             decoded: ros2.tf2_msgs__msg__TFMessage = self._decoder.decode(
-                self._channels[message.channel], payload
+                self._channels[message.channel], message.payload
             )
         except Exception:  # the generated decoders of rosbags raise many kinds
             return []

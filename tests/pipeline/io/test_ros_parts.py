@@ -15,22 +15,14 @@ import pytest
 import zstandard
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.container import Channel, UnpackError, unpack
-from pipeline.io.readers.mcap_file import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_HEAD,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_HEAD,
-    RECORD,
-    McapFile,
-)
+from pipeline.io.readers.container import BrokenChunkError, Channel, unpack
+from pipeline.io.readers.mcap_file import MAGIC, MESSAGE_HEAD, RECORD, McapFile
 from pipeline.io.readers.message_time import WINDOW_NS, Stamped, by_stamp
 from pipeline.io.readers.ros_messages import POINT_CLOUD, MessageDecoder
 from pipeline.io.readers.transforms import TransformTree
@@ -167,13 +159,13 @@ def test_chunks_behind_a_damaged_length_are_found_by_the_summary(tmp_path: Path,
 def test_a_chunk_of_too_many_empty_messages_is_given_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     most = 1000  # the limit itself, a million, takes ten seconds
     monkeypatch.setattr("pipeline.io.readers.container.MOST_IN_CHUNK", most)
-    message = RECORD.pack(MESSAGE, 22) + MESSAGE_HEAD.pack(1, 0, START_NS, START_NS)
+    message = RECORD.pack(Opcode.MESSAGE, 22) + MESSAGE_HEAD.pack(1, 0, START_NS, START_NS)
     raw = message * (most + 10)
     packed = zstandard.ZstdCompressor().compress(raw)
-    head = CHUNK_HEAD.pack(START_NS, START_NS, len(raw), 0) + struct.pack("<I4sQ", 4, b"zstd", len(packed))
+    head = struct.pack("<QQQII4sQ", START_NS, START_NS, len(raw), 0, 4, b"zstd", len(packed))
     path = tmp_path / "run.mcap"
     channel = struct.pack("<HHI7sI3sI", 1, 0, 7, b"/points", 3, b"cdr", 0)
-    records = [(CHANNEL, channel), (CHUNK, head + packed)]
+    records = [(Opcode.CHANNEL, channel), (Opcode.CHUNK, head + packed)]
     content = b"".join(RECORD.pack(opcode, len(record)) + record for opcode, record in records)
     path.write_bytes(MAGIC + content)
     losses: dict[str, int] = {}
@@ -295,21 +287,21 @@ def test_blocks_are_unpacked_to_the_promised_size_only(name: str):
     packed = PACKERS[name](content)
     assert unpack(packed, name, len(content)) == content
     for size in (0, 1002, 1004, 1 << 40):
-        with pytest.raises(UnpackError):
+        with pytest.raises(BrokenChunkError):
             unpack(packed, name, size)
-    with pytest.raises(UnpackError):
+    with pytest.raises(BrokenChunkError):
         unpack(packed[: len(packed) // 2], name, len(content))
 
 
 @pytest.mark.parametrize("name", ["lz4", "zstd", "bz2"])
 def test_a_bomb_is_not_unpacked_beyond_its_promise(name: str):
-    with pytest.raises(UnpackError, match="another size"):
+    with pytest.raises(BrokenChunkError, match="another size"):
         unpack(PACKERS[name](bytes(64 << 20)), name, 1000)
 
 
 @pytest.mark.parametrize("name", ["xz", "zlib"])
 def test_unknown_packings_are_refused(name: str):
-    with pytest.raises(UnpackError, match="unknown compression"):
+    with pytest.raises(BrokenChunkError, match="unknown compression"):
         unpack(zlib.compress(b"x"), name, 1)
 
 
