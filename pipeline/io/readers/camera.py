@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -74,22 +74,17 @@ class Picture:
 
 
 def find_camera(
-    container: Container,
-    decoder: MessageDecoder,
-    tree: TransformTree,
-    base: str,
-    pictures: frozenset[int],
+    container: Container, decoder: MessageDecoder, tree: TransformTree, base: str, topic: str
 ) -> tuple[Camera | None, str]:
-    """Return the camera of some channels by its CameraInfo and the transforms, or None and the reason.
+    """Return the camera of a topic by its CameraInfo and the transforms, or None and the reason.
 
     Args:
         container, decoder: The recording and the decoder of its messages.
         tree: Fixed transforms.
         base: Name of the base frame.
-        pictures: Numbers of the channels with its pictures.
+        topic: Topic of its pictures.
     """
     channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
-    topic = next(channels[number].topic for number in sorted(pictures))
     near = sorted(
         (channel for channel in channels.values() if channel.msgtype == CAMERA_INFO),
         key=lambda channel: (-shared_parts(channel.topic, topic), channel.topic),
@@ -203,54 +198,60 @@ def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
     return log_ns + offset_ns
 
 
-class RecordedPictures:
-    """The pictures of some channels of a recording.
+class MessageSource(FileSource):
+    """Parts that sources of recorded messages share: losses, pictures, and closing the recording.
+
+    A subclass sets `_picture_channels`, `_decoder`, `_offset_ns` and `_time_of`.
 
     Args:
-        container, decoder: The recording and the decoder of its messages.
-        channels: Channels of the recording by number.
-        numbers: Numbers of the channels of pictures.
-        time_of: Returns the time of a message [ns] by its stamp, None when it is impossible.
-        offset_ns: Time minus time of recording, roughly.
+        container: The recording; the source closes it.
     """
 
-    def __init__(
-        self,
-        container: Container,
-        decoder: MessageDecoder,
-        channels: Mapping[int, Channel],
-        numbers: frozenset[int],
-        time_of: Callable[[int | None, Message], int | None],
-        offset_ns: int,
-    ) -> None:
-        self._container, self._decoder, self._channels = container, decoder, channels
-        self._numbers, self._time_of, self._offset_ns = numbers, time_of, offset_ns
+    _picture_channels: Mapping[int, Channel]  # by number
+    _decoder: MessageDecoder
+    _offset_ns: int  # time minus time of recording, roughly
 
-    def stamps(self) -> list[int]:
+    def __init__(self, container: Container) -> None:
+        super().__init__()
+        self._container = container
+        self._damage = container.damage
+
+    def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
+        """Return the time of a picture [ns] by the stamp in its message, None when it is impossible."""
+        raise NotImplementedError
+
+    def picture_stamps(self) -> list[int]:
         """Return the times of the pictures, ascending [ns]."""
-        return sorted(stamp_ns for stamp_ns, _ in self._stamped(None))
+        return sorted(stamp_ns for stamp_ns, _ in self._taken(None))
 
-    def at(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `stamps`, each once."""
+    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
+        """Yield the pictures of some of `picture_stamps`, each once."""
         left = set(wanted_ns)
-        for stamp_ns, message in self._stamped(None) if left else ():
+        for stamp_ns, message in self._taken(None) if left else ():
             if stamp_ns in left:
                 left.discard(stamp_ns)
-                picture = picture_of(message, self._channels, self._decoder, stamp_ns)
+                picture = self._picture(message, stamp_ns)
                 if picture is not None:
                     yield picture
 
-    def near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time [ns]; None if none is within `within_ns` of it."""
+    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
+        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it."""
         # First only a short interval is read: pictures of a fast camera can be a megabyte each.
         best = self._nearest(stamp_ns, min(within_ns, SAME_TIME_NS)) or self._nearest(stamp_ns, within_ns)
-        return None if best is None else picture_of(best[1], self._channels, self._decoder, best[0])
+        return None if best is None else self._picture(best[1], best[0])
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._container.close()
+
+    def _picture(self, message: Message, stamp_ns: int) -> Picture | None:
+        return picture_of(message, self._picture_channels, self._decoder, stamp_ns)
 
     def _nearest(self, stamp_ns: int, within_ns: int) -> tuple[int, Message] | None:
         """Return the time [ns] and message of the nearest picture within an interval."""
         log_ns, best = stamp_ns - self._offset_ns, None
         wider_ns = within_ns - SAME_TIME_NS
-        for taken_ns, message in self._stamped(log_ns - _EARLY_NS - wider_ns):
+        for taken_ns, message in self._taken(log_ns - _EARLY_NS - wider_ns):
             if message.log_ns > log_ns + _LATE_NS + wider_ns:
                 break
             off_ns = abs(taken_ns - stamp_ns)
@@ -258,43 +259,10 @@ class RecordedPictures:
                 best = taken_ns, message
         return best
 
-    def _stamped(self, from_log_ns: int | None) -> Iterator[tuple[int, Message]]:
-        """Yield the messages with their times in the order of recording."""
-        for message in self._container.messages(self._numbers, from_log_ns, {}) if self._numbers else ():
-            stamp = header_stamp(self._channels[message.channel], message.payload)
-            stamp_ns = self._time_of(stamp, message)
+    def _taken(self, from_log_ns: int | None) -> Iterator[tuple[int, Message]]:
+        """Yield the pictures with their times in the order of recording."""
+        channels = self._picture_channels
+        for message in self._container.messages(channels, from_log_ns, {}) if channels else ():
+            stamp_ns = self._time_of(header_stamp(channels[message.channel], message.payload), message)
             if stamp_ns is not None:
                 yield stamp_ns, message
-
-
-class MessageSource(FileSource):
-    """Parts that sources of recorded messages share: losses, pictures, and closing the recording.
-
-    Args:
-        container: The recording; the source closes it.
-    """
-
-    def __init__(self, container: Container) -> None:
-        super().__init__()
-        self._container = container
-        self._damage = container.damage
-
-    def _pictures(self) -> RecordedPictures:
-        """Return the pictures of the camera."""
-        raise NotImplementedError
-
-    def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it."""
-        return self._pictures().near(stamp_ns, within_ns)
-
-    def picture_stamps(self) -> list[int]:
-        """Return the times of the pictures, ascending [ns]."""
-        return self._pictures().stamps()
-
-    def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `picture_stamps`, each once."""
-        return self._pictures().at(wanted_ns)
-
-    def close(self) -> None:
-        """Close the recording."""
-        self._container.close()

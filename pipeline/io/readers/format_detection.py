@@ -23,7 +23,7 @@ def _opener(module: str, function: str) -> Opener:
     return opened
 
 
-_bag_folder = _opener("ros", "open_bag_folder")
+_recording = _opener("live", "open_recording")
 _kitti = _opener("scan_folder", "open_kitti")
 _pcd = _opener("scan_folder", "open_pcd")
 _scan_tables = _opener("scan_folder", "open_table_scans")
@@ -49,9 +49,9 @@ class Format:
 
 
 FILES = (
-    Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _opener("live", "open_mcap")),
-    Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _opener("ros", "open_db3")),
-    Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _opener("ros", "open_bag")),
+    Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _recording),
+    Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
+    Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
     Format(
         "Velodyne .pcap",
         (
@@ -129,7 +129,7 @@ def folder_opener(folder: Path) -> Opener | None:
         return _tree_manager
     suffixes = {Path(name).suffix.lower() for name in names}
     if suffixes & {".mcap", ".db3", ".zstd"}:
-        return _bag_folder
+        return _recording
     inside = folder / "velodyne"
     if ".bin" in suffixes or (inside.is_dir() and any(inside.glob("*.bin"))):
         return _kitti

@@ -190,18 +190,15 @@ class FrameAlignments:
     ) -> None:
         self._container, self._decoder, self._odometry = container, decoder, odometry
         self._times_of = times_of
-        self._kinds = [
-            (kind, topic.numbers)
-            for kind, topic in (
-                (_Kind("gnss", "gnss", "GNSS", "GNSS fixes", "fixes", "the direction of north", decoder.fix,
-                       align_fixes, *FIX_STRETCH, early=False), topics.gnss),
-                (_Kind("pose", "other_slam", "other SLAM", "Poses of another SLAM", "poses",
-                       "the pose of their frame", decoder.other_pose,
-                       lambda poses, stamps, path, _lever: align_poses(poses, stamps, path),
-                       *POSE_STRETCH, early=True), topics.pose),
-            )
-            if topic is not None
-        ]  # fmt: skip
+        kinds = (
+            _Kind("gnss", "gnss", "GNSS", "GNSS fixes", "fixes", "the direction of north", decoder.fix,
+                  align_fixes, *FIX_STRETCH, early=False),
+            _Kind("pose", "other_slam", "other SLAM", "Poses of another SLAM", "poses",
+                  "the pose of their frame", decoder.other_pose,
+                  lambda poses, stamps, path, _lever: align_poses(poses, stamps, path),
+                  *POSE_STRETCH, early=True),
+        )  # fmt: skip
+        self._kinds = [(kind, topics.numbers(kind.role)) for kind in kinds if kind.role in topics.chosen]
         self._open: list[FrameAlignment] = []
         self.numbers = frozenset[int]().union(*(numbers for _, numbers in self._kinds))
         self.notices: list[str] = []

@@ -25,17 +25,16 @@ from pipeline.io.readers.camera import (
     Camera,
     MessageSource,
     Picture,
-    RecordedPictures,
     find_camera,
     picture_of,
     time_beside,
 )
 from pipeline.io.readers.container import Channel, Container, Message
-from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.message_time import SECOND_NS, ClockStepFilter, header_stamp
-from pipeline.io.readers.ros import RosSource, open_ros
+from pipeline.io.readers.message_time import SECOND_NS, header_stamp
+from pipeline.io.readers.ros import RosSource
+from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
 from pipeline.io.readers.ros_messages import CAMERA_INFO, MessageDecoder, standard_types
-from pipeline.io.readers.topics import TYPES_BY_ROLE, Topic
+from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed
 from pipeline.io.readers.transforms import Extrinsics
 from pipeline.types.records import Notice, Record
 
@@ -93,14 +92,13 @@ class ArrivalReader:
     def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
         self._uri, self._kind, self._channels, self._options = uri, kind, channels, options
         self._scans = {c.number for c in channels if c.msgtype in TYPES_BY_ROLE["scan"]}
-        self._fixed = {c.number for c in channels if c.topic.endswith("tf_static")}
+        self._fixed = {c.number for c in channels if is_fixed(c.topic)}
         self._opening: list[Message] = []
         self._first_ns: int | None = None
         self._scan_ns = 0
         self._heard = 0
         self._failures = 0
         self._source: RosSource | None = None
-        self._clock: ClockStepFilter | None = None
         self.description: SourceDescription | None = None
         self.losses: dict[str, int] = {}
         self.from_ns: int | None = None
@@ -123,7 +121,7 @@ class ArrivalReader:
             SourceError: There are scans, and none can be read.
         """
         if self._source is not None:
-            return self._records_of(message)
+            return self._records_of(self._source, message)
         self._opening.append(message)
         if message.channel in self._scans:
             self._scan_ns = self._scan_ns or message.log_ns
@@ -155,40 +153,26 @@ class ArrivalReader:
         self._opening[:half] = old[-half // 2 :]
 
     def _open(self, now_ns: int) -> list[Record]:
-        clocks: list[ClockStepFilter] = []
-
-        def make_clock(offsets_ns: list[int | None]) -> ClockStepFilter:
-            clocks.append(ClockStepFilter(offsets_ns))
-            return clocks[-1]
-
         heard = MessageList(self._kind, self._channels, self._opening)
         try:
-            source = RosSource(self._uri, heard, [], self._options, make_clock, live=True)
+            self._source = RosSource(self._uri, heard, [], self._options, live=True)
         except SourceError:
             self._failures += 1
             if self._failures >= _TRIES:
                 raise
             self._first_ns, self._heard = now_ns, 0  # wait another second
             return []
-        self._source = source
-        # The run starts again with its first message, so the clock must not remember the messages seen here.
-        self._clock = ClockStepFilter(clocks[-1].offsets_ns)
-        source.use_clock(self._clock)
-        known = source.description
+        known = self._source.description
         self.description = replace(known, scans=None, end_ns=None, digest="", in_order_of_arrival=True)
         opening, self._opening = self._opening, []
-        return [record for message in opening for record in self._records_of(message)]
+        return [record for message in opening for record in self._records_of(self._source, message)]
 
-    def _records_of(self, message: Message) -> list[Record]:
-        assert self._source is not None  # noqa: S101 - checked by the two callers
-        assert self._clock is not None  # noqa: S101 - set with it
-        records = list(self._source.records_of(message, self.losses, self.from_ns))
-        notices = [*self._clock.notices, *self._source.notices]
-        if notices:
+    def _records_of(self, source: RosSource, message: Message) -> list[Record]:
+        records = list(source.records_of(message, self.losses, self.from_ns))
+        if source.notices:
             stamp_ns = records[0].stamp_ns if records else 0
-            records = [*(Notice(stamp_ns, text) for text in notices), *records]
-            self._clock.notices.clear()
-            self._source.notices.clear()
+            records = [*(Notice(stamp_ns, text) for text in source.notices), *records]
+            source.notices.clear()
         return records
 
 
@@ -243,7 +227,7 @@ class LiveCamera:
         if self._found is None or self._found[0] != base:
             known = [*self._fixed, *([] if self._info is None else [self._info])]
             messages = MessageList("", list(self._channels.values()), known)
-            self._found = (base, *find_live_camera(messages, self._decoder, self._pictures_of.number, base))
+            self._found = (base, *find_live_camera(messages, self._decoder, self._pictures_of.topic, base))
         return self._found[1:]
 
     def near(self, stamp_ns: int, offset_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
@@ -273,19 +257,18 @@ class LiveCamera:
 
 
 def find_live_camera(
-    container: Container, decoder: MessageDecoder, pictures: int, base: str
+    container: Container, decoder: MessageDecoder, topic: str, base: str
 ) -> tuple[Camera | None, str]:
-    """Return the camera of a channel by the fixed transforms and the CameraInfo, or None and the reason.
+    """Return the camera of a topic by the fixed transforms and the CameraInfo, or None and the reason.
 
     Args:
         container, decoder: The messages and their decoder.
-        pictures: Number of the channel of its pictures.
+        topic: Topic of its pictures.
         base: Name of the base frame.
     """
     mounting = Extrinsics(container, decoder)
-    fixed = [c for c in container.channels if c.topic.endswith("tf_static")]
-    mounting.read([Topic(c.topic, c.msgtype, frozenset((c.number,)), c.count) for c in fixed], ())
-    return find_camera(container, decoder, mounting.tree, base, frozenset((pictures,)))
+    mounting.read(frozenset(c.number for c in container.channels if is_fixed(c.topic)), frozenset())
+    return find_camera(container, decoder, mounting.tree, base, topic)
 
 
 NAME, VERSION = "stemmap_live.json", 1
@@ -318,7 +301,7 @@ class LiveRunHeader(msgspec.Struct, frozen=True):
     camera: list[str] = []
 
 
-def read_live_header(container: McapFile, where: str) -> LiveRunHeader | None:
+def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
     """Return the settings of a live run; None if the file is not the recording of a live run.
 
     Args:
@@ -345,9 +328,9 @@ class LiveRecording(MessageSource):
 
     Args:
         uri: As the user wrote it.
-        container: The file; the source closes it.
+        container: The recording; the source closes it.
         run: Settings of the live run.
-        path: Of the file, for the digest.
+        paths: Files of the recording, for the digest.
         options: Extrinsics, where the user knows better.
 
     Raises:
@@ -355,93 +338,91 @@ class LiveRecording(MessageSource):
     """
 
     def __init__(
-        self, uri: str, container: McapFile, run: LiveRunHeader, path: Path, options: SourceOptions
+        self, uri: str, container: Container, run: LiveRunHeader, paths: list[Path], options: SourceOptions
     ) -> None:
         super().__init__(container)
         self._uri, self._run = uri, run
         self._options = replace(options, topics={"scan": run.topics[0], **options.topics})
         self._channels = _channels(container, run, uri)
+        self._numbers = [channel.number for channel in self._channels]
         self._skipped = self._read_skipped()
-        self._base, self._offset_ns = "", 0
         self._found_camera: tuple[Camera | None, str] | None = None
-        camera = [c for c in container.channels if c.topic in run.camera]
-        self._camera = tuple(replace(c, definition="", definition_format="") for c in camera)
-        self._description = self._describe(path)
+        self._camera = tuple(_with_standard_type(c) for c in container.channels if c.topic in run.camera)
+        self._decoder = MessageDecoder(())
+        pictures = [c for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
+        self._picture_channels = {channel.number: channel for channel in pictures}
+        reader = self._opened_reader()
+        self._base, self._offset_ns = reader.base, reader.offset_ns
+        if reader.description is None:
+            raise SourceError("there is no scan in it", where=uri, remedy="Record the LiDAR's topic.")
+        self._description = self._describe(reader.description, paths)
 
-    def _pictures(self) -> RecordedPictures:
-        """Return the pictures of the camera."""
-        return RecordedPictures(
-            self._container,
-            MessageDecoder(self._camera),
-            {channel.number: channel for channel in self._camera},
-            frozenset(c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]),
-            lambda stamp_ns, message: time_beside(stamp_ns, message.log_ns, self._offset_ns),
-            self._offset_ns,
-        )
+    def _time_of(self, stamp_ns: int | None, message: Message) -> int:
+        """Return the time of a picture [ns]."""
+        return time_beside(stamp_ns, message.log_ns, self._offset_ns)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records in the order of arrival; messages before `start_ns` are not decoded."""
         reader = self._reader()
         self._losses = reader.losses
         reader.from_ns = start_ns
-        numbers = [channel.number for channel in self._channels]
-        for message in self._messages(numbers, reader.losses):
+        for message in self._messages(self._numbers, reader.losses):
             yield from reader.add(message)
         yield from reader.finish()
 
     def camera(self) -> tuple[Camera | None, str]:
         """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
         if self._found_camera is None:  # needed for each picture
-            pictures = [c.number for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
-            self._found_camera = None, ""
-            if pictures:
-                self._found_camera = find_live_camera(
-                    self._container, MessageDecoder(()), pictures[0], self._base
-                )
+            topic = next((c.topic for c in self._picture_channels.values()), None)
+            self._found_camera = (
+                (None, "") if topic is None
+                else find_live_camera(self._container, self._decoder, topic, self._base)
+            )  # fmt: skip
         return self._found_camera
 
     def _reader(self) -> ArrivalReader:
         return ArrivalReader(self._uri, KIND, self._channels, self._options)
 
-    def _describe(self, path: Path) -> SourceDescription:
+    def _opened_reader(self) -> ArrivalReader:
+        """Return a reader that has read up to its description, or to the end."""
         reader = self._reader()
-        numbers = [channel.number for channel in self._channels]
-        for message in self._messages(numbers, {}):
+        for message in self._messages(self._numbers, {}):
             reader.add(message)
             if reader.description is not None:
-                break
-        else:
-            reader.finish()
-        known = reader.description
-        self._base, self._offset_ns = reader.base, reader.offset_ns
-        if known is None:
-            raise SourceError("there is no scan in it", where=self._uri, remedy="Record the LiDAR's topic.")
+                return reader
+        reader.finish()
+        return reader
+
+    def _describe(self, known: SourceDescription, paths: list[Path]) -> SourceDescription:
+        """Return the description of the recording.
+
+        Args:
+            known: Description of its first messages as a live run.
+            paths: Files of the recording.
+        """
         scans = {c.number: c.count for c in self._container.channels if c.topic == self._run.topics[0]}
         recorded, skipped = sum(scans.values()), sum(len(self._skipped.get(c, ())) for c in scans)
         first_ns = next((m.log_ns for m in self._messages(list(scans), {})), 0)
         tail_ns = self._container.tail_ns(scans)
         last_ns = max((m.log_ns for m in self._container.messages(scans, tail_ns, {})), default=first_ns)
-        cut = (
-            ("the recording is cut or damaged: only whole messages are read",)
-            if self._container.damage
-            else ()
-        )
+        warnings = list(known.warnings)
+        if self._container.damage:
+            warnings.append("the recording is cut or damaged: only whole messages are read")
         revisions = tuple(self._revisions())
-        partly: tuple[str, ...] = ()
         if skipped and not self._options.as_live:
             # Scans are counted among those that were mapped live, so the numbers do not fit here.
             revisions = tuple(replace(last, from_scan=0) for last in revisions[-1:])
-            partly = (
+            warnings.append(
                 f"the live run mapped {recorded - skipped:,} of the {recorded:,} recorded scans; all of "
-                "them are read here, with its last parameters; `stemmap map --as-live` repeats the live run",
+                "them are read here, with its last parameters; `stemmap map --as-live` repeats the live run"
             )
         return replace(
             known,
             scans=recorded - (skipped if self._options.as_live else 0),
             end_ns=(known.start_ns or 0) + last_ns - first_ns,
-            digest=digest_of([path]),
+            digest=digest_of(paths),
             preset=self._run.preset,
-            warnings=(*known.warnings, *cut, *partly),
+            warnings=tuple(warnings),
             revisions=revisions,
             topics=(*known.topics, *camera_topics(self._camera)),
         )
@@ -499,7 +480,7 @@ def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
     return tuple(RecordedTopic(c.topic, c.msgtype, c.count, "camera", "") for c in channels)
 
 
-def _channels(container: McapFile, run: LiveRunHeader, where: str) -> list[Channel]:
+def _channels(container: Container, run: LiveRunHeader, where: str) -> list[Channel]:
     """Return the channels of the robot in the order of the live run.
 
     Args:
@@ -514,38 +495,33 @@ def _channels(container: McapFile, run: LiveRunHeader, where: str) -> list[Chann
     channels = [by_topic[topic] for topic in run.topics]
     if channels[0].msgtype not in TYPES_BY_ROLE["scan"]:
         raise SourceError("the recording's first topic is of no scans", where=where)
-    # The live run used the standard definitions.
-    return [replace(channel, definition="", definition_format="", count=0) for channel in channels]
+    return [replace(_with_standard_type(channel), count=0) for channel in channels]
 
 
-def open_live_recording(uri: str, path: Path, options: SourceOptions) -> LiveRecording | None:
-    """Open an MCAP file as the recording of a live run; return None if it is another recording.
+def _with_standard_type(channel: Channel) -> Channel:
+    """Return a channel with the standard definition of its type, which the live run used."""
+    return replace(channel, definition="", definition_format="")
+
+
+def open_recording(uri: str, path: Path, options: SourceOptions) -> Source:
+    """Open a recording of ROS messages, or the recording of a live run; its files are closed if it cannot be
+    read.
 
     Args:
         uri: As the user wrote it.
-        path: The file.
+        path: A file (.mcap, .db3, .bag), or the folder that a ROS 2 recorder wrote.
         options: Choices of the user.
 
     Raises:
-        SourceError: It is the recording of a live run and cannot be read.
+        SourceError: It cannot be read, or has no scans.
     """
-    container = McapFile(path)
+    paths = bag_files(path) if path.is_dir() else [path]
+    container = BagFolder(paths) if path.is_dir() else open_bag(path)
     try:
         run = read_live_header(container, uri)
         if run is not None:
-            return LiveRecording(uri, container, run, path, options)
+            return LiveRecording(uri, container, run, paths, options)
+        return RosSource(uri, container, paths, options)
     except BaseException:
         container.close()
         raise
-    container.close()
-    return None
-
-
-def open_mcap(uri: str, path: Path, options: SourceOptions) -> Source:
-    """Open an MCAP file: the recording of a live run, or any other recording of ROS messages.
-
-    Raises:
-        SourceError: See RosSource.
-    """
-    live = open_live_recording(uri, path, options)
-    return live or open_ros(uri, lambda: McapFile(path), [path], options)

@@ -56,10 +56,11 @@ class McapFile(ChunkedFile):
             try:
                 found = records.Attachment.read(ReadDataStream(io.BytesIO(raw)))
                 (crc,) = struct.unpack("<I", raw[-4:])
-            except DAMAGE:
-                found = None
-            if found is None or len(found.data) > limit:
-                raise damaged(f"the attachment {name} is damaged or longer than {limit >> 20} MB", self._path)
+                if len(found.data) > limit:
+                    raise ValueError("too long")
+            except DAMAGE as error:
+                what = f"the attachment {name} is damaged or longer than {limit >> 20} MB"
+                raise damaged(what, self._path) from error
             if crc and zlib.crc32(raw[:-4]) != crc:
                 raise damaged(f"the attachment {name} has a wrong checksum", self._path)
             return bytes(found.data)

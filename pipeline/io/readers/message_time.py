@@ -51,7 +51,6 @@ class Clock:
     """
 
     def __init__(self, offsets_ns: list[int | None]) -> None:
-        self.offsets_ns = offsets_ns
         known = [offset for offset in offsets_ns if offset is not None]
         self.by_stamp = (
             bool(known) and len(known) == len(offsets_ns) and max(known) - min(known) <= STAMP_LIMIT_NS // 6
@@ -87,14 +86,12 @@ class ClockStepFilter(Clock):
 
     Args:
         offsets_ns: As for Clock.
-
-    Attributes:
-        notices: New messages for the user; whoever shows them clears the list.
+        notices: List to which messages for the user are added.
     """
 
-    def __init__(self, offsets_ns: list[int | None]) -> None:
+    def __init__(self, offsets_ns: list[int | None], notices: list[str] | None = None) -> None:
         super().__init__(offsets_ns)
-        self.notices: list[str] = []
+        self.notices: list[str] = [] if notices is None else notices
         self._channels: dict[int, _ChannelClock] = {}
         self._steps: list[int] = []
 

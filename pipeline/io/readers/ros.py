@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -13,15 +13,21 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.camera import Camera, MessageSource, RecordedPictures, find_camera
-from pipeline.io.readers.container import Channel, Container, Message
+from pipeline.io.readers.camera import Camera, MessageSource, find_camera
+from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.frame_alignment import FrameAlignments
-from pipeline.io.readers.message_time import WINDOW_NS, Clock, Stamped, by_stamp, header_stamp
-from pipeline.io.readers.ros_bags import BagFile, BagFolder, Db3File, bag_files
+from pipeline.io.readers.message_time import (
+    WINDOW_NS,
+    Clock,
+    ClockStepFilter,
+    Stamped,
+    by_stamp,
+    header_stamp,
+)
 from pipeline.io.readers.ros_messages import LASER_SCAN, MessageDecoder
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
-from pipeline.io.readers.topics import Topic, choose_topics
+from pipeline.io.readers.topics import choose_topics
 from pipeline.io.readers.transforms import Extrinsics, frame_name
 from pipeline.io.readers.velodyne import SENSORS
 from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
@@ -35,11 +41,10 @@ class RosSource(MessageSource):
 
     Args:
         uri: As the user wrote it.
-        container: The recording; the source closes it.
+        container: The recording, or the first messages of a live run; the source closes it.
         paths: Files of the recording, for the digest.
         options: Topics and extrinsics chosen by the user.
-        make_clock: Makes the clock from stamp minus time of recording of the first message of each topic.
-        live: Whether `records_of` gets more messages than the container holds.
+        live: Whether the run is live: `records_of` gets all messages, in the order of arrival.
 
     Attributes:
         notices: New messages for the user from `records_of`; whoever shows them clears the list.
@@ -49,41 +54,40 @@ class RosSource(MessageSource):
     """
 
     def __init__(
-        self,
-        uri: str,
-        container: Container,
-        paths: list[Path],
-        options: SourceOptions,
-        make_clock: Callable[[list[int | None]], Clock] = Clock,
-        *,
-        live: bool = False,
+        self, uri: str, container: Container, paths: list[Path], options: SourceOptions, *, live: bool = False
     ) -> None:
         super().__init__(container)
         self._uri = uri
-        channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
-        decoder = MessageDecoder(channels.values())
-        self._channels, self._decoder = channels, decoder
-        self._topics = choose_topics(channels.values(), options.topics, uri)
-        self._extrinsics = Extrinsics(container, decoder)
-        self._extrinsics.read(self._topics.fixed, self._topics.moving)
-        self._records = RecordDecoder(channels, decoder, self._extrinsics.tree)
+        self._channels = {channel.number: channel for channel in container.channels}
+        self._decoder = MessageDecoder(self._channels.values())
+        self._topics = topics = choose_topics(self._channels.values(), options.topics, uri)
+        self._extrinsics = Extrinsics(container, self._decoder)
+        self._extrinsics.read(topics.transforms(fixed=True), topics.transforms(fixed=False))
+        self._records = RecordDecoder(self._channels, self._decoder, self._extrinsics.tree)
         self._warnings: list[str] = []
         self._camera: tuple[Camera | None, str] | None = None
-        named = [t for t in (self._topics.scan, self._topics.odometry, self._topics.imu) if t is not None]
-        self._clock = make_clock([self._clock_offset(topic) for topic in named])
-        self._moving = self._moving_numbers()
-        self._wanted = self._moving.union(*(topic.numbers for topic in named))
+        self._picture_channels = {number: self._channels[number] for number in topics.numbers("camera")}
+        named = [topics.numbers(role) for role in ("scan", "odometry", "imu") if role in topics.chosen]
+        offsets_ns = [self._clock_offset(numbers) for numbers in named]
+        self._clock = ClockStepFilter(offsets_ns) if live else Clock(offsets_ns)
+        self._offset_ns = self._clock.offset_ns
+        self._moving = frozenset[int]()  # channels of transforms that are read as odometry
+        if "odometry" not in topics.chosen and self._extrinsics.odometry_link is not None:
+            self._moving = topics.transforms(fixed=False)
+        self._wanted = self._moving.union(*named)
         self._truth, sensor = self._read_truth()
         first, frame, product = self._first_scan()
         sensor = sensor or SENSORS.get(product) or sensor_of(first)
         self._top_ring = sensor.rings - 1 if rings_descend(first) else None
-        self._description = self._describe(first, frame, sensor, decoder.refused, options)
-        self._description = replace(self._description, digest=digest_of(paths))
-        self._records.poses = frozenset() if self._topics.pose is None else self._topics.pose.numbers
-        odometry = self._moving if self._topics.odometry is None else self._topics.odometry.numbers
-        self._alignments = FrameAlignments(container, self._records, self._topics, odometry, self._times_of)
-        self._description = self._alignments.begin(self._description, live=live)
+        described = self._describe(first, frame, sensor, digest_of(paths), options)
+        self._records.poses = topics.numbers("pose")
+        odometry = topics.numbers("odometry") or self._moving
+        self._alignments = FrameAlignments(container, self._records, topics, odometry, self._times_of)
+        self._description = self._alignments.begin(described, live=live)
         self.notices = self._alignments.notices
+        if live:
+            # The run starts again with its first message: the clock forgets the messages that were read here.
+            self._clock = ClockStepFilter(offsets_ns, self.notices)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records in the order of time; messages before `start_ns` are not decoded."""
@@ -108,22 +112,18 @@ class RosSource(MessageSource):
                 if from_ns is None or stamped.stamp_ns >= from_ns:
                     yield from self._decoded(stamped, losses)
 
-    def use_clock(self, clock: Clock) -> None:
-        """Use another clock from now on."""
-        self._clock = clock
-
     def truth(self) -> Truth | None:
         """Return the ground truth attached to a simulated recording, None when there is none."""
         return self._truth
 
     def camera(self) -> tuple[Camera | None, str]:
         """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
-        topic = self._topics.camera
-        if topic is None:
+        if not self._picture_channels:
             return None, ""
         if self._camera is None:  # needed for each picture
+            topic = self._topics.chosen["camera"].name
             self._camera = find_camera(
-                self._container, self._decoder, self._extrinsics.tree, self._records.base, topic.numbers
+                self._container, self._decoder, self._extrinsics.tree, self._records.base, topic
             )
         return self._camera
 
@@ -134,12 +134,9 @@ class RosSource(MessageSource):
 
     # --- reading ---------------------------------------------------------------------------------
 
-    def _pictures(self) -> RecordedPictures:
-        numbers = frozenset[int]() if self._topics.camera is None else self._topics.camera.numbers
-        clock = self._clock
-        return RecordedPictures(
-            self._container, self._decoder, self._channels, numbers, clock.time_of, clock.offset_ns
-        )
+    def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
+        """Return the time of a message [ns], None when its stamp is impossible."""
+        return self._clock.time_of(stamp_ns, message)
 
     def _arrivals(
         self, start_ns: int | None, losses: dict[str, int]
@@ -178,7 +175,7 @@ class RosSource(MessageSource):
         if time_ns is None:
             count_loss(losses, "messages with an impossible time stamp")
         else:
-            yield Stamped(time_ns, int(message.channel in self._topics.scan.numbers), message)
+            yield Stamped(time_ns, int(message.channel in self._topics.numbers("scan")), message)
 
     def _transforms(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Yield odometry that is recorded as a moving transform."""
@@ -198,14 +195,10 @@ class RosSource(MessageSource):
 
     # --- opening ---------------------------------------------------------------------------------
 
-    def _moving_numbers(self) -> frozenset[int]:
-        if self._topics.odometry is not None or self._extrinsics.odometry_link is None:
-            return frozenset()
-        return frozenset[int]().union(*(topic.numbers for topic in self._topics.moving))
-
-    def _clock_offset(self, topic: Topic) -> int | None:
-        """Return stamp minus time of recording of the first message of a topic [ns], None without a stamp."""
-        for message in islice(self._container.messages(topic.numbers, None, {}), 1):
+    def _clock_offset(self, numbers: frozenset[int]) -> int | None:
+        """Return stamp minus time of recording of the first message of some channels [ns], None without a
+        stamp."""
+        for message in islice(self._container.messages(numbers, None, {}), 1):
             stamp_ns = header_stamp(self._channels[message.channel], message.payload)
             return stamp_ns - message.log_ns if stamp_ns else None
         return None
@@ -225,18 +218,18 @@ class RosSource(MessageSource):
             reason = "the first scans have no points"
         raise SourceError(
             reason,
-            where=f"{self._uri}, topic {self._topics.scan.name}",
+            where=f"{self._uri}, topic {self._topics.chosen['scan'].name}",
             remedy="Name another with --topic scan=NAME.",
         )
 
     def _scan_arrivals(self, log_start: int | None) -> Iterator[Stamped[Message]]:
-        for message in self._container.messages(self._topics.scan.numbers, log_start, {}):
+        for message in self._container.messages(self._topics.numbers("scan"), log_start, {}):
             for arrival in self._stamped(message, {}):
                 if isinstance(arrival.content, Message):
                     yield Stamped(arrival.stamp_ns, arrival.rank, arrival.content)
 
     def _last_stamp(self) -> int | None:
-        tail_ns = self._container.tail_ns(self._topics.scan.numbers)
+        tail_ns = self._container.tail_ns(self._topics.numbers("scan"))
         return max((arrival.stamp_ns for arrival in self._scan_arrivals(tail_ns)), default=None)
 
     def _read_truth(self) -> tuple[Truth | None, Sensor | None]:
@@ -249,8 +242,7 @@ class RosSource(MessageSource):
 
     def _odometry_base(self) -> str:
         """Return the base frame named by the odometry topic, "" when there is none."""
-        topic = self._topics.odometry
-        numbers = frozenset[int]() if topic is None else topic.numbers
+        numbers = self._topics.numbers("odometry")
         for message in islice(self._container.messages(numbers, None, {}), 1 if numbers else 0):
             try:
                 return frame_name(self._records.message(message).child_frame_id)
@@ -259,13 +251,15 @@ class RosSource(MessageSource):
         return ""
 
     def _describe(
-        self, first: Scan, frame: str, sensor: Sensor, refused: list[str], options: SourceOptions
+        self, first: Scan, frame: str, sensor: Sensor, digest: str, options: SourceOptions
     ) -> SourceDescription:
+        chosen = self._topics.chosen
         self._records.base = base = self._extrinsics.base_frame(self._odometry_base())
-        has_odometry = self._topics.odometry is not None or bool(self._moving)
+        has_odometry = "odometry" in chosen or bool(self._moving)
         linked = options.T_base_lidar or self._extrinsics.tree.find(base, frame)
         warnings = [
-            f"the definition of {topic} in the file is not used: it is not valid" for topic in refused
+            f"the definition of {topic} in the file is not used: it is not valid"
+            for topic in self._decoder.refused
         ]
         warnings += self._warnings
         if linked is None and has_odometry and base != frame:
@@ -289,62 +283,12 @@ class RosSource(MessageSource):
             sensor=sensor,
             T_base_lidar=linked or Pose3.identity(),
             has_odometry=has_odometry,
-            has_imu=self._topics.imu is not None,
-            scans=self._topics.scan.count,
+            has_imu="imu" in chosen,
+            scans=chosen["scan"].count,
             start_ns=first.stamp_ns,
             end_ns=self._last_stamp(),
-            digest="",
-            preset="laser2d" if self._topics.scan.msgtype == LASER_SCAN else "forest",
+            digest=digest,
+            preset="laser2d" if chosen["scan"].msgtype == LASER_SCAN else "forest",
             topics=self._topics.recorded(),
             warnings=tuple(warnings),
         )
-
-
-def open_ros(
-    uri: str, open_container: Callable[[], Container], paths: list[Path], options: SourceOptions
-) -> RosSource:
-    """Open a recording; its files are closed if it cannot be read.
-
-    Args:
-        uri: As the user wrote it.
-        open_container: Opens the recording.
-        paths: Files of the recording, for the digest.
-        options: Choices of the user.
-
-    Raises:
-        SourceError: See RosSource.
-    """
-    container = open_container()
-    try:
-        return RosSource(uri, container, paths, options)
-    except BaseException:
-        container.close()
-        raise
-
-
-def open_db3(uri: str, path: Path, options: SourceOptions) -> RosSource:
-    """Open a ROS 2 bag in SQLite.
-
-    Raises:
-        SourceError: See RosSource.
-    """
-    return open_ros(uri, lambda: Db3File(path), [path], options)
-
-
-def open_bag(uri: str, path: Path, options: SourceOptions) -> RosSource:
-    """Open a ROS 1 bag.
-
-    Raises:
-        SourceError: See RosSource.
-    """
-    return open_ros(uri, lambda: BagFile(path), [path], options)
-
-
-def open_bag_folder(uri: str, folder: Path, options: SourceOptions) -> RosSource:
-    """Open a folder that a ROS 2 recorder wrote.
-
-    Raises:
-        SourceError: See RosSource.
-    """
-    files = bag_files(folder)
-    return open_ros(uri, lambda: BagFolder(files), files, options)

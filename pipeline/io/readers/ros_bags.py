@@ -6,7 +6,7 @@ from __future__ import annotations
 import heapq
 import sqlite3
 import struct
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
@@ -136,7 +136,6 @@ class Db3File(Container):
             return {}
 
 
-_OPENERS: dict[str, Callable[[Path], Container]] = {".mcap": McapFile, ".db3": Db3File}
 #: The channels of the n-th file are numbered from n times this value.
 _STRIDE = 1 << 40
 
@@ -147,7 +146,7 @@ def bag_files(folder: Path) -> list[Path]:
     Raises:
         SourceError: The files themselves are compressed, or there are several without metadata.yaml.
     """
-    files = sorted((path for path in folder.iterdir() if path.suffix in _OPENERS), key=_natural)
+    files = sorted((path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")), key=_natural)
     packed = sorted(path for path in folder.iterdir() if path.suffixes[-1:] == [".zstd"])
     if packed and not files:
         raise SourceError(
@@ -185,7 +184,7 @@ class BagFolder(Container):
         self._parts: list[Container] = []
         for path in files:
             try:
-                self._parts.append(_OPENERS[path.suffix](path))
+                self._parts.append(open_bag(path))
             except SourceError:
                 if len(files) == 1:
                     raise
@@ -348,3 +347,19 @@ def _fields(header: bytes) -> Header:
         fields[name] = content
         at += 4 + size
     return fields
+
+
+def open_bag(path: Path) -> Container:
+    """Open a file of recorded messages by its contents.
+
+    Raises:
+        SourceError: It has another format, or cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            head = file.read(len(MAGIC))
+    except OSError as error:
+        raise SourceError(f"cannot open the file: {error.strerror}", where=str(path)) from error
+    if head.startswith(b"SQLite"):
+        return Db3File(path)
+    return BagFile(path) if head.startswith(b"#ROSBAG") else McapFile(path)

@@ -31,6 +31,7 @@ TYPES_BY_ROLE = {
     "pose": (POSE_WITH_COVARIANCE, ODOMETRY),
     "camera": (COMPRESSED_IMAGE, IMAGE),
 }
+TRANSFORM_TYPES = (TRANSFORMS, ROS1_TRANSFORMS)
 ROLES = "scan, odometry, imu, gnss, pose or camera"
 #: A recording that does not name the serialization is read as CDR, the default of ROS 2.
 _READABLE = ("cdr", "ros1", "")
@@ -54,43 +55,44 @@ class Topic:
 
 @dataclass(frozen=True, slots=True)
 class Topics:
-    """The topics that are read by role; `fixed` and `moving` have transforms, `every` lists all topics."""
+    """Topics of a recording.
 
-    scan: Topic
-    odometry: Topic | None
-    imu: Topic | None
-    gnss: Topic | None
-    pose: Topic | None
-    camera: Topic | None
-    fixed: tuple[Topic, ...]
-    moving: tuple[Topic, ...]
+    Attributes:
+        chosen: Topic that is read by role; a role without a topic is missing.
+        every: All topics.
+    """
+
+    chosen: dict[str, Topic]
     every: tuple[Topic, ...]
+
+    def numbers(self, role: str) -> frozenset[int]:
+        """Return the numbers of the channels that are read in a role."""
+        topic = self.chosen.get(role)
+        return frozenset() if topic is None else topic.numbers
+
+    def transforms(self, *, fixed: bool) -> frozenset[int]:
+        """Return the numbers of the channels of fixed or of moving transforms."""
+        found = (t.numbers for t in self.every if t.msgtype in TRANSFORM_TYPES and is_fixed(t.name) is fixed)
+        return frozenset[int]().union(*found)
 
     def recorded(self) -> tuple[RecordedTopic, ...]:
         """Describe all topics for the user, each with its role."""
-        reading: dict[Topic, str] = dict.fromkeys((*self.fixed, *self.moving), "transforms")
-        infos = [topic for topic in self.every if topic.msgtype == CAMERA_INFO]
-        reading.update(dict.fromkeys(infos if self.camera else [], "camera"))
-        chosen = {
-            "scan": self.scan,
-            "odometry": self.odometry,
-            "imu": self.imu,
-            "gnss": self.gnss,
-            "pose": self.pose,
-            "camera": self.camera,
-        }
-        reading.update({topic: role for role, topic in chosen.items() if topic is not None})
-        return tuple(
-            RecordedTopic(
-                topic.name,
-                topic.msgtype,
-                topic.count,
-                reading.get(topic, ""),
-                _role_of(topic),
-                "" if topic in reading else _why_not(topic, chosen.get(_role_of(topic))),
-            )
-            for topic in self.every
-        )
+        reading = {topic: "transforms" for topic in self.every if topic.msgtype in TRANSFORM_TYPES}
+        if "camera" in self.chosen:
+            reading |= {topic: "camera" for topic in self.every if topic.msgtype == CAMERA_INFO}
+        reading |= {topic: role for role, topic in self.chosen.items()}
+        found = []
+        for topic in self.every:
+            role = _role_of(topic)
+            why_not = "" if topic in reading else _why_not(topic, self.chosen.get(role))
+            use = reading.get(topic, "")
+            found.append(RecordedTopic(topic.name, topic.msgtype, topic.count, use, role, why_not))
+        return tuple(found)
+
+
+def is_fixed(topic: str) -> bool:
+    """Return whether a topic of transforms has the fixed ones."""
+    return topic.endswith("tf_static")
 
 
 def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where: str) -> Topics:
@@ -113,28 +115,14 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     chosen = {
         role: _choose(_free(topics, role, wanted), role, wanted.get(role), where) for role in TYPES_BY_ROLE
     }
-    scan = chosen["scan"]
-    if scan is None:
+    if chosen["scan"] is None:
         types = " or ".join(TYPES_BY_ROLE["scan"])
         raise SourceError(
             f"the recording has no scans (messages of {types}); {_listing(topics)}",
             where=where,
             remedy="Record the topic of the LiDAR.",
         )
-    transforms = [topic for topic in topics if topic.msgtype in (TRANSFORMS, ROS1_TRANSFORMS)]
-    fixed = tuple(topic for topic in transforms if topic.name.endswith("tf_static"))
-    moving = tuple(topic for topic in transforms if not topic.name.endswith("tf_static"))
-    return Topics(
-        scan,
-        chosen["odometry"],
-        chosen["imu"],
-        chosen["gnss"],
-        chosen["pose"],
-        chosen["camera"],
-        fixed,
-        moving,
-        tuple(topics),
-    )
+    return Topics({role: topic for role, topic in chosen.items() if topic is not None}, tuple(topics))
 
 
 def _role_of(topic: Topic) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import islice
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,6 @@ import numpy as np
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.ros_messages import MessageDecoder
-from pipeline.io.readers.topics import Topic
 
 if TYPE_CHECKING:
     from rosbags.typesys.stores import ros2_jazzy as ros2
@@ -99,8 +97,8 @@ class Extrinsics:
         self.tree = TransformTree()
         self.odometry_link: tuple[str, str] | None = None
 
-    def read(self, fixed: Iterable[Topic], moving: Iterable[Topic]) -> None:
-        """Read the transforms; messages that cannot be decoded are skipped here."""
+    def read(self, fixed: frozenset[int], moving: frozenset[int]) -> None:
+        """Read the transforms of some channels; messages that cannot be decoded are skipped here."""
         for (parent, child), pose in self._links(moving, MOVING_MESSAGES, steady=True).items():
             self.tree.add(parent, child, pose)
         for (parent, child), pose in self._links(fixed, FIXED_MESSAGES, steady=False).items():
@@ -115,15 +113,14 @@ class Extrinsics:
         usual = ("base_link", "base_footprint", "base")
         return next((name for name in usual if self.tree.knows(name)), "")
 
-    def _links(self, topics: Iterable[Topic], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
+    def _links(self, numbers: frozenset[int], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
         """Return the transforms of the first messages by parent and child.
 
         Args:
-            topics: Topics with transforms.
+            numbers: Numbers of channels with transforms.
             limit: Number of messages that are read.
             steady: Whether transforms that change are left out.
         """
-        numbers = frozenset[int]().union(*(topic.numbers for topic in topics))
         seen: dict[tuple[str, str], Pose3] = {}
         moved: set[tuple[str, str]] = set()
         for message in islice(self._container.messages(numbers, None, {}), limit if numbers else 0):
