@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any
 
@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from pipeline.errors import SourceError
 from pipeline.inventory.cloud import CloudDescription, WholeCloud
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss, digest_of
+from pipeline.io.readers.format_detection import expected_format, file_format
 from pipeline.io.readers.point_files import (
-    MAGIC,
     MISSING,
     MOST_POINTS,
     PART,
-    Columns,
     ScanFileError,
     open_table,
 )
@@ -29,21 +28,18 @@ if TYPE_CHECKING:
     import laspy
 
 _REMEDY = "Copy the file again, or export it again"
-LAS, E57 = b"LASF", b"ASTM-E57"
-#: Files that are clouds by default; a .pcd file is a scan by default.
-SUFFIXES = (".las", ".laz", ".ply", ".npy", ".npz", ".e57")
-READABLE = "LAS, LAZ, PLY, E57, .npy, .npz and PCD"
 
 
 def is_cloud(uri: str) -> bool:
-    """Return whether a file is a whole cloud by its first bytes or its name."""
-    path = Path(uri).expanduser()
+    """Return whether a file is a whole cloud by its first bytes or its name; a .pcd file is a scan."""
     try:
+        path = Path(uri).expanduser()
         with path.open("rb") as file:
             head = file.read(16)
     except (OSError, ValueError, RuntimeError):
         return False
-    return head.startswith((LAS, E57, *MAGIC[".ply"], *MAGIC[".npy"])) or path.suffix.lower() in SUFFIXES
+    kind = file_format(path, head) or expected_format(path)
+    return kind is not None and kind.is_cloud
 
 
 def open_cloud(uri: str) -> WholeCloud:
@@ -56,9 +52,9 @@ def open_cloud(uri: str) -> WholeCloud:
         path = Path(uri).expanduser()
         with path.open("rb") as file:
             head = file.read(8)
-        if head == E57 or path.suffix.lower() == ".e57":
+        if head == b"ASTM-E57" or path.suffix.lower() == ".e57":
             return E57Cloud(uri, path)
-        is_las = head.startswith(LAS) or path.suffix.lower() in (".las", ".laz")
+        is_las = head.startswith(b"LASF") or path.suffix.lower() in (".las", ".laz")
         return LasCloud(uri, path) if is_las else TableCloud(uri, path)
     except MemoryError:
         raise SourceError("it is too large for the memory of this machine", where=uri) from None
@@ -83,64 +79,104 @@ def offset_for(middle: Float) -> Float:
     return np.where(np.abs(middle) < 1000.0, 0.0, np.round(middle / 100.0) * 100.0)
 
 
-class TableCloud:
-    """A PLY, NumPy or PCD file as a cloud (see `pipeline.inventory.cloud.WholeCloud`).
+class CloudFile:
+    """A file of points as a cloud (see `pipeline.inventory.cloud.WholeCloud`).
+
+    A subclass opens the file (`_open`), calls `_describe`, and yields the points (`_read`).
+
+    Args:
+        uri: As the user wrote it.
+        path: The file.
 
     Raises:
         SourceError: It has another format, or is damaged.
         OSError: It cannot be read.
     """
 
+    name: str  # of the format, in errors
+    description: CloudDescription
+
     def __init__(self, uri: str, path: Path) -> None:
+        self._uri, self._path = uri, path
         self.losses: dict[str, int] = {}
-        try:
-            self._table = open_table(path)
-            middle = self._first_places().mean(axis=0)
-        except ScanFileError as error:
-            raise SourceError(str(error), where=uri, remedy=_REMEDY) from None
-        if not np.isfinite(middle).all():
-            raise SourceError("the coordinates of the cloud are not valid", where=uri, remedy=_REMEDY)
-        self.description = CloudDescription(
-            uri=uri,
-            kind=self._table.kind,
-            points=self._table.points,
-            offset=offset_for(middle),
-            crs="",
-            digest=digest_of([path]),
-            attributes=tuple(name for name in self._table.names if name not in ("x", "y", "z")),
-        )
+        with self._one_error():
+            self.description = self._describe()
 
     def parts(self) -> Iterator[Float32]:
         """Yield all points part by part, shape (N, 3)."""
         self.losses = {}
         read = 0
         try:
-            for columns in self._table.parts():
-                with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may have any size
-                    xyz = _places(columns) - self.description.offset
-                good = is_place(xyz)
-                read += len(xyz)
-                if not good.all():
-                    count_loss(self.losses, "points without coordinates", int(np.count_nonzero(~good)))
-                yield xyz[good].astype(np.float32)
+            with self._one_error():
+                for points, xyz in self._read():
+                    with np.errstate(invalid="ignore", over="ignore"):  # damaged numbers may have any size
+                        xyz = xyz - self.description.offset
+                    good = is_place(xyz)
+                    read += points
+                    if not good.all():
+                        count_loss(self.losses, "points without coordinates", int(np.count_nonzero(~good)))
+                    yield xyz[good].astype(np.float32)
+        except SourceError:
+            if read == 0:
+                raise
+            # Points before the damage are valid.
+        if read < self.description.points:
+            count_loss(self.losses, MISSING, self.description.points - read)
+
+    def _describe(self) -> CloudDescription:
+        """Return the description."""
+        raise NotImplementedError
+
+    def _read(self) -> Iterator[tuple[int, Float]]:
+        """Yield the positions part by part, shape (N, 3) [m], each with the number of points read for it."""
+        raise NotImplementedError
+
+    def _described(self, kind: str, points: int, **known: Any) -> CloudDescription:  # noqa: ANN401
+        """Return a description with the offset by the first valid positions.
+
+        Args:
+            kind, points, known: Fields of the description.
+        """
+        for _, xyz in self._read():
+            first = xyz[is_place(xyz)][:1000]
+            if len(first):
+                offset, digest = offset_for(first.mean(axis=0)), digest_of([self._path])
+                return CloudDescription(self._uri, kind, points, offset, digest=digest, **known)
+        raise SourceError("the cloud has no points with valid coordinates", where=self._uri, remedy=_REMEDY)
+
+    @contextmanager
+    def _one_error(self) -> Iterator[None]:
+        """Turn whatever a library raises for a damaged file into a SourceError."""
+        try:
+            yield
+        except (SourceError, OSError):
+            raise
         except ScanFileError as error:
-            raise SourceError(str(error), where=self.description.uri, remedy=_REMEDY) from None
-        if read < self._table.points:
-            count_loss(self.losses, MISSING, self._table.points - read)
+            raise SourceError(str(error), where=self._uri, remedy=_REMEDY) from None
+        except BaseException as error:
+            # A panic of the LAZ decoder is no Exception.
+            if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+                raise
+            reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+            what = f"the {self.name} file is damaged: {reason}"
+            raise SourceError(what, where=self._uri, remedy=_REMEDY) from None
 
-    def _first_places(self) -> Float:
-        """Return the first valid positions, shape (N, 3) [m]; one row of NaN when there is none."""
+
+class TableCloud(CloudFile):
+    """A PLY, NumPy or PCD file as a cloud."""
+
+    name = "point"
+
+    def _describe(self) -> CloudDescription:
+        self._table = table = open_table(self._path)
+        attributes = tuple(name for name in table.names if name not in ("x", "y", "z"))
+        return self._described(table.kind, table.points, crs="", attributes=attributes)
+
+    def _read(self) -> Iterator[tuple[int, Float]]:
         for columns in self._table.parts():
-            xyz = _places({axis: columns[axis][:10_000] for axis in "xyz"})
-            xyz = xyz[is_place(xyz)][:1000]
-            if len(xyz):
-                return xyz
-        return np.full((1, 3), np.nan)
-
-
-def _places(columns: Columns) -> Float:
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+            with np.errstate(over="ignore", invalid="ignore"):
+                xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
+            yield len(xyz), xyz
 
 
 # --- LAS and LAZ ---
@@ -154,95 +190,37 @@ _LASZIP_USER = b"laszip encoded"
 _LASZIP, _ITEMS, _ITEM = 22204, 34, struct.Struct("<HHH")
 
 
-class LasCloud:
-    """A .las or .laz file (see `pipeline.inventory.cloud.WholeCloud`).
+class LasCloud(CloudFile):
+    """A .las or .laz file as a cloud."""
 
-    Raises:
-        SourceError: It has another format, or is damaged.
-        OSError: It cannot be read.
-    """
+    name = "LAS"
 
-    def __init__(self, uri: str, path: Path) -> None:
-        self._path = path
-        self.losses: dict[str, int] = {}
-        points, self._there, compressed, version = _check_las(path, uri)
-        crs = ""
-        try:
-            with _without_panic(), _open_las(path) as reader:
-                header = reader.header
-                self._scales, self._offsets = header.scales.copy(), header.offsets.copy()
-                crs = _crs_of(header)
-                low, high = np.array(header.mins, np.float64), np.array(header.maxs, np.float64)
-                attributes = tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z"))
-                with np.errstate(over="ignore", invalid="ignore"):  # checked below
-                    first = self._xyz(reader.read_points(min(1000, self._there)))
-        except SourceError:
-            raise
-        except _all_that_damage_raises() as error:
-            raise SourceError(f"the LAS file is damaged: {error}", where=uri, remedy=_REMEDY) from None
-        if not len(first):
-            raise SourceError("the LAS file is damaged: no point is whole", where=uri, remedy=_REMEDY)
-        with np.errstate(over="ignore", invalid="ignore"):
-            middle = first.mean(axis=0)
-        if not is_place(middle[None]).all():
-            raise SourceError("the coordinates of the cloud are not valid", where=uri, remedy=_REMEDY)
-        self.description = CloudDescription(
-            uri=uri,
-            kind=f"LAS {version}" + (" compressed" if compressed else ""),
-            points=points,
-            offset=offset_for(middle),
-            crs=crs,
-            digest=digest_of([path]),
-            low=low,
-            high=high,
-            attributes=attributes,
+    def _describe(self) -> CloudDescription:
+        points, self._there, compressed, version = _check_las(self._path, self._uri)
+        with _open_las(self._path) as reader:
+            header = reader.header
+        return self._described(
+            f"LAS {version}" + (" compressed" if compressed else ""),
+            points,
+            crs=_crs_of(header),
+            low=np.array(header.mins, np.float64),
+            high=np.array(header.maxs, np.float64),
+            attributes=tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z")),
         )
 
-    def parts(self) -> Iterator[Float32]:
-        """Yield all points part by part, shape (N, 3)."""
-        self.losses = {}
+    def _read(self) -> Iterator[tuple[int, Float]]:
         read = 0
-        try:
-            with _without_panic(), _open_las(self._path) as reader:
-                while read < self._there:
-                    chunk = reader.read_points(min(_LAS_PART, self._there - read))
-                    if len(chunk) == 0:
-                        break
-                    xyz = self._xyz(chunk) - self.description.offset
-                    good = is_place(xyz)
-                    withheld = np.asarray(chunk.withheld).astype(np.bool_)
-                    self._lose("points without coordinates", int(np.count_nonzero(~good)))
-                    self._lose("points that the file withholds", int(np.count_nonzero(good & withheld)))
-                    read += len(xyz)
-                    yield xyz[good & ~withheld].astype(np.float32)
-        except _all_that_damage_raises() as error:
-            if read == 0:
-                raise SourceError(
-                    f"the LAS file is damaged: {error}", where=self.description.uri, remedy=_REMEDY
-                ) from None
-            # Points before the damage are valid.
-        self._lose("points after the damage in the file", self.description.points - read)
-
-    def _xyz(self, chunk: laspy.ScaleAwarePointRecord) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-        raw = np.stack([np.asarray(chunk[axis], np.float64) for axis in ("X", "Y", "Z")], axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):
-            xyz: np.ndarray[tuple[int, int], np.dtype[np.float64]] = raw * self._scales + self._offsets
-        return xyz
-
-    def _lose(self, reason: str, n: int) -> None:
-        if n > 0:
-            self.losses[reason] = self.losses.get(reason, 0) + n
-
-
-@contextmanager
-def _without_panic() -> Iterator[None]:
-    """Turn a panic of the LAZ decoder, which is no Exception, into a ValueError."""
-    try:
-        yield
-    except BaseException as error:
-        if type(error).__name__ == "PanicException":
-            raise ValueError(str(error)) from None
-        raise
+        with _open_las(self._path) as reader:
+            scales, offsets = reader.header.scales.copy(), reader.header.offsets.copy()
+            while read < self._there and len(chunk := reader.read_points(min(_LAS_PART, self._there - read))):
+                raw = np.stack([np.asarray(chunk[axis], np.float64) for axis in ("X", "Y", "Z")], axis=1)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    xyz = raw * scales + offsets
+                withheld = np.asarray(chunk.withheld).astype(np.bool_)
+                if withheld.any():
+                    count_loss(self.losses, "points that the file withholds", int(np.count_nonzero(withheld)))
+                read += len(xyz)
+                yield len(xyz), xyz[~withheld]
 
 
 def _open_las(path: Path) -> laspy.LasReader:
@@ -250,26 +228,6 @@ def _open_las(path: Path) -> laspy.LasReader:
 
     # One decoder in this thread: results do not depend on the number of cores.
     return laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False)
-
-
-def _all_that_damage_raises() -> tuple[type[BaseException], ...]:
-    import laspy
-    import lazrs
-
-    return (
-        laspy.errors.LaspyException,
-        lazrs.LazrsError,
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        AttributeError,
-        OverflowError,
-        MemoryError,
-        EOFError,
-        RuntimeError,
-        struct.error,
-    )
 
 
 def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
@@ -378,84 +336,46 @@ _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 _INVALID = ("cartesianInvalidState", "sphericalInvalidState")
 
 
-class E57Cloud:
-    """An E57 file (ASTM E2807) as a cloud (see `pipeline.inventory.cloud.WholeCloud`): all stations in one
-    frame.
+class E57Cloud(CloudFile):
+    """An E57 file (ASTM E2807) as a cloud: all stations in one frame."""
 
-    Raises:
-        SourceError: It has another format, is damaged, or pye57 is not installed.
-    """
+    name = "E57"
 
-    def __init__(self, uri: str, path: Path) -> None:
-        self._uri, self._path = uri, path
-        self.losses: dict[str, int] = {}
-        file = self._open()
-        try:
-            stations = self._guarded(lambda: int(file.scan_count))
+    def _describe(self) -> CloudDescription:
+        with closing(self._open()) as file:
+            stations = int(file.scan_count)
             if stations > MOST_STATIONS:
-                raise SourceError(f"it promises {stations} stations", where=uri, remedy=_REMEDY)
-            points = self._guarded(lambda: [int(file.get_header(k).point_count) for k in range(stations)])
-            if not all(0 <= n <= MOST_POINTS for n in points) or sum(points) > MOST_POINTS:
-                raise SourceError("it promises more points than there can be", where=uri, remedy=_REMEDY)
-            first = next((part[good] for part, good in self._places(file) if good.any()), None)
-        finally:
-            file.close()
-        if first is None:
-            raise SourceError("the cloud has no points", where=uri, remedy=_REMEDY)
-        self.description = CloudDescription(
-            uri=uri,
-            kind=f"E57, {stations} station{'s' * (stations != 1)}",
-            points=sum(points),
-            offset=offset_for(first[:1000].mean(axis=0)),
-            crs="",
-            digest=digest_of([path]),
-        )
+                raise SourceError(f"it promises {stations} stations", where=self._uri, remedy=_REMEDY)
+            points = [int(file.get_header(k).point_count) for k in range(stations)]
+        if not all(0 <= n <= MOST_POINTS for n in points) or sum(points) > MOST_POINTS:
+            raise SourceError("it promises more points than there can be", where=self._uri, remedy=_REMEDY)
+        kind = f"E57, {stations} station{'s' * (stations != 1)}"
+        return self._described(kind, sum(points), crs="")
 
-    def parts(self) -> Iterator[Float32]:
-        """Yield all points part by part, shape (N, 3)."""
-        self.losses = {}
-        read = 0
-        file = self._open()
-        try:
-            for xyz, good in self._places(file):
-                read += len(xyz)
-                if not good.all():
-                    count_loss(self.losses, "points without coordinates", int(np.count_nonzero(~good)))
-                yield (xyz[good] - self.description.offset).astype(np.float32)
-        except SourceError:
-            if read == 0:
-                raise
-        finally:
-            file.close()
-        if read < self.description.points:
-            count_loss(self.losses, "points after the damage in the file", self.description.points - read)
+    def _read(self) -> Iterator[tuple[int, Float]]:
+        with closing(self._open()) as file:
+            for station in range(int(file.scan_count)):
+                for xyz in self._station(file, station):
+                    yield len(xyz), xyz
 
-    def _places(self, file: Any) -> Iterator[tuple[Float, Any]]:  # noqa: ANN401 - pye57 has no types
-        """Yield points of all stations in the frame of the file, (N, 3) [m], and which are valid, (N,)."""
-        for station in range(self._guarded(lambda: int(file.scan_count))):
-            yield from self._station(file, station)
-
-    def _station(self, file: Any, station: int) -> Iterator[tuple[Float, Any]]:  # noqa: ANN401
-        header = self._guarded(lambda: file.get_header(station))
-        there = set(self._guarded(lambda: list(header.point_fields)))
+    def _station(self, file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types
+        """Yield the points of a station in the frame of the file, (N, 3) [m]; NaN for invalid ones."""
+        header = file.get_header(station)
+        there = set(header.point_fields)
         axes = _CARTESIAN if there.issuperset(_CARTESIAN) else _SPHERICAL
         if not there.issuperset(axes):
             raise SourceError("its points have no coordinates", where=self._uri, remedy=_REMEDY)
         wanted = [*axes, *(name for name in _INVALID if name in there)]
-        R, t = self._guarded(lambda: _pose(header))
-        arrays, buffers = self._guarded(lambda: file.make_buffers(wanted, PART))
-        reader = self._guarded(lambda: header.points.reader(buffers))
-        try:
-            while count := self._guarded(reader.read):
+        R, t = _pose(header)
+        arrays, buffers = file.make_buffers(wanted, PART)
+        with closing(header.points.reader(buffers)) as reader:
+            while count := reader.read():
                 columns = {name: np.array(arrays[name][:count], dtype=np.float64) for name in wanted}
                 with np.errstate(over="ignore", invalid="ignore"):
                     xyz = _cartesian(columns, axes) @ R.T + t
-                good = is_place(xyz)
                 for name in wanted[3:]:
-                    good &= columns[name] == 0
-                yield xyz, good
-        finally:
-            self._guarded(reader.close)
+                    xyz[columns[name] != 0] = np.nan
+                yield xyz
 
     def _open(self) -> Any:  # noqa: ANN401
         try:
@@ -464,18 +384,7 @@ class E57Cloud:
             raise SourceError(
                 "E57 files need pye57", where=self._uri, remedy="Install it with: uv sync --extra e57"
             ) from None
-        return self._guarded(lambda: E57(str(self._path)))
-
-    def _guarded(self, work: Any) -> Any:  # noqa: ANN401
-        """Call a function of pye57; any exception means damage."""
-        try:
-            return work()
-        except Exception as error:
-            reason = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
-            raise self._damaged(reason) from None
-
-    def _damaged(self, reason: str) -> SourceError:
-        return SourceError(f"the E57 file is damaged: {reason}", where=self._uri, remedy=_REMEDY)
+        return E57(str(self._path))
 
 
 def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401

@@ -40,12 +40,14 @@ class Format:
         magic: First bytes of the file; () when only its name identifies it.
         suffixes: Usual suffixes in lower case.
         open: Opens the source.
+        is_cloud: Whether it is a whole cloud.
     """
 
     words: str
     magic: tuple[bytes, ...]
     suffixes: tuple[str, ...]
     open: Opener
+    is_cloud: bool = False
 
 
 FILES = (
@@ -71,10 +73,10 @@ FILES = (
         _opener("victoria_park", "VictoriaParkSource"),
     ),
     Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _pcd),
-    Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud),
-    Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud),
-    Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), _cloud),
-    Format("whole cloud .npy or .npz", (b"\x93NUMPY",), (".npy", ".npz"), _cloud),
+    Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud, is_cloud=True),
+    Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud, is_cloud=True),
+    Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), _cloud, is_cloud=True),
+    Format("whole cloud .npy or .npz", (b"\x93NUMPY",), (".npy", ".npz"), _cloud, is_cloud=True),
     Format("KITTI .bin", (), (".bin",), _kitti),
 )
 

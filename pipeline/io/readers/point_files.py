@@ -30,22 +30,17 @@ from pipeline.jit import compiled
 
 Columns = dict[str, NDArray[np.generic]]
 
-#: First bytes of the files by their usual suffix; .npz files are zips.
-MAGIC = {
-    ".ply": (b"ply\n", b"ply\r"),
-    ".npy": (b"\x93NUMPY",),
-    ".npz": (b"PK\x03\x04", b"PK\x05\x06"),
-    ".pcd": (b"# .PCD", b"VERSION", b"FIELDS"),
-}
 PART = 1 << 18  # points
 MOST_POINTS = 2_000_000_000
 STEP_LIMIT = 64 << 10  # bytes per point
-#: Largest data that is held in memory as a whole, where a format cannot be read in parts.
+#: Largest compressed PCD data, which is held in memory as a whole.
 WHOLE_LIMIT = 1 << 30  # bytes
 MISSING = "points that the files promise but do not hold"
 _HEADER_LIMIT = 64 << 10  # bytes
 _NPY_HEADER_LIMIT = 16 << 10  # bytes; NumPy itself refuses headers of more than 10,000
 _MOST_FIELDS = 1000
+#: What damaged data and zips raise when they are read.
+_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, struct.error)
 
 
 class ScanFileError(Exception):
@@ -78,12 +73,17 @@ def open_table(path: Path) -> PointTable:
         ScanFileError: It has none of these formats, contradicts itself, or has no x, y and z.
         OSError: It cannot be read.
     """
-    openers = {".ply": _open_ply, ".npy": _open_npy, ".npz": _open_npz, ".pcd": _open_pcd}
     with path.open("rb") as file:
-        head = file.read(16)
-    for suffix, magic in MAGIC.items():
-        if head.startswith(magic):
-            return openers[suffix](path)
+        head = file.read(_HEADER_LIMIT)
+    if head.startswith((b"ply\n", b"ply\r")):
+        return _open_ply(path, head)
+    if head.startswith((b"# .PCD", b"VERSION", b"FIELDS")):
+        return _open_pcd(path, head)
+    if head.startswith(b"\x93NUMPY"):
+        array = _npy_header(io.BytesIO(head), None, path.stat().st_size)
+        return _binary_table(path, "NumPy .npy", array.shape[0], array.streams())
+    if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
+        return _open_npz(path)
     raise ScanFileError("its contents are not those of a PLY, NumPy or PCD file")
 
 
@@ -134,38 +134,131 @@ def _usable(names: list[str]) -> tuple[str, ...]:
     return tuple(name for name in names if not name.startswith("*"))
 
 
-def _check_size(points: int, step: int, *, whole: bool = False) -> None:
-    """Check the number of points and the bytes of one point.
-
-    Args:
-        points, step: Number of points and bytes per point in the header.
-        whole: Whether all points are read at once.
+def _check_size(points: int, step: int) -> None:
+    """Check the number of points and the bytes of one point in a header.
 
     Raises:
         ScanFileError: They are too large.
     """
-    too_large = points > MOST_POINTS or (whole and points * step > WHOLE_LIMIT)
-    if points < 0 or too_large or not 0 < step <= STEP_LIMIT:
+    if not 0 <= points <= MOST_POINTS or not 0 < step <= STEP_LIMIT:
         raise ScanFileError(f"its header promises {points} points of {step} bytes, too many to be read")
 
 
-def _read_records(file: IO[bytes], dtype: np.dtype[Any], points: int) -> Iterator[NDArray[Any]]:
-    """Yield arrays of records from the position of the file; an incomplete last record is left out.
+# --- data ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Stream:
+    """Binary records of the points, or of some of their columns.
+
+    Attributes:
+        start: First byte in the file, or in the member of a zip.
+        dtype: One record.
+        room: Bytes of the file, or of the unpacked member by the directory of the zip.
+        member: Name in the zip, None for other files.
+    """
+
+    start: int
+    dtype: np.dtype[Any]
+    room: int
+    member: str | None = None
+
+    def records(self, path: Path, points: int, stack: ExitStack) -> Iterator[NDArray[Any]]:
+        """Yield the records of the points part by part; an incomplete last one is left out. The stack closes
+        the file."""
+        file: IO[bytes]
+        if self.member is None:
+            file = stack.enter_context(path.open("rb"))
+        else:
+            file = stack.enter_context(stack.enter_context(zipfile.ZipFile(path)).open(self.member))
+        file.seek(self.start)
+        step = self.dtype.itemsize
+        rows = max(1, min(PART, (16 << 20) // step))
+        while points > 0:
+            block = file.read(min(rows, points) * step)
+            whole = len(block) // step
+            if whole:
+                yield np.frombuffer(block, self.dtype, whole)
+            if whole * step < len(block) or not whole:
+                return
+            points -= whole
+
+
+def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) -> PointTable:
+    """Return the table of streams with the same points.
 
     Args:
-        file: Open file.
-        dtype: Type of a record.
-        points: Number of records.
+        path: The file.
+        kind: Name of the format.
+        points: Number of points by the header.
+        streams: Records of the points; several streams have different columns.
     """
-    rows = max(1, min(PART, (16 << 20) // dtype.itemsize))
-    while points > 0:
-        block = file.read(min(rows, points) * dtype.itemsize)
-        whole = len(block) // dtype.itemsize
-        if whole:
-            yield np.frombuffer(block, dtype, whole)
-        if whole * dtype.itemsize < len(block) or not whole:
-            return
-        points -= whole
+    usable = _usable([name for stream in streams for name in stream.dtype.names or ()])
+    for stream in streams:
+        _check_size(points, stream.dtype.itemsize)
+        if points and stream.start + stream.dtype.itemsize > stream.room:
+            raise ScanFileError("it ends before its first point")
+
+    def parts() -> Iterator[Columns]:
+        read = 0
+        try:
+            with ExitStack() as stack:
+                for records in zip(*(s.records(path, points, stack) for s in streams), strict=False):
+                    n = min(map(len, records))
+                    read += n
+                    columns = {name: part[name][:n] for part in records for name in part.dtype.names or ()}
+                    yield {name: columns[name] for name in usable}
+        except _DAMAGE as error:
+            if read == 0:
+                raise ScanFileError(f"its data is damaged: {error}"[:200]) from None
+
+    return PointTable(kind, points, usable, parts)
+
+
+def _text_table(
+    path: Path, kind: str, points: int, dtype: np.dtype[Any], start: int, skipped: int = 0
+) -> PointTable:
+    """Return the table of lines of text.
+
+    Args:
+        path: The file.
+        kind: Name of the format.
+        points: Number of points by the header.
+        dtype: Types of the numbers of a point; a field of several values has its count as shape.
+        start: First byte after the header.
+        skipped: Number of lines before the points.
+    """
+    usable = _usable(list(dtype.names or ()))
+    _check_size(points, dtype.itemsize)
+    counts = [int(np.prod(dtype[name].shape)) for name in dtype.names or ()]
+    first = dict(zip(dtype.names or (), np.cumsum([0, *counts]).tolist(), strict=False))
+    # A point needs a digit and a separator per number.
+    if points and start + skipped + 2 * sum(counts) > path.stat().st_size + 1:
+        raise ScanFileError("it ends before its first point")
+
+    def parts() -> Iterator[Columns]:
+        with path.open("rb") as file:
+            file.seek(start)
+            for _ in range(skipped):
+                file.readline()
+            begin, rows = file.tell(), None
+            for rows in read_rows(file, sum(counts), points):
+                yield {name: _as_type(rows[:, first[name]], dtype[name]) for name in usable}
+            if rows is None and points:
+                file.seek(begin)
+                numbers = len(next((words for line in file if (words := line.split())), []))
+                raise ScanFileError(f"its rows have {numbers} numbers, its header names {sum(counts)}")
+
+    return PointTable(kind, points, usable, parts)
+
+
+def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
+    """Return numbers of a text file; integers by the header are clipped to the range of their type."""
+    if dtype.kind == "f":
+        return numbers
+    bounds = np.iinfo(dtype)
+    high = bounds.max / 2 if dtype.itemsize == 8 else bounds.max
+    return np.clip(np.nan_to_num(numbers), bounds.min, high).astype(dtype)
 
 
 # --- PCD (Point Cloud Library), version 0.7 --------------------------------------------------------
@@ -174,50 +267,39 @@ _PCD_TYPES = {("F", 4): "<f4", ("F", 8): "<f8"}
 _PCD_TYPES |= {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size in (1, 2, 4, 8)}
 
 
-@dataclass(frozen=True, slots=True)
-class _PcdHeader:
-    """Header of a PCD file.
-
-    Attributes:
-        dtype: One point; a field has its count as shape.
-        points: Number of points.
-        data: "ascii", "binary" or "binary_compressed".
-        length: Bytes of the header.
-    """
-
-    dtype: np.dtype[np.void]
-    points: int
-    data: str
-    length: int
-
-
-def _open_pcd(path: Path) -> PointTable:
-    with path.open("rb") as file:
-        header = _pcd_header(file.read(_HEADER_LIMIT))
-    size, step = path.stat().st_size, header.dtype.itemsize
-    _check_size(header.points, step, whole=header.data != "binary")
-    if header.data == "binary" and header.points and size < header.length + step:
-        raise ScanFileError("the PCD file ends before its first point")
-    if header.data != "binary" and size > WHOLE_LIMIT:
-        raise ScanFileError("the PCD file is too large; write it as binary")
-    names = [
-        name if header.dtype[name].shape == () else f"*{name}"  # a field of several values is no column
-        for name in header.dtype.names or ()
-    ]
-    read = {"ascii": _pcd_ascii, "binary": _pcd_binary, "binary_compressed": _pcd_compressed}[header.data]
-    usable = _usable(names)
+def _open_pcd(path: Path, head: bytes) -> PointTable:
+    dtype, points, data, start = _pcd_header(head)
+    kind = f"PCD {data}"
+    if data == "ascii":
+        return _text_table(path, kind, points, dtype, start)
+    if data == "binary":
+        return _binary_table(path, kind, points, [_Stream(start, dtype, path.stat().st_size)])
+    usable = _usable(list(dtype.names or ()))
+    if points * dtype.itemsize > WHOLE_LIMIT:
+        raise ScanFileError("its packed data is too large; write it as binary")
 
     def parts() -> Iterator[Columns]:
+        """Yield the points as one part. The data has one field after the other, each with all points."""
         with path.open("rb") as file:
-            file.seek(header.length)
-            for columns in read(file, header):
-                yield {name: columns[name] for name in usable}
+            file.seek(start)
+            body = file.read(WHOLE_LIMIT)
+        if len(body) < 8:
+            raise ScanFileError("its packed data is missing")
+        packed, size = struct.unpack_from("<II", body)
+        if size != points * dtype.itemsize or packed > len(body) - 8:
+            raise ScanFileError("its packed data is cut or has another size than the header promises")
+        raw = lzf_decompress(memoryview(body)[8 : 8 + packed], size)
+        lengths = [dtype[name].itemsize * points for name in dtype.names or ()]
+        fields = dict(zip(dtype.names or (), np.split(raw, np.cumsum(lengths)[:-1]), strict=True))
+        yield {name: fields[name].view(dtype[name]) for name in usable}
 
-    return PointTable(f"PCD {header.data}", header.points, usable, parts)
+    return PointTable(kind, points, usable, parts)
 
 
-def _pcd_header(head: bytes) -> _PcdHeader:
-    """Parse and check the header of a PCD file.
+def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int]:
+    """Return the type of a point, the number of points, the kind of the data ("ascii", "binary" or
+    "binary_compressed"), and the length of the header. A field of several values has its count as shape, and
+    a name that is not used.
 
     Raises:
         ScanFileError: It is not a header of a PCD file, or contradicts itself.
@@ -253,59 +335,17 @@ def _pcd_header(head: bytes) -> _PcdHeader:
         column = names.index(axis) if axis in names else -1
         if column < 0 or not types[column].startswith("<f") or counts[column] != 1:
             raise ScanFileError(f"it has no field {axis} of floating numbers")
-    shapes = [() if count == 1 else (count,) for count in counts]
-    return _PcdHeader(np.dtype(list(zip(names, types, shapes, strict=True))), points, data, at)
+    parts = [
+        (name, kind) if count == 1 else (f"*{name}", kind, (count,))
+        for name, kind, count in zip(names, types, counts, strict=True)
+    ]
+    return np.dtype(parts), points, data, at
 
 
 def _whole_number(word: str) -> int:
     if not word.isdecimal() or len(word) > 18:
         raise ValueError(word[:20])
     return int(word)
-
-
-def _pcd_binary(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
-    for records in _read_records(file, header.dtype, header.points):
-        yield {name: records[name] for name in header.dtype.names or ()}
-
-
-def _pcd_ascii(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
-    fields = [(name, header.dtype[name]) for name in header.dtype.names or ()]
-    for rows in read_rows(file, sum(max(1, *dtype.shape, 1) for _, dtype in fields), header.points):
-        columns: Columns = {}
-        at = 0
-        for name, dtype in fields:
-            columns[name] = _as_type(rows[:, at], dtype.base)
-            at += dtype.shape[0] if dtype.shape else 1
-        yield columns
-
-
-def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
-    """Return numbers of a text file in the type of the header; integers are clipped to its range."""
-    if dtype.kind == "f":
-        with np.errstate(over="ignore"):
-            return numbers.astype(dtype)
-    bounds = np.iinfo(dtype)
-    high = bounds.max / 2 if dtype.itemsize == 8 else bounds.max
-    return np.clip(np.nan_to_num(numbers), bounds.min, high).astype(dtype)
-
-
-def _pcd_compressed(file: IO[bytes], header: _PcdHeader) -> Iterator[Columns]:
-    """Yield the points of compressed data as one part. The data has one field after the other, each with all
-    its points."""
-    body = file.read(WHOLE_LIMIT)
-    if len(body) < 8:
-        raise ScanFileError("its packed data is missing")
-    packed, size = struct.unpack_from("<II", body)
-    if size != header.points * header.dtype.itemsize or packed > len(body) - 8:
-        raise ScanFileError("its packed data is cut or has another size than the header promises")
-    raw = lzf_decompress(memoryview(body)[8 : 8 + packed], size)
-    columns: Columns = {}
-    at = 0
-    for name in header.dtype.names or ():
-        length = header.dtype[name].itemsize * header.points
-        columns[name] = raw[at : at + length].view(header.dtype[name].base)
-        at += length
-    yield columns
 
 
 def lzf_decompress(block: bytes | memoryview, size: int) -> NDArray[np.uint8]:
@@ -373,59 +413,27 @@ _PLY_TYPES = {
 _PLY_ORDER = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-@dataclass(slots=True)
-class _PlyElement:
-    """An element of the header: its name, count, and properties (name, type); a list has the type ""."""
-
-    name: str
-    count: int
-    fields: list[tuple[str, str]]
-
-    def dtype(self, order: str) -> np.dtype[np.void]:
-        """Return the type of one element; `order` is the byte order, "" for text."""
-        names = _column_names([name for name, _ in self.fields])
-        return np.dtype(
-            [(name, (order or "<") + kind) for name, (_, kind) in zip(names, self.fields, strict=True)]
-        )
+#: An element of the header: its name, count, and properties (name, type); a list has the type "".
+_PlyElement = tuple[str, int, list[tuple[str, str]]]
 
 
-def _open_ply(path: Path) -> PointTable:
-    with path.open("rb") as file:
-        order, elements, start = _ply_header(file.read(_HEADER_LIMIT))
-    place = next((k for k, e in enumerate(elements) if e.name in ("vertex", "point", "points")), None)
+def _open_ply(path: Path, head: bytes) -> PointTable:
+    order, elements, start = _ply_header(head)
+    place = next((k for k, e in enumerate(elements) if e[0] in ("vertex", "point", "points")), None)
     if place is None:
         raise ScanFileError("the PLY file has no vertices")
-    vertex, earlier = elements[place], elements[:place]
-    with_lists = [vertex, *earlier] if order else [vertex]
-    if not all(kind for element in with_lists for _, kind in element.fields):
+    if not all(kind for _, _, fields in elements[0 if order else place : place + 1] for _, kind in fields):
         raise ScanFileError("the PLY file has lists of varying length before its last vertex")
-    dtype = vertex.dtype(order)
-    names = list(dtype.names or ())
-    usable = _usable(names)
-    _check_size(vertex.count, dtype.itemsize)
-    # Lines of text, or bytes of binary data, before the vertices.
-    before = sum(e.count * (e.dtype(order).itemsize if order else 1) for e in earlier)
-    # A vertex in text needs a digit and a separator per number.
-    if (
-        vertex.count
-        and start + before + (dtype.itemsize if order else 2 * len(names)) > path.stat().st_size + 1
-    ):
-        raise ScanFileError("the PLY file ends before its first vertex")
-
-    def parts() -> Iterator[Columns]:
-        with path.open("rb") as file:
-            file.seek(start + before if order else start)
-            if order:
-                for records in _read_records(file, dtype, vertex.count):
-                    yield {name: records[name] for name in usable}
-                return
-            for _ in range(before):
-                file.readline()
-            _check_ply_row(file, len(names))
-            for rows in read_rows(file, len(names), vertex.count):
-                yield {name: rows[:, k] for k, name in enumerate(names) if name in usable}
-
-    return PointTable("PLY binary" if order else "PLY text", vertex.count, usable, parts)
+    types = [
+        np.dtype([(f"*{k}", (order or "<") + kind) for k, (_, kind) in enumerate(fields) if kind])
+        for _, _, fields in elements[: place + 1]
+    ]
+    counts, dtype = [count for _, count, _ in elements[: place + 1]], types[place]
+    dtype.names = tuple(_column_names([name for name, _ in elements[place][2]]))
+    if not order:
+        return _text_table(path, "PLY text", counts[place], dtype, start, sum(counts[:place]))
+    start += sum(count * kind.itemsize for count, kind in zip(counts[:place], types, strict=False))
+    return _binary_table(path, "PLY binary", counts[place], [_Stream(start, dtype, path.stat().st_size)])
 
 
 def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
@@ -449,11 +457,11 @@ def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
                 case ["format", form, *_]:
                     order = _PLY_ORDER[form]
                 case ["element", name, number]:
-                    elements.append(_PlyElement(name.lower(), _whole_number(number), []))
+                    elements.append((name.lower(), _whole_number(number), []))
                 case ["property", "list", _, _, name]:
-                    elements[-1].fields.append((name, ""))
+                    elements[-1][2].append((name, ""))
                 case ["property", kind, name]:
-                    elements[-1].fields.append((name, _PLY_TYPES[kind]))
+                    elements[-1][2].append((name, _PLY_TYPES[kind]))
                 case ["property" | "element", *_]:
                     raise ScanFileError("the header of the PLY file is damaged")
         except (KeyError, IndexError, ValueError):
@@ -461,22 +469,10 @@ def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
     raise ScanFileError("it has no header of a PLY file")
 
 
-def _check_ply_row(file: IO[bytes], columns: int) -> None:
-    """Check that the first row does not have more numbers than the header names."""
-    start = file.tell()
-    words: list[bytes] = []
-    while not words and (line := file.readline(WHOLE_LIMIT)):
-        words = line.split()
-    file.seek(start)
-    if len(words) > columns:
-        raise ScanFileError(f"the rows of the PLY file have {len(words)} numbers, its header names {columns}")
-
-
 # --- NumPy -----------------------------------------------------------------------------------------
 
 _MOST_MEMBERS = 1000
 _BEST_NAMES = ("points", "xyz", "cloud", "point_cloud", "pointcloud", "pts", "data", "arr_0")
-_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, RuntimeError, ValueError, struct.error)
 _HEADER_DAMAGE = (
     *_DAMAGE, KeyError, TypeError, SyntaxError, tokenize.TokenError, MemoryError, OverflowError
 )  # fmt: skip
@@ -489,24 +485,19 @@ class _NumpyArray:
     Attributes:
         member: Name in the .npz, None for an .npy.
         start: Bytes of its header.
-        size: Bytes of the file, or of the unpacked member by the directory of the zip.
+        room: Bytes of the file, or of the unpacked member by the directory of the zip.
         shape, dtype, fortran: As in its header.
     """
 
     member: str | None
     start: int
-    size: int
+    room: int
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     fortran: bool
 
-    @property
-    def name(self) -> str:
-        """Name of the array."""
-        return (self.member or "").removesuffix(".npy").lower()
-
-    def records(self) -> np.dtype[Any]:
-        """Return the record of one row, with a name for each column.
+    def streams(self) -> list[_Stream]:
+        """Return the records of a table, or its columns if they are stored one after the other.
 
         Raises:
             ScanFileError: The array is not a table of numbers.
@@ -521,40 +512,23 @@ class _NumpyArray:
                 [n if _is_number(k) else "" for n, k in zip(self.dtype.names, kinds, strict=True)]
             )
             offsets = [fields[name][1] for name in self.dtype.names]
-            return np.dtype(
-                {"names": names, "formats": kinds, "offsets": offsets, "itemsize": self.dtype.itemsize}
-            )
+            record = {"names": names, "formats": kinds, "offsets": offsets, "itemsize": self.dtype.itemsize}
+            return [_Stream(self.start, np.dtype(record), self.room, self.member)]  # type: ignore[call-overload]
         if len(self.shape) != 2 or not _is_number(self.dtype) or not 3 <= self.shape[1] <= _MOST_FIELDS:
             raise ScanFileError(
                 f"it holds {form}; it must be (N, 3) numbers or more columns, or have fields x, y and z"
             )
         # Four or five columns are those of KITTI and similar sets; six are x, y, z and a colour.
         known = ["x", "y", "z", *(["intensity"] if self.shape[1] in (4, 5) else [])]
+        if self.fortran:
+            return [self.column(name, k) for k, name in enumerate(known)]
         names = [*known, *(f"*{k}" for k in range(len(known), self.shape[1]))]
-        return np.dtype([(name, self.dtype) for name in names])
+        return [_Stream(self.start, np.dtype([(name, self.dtype) for name in names]), self.room, self.member)]
 
-    def parts(self, path: Path, dtype: np.dtype[Any], stack: ExitStack) -> Iterator[NDArray[Any]]:
-        """Yield the rows as records part by part; the stack closes the file."""
-        file: IO[bytes]
-        if self.member is None:
-            file = stack.enter_context(path.open("rb"))
-        else:
-            file = stack.enter_context(stack.enter_context(zipfile.ZipFile(path)).open(self.member))
-        file.seek(self.start)
-        if not (self.fortran and len(self.shape) == 2):
-            yield from _read_records(file, dtype, self.shape[0])
-            return
-        block = file.read(self.shape[0] * dtype.itemsize)
-        if len(block) < self.shape[0] * dtype.itemsize:
-            raise EOFError("it is cut off")
-        table = np.frombuffer(block, self.dtype).reshape(self.shape, order="F")
-        yield np.ascontiguousarray(table).view(dtype)[:, 0]
-
-
-def _open_npy(path: Path) -> PointTable:
-    with path.open("rb") as file:
-        array = _npy_header(file, None, path.stat().st_size)
-    return _numpy_table(path, "NumPy .npy", {array: array.records()})
+    def column(self, name: str, number: int = 0) -> _Stream:
+        """Return a column whose numbers are stored one after the other."""
+        start = self.start + number * self.shape[0] * self.dtype.itemsize
+        return _Stream(start, np.dtype([(name, self.dtype)]), self.room, self.member)
 
 
 def _open_npz(path: Path) -> PointTable:
@@ -568,59 +542,25 @@ def _open_npz(path: Path) -> PointTable:
                     try:
                         with archive.open(info) as file:
                             array = _npy_header(file, info.filename, info.file_size)
-                            arrays[array.name] = array
+                            arrays[info.filename.removesuffix(".npy").lower()] = array
                     except ScanFileError as error:
                         reason = f"{info.filename[:40]}: {error}"
     except _DAMAGE as error:
         raise ScanFileError(f"the .npz file is damaged: {error}"[:200]) from None
     for name in sorted(arrays, key=lambda name: _BEST_NAMES.index(name) if name in _BEST_NAMES else 99):
         try:
-            return _numpy_table(
-                path, f"NumPy .npz, its array {name[:40]}", {arrays[name]: arrays[name].records()}
-            )
+            kind = f"NumPy .npz, its array {name[:40]}"
+            return _binary_table(path, kind, arrays[name].shape[0], arrays[name].streams())
         except ScanFileError as error:
             reason = f"{name[:40]}: {error}"
-    columns = {
-        arrays[name]: np.dtype([(name, arrays[name].dtype)])
-        for name in ("x", "y", "z", "intensity")
-        if name in arrays and len(arrays[name].shape) == 1 and _is_number(arrays[name].dtype)
-    }
-    if len(columns) >= 3 and len({array.shape for array in columns}) == 1:
-        return _numpy_table(path, "NumPy .npz, its arrays x, y and z", columns)
+    found = {name: arrays[name] for name in ("x", "y", "z", "intensity") if name in arrays}
+    columns = {name: a for name, a in found.items() if len(a.shape) == 1 and _is_number(a.dtype)}
+    if len(columns) >= 3 and len({array.shape for array in columns.values()}) == 1:
+        streams = [array.column(name) for name, array in columns.items()]
+        return _binary_table(
+            path, "NumPy .npz, its arrays x, y and z", next(iter(columns.values())).shape[0], streams
+        )
     raise ScanFileError(f"no array of it holds points; {reason}")
-
-
-def _numpy_table(path: Path, kind: str, arrays: dict[_NumpyArray, np.dtype[Any]]) -> PointTable:
-    """Return the table of arrays whose columns belong to the same points.
-
-    Args:
-        path: The file.
-        kind: Name of the format.
-        arrays: Type of one row of each array.
-    """
-    usable = _usable([name for dtype in arrays.values() for name in dtype.names or ()])
-    points = next(iter(arrays)).shape[0]
-    for array, dtype in arrays.items():
-        whole = array.fortran and len(array.shape) == 2
-        _check_size(points, dtype.itemsize, whole=whole)
-        if points and array.start + dtype.itemsize * (points if whole else 1) > array.size:
-            raise ScanFileError("it ends before its first point" if not whole else "it is cut off")
-
-    def parts() -> Iterator[Columns]:
-        read = 0
-        try:
-            with ExitStack() as stack:
-                streams = [array.parts(path, dtype, stack) for array, dtype in arrays.items()]
-                for records in zip(*streams, strict=False):
-                    n = min(map(len, records))
-                    read += n
-                    columns = {name: part[name][:n] for part in records for name in part.dtype.names or ()}
-                    yield {name: columns[name] for name in usable}
-        except _DAMAGE as error:
-            if read == 0:
-                raise ScanFileError(f"the NumPy file is damaged: {error}"[:200]) from None
-
-    return PointTable(kind, points, usable, parts)
 
 
 def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
@@ -640,7 +580,7 @@ def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # headers that Python 2 wrote
             shape, fortran, dtype = read[np.lib.format.read_magic(head)](head)
-    except (*_HEADER_DAMAGE, RecursionError) as error:
+    except _HEADER_DAMAGE as error:
         raise ScanFileError(f"the header of the array is damaged: {error}"[:160]) from None
     if dtype.hasobject:
         raise ScanFileError("an array of Python objects is not read, because it could run code")

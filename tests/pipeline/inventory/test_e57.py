@@ -61,4 +61,4 @@ def test_a_damaged_page_is_one_clear_error_or_a_counted_loss(tmp_path: Path):
     cloud = open_cloud(str(path))
     read = sum(len(part) for part in cloud.parts())
     assert 0 < read < 900
-    assert cloud.losses == {"points after the damage in the file": 900 - read}
+    assert cloud.losses == {"points that the files promise but do not hold": 900 - read}

@@ -143,7 +143,7 @@ def test_an_uncompressed_file_that_is_cut_gives_what_is_there(tmp_path, points):
     file.write_bytes(file.read_bytes()[: 375 + 30 * 10_000 + 7])
     cloud = open_cloud(str(file))
     assert sum(len(part) for part in cloud.parts()) == 10_000
-    assert cloud.losses == {"points after the damage in the file": 10_000}
+    assert cloud.losses == {"points that the files promise but do not hold": 10_000}
 
 
 def test_a_file_that_is_not_there_or_is_something_else(tmp_path, capsys):
