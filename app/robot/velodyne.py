@@ -14,15 +14,12 @@ from app.robot.topics import Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.ros_messages import VELODYNE_SCAN, standard_types
-from pipeline.io.readers.velodyne import PACKET_BYTES, PRODUCT, is_data_packet
+from pipeline.io.readers.velodyne import GAP_NS, PACKET_BYTES, PRODUCT, Rotation, is_data_packet
 
-#: A longer silence between packets ends a sweep.
-GAP_NS = 50_000_000
 #: The fastest sensor (VLS-128, dual return) sends fewer packets in the slowest turn.
 MOST_PACKETS = 4000
 FRAME = "velodyne"
 _SECOND = 1_000_000_000
-_TURN, _HALF = 36_000, 18_000
 
 
 class Sweeps:
@@ -30,8 +27,7 @@ class Sweeps:
 
     def __init__(self) -> None:
         self._packets: list[tuple[int, bytes]] = []
-        self._azimuth = 0
-        self._turned = 0
+        self._rotation = Rotation()
 
     def add(self, stamp_ns: int, packet: bytes) -> bytes | None:
         """Add a data packet; return the sweep that it ends as velodyne_msgs/VelodyneScan in CDR, else None.
@@ -40,13 +36,8 @@ class Sweeps:
             stamp_ns: Time of arrival, not before that of the packet before [ns].
             packet: 1206 bytes that pass `is_data_packet`.
         """
-        azimuth = packet[2] + 256 * packet[3]
-        step = (azimuth - self._azimuth) % _TURN if self._packets else 0
-        # A small step back is jitter of the motor, not most of a turn.
-        self._turned += step if step < _HALF else 0
-        over = self._turned >= _TURN or len(self._packets) >= MOST_PACKETS or self.is_stale(stamp_ns)
-        ended = self.end() if over else None
-        self._azimuth = azimuth
+        begins = self._rotation.begins(packet[2] + 256 * packet[3], stamp_ns)
+        ended = self.end() if begins or len(self._packets) >= MOST_PACKETS else None
         self._packets.append((stamp_ns, packet))
         return ended
 
@@ -57,7 +48,7 @@ class Sweeps:
 
     def end(self) -> bytes | None:
         """End the sweep and return it as a message; None if there is no packet."""
-        packets, self._packets, self._turned = self._packets, [], 0
+        packets, self._packets = self._packets, []
         return _message(packets) if packets else None
 
 

@@ -18,8 +18,12 @@ from pipeline.io.readers.scan_columns import clean_scan
 from pipeline.types.records import Bool, Int, Record, Scan, Sensor
 
 PACKET_BYTES = 1206
-BLOCK_BYTES, BLOCKS = 100, 12
 PRODUCT = 1205
+#: Two flags and the azimuth of each of the twelve blocks of a packet.
+_HEADS = struct.Struct("<" + 12 * "BBH96x" + "6x")
+_TURN = 36_000  # 0.01 degrees
+#: A longer silence between packets ends a sweep.
+GAP_NS = 50_000_000
 #: VLP-32A and VLP-32B share a product number; the later one is assumed.
 VLP_32 = 0x23
 
@@ -44,26 +48,40 @@ class PacketError(Exception):
 
 
 def is_data_packet(packet: bytes) -> bool:
-    """Return whether the bytes are a data packet of a known sensor."""
-    return len(packet) == PACKET_BYTES and bool(
-        are_data_packets(np.frombuffer(packet, np.uint8), np.zeros(1, np.int64))[0]
-    )
-
-
-def are_data_packets(buffer: NDArray[np.uint8], at: Int) -> Bool:
-    """Return which places of a buffer hold a data packet of a known sensor, shape (N,).
+    """Return whether the bytes are a data packet of a known sensor.
 
     The decoder accepts any 1206 bytes, so the flags and azimuths of the twelve blocks and the product number
     are checked before.
-
-    Args:
-        buffer: Bytes.
-        at: First byte of each packet, shape (N,); 1206 bytes from there are in the buffer.
     """
-    heads = buffer[at[:, None, None] + BLOCK_BYTES * np.arange(BLOCKS)[:, None] + np.arange(4)]
-    azimuth = heads[..., 2].astype(np.int64) + 256 * heads[..., 3].astype(np.int64)
-    sound = (heads[..., 0] == 0xFF) & (heads[..., 1] >= 0xBB) & (azimuth < 36000)
-    return np.asarray(sound.all(axis=1) & np.isin(buffer[at + PRODUCT], list(SENSORS)))
+    if len(packet) != PACKET_BYTES or packet[PRODUCT] not in SENSORS:
+        return False
+    heads = _HEADS.unpack(packet)
+    return set(heads[::3]) == {0xFF} and min(heads[1::3]) >= 0xBB and max(heads[2::3]) < _TURN
+
+
+class Rotation:
+    """Finds the packets of one sensor with which a sweep begins: after a full rotation, or after a pause."""
+
+    def __init__(self) -> None:
+        self._azimuth: int | None = None
+        self._stamp_ns = self._turned = 0
+
+    def begins(self, azimuth: int, stamp_ns: int) -> bool:
+        """Process the next packet; return whether a sweep begins with it, which the first one does not do.
+
+        Args:
+            azimuth: Azimuth of its first block [0.01 degrees].
+            stamp_ns: Its time of arrival [ns].
+        """
+        before = self._azimuth
+        step = 0 if before is None else (azimuth - before) % _TURN
+        self._turned += step if step < _TURN // 2 else 0  # a small step back is jitter of the motor
+        paused = before is not None and stamp_ns - self._stamp_ns > GAP_NS
+        self._azimuth, self._stamp_ns = azimuth, stamp_ns
+        if self._turned < _TURN and not paused:
+            return False
+        self._turned = 0
+        return True
 
 
 class PacketDecoder:
@@ -111,8 +129,6 @@ class PacketDecoder:
 
 
 DATA_PORT = 2368
-#: A longer silence between packets ends a sweep.
-_GAP_NS = 50_000_000
 #: A packet whose time differs more from that of its neighbours has a damaged time.
 _JUMP_NS = 1_000_000_000
 #: Bytes before the IP header by link type: Ethernet, raw IP, Linux cooked capture.
@@ -122,6 +138,8 @@ _BLOCK = 8 << 20  # bytes
 #: Longer packets do not occur: the length is damaged.
 _PACKET_LIMIT = 1 << 18
 _RECORD = 16  # bytes of the header of a packet
+#: Of an IP header: version and length, fragment, protocol, sender.
+_IP, _UDP = struct.Struct(">B5xHxB2xI"), 17
 _CUT = "bytes at the end of a capture that was cut"
 
 
@@ -168,7 +186,9 @@ class PcapSource(FileSource):
         self._path = path
         packets, self._damage = find_packets(path)
         self._packets = packets = self._one_sensor(packets, uri)
-        self._first = _sweep_starts(packets.azimuth, packets.stamp_ns)
+        rotation, columns = Rotation(), (packets.azimuth.tolist(), packets.stamp_ns.tolist())
+        starts = [row for row, each in enumerate(zip(*columns, strict=True)) if rotation.begins(*each)]
+        self._first = np.array([0, *starts], np.int64)
         self._last = np.append(self._first[1:], len(packets.offset)) - 1
         self._stamp = packets.stamp_ns[self._last]
         self._file = path.open("rb", buffering=0)
@@ -254,30 +274,64 @@ def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
         OSError: It cannot be read.
     """
     losses: dict[str, int] = {}
-    tables = [np.zeros((0, 5), dtype=np.int64)]
+    found: list[tuple[int, int, int, int, int]] = []
     with path.open("rb", buffering=0) as file:
         order, unit_ns, link = _file_header(file.read(24), path)
         record = struct.Struct(order + "III4x")
         start, rest, broken = 24, b"", False
         while not broken and (block := file.read(_BLOCK)):
             buffer, at = rest + block, 0
-            found: list[tuple[int, int, int]] = []
             while at + _RECORD <= len(buffer):
                 seconds, fraction, length = record.unpack_from(buffer, at)
+                end = at + _RECORD + length
                 broken = length > _PACKET_LIMIT
-                if broken or at + _RECORD + length > len(buffer):
+                if broken or end > len(buffer):
                     break
-                found.append((at + _RECORD, length, seconds * 1_000_000_000 + fraction * unit_ns))
-                at += _RECORD + length
-            table = _data_packets(buffer, np.array(found, np.int64).reshape(-1, 3), link, losses)
-            table[:, 0] += start
-            tables.append(table)
+                first, sender = _data_of(buffer, at + _RECORD, end, link, losses)
+                if first:
+                    stamp_ns = seconds * 1_000_000_000 + fraction * unit_ns
+                    azimuth = buffer[first + 2] + 256 * buffer[first + 3]
+                    found.append((start + first, stamp_ns, azimuth, buffer[first + PRODUCT], sender))
+                at = end
             start, rest = start + at, buffer[at:]
         cut = path.stat().st_size - start
     if cut > 0:
         count_loss(losses, _CUT, cut)
-    table = np.concatenate(tables)
-    return Packets(*(np.ascontiguousarray(table[:, column]) for column in range(5))), losses
+    table = np.array(found, np.int64).reshape(-1, 5)
+    return Packets(*(np.ascontiguousarray(column) for column in table.T)), losses
+
+
+def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]) -> tuple[int, int]:
+    """Return the position of the 1206 bytes of a captured data packet, and the address and port of its sender
+    as one number; (0, 0) for other packets.
+
+    Args:
+        buffer: Bytes of the file.
+        at, end: Position of the captured bytes.
+        link: Bytes before the IP header.
+        losses: Counts other packets to the LiDAR's port.
+    """
+    ip = at + link
+    if link == _ETHERNET and buffer[at + 12 : at + 14] == b"\x81\x00":
+        ip += 4  # a VLAN tag
+    if ip + 20 > end or (link and buffer[ip - 2 : ip] != b"\x08\x00"):
+        return 0, 0
+    version, fragment, protocol, address = _IP.unpack_from(buffer, ip)
+    first = ip + 4 * (version & 15) + 8
+    if version >> 4 != 4 or fragment & 0x1FFF or protocol != _UDP or first > end:
+        return 0, 0
+    port, length = struct.unpack_from(">HH", buffer, first - 6)
+    if length - 8 != PACKET_BYTES:
+        reason = "packets to the LiDAR's port of another length" if port == DATA_PORT else ""
+    elif first + PACKET_BYTES > end:
+        reason = "packets that the capture has cut"
+    elif is_data_packet(buffer[first : first + PACKET_BYTES]):
+        return first, (address << 16) | port
+    else:
+        reason = "packets that are no data packets of a known sensor" if port == DATA_PORT else ""
+    if reason:
+        count_loss(losses, reason)
+    return 0, 0
 
 
 def _file_header(header: bytes, path: Path) -> tuple[str, int, int]:
@@ -299,71 +353,3 @@ def _file_header(header: bytes, path: Path) -> tuple[str, int, int]:
             f"the capture's link type {link & 0xFFFF} cannot be read", where=str(path), remedy="Use Ethernet."
         )
     return order, 1 if magic == 0xA1B23C4D else 1000, _LINKS[link & 0xFFFF]
-
-
-def _data_packets(block: bytes, found: Int, link: int, losses: dict[str, int]) -> Int:
-    """Return the data packets among the packets of a block.
-
-    Args:
-        block: Bytes of the file.
-        found: First byte, length, and time [ns] of each packet, shape (N, 3).
-        link: Bytes before the IP header.
-        losses: Counts other packets to the LiDAR's port.
-
-    Returns:
-        Columns of `Packets`, shape (M, 5); offsets are relative to the block.
-    """
-    buffer = np.frombuffer(block, np.uint8)
-    start, end, stamp_ns = found[:, 0], found[:, 0] + found[:, 1], found[:, 2]
-
-    def number(at: Int, size: int) -> Int:
-        """Big-endian numbers; bytes beyond the block repeat its last one and are refused by their place."""
-        places = np.minimum(at[:, None] + np.arange(size), len(buffer) - 1)
-        value: Int = buffer[places].astype(np.int64) @ (1 << 8 * np.arange(size)[::-1])
-        return value
-
-    ip = start + link
-    if link == _ETHERNET:
-        ip = ip + np.where(number(start + 12, 2) == 0x8100, 4, 0)  # a VLAN tag
-    is_udp = (ip + 20 <= end) & (number(ip, 1) >> 4 == 4) & (number(ip + 9, 1) == 17)
-    is_udp &= number(ip + 6, 2) & 0x1FFF == 0  # a first fragment
-    if link:
-        is_udp &= number(ip - 2, 2) == 0x0800
-    udp = ip + 4 * (number(ip, 1) & 15)
-    is_udp &= udp + 8 <= end
-    first, port, length = udp + 8, number(udp + 2, 2), number(udp + 4, 2) - 8
-    is_cut = is_udp & (length == PACKET_BYTES) & (first + PACKET_BYTES > end)
-    candidate = np.flatnonzero(is_udp & (length == PACKET_BYTES) & ~is_cut)
-    is_data = are_data_packets(buffer, first[candidate])
-    to_lidar = port == DATA_PORT
-    for reason, n in (
-        ("packets to the LiDAR's port of another length", is_udp & to_lidar & (length != PACKET_BYTES)),
-        ("packets that are no data packets of a known sensor", to_lidar[candidate] & ~is_data),
-        ("packets that the capture has cut", is_cut),
-    ):
-        if n.any():
-            count_loss(losses, reason, int(np.count_nonzero(n)))
-    rows = candidate[is_data]
-    at = first[rows]
-    azimuth = buffer[at + 2] + 256 * buffer[at + 3].astype(np.int64)
-    sender = (number(ip[rows] + 12, 4) << 16) | port[rows]
-    return np.stack([at, stamp_ns[rows], azimuth, buffer[at + PRODUCT].astype(np.int64), sender], axis=1)
-
-
-def _sweep_starts(azimuth: Int, stamp_ns: Int) -> Int:
-    """Return the rows at which a sweep begins: after a full rotation, or after a pause.
-
-    Args:
-        azimuth: Azimuth of each packet [0.01 degrees], shape (N,).
-        stamp_ns: Time of arrival of each packet [ns], shape (N,).
-    """
-    step = np.diff(azimuth) % 36000
-    step[step >= 18000] = 0  # a small step back is jitter of the motor
-    silent = np.diff(stamp_ns) > _GAP_NS
-    starts, turned = [0], 0
-    for row, (angle, gap) in enumerate(zip(step.tolist(), silent.tolist(), strict=True), 1):
-        turned += angle
-        if turned >= 36000 or gap:
-            starts.append(row)
-            turned = 0
-    return np.array(starts, np.int64)
