@@ -1,21 +1,16 @@
-"""Sources of records: `open_source` opens a file, a folder or a URI."""
+"""Sources of records: `open_source` opens a file, a folder or a URI. Formats are detected by the contents
+first, then by the names."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
-from pipeline.io.readers.format_detection import (
-    READABLE,
-    Opener,
-    expected_format,
-    file_format,
-    folder_opener,
-    named,
-    recordings_in,
-)
 
 __all__ = ["Source", "SourceDescription", "SourceOptions", "open_source"]
 
@@ -40,7 +35,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         if scheme is not None and not Path(uri).exists():
             return _open_scheme(scheme.group(1).lower(), uri, chosen)
         path = Path(uri).expanduser()
-        return _opener(path, uri)(uri, path, chosen)
+        return _find_opener(path, uri)(uri, path, chosen)
     except RuntimeError as error:  # the home folder of an unknown user
         raise SourceError("there is no such user", where=uri, remedy="Look at the path.") from error
     except (OSError, MemoryError) as error:
@@ -65,12 +60,12 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
             where=uri,
             remedy="ROS 2 is heard over Zenoh, as zenoh:tcp/host:7447; or record it and open the file.",
         )
-    raise UsageError(f"unknown kind of source {scheme!r}", where=uri, remedy=f"Readable are: {READABLE}.")
+    raise UsageError(f"unknown kind of source {scheme!r}", where=uri, remedy=READABLE)
 
 
-def _opener(path: Path, uri: str) -> Opener:
+def _find_opener(path: Path, uri: str) -> Opener:
     if "\0" in uri or not path.exists():
-        raise SourceError("there is no such file or folder", where=uri, remedy=f"Readable are: {READABLE}.")
+        raise SourceError("there is no such file or folder", where=uri, remedy=READABLE)
     if path.is_dir():
         opener = folder_opener(path)
         if opener is None:
@@ -78,11 +73,11 @@ def _opener(path: Path, uri: str) -> Opener:
             raise SourceError(
                 "the folder is no run" if inside else "nothing in the folder can be read",
                 where=uri,
-                remedy=f"Open what is in it: {inside}." if inside else f"Readable are: {READABLE}.",
+                remedy=f"Open what is in it: {inside}." if inside else READABLE,
             )
         return opener
     if not path.is_file():
-        raise SourceError("neither a file nor a folder", where=uri, remedy=f"Readable are: {READABLE}.")
+        raise SourceError("neither a file nor a folder", where=uri, remedy=READABLE)
     with path.open("rb") as file:
         head = file.read(16)
     if not head:
@@ -91,5 +86,123 @@ def _opener(path: Path, uri: str) -> Opener:
     if kind is None:
         promised = expected_format(path)
         what = f"the contents are not those of a {promised.words} file" if promised else "unknown format"
-        raise SourceError(what, where=uri, remedy=f"Readable are: {READABLE}.")
+        raise SourceError(what, where=uri, remedy=READABLE)
     return kind.open
+
+
+# --- formats ---------------------------------------------------------------------------------------
+
+Opener = Callable[[str, Path, SourceOptions], Source]
+
+
+def _opener(module: str, function: str) -> Opener:
+    """Return a function that imports `module` of this package and calls its `function` when a file is
+    opened."""
+
+    def opened(uri: str, path: Path, options: SourceOptions) -> Source:
+        found: Opener = getattr(import_module(f"pipeline.io.readers.{module}"), function)
+        return found(uri, path, options)
+
+    return opened
+
+
+_recording = _opener("live", "open_recording")
+_kitti = _opener("scan_folder", "open_kitti")
+_point_files = _opener("scan_folder", "open_point_files")
+_victoria_park = _opener("victoria_park", "VictoriaParkSource")
+_cloud = _opener("simulated", "open_cloud_drive")
+_tree_manager = _opener("tree_manager", "TreeManagerSource")
+
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A kind of file.
+
+    Attributes:
+        words: Name for the user.
+        magic: First bytes of the file; () when only its name identifies it.
+        suffixes: Usual suffixes in lower case.
+        open: Opens the source.
+        is_cloud: Whether it is a whole cloud.
+    """
+
+    words: str
+    magic: tuple[bytes, ...]
+    suffixes: tuple[str, ...]
+    open: Opener
+    is_cloud: bool = False
+
+
+_PCAP = (
+    b"\xd4\xc3\xb2\xa1", b"\xa1\xb2\xc3\xd4", b"\x4d\x3c\xb2\xa1", b"\xa1\xb2\x3c\x4d", b"\x0a\x0d\x0d\x0a"
+)  # fmt: skip
+FILES = (
+    Format("ROS 2 .mcap", (b"\x89MCAP",), (".mcap",), _recording),
+    Format("ROS 2 .db3", (b"SQLite format 3\x00",), (".db3",), _recording),
+    Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
+    Format("Velodyne .pcap", _PCAP, (".pcap",), _opener("velodyne", "PcapSource")),
+    Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria_park),
+    Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _point_files),
+    Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud, is_cloud=True),
+    Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud, is_cloud=True),
+    Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), _cloud, is_cloud=True),
+    Format("whole cloud .npy or .npz", (b"\x93NUMPY",), (".npy", ".npz"), _cloud, is_cloud=True),
+    Format("KITTI .bin", (), (".bin",), _kitti),
+)
+
+_MOST_NAMED = 5
+READABLE = "Readable are: " + ", ".join(
+    [kind.words for kind in FILES]
+    + [
+        "a folder of .bin, .pcd, .ply, .npy, .npz, .las or .laz scans",
+        "a rosbag2 folder",
+        "a folder of TreeManagerState_<i>.csv with trajectory.txt",
+        "sim:stand and the other sim: scenarios.",
+    ]
+)
+
+
+def file_format(path: Path, head: bytes) -> Format | None:
+    """Return the format of a file, None if it is unknown.
+
+    Args:
+        path: The file; its name decides for formats without magic bytes.
+        head: Its first bytes.
+    """
+    if path.suffix.lower() == ".npz":  # a .zip by its contents
+        return expected_format(path)
+    for kind in FILES:
+        if any(head.startswith(mark) for mark in kind.magic):
+            return kind
+    suffix = path.suffix.lower()
+    return next((kind for kind in FILES if not kind.magic and suffix in kind.suffixes), None)
+
+
+def expected_format(path: Path) -> Format | None:
+    """Return the format by the suffix of a file."""
+    return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
+
+
+def recordings_in(folder: Path) -> list[str]:
+    """Return the names of the files in a folder that are runs or clouds by their suffixes."""
+    return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
+
+
+def named(names: list[str]) -> str:
+    """Return the first few names as text for a message."""
+    more = len(names) - _MOST_NAMED
+    return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def folder_opener(folder: Path) -> Opener | None:
+    """Return the opener of a folder, None when nothing in it can be read."""
+    names = {path.name for path in folder.iterdir() if path.is_file()}
+    if any(name.startswith("TreeManagerState_") for name in names):
+        return _tree_manager
+    suffixes = {Path(name).suffix.lower() for name in names}
+    if suffixes & {".mcap", ".db3", ".zstd"}:
+        return _recording
+    inside = folder / "velodyne"
+    if ".bin" in suffixes or (inside.is_dir() and any(inside.glob("*.bin"))):
+        return _kitti
+    return _point_files if suffixes & {".pcd", ".ply", ".npy", ".npz", ".las", ".laz"} else None

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
 from pipeline.inventory.cloud import CloudDescription, WholeCloud
+from pipeline.io.readers import expected_format, file_format
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss, digest_of
-from pipeline.io.readers.format_detection import expected_format, file_format
 from pipeline.io.readers.point_files import (
     MISSING,
     MOST_POINTS,

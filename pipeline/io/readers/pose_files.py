@@ -62,31 +62,21 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
         TextError: It has neither format, or positions beyond 1e8 m.
         OSError: It cannot be read.
     """
-    if _columns(path) != TUM_COLUMNS:
+    lines = _lines(path)
+    if not lines or len(lines[0]) != TUM_COLUMNS:
         return None, read_poses(path)
-    rows = read_table(path, TUM_COLUMNS)
+    rows = _table(lines, TUM_COLUMNS)
     _check_positions(rows[:, 1:4])
-    times = exact_ns(path)
+    try:  # a float has too few digits for the times
+        times = np.array([seconds_ns(line[0]) for line in lines], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise TextError("its times are no seconds") from error
     if np.any(np.diff(times) <= 0):
         raise TextError("its times do not ascend")
     try:
         return times, [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in rows]
     except ValueError as error:
         raise TextError("it has a quaternion of no length") from error
-
-
-def exact_ns(path: Path) -> Int:
-    """Return the times in the first column of a text file, decimal seconds, as integer nanoseconds, shape
-    (rows,). A float has too few digits for them.
-
-    Raises:
-        TextError: A word is not a number.
-    """
-    words = [line.split()[0] for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
-    try:
-        return np.array([seconds_ns(word) for word in words], dtype=np.int64)
-    except (ValueError, OverflowError) as error:
-        raise TextError("its times are no seconds") from error
 
 
 def seconds_ns(text: str) -> int:
@@ -105,11 +95,6 @@ def seconds_ns(text: str) -> int:
     if abs(nanoseconds) >= 1 << 62:
         raise ValueError("too far away in time")
     return nanoseconds
-
-
-def _columns(path: Path) -> int:
-    lines = (line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#"))
-    return len(next(lines, []))
 
 
 def read_times(path: Path) -> Int:
@@ -142,6 +127,11 @@ def _text(path: Path) -> str:
         raise TextError("it is no text") from error
 
 
+def _lines(path: Path) -> list[list[str]]:
+    """Return the words of each line that is not empty and does not begin with #."""
+    return [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
+
+
 def read_table(path: Path, columns: int) -> Float:
     """Read rows of finite numbers below 1e10, shape (rows, columns); lines that begin with # are skipped.
 
@@ -149,16 +139,19 @@ def read_table(path: Path, columns: int) -> Float:
         TextError: It has another format.
         OSError: It cannot be read.
     """
-    lines = [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
+    return _table(_lines(path), columns)
+
+
+def _table(lines: list[list[str]], columns: int) -> Float:
     if not lines or any(len(line) != columns for line in lines):
         raise TextError(f"its rows do not have {columns} numbers")
     try:
-        numbers = np.array([float(word) for line in lines for word in line])
+        numbers = np.array(lines, dtype=np.float64)
     except ValueError as error:
         raise TextError("it has words where numbers should be") from error
     if not np.all(np.abs(numbers) < 1e10):
         raise TextError("it has numbers that are not finite or too large")
-    return numbers.reshape(-1, columns)
+    return numbers
 
 
 def _date(line: str) -> int:

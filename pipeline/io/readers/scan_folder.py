@@ -11,8 +11,8 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers import named, recordings_in
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.format_detection import named, recordings_in
 from pipeline.io.readers.point_files import ScanFileError, read_columns
 from pipeline.io.readers.pose_files import TextError, pose_at, read_any_poses, read_times, seconds_ns
 from pipeline.io.readers.scan_columns import POINT_LIMIT, RANGE_LIMIT, clean_scan, scan_of, sensor_of
@@ -256,7 +256,7 @@ def _number(file: Path) -> int:
 
 _KITTI_ROW = 16  # bytes: four little-endian float32, x, y, z [m] and reflectance
 HDL_64 = Sensor("HDL-64", 64, float(np.radians(0.4)), float(np.radians(0.17)), 0.03, 120.0)
-_TABLES = {".ply": "PLY", ".npy": "NumPy", ".npz": "NumPy", ".las": "LAS", ".laz": "LAS"}
+_TABLES = {".pcd": "PCD", ".ply": "PLY", ".npy": "NumPy", ".npz": "NumPy", ".las": "LAS", ".laz": "LAS"}
 
 
 def open_kitti(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
@@ -269,30 +269,18 @@ def open_kitti(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
     return ScanFolder(uri, path, ScanFormat("KITTI .bin", ".bin", load_bin, _kitti_sensor), options)
 
 
-def open_pcd(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
-    """Open a .pcd file or a folder of .pcd files.
+def open_point_files(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
+    """Open a .pcd file, or a folder of PCD, PLY, NumPy or LAS files. Of several formats PCD is read, else the
+    one with the most files.
 
     Raises:
         SourceError: None of the first files holds a scan.
         OSError: The folder cannot be read.
     """
-    return ScanFolder(uri, path, ScanFormat("PCD", ".pcd", load_table, sensor_of), options)
-
-
-def open_table_scans(uri: str, folder: Path, options: SourceOptions) -> ScanFolder:
-    """Open a folder of PLY, NumPy or LAS files; of several formats the one with the most files is read.
-
-    Raises:
-        SourceError: None of the first files holds a scan.
-        OSError: The folder cannot be read.
-    """
-    counts = dict.fromkeys(_TABLES, 0)
-    for file in folder.iterdir():
-        if file.suffix.lower() in counts:
-            counts[file.suffix.lower()] += 1
-    suffix = max(counts, key=lambda each: counts[each])
+    suffixes = [".pcd"] if path.is_file() else [file.suffix.lower() for file in path.iterdir()]
+    suffix = ".pcd" if ".pcd" in suffixes else max(_TABLES, key=suffixes.count)
     load = load_las if suffix in (".las", ".laz") else load_table
-    return ScanFolder(uri, folder, ScanFormat(_TABLES[suffix], suffix, load, sensor_of), options)
+    return ScanFolder(uri, path, ScanFormat(_TABLES[suffix], suffix, load, sensor_of), options)
 
 
 def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:

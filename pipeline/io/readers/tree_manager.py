@@ -14,7 +14,6 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -113,20 +112,9 @@ def _write(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
 
 
 def _row(trees: Trees, k: int, place: Float) -> list[float | bool]:
-    dbh = float(trees.dbh[k])
-    upright = np.eye(3).ravel().tolist()
-    fitted = math.isfinite(dbh)
-    return [
-        *upright,
-        float(place[0]),
-        float(place[1]),
-        0.0,
-        dbh,
-        dbh,
-        1.0,
-        fitted,
-        int(trees.observations[k]),
-    ]
+    dbh, upright = float(trees.dbh[k]), np.eye(3).ravel().tolist()
+    fit = [dbh, dbh, 1.0, math.isfinite(dbh), int(trees.observations[k])]
+    return [*upright, float(place[0]), float(place[1]), 0.0, *fit]
 
 
 def _field(value: float | bool) -> str:
@@ -171,8 +159,10 @@ class TreeManagerSource(FileSource):
         self._stamp, self._poses = _read_trajectory(path / TRAJECTORY, uri)
         number = np.array([n for n, _ in numbered], dtype=np.int64)
         self._row, warnings = _rows(number, len(self._stamp), uri)
-        _check_sizes(self._files, uri)
-        _columns(_header(self._files[0]), self._files[0], uri)
+        too_large = next((file for file in self._files if file.stat().st_size > CSV_LIMIT), None)
+        if too_large is not None:
+            raise _too_large(too_large, uri)
+        _read_frame(self._files[0], uri)
         self._description = SourceDescription(
             uri=uri,
             kind="folder of TreeManagerState files",
@@ -204,28 +194,23 @@ class TreeManagerSource(FileSource):
     def _scan(self, file: Path, stamp_ns: int, losses: dict[str, int]) -> Scan | None:
         """Return the scan of a frame, which may have no stems; None when the file cannot be read."""
         try:
-            frame = _read_frame(file, self._uri)
+            table, at, damaged = _read_frame(file, self._uri)
         except (SourceError, OSError):
             count_loss(losses, "TreeManagerState files that cannot be read")
             return None
-        if frame.damaged:
-            count_loss(losses, "damaged rows of TreeManagerState files", frame.damaged)
-        points = frame.place.astype(np.float32)
-        return Scan(stamp_ns, points, dropped=frame.damaged, stems=Stems(frame.axis, frame.dbh))
+        place = table[:, [at[name] for name in PLACE]]
+        with np.errstate(invalid="ignore"):
+            sound = (np.abs(place) < PLACE_LIMIT).all(axis=1)
+        table, place = table[sound], place[sound]
+        damaged += int(np.count_nonzero(~sound))
+        if damaged:
+            count_loss(losses, "damaged rows of TreeManagerState files", damaged)
+        stems = Stems(_axes(table, at), _dbh(table, at))
+        return Scan(stamp_ns, place.astype(np.float32), dropped=damaged, stems=stems)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _FrameTable:
-    """Stems of one file: places (N, 3), axes (N, 3), DBH (N,), and the number of damaged rows."""
-
-    place: Float
-    axis: Float
-    dbh: Float
-    damaged: int
-
-
-def _read_frame(file: Path, uri: str) -> _FrameTable:
-    """Read the stems of a file.
+def _read_frame(file: Path, uri: str) -> tuple[Float, dict[str, int], int]:
+    """Read the table of a file: its rows, the index of each column, and the number of damaged rows.
 
     Raises:
         SourceError: It is too large, or its header lacks a column.
@@ -234,16 +219,24 @@ def _read_frame(file: Path, uri: str) -> _FrameTable:
     with file.open("rb") as opened:
         text = opened.read(CSV_LIMIT + 1)
     if len(text) > CSV_LIMIT:
-        raise SourceError(f"{file.name} is larger than {CSV_LIMIT >> 20} MB", where=uri)
+        raise _too_large(file, uri)
     head, _, body = text.partition(b"\n")
-    names = _names(head)
-    at = _columns(names, file, uri)
+    names = [name.strip() for name in head.decode("utf-8", "replace").lstrip("\ufeff").split(",")]
+    at = {name: k for k, name in enumerate(names)}
+    missing = [name for name in PLACE if name not in at]
+    if missing:
+        raise SourceError(
+            f"{file.name} has no column {missing[0]}",
+            where=uri,
+            remedy=f"Its first line must name the columns, among them {', '.join(PLACE)}.",
+        )
     table, damaged = _numbers(body, len(names))
-    place = table[:, [at[name] for name in PLACE]]
-    with np.errstate(invalid="ignore"):
-        sound = (np.abs(place) < PLACE_LIMIT).all(axis=1)
-    table, place = table[sound], place[sound]
-    return _FrameTable(place, _axes(table, at), _dbh(table, at), damaged + int(np.count_nonzero(~sound)))
+    return table, at, damaged
+
+
+def _too_large(file: Path, uri: str) -> SourceError:
+    what = f"{file.name} is larger than {CSV_LIMIT >> 20} MB"
+    return SourceError(what, where=uri, remedy="It is not a frame of stems.")
 
 
 def _axes(table: Float, at: dict[str, int]) -> Float:
@@ -278,46 +271,6 @@ def _numbers(body: bytes, columns: int) -> tuple[Float, int]:
     for gap, filled in ((b",,", b",nan,"), (b",,", b",nan,"), (b",\n", b",nan\n"), (b"\n,", b"\nnan,")):
         text = text.replace(gap, filled)
     return parse_table(text.replace(b",", b" "), columns)
-
-
-def _names(head: bytes) -> list[str]:
-    return [name.strip() for name in head.decode("utf-8", "replace").lstrip("\ufeff").split(",")]
-
-
-def _header(file: Path) -> list[str]:
-    with file.open("rb") as opened:
-        return _names(opened.readline(4096))
-
-
-def _columns(names: list[str], file: Path, uri: str) -> dict[str, int]:
-    """Return the index of each column.
-
-    Args:
-        names: Names in the header.
-        file, uri: File and source, for errors.
-
-    Raises:
-        SourceError: A column of the position is missing.
-    """
-    at = {name: k for k, name in enumerate(names)}
-    missing = [name for name in PLACE if name not in at]
-    if missing:
-        raise SourceError(
-            f"{file.name} has no column {missing[0]}",
-            where=uri,
-            remedy=f"Its first line must name the columns, among them {', '.join(PLACE)}.",
-        )
-    return at
-
-
-def _check_sizes(files: list[Path], uri: str) -> None:
-    for file in files:
-        if file.stat().st_size > CSV_LIMIT:
-            raise SourceError(
-                f"{file.name} is larger than {CSV_LIMIT >> 20} MB",
-                where=uri,
-                remedy="It is not a frame of stems.",
-            )
 
 
 def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:

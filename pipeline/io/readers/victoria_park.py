@@ -236,15 +236,7 @@ def _unpack(path: Path, uri: str) -> dict[str, bytes]:
             if large:
                 raise SourceError(f"{large[0]} unpacks to more than {MEMBER_LIMIT >> 20} MB", where=uri)
             return {name: archive.read(entry) for name, entry in chosen.items()}
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        EOFError,
-        RuntimeError,
-        OSError,
-        ValueError,
-        UnicodeDecodeError,
-    ) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, OSError, ValueError) as error:
         raise SourceError(
             f"the zip is damaged: {error}", where=uri, remedy="Download the file again."
         ) from error
