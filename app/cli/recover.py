@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Repair the recording."""
     from pipeline.errors import StemmapError
-    from pipeline.io.recording.recovery import mend
+    from pipeline.io.recording.mcap_writer import mend
 
     if arguments.out.exists() and arguments.file.exists() and arguments.out.samefile(arguments.file):
         raise StemmapError(

@@ -15,7 +15,7 @@ from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import Camera, MessageSource, find_camera
 from pipeline.io.readers.container import Container, Message
-from pipeline.io.readers.frame_alignment import FrameAlignments
+from pipeline.io.readers.measured_poses import FrameAlignments
 from pipeline.io.readers.message_time import (
     WINDOW_NS,
     Clock,

@@ -1,24 +1,36 @@
-"""Writers of MCAP files in the ROS 2 profile: whole runs, and live runs message by message."""
+"""Writers of MCAP files in the ROS 2 profile: whole runs, live runs message by message, and repaired
+recordings."""
 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
 
+from mcap.records import Attachment, Metadata, Schema
+from mcap.records import Channel as McapChannel
+from mcap.records import Message as McapMessage
 from mcap.writer import CompressionType, Writer
 
+from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.ground_truth import ATTACHMENT, truth_json
 from pipeline.io.readers.camera import Camera, Picture
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import NAME, PARAMETERS, SKIPPED, VERSION
+from pipeline.io.readers.mcap_file import McapFile
+from pipeline.io.readers.topics import is_fixed
 from pipeline.io.recording import messages, outputs
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor, Truth
 
 CHUNK_SIZE = 1 << 20
+#: Small, because a crash loses the last chunk.
+LIVE_CHUNK_SIZE = 256 << 10
 TOPICS = {
     "/velodyne_points": "sensor_msgs/msg/PointCloud2",
     "/odom": "nav_msgs/msg/Odometry",
@@ -28,7 +40,81 @@ TOPICS = {
 }
 _LATCHED = "/tf_static"
 CAMERA_INFO = "/camera/camera_info"
+_TEXT = "std_msgs/msg/String"
 _PICTURE, _INFO = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo"
+
+
+# The numbers below are those of Humble; later releases write words instead.
+BAG_METADATA = ("rosbag2", {"ROS_DISTRO": "humble"})
+
+# Quality of service of each topic for `ros2 bag play`. Without it all topics are replayed as volatile, and
+# late subscribers such as RViz get no /tf_static.
+_KEEP_LAST, _RELIABLE, _TRANSIENT_LOCAL, _VOLATILE, _AUTOMATIC = 1, 1, 1, 2, 1
+_FOREVER = "{sec: 9223372036, nsec: 854775807}"
+
+
+def offered_qos_profiles(latched: bool) -> str:
+    """Return the profile of a topic as YAML; `latched` keeps the last message for late subscribers."""
+    return (
+        f"- history: {_KEEP_LAST}\n"
+        f"  depth: {1 if latched else 10}\n"
+        f"  reliability: {_RELIABLE}\n"
+        f"  durability: {_TRANSIENT_LOCAL if latched else _VOLATILE}\n"
+        f"  deadline: {_FOREVER}\n"
+        f"  lifespan: {_FOREVER}\n"
+        f"  liveliness: {_AUTOMATIC}\n"
+        f"  liveliness_lease_duration: {_FOREVER}\n"
+        f"  avoid_ros_namespace_conventions: false\n"
+    )
+
+
+class Stream(Protocol):
+    """Sink of the bytes."""
+
+    def write(self, data: bytes) -> int: ...
+    def tell(self) -> int: ...
+
+
+class _RosWriter:
+    """An MCAP file in the ROS 2 profile that is being written.
+
+    Args:
+        stream: Stream of a new file.
+        chunk_size: Size of a chunk [bytes].
+        attachment, content: Name and JSON of its attachment.
+    """
+
+    def __init__(self, stream: Stream | BinaryIO, chunk_size: int, attachment: str, content: bytes) -> None:
+        self._writer = Writer(stream, chunk_size=chunk_size, compression=CompressionType.LZ4)
+        # The default contains the version of the library, so the bytes would change with its releases.
+        self._writer.start(profile="ros2", library="stemmap")
+        # At the front, so that a file that is cut still has it.
+        self._writer.add_attachment(0, 0, attachment, "application/json", content)
+        self._writer.add_metadata(*BAG_METADATA)
+        self._schemas: dict[str, int] = {}
+        self._sequence = Counter[int]()
+
+    def finish(self) -> None:
+        """Write the index.
+
+        Raises:
+            OSError: The disk refuses.
+        """
+        self._writer.finish()
+
+    def _schema(self, kind: str) -> int:
+        if kind not in self._schemas:
+            text = messages.definition(kind).encode()
+            self._schemas[kind] = int(self._writer.register_schema(kind, "ros2msg", text))
+        return self._schemas[kind]
+
+    def _channel(self, topic: str, kind: str, latched: bool = False) -> int:
+        profiles = {"offered_qos_profiles": offered_qos_profiles(latched or is_fixed(topic))}
+        return int(self._writer.register_channel(topic, "cdr", self._schema(kind), profiles))
+
+    def _write(self, channel: int, stamp_ns: int, payload: bytes) -> None:
+        self._writer.add_message(channel, stamp_ns, payload, stamp_ns, self._sequence[channel])
+        self._sequence[channel] += 1
 
 
 def write_recording(
@@ -67,106 +153,52 @@ def write_recording(
         return run.count
 
 
-class _Run:
-    """An MCAP file that is being written."""
+class _Run(_RosWriter):
+    """The recording of a whole run."""
 
     def __init__(self, stream: BinaryIO, truth: bytes, T_base_lidar: Pose3, camera: Camera | None) -> None:
-        self.count = 0
+        super().__init__(stream, CHUNK_SIZE, ATTACHMENT, truth)
         self._T_base_lidar: Pose3 | None = T_base_lidar
         self._camera = camera
         topics = TOPICS if camera is None else {**TOPICS, camera.topic: _PICTURE, CAMERA_INFO: _INFO}
-        self._writer = Writer(stream, chunk_size=CHUNK_SIZE, compression=CompressionType.LZ4)
-        # The default contains the version of the library, so the bytes would change with its releases.
-        self._writer.start(profile="ros2", library="stemmap")
-        # At the front, so that a file that is cut still has it.
-        self._writer.add_attachment(0, 0, ATTACHMENT, "application/json", truth)
-        self._writer.add_metadata(*BAG_METADATA)
-        schemas = {name: self._register(name) for name in dict.fromkeys(topics.values())}
-        self._channels = {
-            topic: self._writer.register_channel(
-                topic, "cdr", schemas[name], {"offered_qos_profiles": offered_qos_profiles(topic == _LATCHED)}
-            )
-            for topic, name in topics.items()
-        }
-        self._sequence = dict.fromkeys(topics, 0)
+        for kind in topics.values():  # all types come before the topics
+            self._schema(kind)
+        self._channels = {topic: self._channel(topic, kind) for topic, kind in topics.items()}
+
+    @property
+    def count(self) -> int:
+        """Number of messages."""
+        return self._sequence.total()
 
     def add(self, record: Record | Picture) -> None:
         """Write a record; the extrinsics of the LiDAR come before the first one."""
         stamp = record.stamp_ns
         if self._T_base_lidar is not None:
             mounting = messages.transform(stamp, messages.BASE, messages.LIDAR, self._T_base_lidar)
-            self._write(_LATCHED, stamp, mounting)
+            self._encode(_LATCHED, stamp, mounting)
             self._T_base_lidar = None
             if self._camera is not None:
                 c = self._camera
                 placed = messages.transform(stamp, messages.BASE, messages.CAMERA, c.T_base_camera)
-                self._write(_LATCHED, stamp, placed)
+                self._encode(_LATCHED, stamp, placed)
         if isinstance(record, Scan):
-            self._write("/velodyne_points", stamp, messages.point_cloud(record))
+            self._encode("/velodyne_points", stamp, messages.point_cloud(record))
         elif isinstance(record, Odometry):
-            self._write("/odom", stamp, messages.odometry(record))
+            self._encode("/odom", stamp, messages.odometry(record))
             moved = messages.transform(stamp, messages.ODOM, messages.BASE, record.T_odom_base)
-            self._write("/tf", stamp, moved)
+            self._encode("/tf", stamp, moved)
         elif isinstance(record, Picture) and self._camera is not None:
             c = self._camera
-            self._write(CAMERA_INFO, stamp, messages.camera_info(stamp, c.width, c.height, c.K))
-            self._write(c.topic, stamp, messages.compressed_image(stamp, record.data))
+            self._encode(CAMERA_INFO, stamp, messages.camera_info(stamp, c.width, c.height, c.K))
+            self._encode(c.topic, stamp, messages.compressed_image(stamp, record.data))
         elif isinstance(record, Imu):
-            self._write("/imu/data", stamp, messages.imu(record))
+            self._encode("/imu/data", stamp, messages.imu(record))
 
-    def finish(self) -> None:
-        """Write the index."""
-        self._writer.finish()
-
-    def _register(self, type_name: str) -> int:
-        text = messages.definition(type_name).encode()
-        return int(self._writer.register_schema(type_name, "ros2msg", text))
-
-    def _write(self, topic: str, stamp_ns: int, message: messages.Message) -> None:
-        self._writer.add_message(
-            self._channels[topic], stamp_ns, messages.encode(message), stamp_ns, self._sequence[topic]
-        )
-        self._sequence[topic] += 1
-        self.count += 1
+    def _encode(self, topic: str, stamp_ns: int, message: messages.Message) -> None:
+        self._write(self._channels[topic], stamp_ns, messages.encode(message))
 
 
-# The numbers below are those of Humble; later releases write words instead.
-BAG_METADATA = ("rosbag2", {"ROS_DISTRO": "humble"})
-
-# Quality of service of each topic for `ros2 bag play`. Without it all topics are replayed as volatile, and
-# late # subscribers such as RViz get no /tf_static.
-_KEEP_LAST, _RELIABLE, _TRANSIENT_LOCAL, _VOLATILE, _AUTOMATIC = 1, 1, 1, 2, 1
-_FOREVER = "{sec: 9223372036, nsec: 854775807}"
-
-
-def offered_qos_profiles(latched: bool) -> str:
-    """Return the profile of a topic as YAML; `latched` keeps the last message for late subscribers."""
-    return (
-        f"- history: {_KEEP_LAST}\n"
-        f"  depth: {1 if latched else 10}\n"
-        f"  reliability: {_RELIABLE}\n"
-        f"  durability: {_TRANSIENT_LOCAL if latched else _VOLATILE}\n"
-        f"  deadline: {_FOREVER}\n"
-        f"  lifespan: {_FOREVER}\n"
-        f"  liveliness: {_AUTOMATIC}\n"
-        f"  liveliness_lease_duration: {_FOREVER}\n"
-        f"  avoid_ros_namespace_conventions: false\n"
-    )
-
-
-#: Small, because a crash loses the last chunk.
-LIVE_CHUNK_SIZE = 256 << 10
-_TEXT = "std_msgs/msg/String"
-
-
-class Stream(Protocol):
-    """Sink of the bytes."""
-
-    def write(self, data: bytes) -> int: ...
-    def tell(self) -> int: ...
-
-
-class LiveWriter:
+class LiveWriter(_RosWriter):
     """Writer of one recording of a live run, in the ROS 2 profile of MCAP.
 
     The robot's messages are written in their order of arrival, with their times of arrival as log times. A
@@ -182,12 +214,8 @@ class LiveWriter:
     def __init__(
         self, stream: Stream, channels: Sequence[Channel], header: Mapping[str, Any], robot: str
     ) -> None:
-        self._writer = Writer(stream, chunk_size=LIVE_CHUNK_SIZE, compression=CompressionType.LZ4)
-        self._writer.start(profile="ros2", library="stemmap")
-        content = {"version": VERSION, **header}
-        self._writer.add_attachment(0, 0, NAME, "application/json", json.dumps(content).encode())
-        self._writer.add_metadata(*BAG_METADATA)
-        self._schemas: dict[str, int] = {}
+        content = json.dumps({"version": VERSION, **header}).encode()
+        super().__init__(stream, LIVE_CHUNK_SIZE, NAME, content)
         self._numbers = {c.number: self._channel(c.topic, c.msgtype) for c in channels}
         prefix = f"/{robot}/stemmap" if robot else "/stemmap"
         self._outputs = {
@@ -196,7 +224,6 @@ class LiveWriter:
         }
         self._parameters = self._channel(PARAMETERS, _TEXT, latched=True)
         self._skipped = self._channel(SKIPPED, _TEXT)
-        self._sequence: dict[int, int] = {}
         self._last_ns = 0
 
     def add(self, message: Message) -> None:
@@ -206,7 +233,7 @@ class LiveWriter:
             OSError: The disk refuses.
         """
         self._last_ns = message.log_ns
-        self._write(self._numbers[message.channel], message.payload)
+        self._write(self._numbers[message.channel], self._last_ns, message.payload)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
         """Write results of the mapping, at the time of the last message of the robot.
@@ -215,7 +242,7 @@ class LiveWriter:
             OSError: The disk refuses.
         """
         for topic, payload in messages_by_topic.items():
-            self._write(self._outputs[topic], payload)
+            self._write(self._outputs[topic], self._last_ns, payload)
 
     def add_parameters(self, revision: int, from_scan: int, values: Mapping[str, Any]) -> None:
         """Write the parameters that apply from a mapped scan onwards.
@@ -224,7 +251,7 @@ class LiveWriter:
             OSError: The disk refuses.
         """
         text = json.dumps({"revision": revision, "from_scan": from_scan, "values": values})
-        self._write(self._parameters, messages.text(text))
+        self._write(self._parameters, self._last_ns, messages.text(text))
 
     def add_skipped(self, times_by_topic: Mapping[str, Sequence[int]]) -> None:
         """Write which messages the mapping did not use: log times [ns] by topic.
@@ -232,7 +259,7 @@ class LiveWriter:
         Raises:
             OSError: The disk refuses.
         """
-        self._write(self._skipped, messages.text(json.dumps(times_by_topic)))
+        self._write(self._skipped, self._last_ns, messages.text(json.dumps(times_by_topic)))
 
     def flush(self) -> None:
         """End the present chunk, so that the system has all messages.
@@ -243,23 +270,61 @@ class LiveWriter:
         # The library ends a chunk when it is full or the file ends, and has no public method for it.
         self._writer._Writer__finalize_chunk()
 
-    def finish(self) -> None:
-        """Write the index.
 
-        Raises:
-            OSError: The disk refuses.
-        """
-        self._writer.finish()
+@dataclass(frozen=True, slots=True)
+class Mended:
+    """Result of a repair.
 
-    def _channel(self, topic: str, kind: str, latched: bool = False) -> int:
-        if kind not in self._schemas:
-            text = messages.definition(kind)
-            self._schemas[kind] = int(self._writer.register_schema(kind, "ros2msg", text.encode()))
-        latched = latched or topic.endswith("tf_static")
-        profiles = {"offered_qos_profiles": offered_qos_profiles(latched)}
-        return int(self._writer.register_channel(topic, "cdr", self._schemas[kind], profiles))
+    Attributes:
+        messages: Number of messages in the new file.
+        losses: Parts that are lost, by reason.
+    """
 
-    def _write(self, channel: int, payload: bytes) -> None:
-        number = self._sequence.get(channel, 0)
-        self._sequence[channel] = number + 1
-        self._writer.add_message(channel, self._last_ns, payload, self._last_ns, number)
+    messages: int
+    losses: dict[str, int]
+
+
+def mend(path: Path, out: Path) -> Mended:
+    """Write all complete messages of a recording to a new file, which appears when it is complete; return
+    what was written and lost.
+
+    Args:
+        path: The recording, which does not change.
+        out: The new file.
+
+    Raises:
+        SourceError: It cannot be read, is not an MCAP file, or has no complete message.
+        StemmapError: The new file cannot be written.
+    """
+    with closing(McapFile(path)) as recording:
+        lost, written = Counter[str](), 0
+        with write_beside(out) as partial, partial.open("wb") as target:
+            writer = Writer(target, compression=CompressionType.LZ4)
+            writer.start(profile="ros2", library="stemmap")
+            schemas, channels = {0: 0}, dict[int, int]()
+            for record in recording.whole_records():
+                match record:
+                    case Schema(id=known) if known not in schemas:
+                        schemas[known] = writer.register_schema(record.name, record.encoding, record.data)
+                    case McapChannel(id=known) if known not in channels and record.schema_id in schemas:
+                        channels[known] = writer.register_channel(
+                            record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                        )
+                    case McapMessage(channel_id=known) if known in channels:
+                        writer.add_message(
+                            channels[known], record.log_time, record.data, record.publish_time,
+                            record.sequence,
+                        )  # fmt: skip
+                        written += 1
+                    case McapMessage():
+                        lost["messages of an unknown topic"] += 1
+                    case Attachment():
+                        writer.add_attachment(
+                            record.create_time, record.log_time, record.name, record.media_type, record.data
+                        )
+                    case Metadata():
+                        writer.add_metadata(record.name, record.metadata)
+            if not written:
+                raise SourceError("nothing in the recording is whole", where=str(path))
+            writer.finish()
+        return Mended(written, {**recording.damage, **lost})

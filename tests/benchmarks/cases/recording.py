@@ -68,7 +68,7 @@ def kill_once(folder: Path, k: int) -> tuple[int, int, float]:
     """Messages taken, messages that the mended file has, and how much time is missing at its end [s]."""
     from pipeline.io.readers import open_source
     from pipeline.io.recording import write_recording
-    from pipeline.io.recording.recovery import mend
+    from pipeline.io.recording.mcap_writer import mend
     from tests.app.robot.conftest import Child
 
     drive, out, mended = folder / "drive.mcap", folder / f"killed{k}.mcap", folder / f"mended{k}.mcap"
