@@ -8,9 +8,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Stage(BaseModel):
-    """Parameters of one stage: immutable, strictly typed, without unknown names, NaN or infinity."""
+    """Parameters of one stage: immutable, strictly typed, without unknown names, NaN or infinity.
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+    The docstring of a parameter explains it in one sentence, for the help text and docs/parameters.md.
+    """
+
+    model_config = ConfigDict(
+        frozen=True, strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
     @classmethod
     def title(cls) -> str:
@@ -18,7 +23,7 @@ class Stage(BaseModel):
         return (cls.__doc__ or cls.__name__).partition(":")[0].strip()
 
 
-def number(default: float, title: str, unit: str, low: float, high: float, step: float, doc: str) -> Any:  # noqa: ANN401 - pydantic's Field is the default of a field of any type
+def number(default: float, title: str, unit: str, low: float, high: float, step: float) -> Any:  # noqa: ANN401 - pydantic's Field is the default of a field of any type
     """Return the declaration of a floating-point parameter.
 
     Args:
@@ -27,19 +32,13 @@ def number(default: float, title: str, unit: str, low: float, high: float, step:
         unit: Unit symbol; empty if dimensionless.
         low, high: Bounds, inclusive.
         step: Increment of the slider.
-        doc: Explanation in one sentence, for the help text and docs/parameters.md.
     """
     return Field(
-        default=default,
-        title=title,
-        description=doc,
-        ge=low,
-        le=high,
-        json_schema_extra={"unit": unit, "step": step},
+        default=default, title=title, ge=low, le=high, json_schema_extra={"unit": unit, "step": step}
     )
 
 
-def count(default: int, title: str, unit: str, low: int, high: int, doc: str) -> Any:  # noqa: ANN401
+def count(default: int, title: str, unit: str, low: int, high: int) -> Any:  # noqa: ANN401
     """Return the declaration of an integer parameter.
 
     Args:
@@ -47,25 +46,17 @@ def count(default: int, title: str, unit: str, low: int, high: int, doc: str) ->
         title: Label of the slider.
         unit: Unit symbol; empty if dimensionless.
         low, high: Bounds, inclusive.
-        doc: Explanation in one sentence, for the help text and docs/parameters.md.
     """
-    return Field(
-        default=default,
-        title=title,
-        description=doc,
-        ge=low,
-        le=high,
-        json_schema_extra={"unit": unit, "step": 1},
-    )
+    return number(default, title, unit, low, high, 1)
 
 
-def name(default: str, title: str, pattern: str, doc: str) -> Any:  # noqa: ANN401
+def name(default: str, title: str, pattern: str) -> Any:  # noqa: ANN401
     """Return the declaration of a parameter that holds a name; the regular expression `pattern` defines the
     valid names. See `number` for the other arguments."""
-    return Field(default=default, title=title, description=doc, pattern=pattern)
+    return Field(default=default, title=title, pattern=pattern)
 
 
-def choice(default: str | bool, title: str, doc: str) -> Any:  # noqa: ANN401
+def choice(default: str | bool, title: str) -> Any:  # noqa: ANN401
     """Return the declaration of a parameter of type bool or Literal, which lists the valid words. See
     `number` for the arguments."""
-    return Field(default=default, title=title, description=doc)
+    return Field(default=default, title=title)

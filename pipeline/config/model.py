@@ -25,7 +25,7 @@ RENAMED = {
 # Choices of earlier versions and their replacement: a graph of keyframes now always corrects FastSLAM.
 RENAMED_CHOICES = {("slam.method", "graph"): "fastslam2"}
 # Parameters of earlier versions that no longer exist; their values are ignored.
-REMOVED = frozenset({"tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"})
+REMOVED = frozenset({"shape.plane", "tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"})
 
 
 class RenamedParameterWarning(FutureWarning):
@@ -133,18 +133,8 @@ def validated(tree: Mapping[str, Any]) -> Parameters:
 
 def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested mappings with the names of earlier versions replaced by the current names."""
-    known = Parameters.model_fields
     nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
     result = {stage: values for stage, values in tree.items() if stage not in nested}
-    old = any(
-        stage not in known
-        or _current_name(f"{stage}.{name}") != f"{stage}.{name}"
-        or (isinstance(value, str) and (f"{stage}.{name}", value) in RENAMED_CHOICES)
-        for stage, values in nested.items()
-        for name, value in values.items()
-    )
-    if not old:
-        return result | {stage: dict(values) for stage, values in nested.items()}
     flat = {f"{stage}.{name}": value for stage, values in nested.items() for name, value in values.items()}
     for dotted, value in current_names(flat).items():
         stage, _, name = dotted.partition(".")
@@ -235,7 +225,7 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
         stage=stage_model.title(),
         title=field.title or name,
         unit=str(extra.get("unit", "")),
-        doc=field.description or "",
+        doc=" ".join((field.description or "").split()),
         kind=kind,
         minimum=None if minimum is None else float(minimum.ge),
         maximum=None if maximum is None else float(maximum.le),

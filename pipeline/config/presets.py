@@ -25,7 +25,6 @@ _PAPER: dict[str, object] = {
     "clustering.eps": 0.25,
     "clustering.min_points": 20,
     "clustering.stem_area": 0.0,
-    "shape.plane": 2,
     "shape.centre": "centroid",
     "shape.split_slices": 0,
     "detection.whole": False,

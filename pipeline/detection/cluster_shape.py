@@ -16,26 +16,17 @@ from pipeline.types.records import Clusters, Float32, Int, Labels, Sensor, Verdi
 
 
 @compiled
-def take_rows(points: Float32, order: Int) -> Float:
-    """Return the points in the given order in double precision, shape (M, 3)."""
-    taken = np.empty((order.shape[0], 3))
-    for k in range(order.shape[0]):
-        i = order[k]
-        taken[k, 0], taken[k, 1], taken[k, 2] = points[i, 0], points[i, 1], points[i, 2]
-    return taken
-
-
-@compiled
 def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
     """Return the moments of each cluster (Eq. 3).
 
     Returns:
-        Centroid, shape (K, 3) [m]; covariance normalised by N, shape (K, 3, 3) [m^2]; and extent along the
-        ray from the sensor to the centroid, across it and upwards, shape (K, 3) [m].
+        Centroid, shape (K, 3) [m]; descending eigenvalues of the horizontal covariance normalised by N, shape
+        (K, 3) [m^2], of which the third is 0; and extent along the ray from the sensor to the centroid,
+        across it and upwards, shape (K, 3) [m].
     """
     clusters = bounds.shape[0] - 1
     centroid = np.zeros((clusters, 3))
-    covariance = np.zeros((clusters, 3, 3))
+    eigenvalues = np.zeros((clusters, 3))
     extent = np.zeros((clusters, 3))
     for k in range(clusters):
         n = bounds[k + 1] - bounds[k]
@@ -48,40 +39,22 @@ def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
         rho = max(np.sqrt(mx * mx + my * my), 1e-9)
         ux, uy = mx / rho, my / rho
         near, far, right, left, low, high = np.inf, -np.inf, np.inf, -np.inf, np.inf, -np.inf
-        xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        xx, xy, yy = 0.0, 0.0, 0.0
         for i in range(bounds[k], bounds[k + 1]):
             x, y, z = points[i, 0] - mx, points[i, 1] - my, points[i, 2] - mz
             xx += x * x
             xy += x * y
-            xz += x * z
             yy += y * y
-            yz += y * z
-            zz += z * z
             along, across = ux * x + uy * y, ux * y - uy * x
             near, far = min(near, along), max(far, along)
             right, left = min(right, across), max(left, across)
             low, high = min(low, z), max(high, z)
         centroid[k, 0], centroid[k, 1], centroid[k, 2] = mx, my, mz
-        C = covariance[k]
-        C[0, 0], C[1, 1], C[2, 2] = xx / n, yy / n, zz / n
-        C[0, 1] = C[1, 0] = xy / n
-        C[0, 2] = C[2, 0] = xz / n
-        C[1, 2] = C[2, 1] = yz / n
+        middle, half = 0.5 * (xx / n + yy / n), 0.5 * (xx / n - yy / n)
+        root = np.sqrt(half * half + (xy / n) * (xy / n))
+        eigenvalues[k, 0], eigenvalues[k, 1] = max(middle + root, 0.0), max(middle - root, 0.0)
         extent[k, 0], extent[k, 1], extent[k, 2] = far - near, left - right, high - low
-    return centroid, covariance, extent
-
-
-@compiled
-def planar_eigenvalues(covariance: Float) -> Float:
-    """Return the descending eigenvalues of the upper left 2 x 2 block of each matrix, shape (K, 3); the third
-    is 0."""
-    values = np.zeros((covariance.shape[0], 3))
-    for k in range(covariance.shape[0]):
-        C = covariance[k]
-        middle, half = 0.5 * (C[0, 0] + C[1, 1]), 0.5 * (C[0, 0] - C[1, 1])
-        root = np.sqrt(half * half + C[0, 1] * C[0, 1])
-        values[k, 0], values[k, 1] = max(middle + root, 0.0), max(middle - root, 0.0)
-    return values
+    return centroid, eigenvalues, extent
 
 
 @compiled
@@ -149,9 +122,8 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
         parameters: Choice of covariance and centre.
     """
     order, bounds = group_rows(labels.label, labels.clusters)
-    members = take_rows(points, order)
-    centroid, covariance, extent = moments(members, bounds)
-    eigenvalues = _eigenvalues(covariance, parameters.plane)
+    members = points[order].astype(np.float64)
+    centroid, eigenvalues, extent = moments(members, bounds)
     size = np.diff(bounds)
     if parameters.centre == "circle":
         stem = fit_stems(members, bounds, sensor.range_sigma, sensor.azimuth_step)
@@ -195,14 +167,6 @@ def eccentricity(eigenvalues: Float) -> Float:
         elif first > FLAT:
             ratio[k] = np.inf
     return ratio
-
-
-def _eigenvalues(covariance: Float, dimensions: int) -> Float:
-    """Return descending eigenvalues, shape (K, 3); the third is 0 if only x and y are used."""
-    if dimensions == 2:
-        return planar_eigenvalues(covariance)
-    values: Float = np.maximum(np.linalg.eigvalsh(covariance)[:, ::-1], 0.0)
-    return values
 
 
 def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigma: float) -> Float:

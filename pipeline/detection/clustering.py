@@ -72,25 +72,19 @@ def dbscan_grid(
     cells = _cells(points, side)
     if int(cells.max()) + 2 >= 1 << _AXIS_BITS:
         raise ValueError("the cloud is too wide for cells of this eps")
-    rows, offsets = _offsets(dimensions)
     weight = np.ones(n, np.int32) if weight is None else weight
-    return _cluster(points, cells, rows, offsets, eps * eps, min_points, weight)
+    return _cluster(points, cells, _row_offsets(dimensions), eps * eps, min_points, weight)
 
 
 @cache
-def _offsets(dimensions: int) -> tuple[Int, Int]:
-    """Return the key differences between a cell and the cells that can contain a neighbour.
-
-    Returns:
-        The differences to the middle cell of each row along the last axis, the row of the cell itself first;
-        and the differences to all cells without the cell itself, nearest cell first.
-    """
+def _row_offsets(dimensions: int) -> Int:
+    """Return the key differences between a cell and the middle cell of each row along the last axis that can
+    contain a neighbour: the row of the cell itself first, then by distance."""
     reach = np.arange(-_REACH, _REACH + 1)
-    grid = np.stack(np.meshgrid(*([reach] * dimensions), indexing="ij"), axis=-1).reshape(-1, dimensions)
-    grid = grid[np.argsort((grid**2).sum(axis=1), kind="stable")]
-    weights = np.array([1 << (_AXIS_BITS * (dimensions - 1 - axis)) for axis in range(dimensions)], np.int64)
-    keys: Int = grid @ weights
-    return keys[grid[:, -1] == 0], keys[1:]
+    rows = np.stack(np.meshgrid(*([reach] * (dimensions - 1)), indexing="ij"), -1).reshape(-1, dimensions - 1)
+    rows = rows[np.argsort((rows**2).sum(axis=1), kind="stable")]
+    keys: Int = rows @ np.array([1 << (_AXIS_BITS * axis) for axis in range(dimensions - 1, 0, -1)], np.int64)
+    return keys
 
 
 @compiled
@@ -142,7 +136,7 @@ def _by_key(cells: Int32) -> Int:
 
 @compiled
 def _cluster(
-    points: Float, cells: Int32, rows: Int, offsets: Int, eps2: float, min_points: int, weight: Int32
+    points: Float, cells: Int32, rows: Int, eps2: float, min_points: int, weight: Int32
 ) -> tuple[Int32, Bool]:
     """Sort the points by cell and label them; see `dbscan_grid`."""
     n = points.shape[0]
@@ -175,24 +169,26 @@ def _cluster(
             if core[i]:
                 label[order[i]] = root
                 continue
-            d = _cell_of_nearest_core(laid, i, cores, keys, c, reach, offsets, eps2)
+            d = _cell_of_nearest_core(laid, i, cores, c, reach, eps2)
             if d >= 0:
                 label[order[i]] = _root(parent, d)
-    _number(label, filled)
-    return label, core_out
+    return number_by_first_point(label), core_out
 
 
 @compiled
-def _number(label: Int32, most: int) -> None:
-    """Renumber the labels, which are less than `most`, in the order of their first point, in place."""
-    number, clusters = np.full(most, -1, np.int32), 0
+def number_by_first_point(label: Int32) -> Int32:
+    """Return the labels, int32, shape (N,), renumbered in the order of their first point; -1 stays."""
+    most = 0
+    for each in label:
+        most = max(most, each)
+    number, ordered, clusters = np.full(most + 1, -1, np.int32), np.full_like(label, -1), 0
     for k in range(label.shape[0]):
-        root = label[k]
-        if root >= 0:
-            if number[root] < 0:
-                number[root] = clusters
+        if label[k] >= 0:
+            if number[label[k]] < 0:
+                number[label[k]] = clusters
                 clusters += 1
-            label[k] = number[root]
+            ordered[k] = number[label[k]]
+    return ordered
 
 
 @compiled
@@ -327,12 +323,10 @@ def _touch(cores: Cores, c: int, d: int, eps2: float) -> bool:
 
 
 @compiled_borrowing
-def _cell_of_nearest_core(
-    laid: Float, i: int, cores: Cores, keys: Int, c: int, reach: Int32, offsets: Int, eps2: float
-) -> int:
+def _cell_of_nearest_core(laid: Float, i: int, cores: Cores, c: int, reach: Int32, eps2: float) -> int:
     """Return the cell of the core point nearest to point i of cell c, or -1 if none is within eps.
 
-    Of several cells at the same distance, the first in the order of `offsets` is returned.
+    Of several cells at the same distance, the first in the order of the keys is returned.
     """
     best, best2 = -1, eps2
     x, y, z = laid[0, i], laid[1, i], laid[2, i]
@@ -341,22 +335,9 @@ def _cell_of_nearest_core(
             for j in range(cores.bounds[d], cores.bounds[d + 1]):
                 dx, dy, dz = x - cores.place[0, j], y - cores.place[1, j], z - cores.place[2, j]
                 d2 = dx * dx + dy * dy + dz * dz
-                if d2 < best2 or (
-                    d2 == best2
-                    and d != best
-                    and (best < 0 or _turn(offsets, keys[d] - keys[c]) < _turn(offsets, keys[best] - keys[c]))
-                ):
+                if d2 < best2 or (d2 == best2 and (best < 0 or d < best)):
                     best, best2 = d, d2
     return best
-
-
-@compiled_borrowing
-def _turn(offsets: Int, offset: int) -> int:
-    """Return the rank of a cell in the search order; the cell itself has rank 0."""
-    for k in range(offsets.shape[0]):
-        if offsets[k] == offset:
-            return k + 1
-    return 0
 
 
 # Ring spacing [rad] of a solid-state sensor with 24,000 returns in a cone of 70 degrees, used for sensors
@@ -473,7 +454,7 @@ def _sklearn(points: Float32, eps: float, min_points: int, weight: Int32 | None 
     fitted = DBSCAN(eps=eps, min_samples=min_points).fit(points.astype(np.float64), sample_weight=weight)
     core = np.zeros(len(points), np.bool_)
     core[fitted.core_sample_indices_] = True
-    return Dbscan(in_order_of_first_point(fitted.labels_.astype(np.int32)), core)
+    return Dbscan(number_by_first_point(fitted.labels_.astype(np.int32)), core)
 
 
 def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
@@ -490,7 +471,7 @@ def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None =
     # Open3D uses distance < radius, the other engines distance <= radius.
     radius = float(np.nextafter(eps, np.inf))
     label = np.asarray(cloud.cluster_dbscan(radius, min_points), np.int32)[first]
-    return Dbscan(in_order_of_first_point(label), None)
+    return Dbscan(number_by_first_point(label), None)
 
 
 ENGINES: dict[str, Engine] = {
@@ -498,17 +479,6 @@ ENGINES: dict[str, Engine] = {
     "sklearn": _sklearn,
     "open3d": _open3d,
 }
-
-
-def in_order_of_first_point(label: Int32) -> Int32:
-    """Return the labels renumbered in the order of the first point of each cluster."""
-    found, first = np.unique(label, return_index=True)
-    number = np.full(int(label.max(initial=-1)) + 2, -1, np.int32)  # the last entry is for noise, -1
-    by_first = found[np.argsort(first)]
-    by_first = by_first[by_first >= 0]
-    number[by_first] = np.arange(len(by_first), dtype=np.int32)
-    ordered: Int32 = number[label]
-    return ordered
 
 
 def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:

@@ -10,80 +10,16 @@ import numpy as np
 from pipeline.config.stages import Detection
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import Bool, Clusters, Detections, Int, Int32, Verdict
+from pipeline.types.records import Bool, Clusters, Detections, Int, Verdict
 
 
 def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
     """Return the clusters with their verdicts: the first check that fails, in the order of `checks`, else
     TREE."""
-    p, c = parameters, clusters
-    verdict = _verdicts(
-        c.hidden,
-        c.cut,
-        c.extent,
-        c.eccentricity,
-        c.radial_std,
-        c.radius,
-        c.arc,
-        p.size_max,
-        p.height_extent_min,
-        p.whole,
-        p.e_min,
-        p.e_max,
-        p.cylindrical_stddev_thresh,
-        float(np.radians(p.arc_min)),
-        p.radius_min,
-        p.radius_max,
-    )
+    verdict = np.full(len(clusters.size), Verdict.TREE, np.int32)
+    for check in reversed(checks(clusters, parameters)):  # the first check that fails is written last
+        verdict[check.fails] = check.verdict
     return replace(clusters, verdict=verdict)
-
-
-@compiled
-def _verdicts(
-    hidden: Bool,
-    cut: Bool,
-    extent: Float,
-    eccentricity: Float,
-    radial_std: Float,
-    radius: Float,
-    arc: Float,
-    size_max: float,
-    height_extent_min: float,
-    whole: bool,
-    e_min: float,
-    e_max: float,
-    deviation_max: float,
-    arc_min: float,
-    radius_min: float,
-    radius_max: float,
-) -> Int32:
-    verdict = np.empty(len(hidden), np.int32)
-    for k in range(len(hidden)):
-        # Without a circle, radius and arc are NaN and are not checked.
-        has_circle = np.isfinite(radius[k])
-        if hidden[k]:
-            verdict[k] = Verdict.HIDDEN
-        elif max(extent[k, 0], extent[k, 1]) > size_max:
-            verdict[k] = Verdict.TOO_THICK
-        elif extent[k, 2] < height_extent_min:
-            verdict[k] = Verdict.TOO_LOW
-        elif whole and cut[k]:  # the checks below need a whole side of the trunk
-            verdict[k] = Verdict.AT_BORDER
-        elif eccentricity[k] < e_min:
-            verdict[k] = Verdict.TOO_ROUND
-        elif eccentricity[k] > e_max:
-            verdict[k] = Verdict.TOO_LONG
-        elif radial_std[k] > deviation_max:
-            verdict[k] = Verdict.NOT_ROUND
-        elif has_circle and arc[k] < arc_min:
-            verdict[k] = Verdict.NO_ARC
-        elif has_circle and radius[k] < radius_min:
-            verdict[k] = Verdict.TOO_THIN
-        elif has_circle and radius[k] > radius_max:
-            verdict[k] = Verdict.TOO_THICK
-        else:
-            verdict[k] = Verdict.TREE
-    return verdict
 
 
 def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) -> Detections:

@@ -129,7 +129,7 @@ class Clusters:
     Attributes:
         size: int64, number of points.
         centroid: shape (K, 3) [m].
-        eigenvalues: shape (K, 3) [m^2], descending; the third is 0 in two dimensions.
+        eigenvalues: shape (K, 3) [m^2], descending, of the horizontal covariance; the third is 0.
         eccentricity: lambda1 / lambda2 >= 1 (Eq. 4); inf for points on a line.
         centre: shape (K, 2) [m], the estimate of the trunk's axis.
         covariance: shape (K, 2, 2) [m^2], of `centre`.

@@ -65,8 +65,7 @@ def detect(
     for k in range(labels.max(initial=-1) + 1):
         members = points[labels == k]
         centroid = members.mean(axis=0)
-        plane = p["shape.plane"]
-        ascending = np.linalg.eigvalsh(np.cov(members[:, :plane].T, bias=True))
+        ascending = np.linalg.eigvalsh(np.cov(members[:, :2].T, bias=True))
         eccentricity = ascending[-1] / ascending[-2] if ascending[-2] > 1e-12 else np.inf
         radial = np.linalg.norm(members[:, :2] - centroid[:2], axis=1)
         ray = centroid[:2] / max(float(np.linalg.norm(centroid[:2])), 1e-9)

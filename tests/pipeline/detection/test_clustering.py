@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
-from pipeline.detection.clustering import ENGINES, cluster, dbscan_grid, in_order_of_first_point, weigh
+from pipeline.detection.clustering import ENGINES, cluster, dbscan_grid, number_by_first_point, weigh
 from tests.pipeline.strategies import SENSOR, simulated_cloud
 
 FOREST = preset("forest").clustering
@@ -162,7 +162,7 @@ def test_engines_agree_on_a_scan(dimensions, eps, min_points, other):
 @example(np.array([], np.int32))
 @example(np.array([-1, -1], np.int32))
 def test_renumbering_keeps_the_parts(label):
-    ordered = in_order_of_first_point(label)
+    ordered = number_by_first_point(label)
     assert_numbered_by_first_point(ordered)
     np.testing.assert_array_equal(ordered < 0, label < 0)
     assert len(set(zip(label.tolist(), ordered.tolist(), strict=True))) == len(set(label.tolist()))
