@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.config import Parameters
-from pipeline.detection.obstacles import find_clearance
+from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.ground.scan_ground import find_terrain
-from pipeline.ground.terrain import shows_ground
-from pipeline.preprocessing.acquisition import acquire, acquire_near
 from pipeline.simulation.lidar import SpinningLidar, sweep_scene
 from pipeline.simulation.robot_motion import RATE_HZ, Course, Drive, lay_on_terrain, on_course, speed_limit
 from pipeline.simulation.scene import SimulatedScene
-from pipeline.types.clearance import Clearance, Zone
+from pipeline.types.clearance import Zone
 from pipeline.types.records import Step
 
 #: Share of the speed in each zone.
@@ -26,7 +23,7 @@ _TICKS = RATE_HZ * _LIDAR.period_ns // 1_000_000_000  # per sweep
 
 def obstacle_aware_drive(
     course: Course, speed: float, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, duration_s: float
-) -> tuple[Drive, list[Clearance]]:
+) -> Drive:
     """Drive a course one sweep at a time; the clearance after a sweep decides the speed of the next one.
 
     Args:
@@ -36,15 +33,12 @@ def obstacle_aware_drive(
         T_base_lidar: Extrinsics of the LiDAR.
         seed: Random seed of the sensor.
         duration_s: Duration [s].
-
-    Returns:
-        The drive, and the clearance after each sweep.
     """
     limit, step = speed_limit(course, speed), 1.0 / RATE_HZ
     speeds, along = [0.0], [0.0]
-    clearances: list[Clearance] = []
+    zone = Zone.STOP
     for k in range(int(np.ceil((duration_s + 0.5) * 1e9 / _LIDAR.period_ns)) + 1):
-        share = SPEED[clearances[-1].zone] if clearances else 0.0
+        share = SPEED[zone]
         v, s = speeds[-1], along[-1]
         for _ in range(_TICKS):
             here = s % course.s[-1] if course.closed else min(s, float(course.s[-1]))
@@ -56,8 +50,8 @@ def obstacle_aware_drive(
             speeds.append(v)
             along.append(s)
         latest = _drive(course, along, speeds, k * _TICKS)
-        clearances.append(_clearance(latest, scene, T_base_lidar, seed, k))
-    return _drive(course, along, speeds, 0), clearances
+        zone = _zone(latest, scene, T_base_lidar, seed, k)
+    return _drive(course, along, speeds, 0)
 
 
 def _drive(course: Course, along: list[float], speeds: list[float], first: int) -> Drive:
@@ -66,8 +60,8 @@ def _drive(course: Course, along: list[float], speeds: list[float], first: int) 
     return on_course(course, t, np.array(along[first:]), np.array(speeds[first:]))
 
 
-def _clearance(drive: Drive, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, k: int) -> Clearance:
-    """Return the clearance after sweep k, which was made during a drive."""
+def _zone(drive: Drive, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, k: int) -> Zone:
+    """Return the zone of obstacle detection after sweep k, which was made during a drive."""
     # The same phases in each sweep, so that the pieces belong to one vibration.
     motion = lay_on_terrain(drive, scene.terrain, np.random.default_rng(seed))
     offsets = _LIDAR.column_offsets_ns() * 1e-9
@@ -78,9 +72,5 @@ def _clearance(drive: Drive, scene: SimulatedScene, T_base_lidar: Pose3, seed: i
     twist = (float(drive.speed[-1]), 0.0, float(drive.yaw_rate[-1]))
     tilt = (float(motion.roll[0]), float(motion.pitch[0]))
     step = Step(k, sweep.scan, Pose2(), *tilt, tilt_known=True, twist=twist)
-    p = Parameters()
-    points, sensor = acquire(step, T_base_lidar, p.acquisition)
-    terrain = find_terrain(points, p.ground)
-    near = acquire_near(step, T_base_lidar, p.acquisition)
-    ground = terrain if shows_ground(terrain) else None
-    return find_clearance(points, near, ground, sensor, twist, p.obstacles) or Clearance(Zone.CLEAR)
+    clearance = segment(step, _LIDAR.sensor, T_base_lidar, Parameters()).clearance
+    return Zone.CLEAR if clearance is None else clearance.zone

@@ -42,15 +42,9 @@ class Optics(NamedTuple):
 
 
 @compiled
-def meet_cone(shape: Float, o: Float, d: Float) -> float:
-    """Return the range at which a ray (origin o, unit direction d) enters the mantle of a tapered
-    cylinder."""
-    return _meet_mantle(shape, 1.0, o, d)
-
-
-@compiled
-def _meet_mantle(shape: Float, widest: float, o: Float, d: Float) -> float:
-    """Return the same with radii that are multiplied by `widest`."""
+def meet_cone(shape: Float, o: Float, d: Float, widest: float = 1.0) -> float:
+    """Return the range at which a ray (origin o, unit direction d) enters the mantle of a tapered cylinder,
+    whose radii are multiplied by `widest`."""
     wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
     along = wx * shape[3] + wy * shape[4] + wz * shape[5]
     rate = d[0] * shape[3] + d[1] * shape[4] + d[2] * shape[5]
@@ -97,7 +91,7 @@ def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
     """Return the range at which a ray enters the bark of a stem. From the mantle that encloses the stem
     the ray advances by a share of the gap, which is small enough for furrows with a slope of 2."""
     widest = 1.0 + surface[2] + surface[4]
-    t = _meet_mantle(shape, widest, o, d)
+    t = meet_cone(shape, o, d, widest)
     if t == MISS:
         return MISS
     ux, uy, uz = shape[3], shape[4], shape[5]
@@ -269,30 +263,6 @@ def solid_incidence(kind: int, shape: Float, o: Float, d: Float, t: float) -> fl
 
 
 @compiled
-def clip_to_view(a: Float, b: Float, r: float, lowest: float, highest: float) -> float:
-    """Clip the segment from a to b (3,) to the part between the lowest and highest beam, in place.
-
-    Return the largest distance of the segment from the axis of the sensor [m], or -1 when the segment,
-    thickened by r, is out of view.
-    """
-    reach = 0.0
-    for _ in range(2):
-        reach = max(np.sqrt(a[0] * a[0] + a[1] * a[1]), np.sqrt(b[0] * b[0] + b[1] * b[1])) + r
-        floor, ceiling = np.tan(lowest) * reach - r, np.tan(highest) * reach + r
-        rise = b[2] - a[2]
-        if max(a[2], b[2]) < floor or min(a[2], b[2]) > ceiling:
-            return -1.0
-        if abs(rise) > 1e-9:
-            s1, s2 = (floor - a[2]) / rise, (ceiling - a[2]) / rise
-            first, last = max(0.0, min(s1, s2)), min(1.0, max(s1, s2))
-            for i in range(3):
-                way = b[i] - a[i]
-                b[i] = a[i] + last * way
-                a[i] = a[i] + first * way
-    return reach
-
-
-@compiled
 def interval_of_capsule(
     capsule: Float, R: Float, o: Float, lowest: float, highest: float
 ) -> tuple[float, float, float, float, float]:
@@ -309,8 +279,9 @@ def interval_of_capsule(
             a[i] += R[j, i] * (capsule[j] - o[j])
             b[i] += R[j, i] * (capsule[3 + j] - o[j])
     r = capsule[6]
-    reach = clip_to_view(a, b, r, lowest, highest)
-    if reach < 0.0:
+    rho_a, rho_b = np.sqrt(a[0] * a[0] + a[1] * a[1]), np.sqrt(b[0] * b[0] + b[1] * b[1])
+    reach = max(rho_a, rho_b) + r
+    if max(a[2], b[2]) < np.tan(lowest) * reach - r or min(a[2], b[2]) > np.tan(highest) * reach + r:
         return 0.0, -1.0, 0.0, 0.0, 0.0
     dx, dy = b[0] - a[0], b[1] - a[1]
     span = dx * dx + dy * dy
@@ -322,7 +293,6 @@ def interval_of_capsule(
     elevation_bottom = np.arctan2(bottom, nearest if bottom < 0.0 else reach)
     if distance <= r * 1.001:
         return 0.0, np.pi, elevation_bottom, elevation_top, nearest
-    rho_a, rho_b = np.sqrt(a[0] * a[0] + a[1] * a[1]), np.sqrt(b[0] * b[0] + b[1] * b[1])
     turn = np.arctan2(a[0] * b[1] - a[1] * b[0], a[0] * b[0] + a[1] * b[1])
     wide_a, wide_b = np.arcsin(min(r / rho_a, 1.0)), np.arcsin(min(r / rho_b, 1.0))
     low, high = min(-wide_a, turn - wide_b), max(wide_a, turn + wide_b)
@@ -452,9 +422,7 @@ def first_returns(
             for k in range(ring_first, ring_last + 1):
                 if ranges[c, k] <= nearest - 0.2:
                     continue
-                chance = 0.5
-                if kind[n] == 1 and shape[n, 8] > 0.0:
-                    chance = random_unit(key, c * rings + k, n)
+                chance = random_unit(key, c * rings + k, n)
                 t = meet_solid(kind[n], shape[n], surface[n], o[c], directions[c, k], chance)
                 if t < ranges[c, k]:
                     ranges[c, k] = t
@@ -478,31 +446,14 @@ def first_along(solids: Solids, directions: Float, key: int) -> Float:
     (N,).
 
     Args:
-        solids: Solids; none contains the origin.
+        solids: Solids.
         directions: Unit vectors, shape (N, 3).
         key: Seed of the depths at which foliage stops light.
     """
-    kind, shape, surface, capsule = solids.kind, solids.shape, solids.surface, solids.capsule
-    ranges = np.full(directions.shape[0], np.inf)
-    middle = np.zeros(3)
-    origin = np.zeros(3)
+    kind, shape, surface = solids.kind, solids.shape, solids.surface
+    ranges, origin = np.full(directions.shape[0], np.inf), np.zeros(3)
     for n in range(kind.shape[0]):
-        # A ball around the shape: only rays within its cone are tested.
-        reach, away = capsule[n, 6], 0.0
-        half = 0.0
-        for i in range(3):
-            middle[i] = 0.5 * (capsule[n, i] + capsule[n, i + 3])
-            away += middle[i] ** 2
-            half += (0.5 * (capsule[n, i] - capsule[n, i + 3])) ** 2
-        reach, away = reach + np.sqrt(half), np.sqrt(away)
-        sine = reach / away if away > reach else 1.0
-        ahead = np.sqrt(1.0 - sine * sine) * away
         for k in range(directions.shape[0]):
-            d = directions[k]
-            if away > reach and d[0] * middle[0] + d[1] * middle[1] + d[2] * middle[2] < ahead:
-                continue
-            chance = 0.5
-            if kind[n] == 1 and shape[n, 8] > 0.0:
-                chance = random_unit(key, k, n)
-            ranges[k] = min(ranges[k], meet_solid(kind[n], shape[n], surface[n], origin, d, chance))
+            met = meet_solid(kind[n], shape[n], surface[n], origin, directions[k], random_unit(key, k, n))
+            ranges[k] = min(ranges[k], met)
     return ranges

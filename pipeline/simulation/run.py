@@ -141,7 +141,7 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     mounting = MOUNTING if T_base_lidar is None else T_base_lidar
     if scenario.obeys:
         seed = int(random_stream(SENSE, request).integers(2**31))
-        drive, _ = obstacle_aware_drive(course, scenario.speed, scene, mounting, seed, request.duration_s)
+        drive = obstacle_aware_drive(course, scenario.speed, scene, mounting, seed, request.duration_s)
     else:
         drive = drive_course(course, scenario.speed, request.duration_s)
     motion = lay_on_terrain(drive, ground, random_stream(SHAKE, request))

@@ -13,7 +13,6 @@ from pipeline.simulation.robot_motion import Course
 from pipeline.simulation.scenarios import Placed, Scenario
 from pipeline.simulation.scene_objects import (
     SceneBuilder,
-    TreeShape,
     add_box,
     add_bush,
     add_pole,
@@ -271,13 +270,11 @@ class _Planter:
 
     def built(self) -> SimulatedScene:
         """Return the scene."""
-        truth = self._scene.truth
-        x, y, dbh, kind = zip(*truth, strict=True) if truth else ((), (), (), ())
         return SimulatedScene(
             terrain=self._scene.terrain,
             still=self._scene.solids.build(),
             persons=tuple(self._persons),
-            truth=TruthTrees(np.array(x), np.array(y), np.array(dbh), tuple(kind)),
+            truth=self._scene.true_objects(),
             kinds=tuple(self._scene.kinds),
             owners=tuple(self._scene.owners),
         )
@@ -289,7 +286,7 @@ class _Planter:
         crown = float(rng.uniform(low, high) if dbh > 0.12 else rng.uniform(low, low + 1.0))
         top = max(float(4.0 + 28.0 * dbh * rng.uniform(0.85, 1.15)), crown + 1.5)
         branches = int(rng.integers(3, 9)) if rng.random() < scenario.branchy else 0
-        add_tree(self._scene, TreeShape(x, y, dbh, (float(lean[0]), float(lean[1])), top, crown, branches))
+        add_tree(self._scene, x, y, dbh, (float(lean[0]), float(lean[1])), top, crown, branches)
 
     def _add_standing(self, x: float, y: float) -> None:
         at: Float = np.array([x, y])

@@ -9,14 +9,13 @@ object is, not how large it is in one town.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
 from pipeline.simulation.primitives import Solids, SolidsBuilder
 from pipeline.simulation.terrain import SimulatedTerrain
-from pipeline.types.records import Float
+from pipeline.types.records import Float, TruthTrees
 
 BREAST_HEIGHT = 1.3  # m
 TAPER = 0.01  # decrease of the diameter per metre of height
@@ -35,7 +34,6 @@ class SceneBuilder:
         kinds: Kind of each object or part of an object by its number (`Solids.owner`).
         truth: x, y [m], DBH [m] (NaN if not a tree) and kind of the objects of the ground truth.
         owners: Numbers of the objects of the ground truth.
-        trunks: Number, x and y [m] of each trunk.
     """
 
     def __init__(self, terrain: SimulatedTerrain, rng: np.random.Generator) -> None:
@@ -44,7 +42,6 @@ class SceneBuilder:
         self.kinds: list[str] = []
         self.truth: list[tuple[float, float, float, str]] = []
         self.owners: list[int] = []
-        self.trunks: list[tuple[int, float, float]] = []
 
     def owner(self, kind: str) -> int:
         """Return the number of a new object or part of a kind."""
@@ -56,6 +53,11 @@ class SceneBuilder:
         self.truth.append((x, y, dbh, kind))
         self.owners.append(self.owner(kind))
         return self.owners[-1]
+
+    def true_objects(self) -> TruthTrees:
+        """Return the ground truth."""
+        x, y, dbh, kind = zip(*self.truth, strict=True) if self.truth else ((), (), (), ())
+        return TruthTrees(np.array(x), np.array(y), np.array(dbh), tuple(kind))
 
     def foot(self, x: float, y: float) -> Float:
         """Return the point on the ground at x, y [m], shape (3,)."""
@@ -77,65 +79,58 @@ def _ahead(angle: float, rise: float = 0.0) -> Float:
 # --- forest ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class TreeShape:
-    """Shape of a forest tree. The axis of its trunk is at x, y at breast height.
+def add_tree(
+    scene: SceneBuilder,
+    x: float,
+    y: float,
+    dbh: float,
+    lean: tuple[float, float],
+    top: float,
+    crown_base: float,
+    branches: int,
+) -> None:
+    """Add a tapered, leaning trunk with rough bark, branches and a crown.
 
-    Attributes:
-        x, y: [m].
+    Args:
+        scene: The scene.
+        x, y: Position of the axis at breast height [m].
         dbh: Diameter at 1.3 m [m].
         lean: Shift of the axis per metre of height along x and y.
-        top: Height of the trunk above the ground [m].
+        top: Height of the tree above the ground [m].
         crown_base: Lower end of the foliage [m]; a tree with a crown base above `top` has none.
         branches: Number of branches below the crown.
     """
+    rng, owner = scene.rng, scene.true_object("tree", x, y, dbh)
+    ground = float(scene.foot(x, y)[2])
 
-    x: float
-    y: float
-    dbh: float
-    lean: tuple[float, float]
-    top: float
-    crown_base: float
-    branches: int
-
-    def axis(self, height: float) -> tuple[float, float]:
-        """Return x, y [m] of the axis at a height above the ground [m]."""
+    def axis(height: float) -> Float:
         up = height - BREAST_HEIGHT
-        return self.x + self.lean[0] * up, self.y + self.lean[1] * up
+        return np.array([x + lean[0] * up, y + lean[1] * up, ground + height])
 
-    def radius(self, height: float) -> float:
-        """Return the radius of the trunk at a height [m]."""
-        return max(0.5 * (self.dbh - TAPER * (height - BREAST_HEIGHT)), 0.015)
+    def radius(height: float) -> float:
+        return max(0.5 * (dbh - TAPER * (height - BREAST_HEIGHT)), 0.015)
 
-
-def add_tree(scene: SceneBuilder, tree: TreeShape) -> None:
-    """Add a tapered, leaning trunk with rough bark, branches and a crown."""
-    rng, owner = scene.rng, scene.true_object("tree", tree.x, tree.y, tree.dbh)
-    ground = float(scene.foot(tree.x, tree.y)[2])
-    top = min(tree.top, BREAST_HEIGHT + (tree.dbh - 0.04) / TAPER)
-    ends = [np.array([*tree.axis(h), ground + h]) for h in (-_FOOT, top)]
-    bark = min(0.012 * tree.dbh, 0.004)
+    end_of_trunk = min(top, BREAST_HEIGHT + (dbh - 0.04) / TAPER)
+    bark = min(0.012 * dbh, 0.004)
     shade = rng.uniform(0.25, 0.45)
-    radii = (tree.radius(-_FOOT), tree.radius(top))
-    scene.solids.cone(owner, ends[0], ends[1], radii, reflectivity=shade, roughness=bark)
-    for _ in range(tree.branches):
-        height = rng.uniform(0.6, min(3.5, tree.crown_base))
+    radii = (radius(-_FOOT), radius(end_of_trunk))
+    scene.solids.cone(owner, axis(-_FOOT), axis(end_of_trunk), radii, reflectivity=shade, roughness=bark)
+    for _ in range(branches):
+        height = rng.uniform(0.6, min(3.5, crown_base))
         direction, rise = rng.uniform(0.0, 2.0 * np.pi), np.tan(rng.uniform(-0.2, 0.7))
         length = rng.uniform(0.4, 1.3)
-        start = np.array([*tree.axis(height), ground + height])
-        radius = rng.uniform(0.006, 0.018)
-        end = start + (length + tree.radius(height)) * _ahead(direction, rise)
-        scene.solids.cone(owner, start, end, (radius, 0.003), reflectivity=shade)
-    if tree.crown_base >= tree.top:
+        thick = rng.uniform(0.006, 0.018)
+        end = axis(height) + (length + radius(height)) * _ahead(direction, rise)
+        scene.solids.cone(owner, axis(height), end, (thick, 0.003), reflectivity=shade)
+    if crown_base >= top:
         return
-    width = np.clip(0.9 + 3.0 * tree.dbh, 1.0, 2.4)
-    depth = tree.top + 0.8 - tree.crown_base
+    width = np.clip(0.9 + 3.0 * dbh, 1.0, 2.4)
+    depth = top + 0.8 - crown_base
     for n in range(3):
-        middle = tree.crown_base + depth * (n + 0.5) / 3.0
+        middle = crown_base + depth * (n + 0.5) / 3.0
         half = np.array([width, width, depth / 5.0]) * rng.uniform(0.75, 1.1, 3) * (1.0 - 0.18 * n)
         shift = 0.2 * width * rng.standard_normal(2)
-        x, y = tree.axis(middle)
-        centre = [x + shift[0], y + shift[1], ground + max(middle, tree.crown_base + half[2])]
+        centre = [*(axis(middle)[:2] + shift), ground + max(middle, crown_base + half[2])]
         _foliage(scene, owner, centre, half, 1.2)
 
 
@@ -291,9 +286,8 @@ def add_crown(scene: SceneBuilder, x: float, y: float) -> None:
 def _trunk(
     scene: SceneBuilder, x: float, y: float, start: Float, end: Float, radii: tuple[float, float]
 ) -> int:
-    owner = scene.owner("trunk")
+    owner = scene.true_object("trunk", x, y)
     scene.solids.cone(owner, start, end, radii, roughness=0.018 * radii[0])
-    scene.trunks.append((owner, x, y))
     return owner
 
 

@@ -111,17 +111,15 @@ def _scanned(scene: SceneBuilder, lidar: SpinningLidar, height: float, poses: li
         clouds.append(points @ R.T + o)
         owners.append(np.where(solid >= 0, solids.owner[solid], -1))
     owner = np.concatenate(owners)
-    number, x, y = (np.array(column) for column in zip(*scene.trunks, strict=True)) if scene.trunks else (
-        np.zeros(0, np.int64), np.zeros(0), np.zeros(0)
-    )  # fmt: skip
+    trunks = scene.true_objects()  # streets and parks have no other ground truth
     return StreetScans(
         steps=steps,
         sensor=lidar.sensor,
         T_base_lidar=Pose3(np.eye(3), np.array([0.0, 0.0, height])),
         points=np.concatenate(clouds),
         kind=np.array([*scene.kinds, "ground"])[owner],
-        trunk=np.stack([x, y], axis=1),
-        returns=np.bincount(owner[owner >= 0], minlength=len(scene.kinds))[number],
+        trunk=np.stack([trunks.x, trunks.y], axis=1),
+        returns=np.bincount(owner[owner >= 0], minlength=len(scene.kinds))[np.array(scene.owners, np.int64)],
     )
 
 

@@ -143,17 +143,11 @@ def build_wild_scene(
             _add_object(scene, plot, name, x, y)
             scene.truth.append((x, y, np.nan, objects.kind))
             scene.owners.append(len(scene.kinds) - 1)
-    truth = TruthTrees(
-        np.array([row[0] for row in scene.truth]),
-        np.array([row[1] for row in scene.truth]),
-        np.array([row[2] for row in scene.truth]),
-        tuple(row[3] for row in scene.truth),
-    )
     return lidar, SimulatedScene(
         terrain=scene.terrain,
         still=scene.solids.build(),
         persons=(),
-        truth=truth,
+        truth=scene.true_objects(),
         kinds=tuple(scene.kinds),
         owners=tuple(scene.owners),
         wind=_draw("wind", rng),

@@ -75,10 +75,9 @@ def test_the_same_request_drives_the_same_path():
 def test_on_a_loop_the_robot_keeps_to_the_course_and_to_its_speed():
     angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
     course = lay_course(np.stack([2.0 * np.cos(angle), 2.0 * np.sin(angle)], axis=1), closed=True)
-    drive, clearances = obstacle_aware_drive(course, 0.9, crossing().scene, MOUNTING, 1, 20.0)
+    drive = obstacle_aware_drive(course, 0.9, crossing().scene, MOUNTING, 1, 20.0)
     assert drive.yaw[-1] > 2.0 * np.pi
     assert drive.speed.max() <= speed_limit(course, 0.9).max() + 1e-9
-    assert {clearance.zone for clearance in clearances} <= set(Zone)
     np.testing.assert_allclose(
         np.hypot(np.diff(drive.x), np.diff(drive.y)) * RATE_HZ, drive.speed[1:], atol=0.02
     )
