@@ -62,7 +62,7 @@ CLI_CHANGES = {
     "classification.tree_share": 0.45,
 }
 # Parameters of 0.1.0 that no longer exist.
-REMOVED = {"tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"}
+REMOVED = {"shape.plane", "tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"}
 NAMES_OF_0_1_0 = {
     "shape.split_slices": "shape.slices",
     "slam.independent_views_max": "slam.looks",

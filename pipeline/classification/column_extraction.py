@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.classification.voxel_map import SIDE, SLICE, SLICES
+from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int, Int32
@@ -103,18 +104,11 @@ def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
     1,)."""
     across = int(np.ceil((side + 2 * MARGIN) / BUCKET))
     bucket = np.empty(mean.shape[0], np.int64)
-    bounds = np.zeros(across * across + 1, np.int64)
     for i in range(mean.shape[0]):
         a = min(max(int((mean[i, 0] - low[0] + MARGIN) / BUCKET), 0), across - 1)
         b = min(max(int((mean[i, 1] - low[1] + MARGIN) / BUCKET), 0), across - 1)
         bucket[i] = a * across + b
-        bounds[bucket[i] + 1] += 1
-    bounds = np.cumsum(bounds)
-    place, order = bounds[:-1].copy(), np.empty(mean.shape[0], np.int64)
-    for i in range(mean.shape[0]):
-        order[place[bucket[i]]] = i
-        place[bucket[i]] += 1
-    return order, bounds
+    return group_rows(bucket, across * across)
 
 
 @compiled

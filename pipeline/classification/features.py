@@ -123,10 +123,10 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
     out[k + 13] = above / max(above + inside, 1.0)
     out[k + 14] = absent / max(present + absent, 1.0)
     out[k + 15] = np.log(1.0 + inside / some)
-    _shape(rows, last, out[k + 16 : k + 19])
+    out[k + 16], out[k + 17], out[k + 18] = _widths(rows, 1, min(last + 1, SLICES))
     out[k + 19] = last * SLICE / max(out[k + 6], SLICE)
     _circle(rows, last, out[k + 20 : k + 23])
-    _above(rows, last, out[k + 23 : k + 25])
+    out[k + 23], out[k + 24], _ = _widths(rows, last + 1, SLICES)
     out[k + 25] = rows[1:HIGH, 3].sum()
     for b in range(4):
         _nearer(rows, BANDS[b, 0], BANDS[b, 1], out[k + 26 + b : k + 31 + b : 4])
@@ -175,11 +175,17 @@ def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
 
 
 @compiled
-def _shape(rows: Float, last: int, out: Float) -> None:
-    """Of the slices up to `last`: mean standard deviation of the inside across and along its long side [m],
-    and the relative variation of the width."""
+def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
+    """Return the mean standard deviations of the inside of slices across and along its long side [m], and the
+    relative variation of the width; the former are UNSEEN where no slice has two voxels. Above the clean
+    slices the plate of a sign is flat, foliage is not.
+
+    Args:
+        rows: Profile of the column.
+        first, end: First slice, and one past the last slice.
+    """
     xx, xy, yy, n, total, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for s in range(1, min(last + 1, SLICES)):
+    for s in range(first, end):
         if rows[s, 3] >= 2.0:
             n += 1.0
             xx += rows[s, 8]
@@ -189,10 +195,11 @@ def _shape(rows: Float, last: int, out: Float) -> None:
             total += wide
             squares += wide * wide
     some = max(n, 1.0)
+    uneven = np.sqrt(max(squares / some - (total / some) ** 2, 0.0)) / max(total / some, 0.01)
+    if n == 0.0:
+        return UNSEEN, UNSEEN, uneven
     middle, half = 0.5 * (xx + yy) / some, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy) / some
-    out[0] = np.sqrt(max(middle - half, 0.0)) if n > 0.0 else UNSEEN
-    out[1] = np.sqrt(max(middle + half, 0.0)) if n > 0.0 else UNSEEN
-    out[2] = np.sqrt(max(squares / some - (total / some) ** 2, 0.0)) / max(total / some, 0.01)
+    return np.sqrt(max(middle - half, 0.0)), np.sqrt(max(middle + half, 0.0)), uneven
 
 
 @compiled
@@ -223,23 +230,6 @@ def _circle(rows: Float, last: int, out: Float) -> None:
     out[0] = min(radius, 1.0)
     out[1] = np.sqrt(max(misfit, 0.0)) / (2.0 * radius)
     out[2] = out[1] / out[0]
-
-
-@compiled
-def _above(rows: Float, last: int, out: Float) -> None:
-    """Standard deviations of the returns above the clean slices, across and along their long side [m]: the
-    plate of a sign is flat, foliage is not."""
-    n, xx, xy, yy = 0.0, 0.0, 0.0, 0.0
-    for s in range(last + 1, SLICES):
-        if rows[s, 3] >= 2.0:
-            n += 1.0
-            xx += rows[s, 8]
-            xy += rows[s, 9]
-            yy += rows[s, 10]
-    some = max(n, 1.0)
-    middle, half = 0.5 * (xx + yy) / some, np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy) / some
-    out[0] = np.sqrt(max(middle - half, 0.0)) if n > 0.0 else UNSEEN
-    out[1] = np.sqrt(max(middle + half, 0.0)) if n > 0.0 else UNSEEN
 
 
 @compiled

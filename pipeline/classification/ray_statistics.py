@@ -38,10 +38,8 @@ class ScanView:
 
 
 ELEVATIONS, LOWEST, STEP = 96, -0.84, 0.0175  # of a depth image, as tangents; a step is about one degree
-MET, PASSED = (
-    0.45,
-    0.5,
-)  # m; a ray that ends this near to the axis met the column, one this far behind passed it
+# m; a ray that ends this near to the axis met the column, one this far behind passed it.
+MET, PASSED = 0.45, 0.5
 NEAR = 0.6  # m; a return this near to a column belongs to it
 
 

@@ -201,13 +201,21 @@ class VoxelMap:
         return fresh
 
 
+@compiled
 def keys_of(mean: Float32) -> Int:
-    """Return the cells of positions of shape (N, 3), shape (N,); -1 outside of the map."""
-    place = mean.astype(np.float64)
-    cell = np.floor(place / np.array([SIDE, SIDE, SLICE]))
-    inside = (cell[:, 2] >= 0) & (cell[:, 2] < SLICES) & np.all(np.abs(place[:, :2]) < _FARTHEST, axis=1)
-    ix, iy, h = np.where(inside[:, None], cell, 0.0).astype(np.int64).T
-    return np.where(inside, (ix + _OFFSET << 36) | (iy + _OFFSET << 5) | h, -1)
+    """Return the key of each position, int64, shape (N,): cell along x and y and the slice, -1 outside of the
+    map.
+
+    Args:
+        mean: Positions, the third column the height above the ground, shape (N, 3) [m].
+    """
+    keys = np.full(mean.shape[0], -1, np.int64)
+    for i in range(mean.shape[0]):
+        x, y, h = mean[i, 0], mean[i, 1], np.floor(mean[i, 2] / SLICE)
+        if 0 <= h < SLICES and abs(x) < _FARTHEST and abs(y) < _FARTHEST:  # false for NaN
+            ix, iy = np.int64(np.floor(x / SIDE)) + _OFFSET, np.int64(np.floor(y / SIDE)) + _OFFSET
+            keys[i] = (ix << 36) | (iy << 5) | np.int64(h)
+    return keys
 
 
 def tiles_of(keys: Int) -> Int:
@@ -314,25 +322,23 @@ def _add(
     """Return the first point without room (the number of points when all fit), voxels and tiles in use."""
     keys, slot, mean, latest = tables.key, tables.slot, tables.mean, tables.latest
     returns, scans, home, tile_returns = tables.returns, tables.scans, tables.home, tables.tile_returns
-    wanted, guess = _guess(points, begin, keys, slot)
+    wanted = keys_of(points)
     row, last = np.int64(-1), np.int64(-1)
     for i in range(begin, points.shape[0]):
         key = wanted[i]
         if key < 0:
             continue
         if key != last:
-            row = guess[i]
+            at = _find(key, keys, slot)
+            row = np.int64(slot[at]) - 1
             if row < 0:
-                at = _find(key, keys, slot)
-                row = np.int64(slot[at]) - 1
-                if row < 0:
-                    if used == keys.shape[0] or tiles == tables.tile_key.shape[0]:
-                        return i, used, tiles
-                    row = np.int64(used)
-                    used += 1
-                    slot[at] = used
-                    keys[row], latest[row] = key, -1
-                    tiles = _link(row, tables, tiles)
+                if used == keys.shape[0] or tiles == tables.tile_key.shape[0]:
+                    return i, used, tiles
+                row = np.int64(used)
+                used += 1
+                slot[at] = used
+                keys[row], latest[row] = key, -1
+                tiles = _link(row, tables, tiles)
             last = key
         returns[row] += 1
         for a in range(3):
@@ -342,33 +348,6 @@ def _add(
             scans[row] += 1
         tile_returns[home[row]] += 1
     return points.shape[0], used, tiles
-
-
-@compiled
-def _guess(points: Float32, begin: int, keys: Int, slot: Int32) -> tuple[Int, Int]:
-    """Return the key of each point, -1 outside of the map, and the row of its voxel where the hash table
-    gives it at the first position, else -1.
-
-    The table does not fit into the caches, so lookups take most of the time. Here no lookup depends on
-    another one, so the processor overlaps them.
-    """
-    n = points.shape[0]
-    wanted, guess = np.empty(n, np.int64), np.empty(n, np.int64)
-    for i in range(begin, n):
-        x, y = points[i, 0], points[i, 1]
-        h = np.int64(np.floor(points[i, 2] / SLICE))
-        # The comparison is false for NaN.
-        if not (0 <= h < SLICES and abs(x) < _FARTHEST and abs(y) < _FARTHEST):
-            wanted[i] = -1
-            continue
-        ix, iy = np.int64(np.floor(x / SIDE)) + _OFFSET, np.int64(np.floor(y / SIDE)) + _OFFSET
-        wanted[i] = (ix << 36) | (iy << 5) | h
-    mask = slot.shape[0] - 1
-    for i in range(begin, n):
-        guess[i] = slot[_first_place(wanted[i], mask)] - 1
-    for i in range(begin, n):
-        guess[i] = guess[i] if keys[max(guess[i], 0)] == wanted[i] else -1
-    return wanted, guess
 
 
 @compiled
@@ -398,7 +377,6 @@ def _rows_around(tx: int, ty: int, margin: float, tables: _Tables) -> Int:
 
 
 LARGEST_ROOM = 1 << 25  # rows; the parameters allow less
-MASK = (1 << 31) - 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -460,7 +438,6 @@ class PackedVoxelMap:
             raise ValueError("the columns of the voxels have other lengths")
         if n and (self.key.min() < 0 or len(np.unique(self.key)) < n):
             raise ValueError("two voxels are one")
-        tile = ((self.key >> 36) // TILE_CELLS << 31) | ((self.key >> 5) & MASK) // TILE_CELLS
-        if len(np.unique(tile)) != tiles:
+        if len(np.unique(tiles_of(self.key))) != tiles:
             raise ValueError("the tiles are not those of the voxels")
         return self

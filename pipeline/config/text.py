@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import tomllib
 from typing import Any
 
@@ -77,25 +76,16 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
             raise ParameterError(
                 f"{stage} is not inside a stage", where=where, remedy="Write it below a line [stage]"
             )
-    floats = {spec.name for spec in field_specs() if spec.kind == "float"}
     values = current_names({f"{stage}.{name}": v for stage, vs in given.items() for name, v in vs.items()})
     tree: dict[str, Any] = base.model_dump()
     for dotted, value in values.items():
         stage, _, name = dotted.partition(".")
         # TOML distinguishes 1 from 1.0; both are valid for a floating-point parameter.
-        integral = dotted in floats and type(value) is int
-        tree.setdefault(stage, {})[name] = _as_float(value) if integral else value
+        tree.setdefault(stage, {})[name] = value
     try:
         return validated(tree)
     except ParameterError as error:
         raise ParameterError(error.what, where=where) from None
-
-
-def _as_float(value: int) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf  # rejected by every bound
 
 
 def markdown_table(presets: dict[str, Parameters]) -> str:

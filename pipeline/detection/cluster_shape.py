@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.config.stages import Shape
 from pipeline.detection.cluster_splitting import split_trunks
-from pipeline.detection.clustering import group_rows
 from pipeline.detection.cylinder_fit import COLUMNS, fit_stems
+from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Clusters, Float32, Int, Labels, Sensor, Verdict

@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.detection.clustering import group_rows
 from pipeline.detection.cylinder_fit import BARK
+from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Clusters, Float32, Int, Int32, Labels, Sensor

@@ -25,8 +25,6 @@ from pipeline.types.records import Bool, Float32, Int, Int32, Labels, Sensor
 
 _AXIS_BITS = 21
 _FARTHEST = float(1 << _AXIS_BITS)
-_DIGIT_BITS = 10  # of the counting sort: the table fits the first-level cache
-_DIGIT = 1 << _DIGIT_BITS
 _ROUNDING = 1.0 - 1e-9  # keeps the diagonal of a cell below eps in floating point
 _REACH = 2  # cells along each axis
 _AXES = 3
@@ -69,11 +67,14 @@ def dbscan_grid(
     if n == 0:
         return np.zeros(0, np.int32), np.zeros(0, np.bool_)
     side = eps / np.sqrt(dimensions) * _ROUNDING
-    cells = _cells(points, side)
-    if int(cells.max()) + 2 >= 1 << _AXIS_BITS:
+    # A margin of two cells on every side prevents that the key of a neighbour wraps into another row.
+    cells = np.minimum((points - points.min(axis=0)) / side, _FARTHEST).astype(np.int64) + _REACH
+    if int(cells.max()) + _REACH >= 1 << _AXIS_BITS:
         raise ValueError("the cloud is too wide for cells of this eps")
+    key = cells @ np.array([1 << (_AXIS_BITS * axis) for axis in reversed(range(dimensions))], np.int64)
     weight = np.ones(n, np.int32) if weight is None else weight
-    return _cluster(points, cells, _row_offsets(dimensions), eps * eps, min_points, weight)
+    order = np.argsort(key, kind="stable")
+    return _cluster(points, key, order, _row_offsets(dimensions), eps * eps, min_points, weight)
 
 
 @cache
@@ -88,72 +89,23 @@ def _row_offsets(dimensions: int) -> Int:
 
 
 @compiled
-def _cells(points: Float, side: float) -> Int32:
-    """Return the cell index of each point along each axis, int32, shape (N, dimensions).
-
-    A margin of two cells on every side prevents that the key of a neighbour wraps into another row. Indices
-    above the maximum are clipped to one value beyond it.
-    """
-    cells = np.empty(points.shape, np.int32)
-    for a in range(points.shape[1]):
-        low = points[0, a]
-        for i in range(points.shape[0]):
-            low = min(low, points[i, a])
-        for i in range(points.shape[0]):
-            cells[i, a] = np.int32(min((points[i, a] - low) / side, _FARTHEST)) + 2
-    return cells
-
-
-@compiled
-def _by_key(cells: Int32) -> Int:
-    """Return the order of the points sorted by cell, first axis first; the sort is stable.
-
-    The sort is a counting (radix) sort from the least significant digit; an axis with few cells has one
-    digit.
-    """
-    n = cells.shape[0]
-    order, other = np.arange(n), np.empty(n, np.int64)
-    place = np.empty(_DIGIT + 1, np.int64)
-    for a in range(cells.shape[1] - 1, -1, -1):
-        most = 0
-        for i in range(n):
-            most = max(most, cells[i, a])
-        shift = 0
-        while most >> shift > 0:
-            place[:] = 0
-            for i in range(n):
-                place[((cells[i, a] >> shift) & (_DIGIT - 1)) + 1] += 1
-            for d in range(_DIGIT):
-                place[d + 1] += place[d]
-            for k in range(n):
-                d = (cells[order[k], a] >> shift) & (_DIGIT - 1)
-                other[place[d]] = order[k]
-                place[d] += 1
-            order, other = other, order
-            shift += _DIGIT_BITS
-    return order
-
-
-@compiled
 def _cluster(
-    points: Float, cells: Int32, rows: Int, eps2: float, min_points: int, weight: Int32
+    points: Float, key_of: Int, order: Int, rows: Int, eps2: float, min_points: int, weight: Int32
 ) -> tuple[Int32, Bool]:
     """Sort the points by cell and label them; see `dbscan_grid`."""
     n = points.shape[0]
-    order = _by_key(cells)
     keys, bounds = np.empty(n, np.int64), np.empty(n + 1, np.int64)
     # A third axis of zeros does not change distances in the plane.
     laid, weight_laid = np.zeros((_AXES, n)), np.empty_like(weight)
     last, filled = np.int64(-1), 0
     for k in range(n):
         i = order[k]
-        key = np.int64(0)
         for a in range(points.shape[1]):
-            key = (key << _AXIS_BITS) | np.int64(cells[i, a])
             laid[a, k] = points[i, a]
         weight_laid[k] = weight[i]
-        if key != last:
-            keys[filled], bounds[filled], last = key, k, key
+        if key_of[i] != last:
+            keys[filled] = last = key_of[i]
+            bounds[filled] = k
             filled += 1
     bounds[filled] = n
     keys, bounds = keys[:filled], bounds[: filled + 1]
@@ -163,7 +115,7 @@ def _cluster(
     parent = _join(cores, rows, reach, eps2)
     label, core_out = np.full(n, -1, np.int32), np.empty(n, np.bool_)
     for c in range(filled):
-        root = _root(parent, c)
+        root = root_of(parent, c)
         for i in range(bounds[c], bounds[c + 1]):
             core_out[order[i]] = core[i]
             if core[i]:
@@ -171,7 +123,7 @@ def _cluster(
                 continue
             d = _cell_of_nearest_core(laid, i, cores, c, reach, eps2)
             if d >= 0:
-                label[order[i]] = _root(parent, d)
+                label[order[i]] = root_of(parent, d)
     return number_by_first_point(label), core_out
 
 
@@ -289,14 +241,14 @@ def _join(cores: Cores, rows: Int, reach: Int32, eps2: float) -> Int:
             for d in range(max(reach[c, r, 0], c + 1), reach[c, r, 1]):
                 if cores.bounds[d] == cores.bounds[d + 1]:
                     continue
-                a, b = _root(parent, c), _root(parent, d)
+                a, b = root_of(parent, c), root_of(parent, d)
                 if a != b and _touch(cores, c, d, eps2):
                     parent[max(a, b)] = min(a, b)
     return parent
 
 
 @compiled
-def _root(parent: Int, c: int) -> int:
+def root_of(parent: Int, c: int) -> int:
     while parent[c] != c:
         parent[c] = parent[parent[c]]
         c = parent[c]
@@ -500,25 +452,3 @@ def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
     label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points, weight).label
     clusters = int(label.max(initial=-1)) + 1
     return Labels(label, clusters, np.zeros(clusters, np.bool_))
-
-
-@compiled
-def group_rows(label: Int32, clusters: int) -> tuple[Int, Int]:
-    """Sort the rows of the points by cluster, without noise.
-
-    Returns:
-        Rows sorted by cluster, stable, shape (points in clusters,); and the index of the first row of each
-        cluster in that order, shape (clusters + 1,).
-    """
-    bounds = np.zeros(clusters + 1, np.int64)
-    for k in label:
-        if k >= 0:
-            bounds[k + 1] += 1
-    bounds = np.cumsum(bounds)
-    place = bounds[:-1].copy()
-    order = np.empty(bounds[clusters], np.int64)
-    for i in range(label.shape[0]):
-        if label[i] >= 0:
-            order[place[label[i]]] = i
-            place[label[i]] += 1
-    return order, bounds

@@ -26,7 +26,7 @@ import numpy as np
 
 from pipeline.geometry.gaussian import factorise, solve
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled, compiled_borrowing, compiled_sums
+from pipeline.jit import compiled, compiled_sums
 from pipeline.types.records import Int, Sensor
 
 RAY = 4
@@ -179,14 +179,13 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf
         y += rays[1, i] * rays[2, i]
     away = max(np.sqrt(x * x + y * y), 1e-9)
     c, s = x / away, y / away
-    across, ordered, front = np.empty(n), np.empty(n), np.empty(n)
+    across, front = np.empty(n), np.empty(n)
     shift = c * lean_y - s * lean_x
     for i in range(n):
         across[i] = rays[2, i] * (c * rays[1, i] - s * rays[0, i]) - shift * rays[3, i]
-        ordered[i] = across[i]
-    first = quantile(ordered, 0, n, 0.25)
-    middle = quantile(ordered, int(0.25 * (n - 1)), n, 0.5)
-    radius = quantile(ordered, int(0.5 * (n - 1)), n, 0.75) - first
+    ordered = np.sort(across)
+    first, middle = quantile(ordered, 0.25), quantile(ordered, 0.5)
+    radius = quantile(ordered, 0.75) - first
     m = 0
     for i in range(n):
         if abs(across[i] - middle) <= max(0.5 * radius, 0.02):
@@ -196,54 +195,17 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf
         for i in range(n):
             front[i] = rays[2, i] * (c * rays[0, i] + s * rays[1, i])
         m = n
-    reach = quantile(front, 0, m, 0.5)
+    reach = quantile(np.sort(front[:m]), 0.5)
     return MiddleHalf(c, s, middle, c * reach - s * middle, s * reach + c * middle, radius)
 
 
-@compiled_borrowing
-def quantile(numbers: Float, low: int, n: int, part: float) -> float:
-    """Return the quantile `part` of the first n numbers with linear interpolation.
-
-    The numbers are partially reordered in place, which takes half the time of a sort.
-
-    Args:
-        numbers: shape (capacity,).
-        low: Row before which no number is greater than any number from it on: the row of a smaller quantile
-            computed before, or 0.
-        n: Numbers to use.
-        part: Between 0 and 1.
-    """
-    at = part * (n - 1)
+@compiled
+def quantile(ordered: Float, part: float) -> float:
+    """Return the quantile `part`, 0 to 1, of ascending numbers, shape (N,), with linear interpolation."""
+    at = part * (ordered.shape[0] - 1)
     k = int(at)
-    _put_in_place(numbers, low, n, k)
-    after = numbers[k]
-    if k + 1 < n:
-        after = numbers[k + 1]
-        for i in range(k + 2, n):
-            after = min(after, numbers[i])
-    return float(numbers[k] + (at - k) * (after - numbers[k]))
-
-
-@compiled_borrowing
-def _put_in_place(numbers: Float, low: int, n: int, k: int) -> None:
-    """Reorder rows low..n-1 so that row k holds its sorted value, smaller ones before it (quickselect, Hoare
-    1961)."""
-    high = n - 1
-    while low < high:
-        pivot, i, j = numbers[k], low, high
-        while i <= j:
-            while numbers[i] < pivot:
-                i += 1
-            while pivot < numbers[j]:
-                j -= 1
-            if i <= j:
-                numbers[i], numbers[j] = numbers[j], numbers[i]
-                i += 1
-                j -= 1
-        if j < k:
-            low = i
-        if k < i:
-            high = j
+    after = ordered[min(k + 1, ordered.shape[0] - 1)]
+    return float(ordered[k] + (at - k) * (after - ordered[k]))
 
 
 @compiled

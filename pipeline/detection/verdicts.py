@@ -9,8 +9,7 @@ import numpy as np
 
 from pipeline.config.stages import Detection
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled
-from pipeline.types.records import Bool, Clusters, Detections, Int, Verdict
+from pipeline.types.records import Bool, Clusters, Detections, Verdict
 
 
 def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
@@ -25,55 +24,24 @@ def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
 def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) -> Detections:
     """Return the clusters with the verdict TREE in the base frame (Eq. 8: p_base = T_base_lidar p_lidar)."""
     rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
-    centre, covariance = _seen_from_base(
-        rows,
-        clusters.centre,
-        clusters.covariance,
-        sensor_offset,
-        parameters.sigma_range,
-        float(np.radians(parameters.sigma_bearing)),
-    )
+    place, covariance = clusters.centre[rows], clusters.covariance[rows]
+    reach = np.maximum(np.sqrt(place[:, 0] * place[:, 0] + place[:, 1] * place[:, 1]), 1e-6)
+    ux, uy = (place / reach[:, None]).T
+    along = parameters.sigma_range * parameters.sigma_range
+    across = (reach * np.radians(parameters.sigma_bearing)) ** 2
+    covariance[:, 0, 0] = covariance[:, 0, 0] + along * ux * ux + across * uy * uy
+    covariance[:, 0, 1] += (along - across) * ux * uy
+    covariance[:, 1, 0] += (along - across) * ux * uy
+    covariance[:, 1, 1] = covariance[:, 1, 1] + along * uy * uy + across * ux * ux
     return Detections(
         cluster=rows,
-        centre=centre,
+        centre=place + sensor_offset[:2],
         covariance=covariance,
         radius=clusters.radius[rows],
         radius_sigma=clusters.radius_sigma[rows],
         arc=clusters.arc[rows],
         eccentricity=clusters.eccentricity[rows],
     )
-
-
-@compiled
-def _seen_from_base(
-    rows: Int,
-    centre: Float,
-    covariance: Float,
-    sensor_offset: Float,
-    sigma_range: float,
-    sigma_bearing: float,
-) -> tuple[Float, Float]:
-    """Return centres and covariances of the given clusters in the base frame.
-
-    The covariance is that of the fit plus `sigma_range` along the ray and `sigma_bearing` times the range
-    across it.
-
-    Returns:
-        Centres, shape (D, 2) [m]; covariances, shape (D, 2, 2) [m^2].
-    """
-    place, spread = np.empty((len(rows), 2)), np.empty((len(rows), 2, 2))
-    for d in range(len(rows)):
-        x, y = centre[rows[d], 0], centre[rows[d], 1]
-        reach = max(np.sqrt(x * x + y * y), 1e-6)
-        ux, uy = x / reach, y / reach
-        along, across = sigma_range * sigma_range, (reach * sigma_bearing) ** 2
-        C, R = covariance[rows[d]], spread[d]
-        R[0, 0] = C[0, 0] + along * ux * ux + across * uy * uy
-        R[0, 1] = C[0, 1] + (along - across) * ux * uy
-        R[1, 0] = C[1, 0] + (along - across) * ux * uy
-        R[1, 1] = C[1, 1] + along * uy * uy + across * ux * ux
-        place[d, 0], place[d, 1] = x + sensor_offset[0], y + sensor_offset[1]
-    return place, spread
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,19 +79,10 @@ def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
     cut = c.cut & p.whole
     width, up = np.maximum(c.extent[:, 0], c.extent[:, 1]), c.extent[:, 2]
     return (
-        Check(Verdict.HIDDEN, "edge hidden", "", c.hidden.astype(np.float64), "", np.nan, "", c.hidden),
+        _flag(Verdict.HIDDEN, "edge hidden", c.hidden, ""),
         _at_most(Verdict.TOO_THICK, "width", "m", width, p.size_max, "size_max"),
         _at_least(Verdict.TOO_LOW, "visible height", "m", up, p.height_extent_min, "height_extent_min"),
-        Check(
-            Verdict.AT_BORDER,
-            "cut off at the border",
-            "",
-            cut.astype(np.float64),
-            "",
-            np.nan,
-            "detection.whole" if p.whole else "",
-            cut,
-        ),
+        _flag(Verdict.AT_BORDER, "cut off at the border", cut, "detection.whole" if p.whole else ""),
         _at_least(Verdict.TOO_ROUND, "eccentricity", "", c.eccentricity, p.e_min, "e_min"),
         _at_most(Verdict.TOO_LONG, "eccentricity", "", c.eccentricity, p.e_max, "e_max"),
         _at_most(
@@ -147,6 +106,10 @@ def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
         _at_least(Verdict.TOO_THIN, "radius", "m", radius, p.radius_min, "radius_min"),
         _at_most(Verdict.TOO_THICK, "radius", "m", radius, p.radius_max, "radius_max"),
     )
+
+
+def _flag(verdict: Verdict, figure: str, is_set: Bool, parameter: str) -> Check:
+    return Check(verdict, figure, "", is_set.astype(np.float64), "", np.nan, parameter, is_set)
 
 
 def _at_least(verdict: Verdict, figure: str, unit: str, value: Float, limit: float, name: str) -> Check:

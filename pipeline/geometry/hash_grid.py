@@ -1,7 +1,8 @@
 """Hash grid: chains of positions by square cells of the plane, for searches within a radius.
 
 A search of the radius r uses cells with a side of 2 r (`per_metre`), so that all positions within r of a
-point are in two by two cells. The plane is folded into SIDE x SIDE cells.
+point are in two by two cells. The plane is folded into SIDE x SIDE cells. `group_rows` sorts rows by cell or
+by cluster instead, for loops over whole groups.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 
 Bool = NDArray[np.bool_]
+Int = NDArray[np.int64]
 Int32 = NDArray[np.int32]
 
 SIDE = 32  # cells per side; the plane is folded into these cells, because a search covers fewer
@@ -141,3 +143,29 @@ def nearest_in(cells: Cells, mean: Float, x: float, y: float, reach: float, scal
                 best, nearest = d, at
             at = cells.following[at]
     return nearest
+
+
+@compiled
+def group_rows(label: Int | Int32, groups: int) -> tuple[Int, Int]:
+    """Sort rows by their group; negative labels belong to none.
+
+    Args:
+        label: Group of each row, shape (N,).
+        groups: Number of groups.
+
+    Returns:
+        Rows sorted by group, stable, int64; and the index of the first row of each group in that order,
+        int64, shape (groups + 1,).
+    """
+    bounds = np.zeros(groups + 1, np.int64)
+    for k in label:
+        if k >= 0:
+            bounds[k + 1] += 1
+    bounds = np.cumsum(bounds)
+    place = bounds[:-1].copy()
+    order = np.empty(bounds[groups], np.int64)
+    for i in range(label.shape[0]):
+        if label[i] >= 0:
+            order[place[label[i]]] = i
+            place[label[i]] += 1
+    return order, bounds

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.detection.clustering import dbscan_grid
+from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int
@@ -267,10 +268,7 @@ def cut(points: Float32) -> Slices:
     """
     steps = round((HIGHEST - LOWEST) / STEP)
     step = np.floor((points[:, 3] - LOWEST) / STEP).astype(np.int64)
-    inside = (step >= 0) & (step < steps)
-    points, step = points[inside], step[inside]
-    order = np.argsort(step, kind="stable")
-    bounds = np.searchsorted(step[order], np.arange(steps + 1))
+    order, bounds = group_rows(np.where(step < steps, step, -1), steps)
     chosen = points[order][:, [0, 1, 3]].astype(np.float64)
     return Slices(chosen, bounds, _spacing(chosen))
 
@@ -303,10 +301,7 @@ def find_circles(slices: Slices, r_min: float, r_max: float) -> Float:
     for k in range(slices.count):
         xy = np.ascontiguousarray(slices.slab(k)[:, :2])
         label = dbscan_grid(xy, eps, 4)[0]
-        order = np.argsort(label, kind="stable")
-        order = order[label[order] >= 0]
-        clusters = int(label.max(initial=-1)) + 1
-        bounds = np.searchsorted(label[order], np.arange(clusters + 1))
+        order, bounds = group_rows(label, int(label.max(initial=-1)) + 1)
         found.append(_circles(xy[order], bounds, tolerance, r_min, r_max, float(k)))
     return np.concatenate(found)
 
@@ -345,15 +340,9 @@ def _in_windows(xy: Float, x0: float, y0: float, wide: float) -> tuple[Int, Int,
     """
     across = int(wide / WINDOW) + 1
     cell = np.empty(xy.shape[0], np.int64)
-    cells = np.zeros(across * across + 1, np.int64)
     for i in range(xy.shape[0]):
         cell[i] = int((xy[i, 0] - x0) / WINDOW) * across + int((xy[i, 1] - y0) / WINDOW)
-        cells[cell[i] + 1] += 1
-    cells = np.cumsum(cells)
-    place, order = cells[:-1].copy(), np.empty(xy.shape[0], np.int64)
-    for i in range(xy.shape[0]):
-        order[place[cell[i]]] = i
-        place[cell[i]] += 1
+    order, cells = group_rows(cell, across * across)
     return order, cells, across
 
 

@@ -21,9 +21,7 @@ FILLED = 0.7  # least share of the slices between the lowest and the highest wit
 # with the number of # slices.
 ROUGH, UNEVEN, CROOKED, WOBBLE = 0.2, 0.08, 0.2, 0.04
 USUAL, FORGIVEN = 15.0, (0.8, 1.4)
-LEAST_CONTRAST = (
-    2.5  # ratio of densities on the surface and next to it; uniformly distributed points give 1 to 1.5
-)
+LEAST_CONTRAST = 2.5  # ratio of densities on the surface and next to it; uniform points give 1 to 1.5
 LEAST_POINTS = 14  # median points on a circle; with fewer, chance places circles above one another
 UNSURE = 0.08  # largest sigma of the radius as a share of it
 LEAN = np.radians(25.0)

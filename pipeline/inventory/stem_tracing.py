@@ -3,12 +3,16 @@ voxels, which the random forest classifies."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.classification.column_extraction import MARGIN, examine
 from pipeline.classification.features import COUNT, features
 from pipeline.classification.forest import CLASSES, Forest, vote
 from pipeline.classification.voxel_map import SLICE, SLICES, TILE, VoxelMap
+from pipeline.detection.clustering import root_of
+from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.inventory.cross_sections import (
     ARC,
@@ -19,6 +23,7 @@ from pipeline.inventory.cross_sections import (
     SLAB,
     STEP,
     THICK,
+    TUKEY,
     Slices,
     fit_circle,
     share_inside,
@@ -35,7 +40,6 @@ REACH = 0.25  # m around the circle of the previous slice in which points are us
 WANDER, WANDER_OF_RADIUS = 0.06, 0.25  # m, and share of the radius; largest offset of the next circle
 LOST = 5  # slices without a circle after which a stem ends
 BUCKET = 0.5  # m
-TUKEY = 4.7
 
 
 def chain(circles: Float) -> tuple[Int, int]:
@@ -73,19 +77,11 @@ def _link(circles: Float, bounds: Int) -> Int:
             if dx * dx + dy * dy < near * near:
                 r, s = circles[i, 2], circles[j, 2]
                 if abs(r - s) < ALIKE * max(r, s) + 0.01:
-                    a, b = _root(parent, i), _root(parent, j)
+                    a, b = root_of(parent, i), root_of(parent, j)
                     parent[max(a, b)] = min(a, b)
     for i in range(n):
-        parent[i] = _root(parent, i)
+        parent[i] = root_of(parent, i)
     return parent
-
-
-@compiled
-def _root(parent: Int, c: int) -> int:
-    while parent[c] != c:
-        parent[c] = parent[parent[c]]
-        c = parent[c]
-    return c
 
 
 def follow(slices: Slices, circles: Float, number: Int, stems: int, r_min: float, r_max: float) -> Float:
@@ -101,51 +97,49 @@ def follow(slices: Slices, circles: Float, number: Int, stems: int, r_min: float
     Returns:
         Values of `fit_circle`, NaN in slices without a circle, shape (stems, slices, FIGURES).
     """
-    buckets = _Buckets(slices)
-    return _follow(
-        buckets.xy,
-        buckets.start,
-        buckets.low,
-        buckets.across,
-        slices.count,
-        circles,
-        number,
-        stems,
-        r_min,
-        r_max,
-    )
+    return _follow(_buckets_of(slices), slices.count, circles, number, stems, r_min, r_max)
 
 
-class _Buckets:
-    """The points of each step of height in horizontal square buckets."""
+class _Buckets(NamedTuple):
+    """The points of each step of height in horizontal square buckets.
 
-    def __init__(self, slices: Slices) -> None:
-        xy = slices.points[:, :2]
-        steps = len(slices.bounds) - 1
-        self.low = xy.min(axis=0) if len(xy) else np.zeros(2)
-        high = xy.max(axis=0) if len(xy) else np.zeros(2)
-        self.across = np.floor((high - self.low) / BUCKET).astype(np.int64) + 1
-        cell = np.floor((xy - self.low) / BUCKET).astype(np.int64)
-        step = np.repeat(np.arange(steps), np.diff(slices.bounds))
-        each = int(self.across[0] * self.across[1])
-        key = step * each + cell[:, 0] * self.across[1] + cell[:, 1]
-        order = np.argsort(key, kind="stable")
-        self.xy = np.ascontiguousarray(xy[order])
-        self.start = np.searchsorted(key[order], np.arange(steps * each + 1))
+    Attributes:
+        xy: Points sorted by step and bucket, shape (N, 2) [m].
+        start: First point of each bucket of each step, shape (steps * buckets + 1,).
+        low: Corner of the first bucket, shape (2,) [m].
+        across: Number of buckets along x and y, shape (2,).
+    """
+
+    xy: Float
+    start: Int
+    low: Float
+    across: Int
+
+
+def _buckets_of(slices: Slices) -> _Buckets:
+    xy = slices.points[:, :2]
+    steps = len(slices.bounds) - 1
+    low = xy.min(axis=0) if len(xy) else np.zeros(2)
+    high = xy.max(axis=0) if len(xy) else np.zeros(2)
+    across = np.floor((high - low) / BUCKET).astype(np.int64) + 1
+    cell = np.floor((xy - low) / BUCKET).astype(np.int64)
+    step = np.repeat(np.arange(steps), np.diff(slices.bounds))
+    each = int(across[0] * across[1])
+    order, start = group_rows(step * each + cell[:, 0] * across[1] + cell[:, 1], steps * each)
+    return _Buckets(np.ascontiguousarray(xy[order]), start, low, across)
 
 
 @compiled
-def _around(
-    xy: Float, start: Int, low: Float, across: Int, k: int, x: float, y: float, reach: float
-) -> Float:
+def _around(buckets: _Buckets, k: int, x: float, y: float, reach: float) -> Float:
     """Return the points of slice k within `reach` [m] of x, y [m], shape (M, 2).
 
     Args:
-        xy, start, low, across: Points of all slices in buckets, see `_Buckets`.
+        buckets: Points of all slices.
         k: Number of the slice.
         x, y: The position [m].
         reach: Radius [m].
     """
+    xy, start, low, across = buckets
     a0, a1 = int((x - reach - low[0]) / BUCKET), int((x + reach - low[0]) / BUCKET)
     b0, b1 = int((y - reach - low[1]) / BUCKET), int((y + reach - low[1]) / BUCKET)
     a0, a1, b0, b1 = max(a0, 0), min(a1, across[0] - 1), max(b0, 0), min(b1, across[1] - 1)
@@ -165,10 +159,7 @@ def _around(
 
 @compiled
 def _follow(
-    xy: Float,
-    start: Int,
-    low: Float,
-    across: Int,
+    buckets: _Buckets,
     slabs: int,
     circles: Float,
     number: Int,
@@ -192,7 +183,7 @@ def _follow(
             k = k0 if way == 1 else k0 - 1
             while 0 <= k < slabs and missed <= LOST:
                 x, y = x + lean_x, y + lean_y
-                near = _around(xy, start, low, across, k, x, y, r + REACH)
+                near = _around(buckets, k, x, y, r + REACH)
                 row[0], row[1], row[2] = x, y, r
                 if _fits(near, row, r_min, r_max, missed):
                     out[s, k] = row

@@ -149,7 +149,8 @@ def _supported(lowest: Float32, count: Int32) -> Float:
         count: Number of returns of each cell, shape (columns, rows).
     """
     columns, rows = count.shape
-    ground = np.full((columns, rows, 3), np.inf)
+    ground = np.zeros((columns, rows, 3))
+    ground[:, :, 2] = np.inf
     for a in range(columns):
         for b in range(rows):
             kept = min(count[a, b], KEPT)
@@ -162,10 +163,6 @@ def _supported(lowest: Float32, count: Int32) -> Float:
                     break
             for c in range(3):
                 ground[a, b, c] = lowest[a, b, chosen, c]
-    for a in range(columns):
-        for b in range(rows):
-            if ground[a, b, 2] == np.inf:
-                ground[a, b, 0] = ground[a, b, 1] = 0.0
     return ground
 
 

@@ -164,9 +164,7 @@ def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> SimulatedScene
     return SimulatedScene(
         terrain=SimulatedTerrain(np.zeros((1, 4))),
         still=SolidsBuilder().build(),
-        persons=(),
         truth=truth,
-        kinds=(),
     )
 
 

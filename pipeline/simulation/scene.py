@@ -85,9 +85,9 @@ class SimulatedScene:
 
     terrain: SimulatedTerrain
     still: Solids
-    persons: tuple[Person, ...]
     truth: TruthTrees
-    kinds: tuple[str, ...]
+    kinds: tuple[str, ...] = ()
+    persons: tuple[Person, ...] = ()
     owners: tuple[int, ...] = ()
     wind: float = 0.0
 

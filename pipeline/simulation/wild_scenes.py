@@ -73,10 +73,8 @@ DISTRIBUTIONS = {
 BARK = (0.005, 0.02)  # m; smallest and largest depth of furrows
 LOWER_STEM = 3.0  # m
 FORKED, DUAL = 0.15, 0.3  # share of forked stems, of spinning sensors that report two echoes
-DEAD_BRANCHES, PLANTS = (
-    (0, 9),
-    (2, 6),
-)  # numbers of dead branches and of plants at a stem, upper bound excluded
+# Numbers of dead branches and of plants at a stem, upper bound excluded.
+DEAD_BRANCHES, PLANTS = (0, 9), (2, 6)
 FREE_LANE = 0.3  # m; the robot drives where nothing grows
 GAP, CLEAR = 0.6, 0.8  # m; least distance between two stems, and of a stem from the path
 
@@ -146,7 +144,6 @@ def build_wild_scene(
     return lidar, SimulatedScene(
         terrain=scene.terrain,
         still=scene.solids.build(),
-        persons=(),
         truth=scene.true_objects(),
         kinds=tuple(scene.kinds),
         owners=tuple(scene.owners),

@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe, eccentricity, moments
-from pipeline.detection.clustering import group_rows
+from pipeline.geometry.hash_grid import group_rows
 from pipeline.types.records import Labels
 from tests.pipeline.strategies import SENSOR, arc, one_cluster
 

@@ -57,7 +57,7 @@ def test_a_sign_is_a_pole_and_its_plate():
     solids = scene.solids.build()
     assert scene.kinds[solids.owner[0]] == "pole"
     assert len(solids.kind) >= 2
-    assert not scene.trunks
+    assert not scene.truth
 
 
 def test_examples_of_a_street_know_trees_and_other_things():
