@@ -206,7 +206,7 @@ class ColumnClassifier:
         p, pose = self.parameters, view.T_map_base.as_array()
         here = _to_map(points, height, pose, view.sensor_offset, p.range_max)
         tiles = self._remember(here, scan, 1 << p.voxels_log2)
-        profiles = self._find_again(_joined(tiles, seen_higher(self.columns)))
+        profiles = self._extract_columns(_joined(tiles, seen_higher(self.columns)))
         c = self.columns
         first = len(c.verdict) - len(profiles)
         seen = (view.clear_range, view.steepest, view.sensor_offset, view.terrain)
@@ -252,7 +252,7 @@ class ColumnClassifier:
         self.memory.add(points, scan, most)
         return self.memory.due_tiles(GROWN)
 
-    def _find_again(self, tiles: Int) -> Float:
+    def _extract_columns(self, tiles: Int) -> Float:
         """Extract the columns of tiles again, at the end of a new table; return their profiles."""
         old = self.columns
         kept = ~_among(old.tile, tiles)

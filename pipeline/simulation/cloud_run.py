@@ -34,7 +34,7 @@ SLOPE = 35.0  # degrees; of the terrain against the plane of the plot
 BAND = (-0.5, 40.0)  # m above the ground; noise below it is not scanned
 MOST = 1 << 20  # points after thinning
 SPEED = 0.6  # m/s
-SHORTEST, LONGEST = 10.0, 600.0  # s; of one loop, unless a duration is asked for
+SHORTEST, LONGEST = 10.0, 600.0  # s; of one loop, unless a duration is planned for
 REFLECTANCE = 60.0  # of all returns: intensities of clouds have other scales
 
 
@@ -113,17 +113,17 @@ def open_cloud_run(
     start = np.append(way[0], ground.at(way[:1, 0], way[:1, 1]))
     lap = float(np.ceil(lap_time(course, SPEED)))
     duration = request.duration_s or min(max(lap, SHORTEST), LONGEST)
-    asked = RunRequest(request.name, request.seed, request.sigma, request.odometry, duration, 0)
+    planned = RunRequest(request.name, request.seed, request.sigma, request.odometry, duration, 0)
     drive = drive_course(course, SPEED, duration)
-    motion = lay_on_terrain(drive, PlotGround(ground, start, heading), random_stream(simulated.SHAKE, asked))
+    motion = lay_on_terrain(drive, PlotGround(ground, start, heading), random_stream(simulated.SHAKE, planned))
     return CloudRun(
-        request=asked,
+        request=planned,
         T_base_lidar=MOUNTING if T_base_lidar is None else T_base_lidar,
-        lidar=SpinningLidar(range_sigma=asked.sigma),
+        lidar=SpinningLidar(range_sigma=planned.sigma),
         scene=_scene(trees, cloud.description.offset + start, heading),
         motion=motion,
-        odometry=odometry_of(motion, asked),
-        inertial=inertial_readings(motion, random_stream(simulated.INERTIAL, asked)),
+        odometry=odometry_of(motion, planned),
+        inertial=inertial_readings(motion, random_stream(simulated.INERTIAL, planned)),
         scans=round(duration * 1e9) // SpinningLidar().period_ns,
         surfels=lay_surfels(_from(points[:, :3], start, heading)),
         source_digest=cloud.description.digest,

@@ -34,15 +34,15 @@ def sharp_cells(s: Float, yaw: Float) -> Bool:
     return sharp
 
 
-def curvature_beside(sharp: Bool, s: Float, yaw: Float, closed: bool) -> Float:
+def neighbouring_curvature(sharp: Bool, s: Float, yaw: Float, closed: bool) -> Float:
     """Return the curvature at each sample by the yaw of its neighbouring cells that are not sharp, else 0
     [1/m]."""
     slope = np.where(sharp, np.nan, np.diff(yaw) / np.diff(s))
     before = np.concatenate([slope[-1:] if closed else slope[:1], slope])
     after = np.concatenate([slope, slope[:1] if closed else slope[-1:]])
     before, after = np.where(np.isnan(before), after, before), np.where(np.isnan(after), before, after)
-    beside: Float = np.nan_to_num(0.5 * (before + after))
-    return beside
+    curvature: Float = np.nan_to_num(0.5 * (before + after))
+    return curvature
 
 
 def runs_of(sharp: Bool) -> Int:
@@ -232,8 +232,8 @@ class _Timetable:
 def _timetable(course: Course, speed: float, laps: int) -> _Timetable:
     sharp = sharp_cells(course.s, course.yaw)
     if sharp.any():
-        beside = curvature_beside(sharp, course.s, course.yaw, course.closed)
-        course = replace(course, curvature=beside)
+        curvature = neighbouring_curvature(sharp, course.s, course.yaw, course.closed)
+        course = replace(course, curvature=curvature)
     limit, curvature = speed_limit(course, speed), course.curvature
     # All laps in a row, so that the joint between two laps needs no special case.
     v, k = (
