@@ -115,7 +115,9 @@ def open_cloud_run(
     duration = request.duration_s or min(max(lap, SHORTEST), LONGEST)
     planned = RunRequest(request.name, request.seed, request.sigma, request.odometry, duration, 0)
     drive = drive_course(course, SPEED, duration)
-    motion = lay_on_terrain(drive, PlotGround(ground, start, heading), random_stream(simulated.SHAKE, planned))
+    motion = lay_on_terrain(
+        drive, PlotGround(ground, start, heading), random_stream(simulated.SHAKE, planned)
+    )
     return CloudRun(
         request=planned,
         T_base_lidar=MOUNTING if T_base_lidar is None else T_base_lidar,
