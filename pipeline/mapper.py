@@ -21,7 +21,7 @@ from pipeline.ground.terrain_map import HeightMapper, HeightMapState
 from pipeline.loop_closure import detection
 from pipeline.loop_closure.correction import (
     LoopClosure,
-    Relocalisation,
+    RelocalisedPose,
     Restart,
     SearchFailure,
     Smoothing,
@@ -85,7 +85,7 @@ class MapperState:
     delayed: PathCorrection | None = None
 
 
-Correction = Restart[MapperState] | Relocalisation | LoopClosure | Smoothing | SearchFailure
+Correction = Restart[MapperState] | RelocalisedPose | LoopClosure | Smoothing | SearchFailure
 
 
 class Mapper:
@@ -409,9 +409,9 @@ class Mapper:
                 elif stems is None:
                     return estimate, None
                 else:  # the graph contradicts the path to the place, not the place itself
-                    located = Relocalisation(loop.T_map_base, loop.covariance, stems)
+                    located = RelocalisedPose(loop.T_map_base, loop.covariance, stems)
                     return self._apply(index, located, estimate)
-            case Relocalisation(T_map_base=pose, covariance=covariance):
+            case RelocalisedPose(T_map_base=pose, covariance=covariance):
                 slam.place(index, pose, covariance)
                 self._placed = index + 1
                 estimate = slam.estimate(estimate)

@@ -24,7 +24,7 @@ from pipeline.io.checkpoints.codec import damaged
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.base import Source
-from pipeline.loop_closure.stem_matching import Match, Stems, find_constellation
+from pipeline.loop_closure.stem_matching import MapStems, Match, find_constellation
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import OdometryChoice, steps
 from pipeline.types.records import Step, Truth
@@ -236,7 +236,7 @@ def continue_map(
     covariance = np.diag(np.square(GIVEN_SIGMA))
     if start == "auto":
         found = localise(
-            source, mapper.parameters, Stems.of_trees(saved.map.trees(mapper.parameters)), odometry, seed
+            source, mapper.parameters, MapStems.of_trees(saved.map.trees(mapper.parameters)), odometry, seed
         )
         pose, covariance = found.pose, found.covariance
     mapper.load(replace(saved.map.state(), odometry=None), path, saved.map.sigma_xy, saved.map.motion)
@@ -279,7 +279,7 @@ def _in_another_run(
 
 
 def localise(
-    source: Source, parameters: Parameters, reference: Stems, odometry: OdometryChoice, seed: int
+    source: Source, parameters: Parameters, reference: MapStems, odometry: OdometryChoice, seed: int
 ) -> Match:
     """Return the pose of the first scan of a source in a map. The first scans are mapped separately until
     their stems match.
@@ -302,12 +302,12 @@ def localise(
             continue
         due = NEXT_TRY * (step.index + 1)
         match = find_constellation(
-            Stems.of_trees(frame.trees), reference, parameters.relocalisation, hypotheses=HYPOTHESES
+            MapStems.of_trees(frame.trees), reference, parameters.relocalisation, hypotheses=HYPOTHESES
         )
         if match.pose is not None:
             return match
     if frame is not None:
-        stems = Stems.of_trees(frame.trees)
+        stems = MapStems.of_trees(frame.trees)
         match = find_constellation(stems, reference, parameters.relocalisation, hypotheses=HYPOTHESES)
         if match.pose is not None:
             return match

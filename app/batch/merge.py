@@ -22,7 +22,7 @@ from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.merged_map import MergedMap, merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.result_files import DETECTION_COLUMNS, RunFiles, csv_text
-from pipeline.loop_closure.stem_matching import Match, Stems, find_constellation
+from pipeline.loop_closure.stem_matching import MapStems, Match, find_constellation
 from pipeline.types.records import Path, Trees
 
 CORRESPONDENCE_COLUMNS = ("tree", "tree_a", "tree_b", "distance_m")
@@ -65,7 +65,7 @@ def merge_runs(
     check_folder(out, a.sources[0].digest, force=force)
     trees_a, trees_b = a.map.trees(chosen), b.map.trees(b.chosen_parameters())
     match = find_constellation(
-        Stems.of_trees(trees_b), Stems.of_trees(trees_a), chosen.relocalisation, hypotheses=HYPOTHESES
+        MapStems.of_trees(trees_b), MapStems.of_trees(trees_a), chosen.relocalisation, hypotheses=HYPOTHESES
     )
     if match.pose is None:
         raise StemmapError(

@@ -143,11 +143,11 @@ def alignment(question: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
     from pipeline.config import preset
-    from pipeline.loop_closure.stem_matching import Stems, find_constellation
+    from pipeline.loop_closure.stem_matching import MapStems, find_constellation
 
-    def stems(rows: list[list[float | None]]) -> Stems:
+    def stems(rows: list[list[float | None]]) -> MapStems:
         columns = np.array(rows, np.float64).reshape(-1, 5)
-        return Stems(columns[:, :2], columns[:, 2], columns[:, 3], columns[:, 4])
+        return MapStems(columns[:, :2], columns[:, 2], columns[:, 3], columns[:, 4])
 
     match = find_constellation(
         stems(question["local"]),

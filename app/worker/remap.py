@@ -39,8 +39,8 @@ class MapperLike(Protocol):
 
 
 @dataclass(slots=True)
-class RunHistory:
-    """What the map itself does not hold about the mapped scans.
+class MappingRecord:
+    """Results of the mapped scans that are not part of the map.
 
     Attributes:
         history: Estimate of each tree over time.
@@ -87,7 +87,7 @@ class RunMap:
     parameters: ParameterHistory
     mapper: MapperLike
     snapshots: Snapshots[Any]
-    record: RunHistory = field(default_factory=RunHistory)
+    record: MappingRecord = field(default_factory=MappingRecord)
     before: Any = None
 
     @classmethod

@@ -38,7 +38,7 @@ class Restart(Generic[S]):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Relocalisation:
+class RelocalisedPose:
     """A lost robot is located in the map, at a place to which it was carried.
 
     Attributes:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.loop_closure.stem_matching import Stems, find_constellation
+from pipeline.loop_closure.stem_matching import MapStems, find_constellation
 from pipeline.loop_closure.stem_matching.stem_constellation import worst_sigma
 from pipeline.slam import Loop
 from pipeline.slam.loop_correction import drift_of, without_jumps
@@ -210,8 +210,8 @@ def _way(path: Float) -> Float:
     return way
 
 
-def _stems(place: Float, covariance: Float) -> Stems:
+def _stems(place: Float, covariance: Float) -> MapStems:
     """Return stems without diameters, which are unknown for distant trees. Their sigma is limited to SIGMA,
     since the error that all positions share is what the match finds."""
     unknown = np.full(len(place), np.nan)
-    return Stems(place, np.minimum(worst_sigma(covariance), SIGMA), unknown, unknown)
+    return MapStems(place, np.minimum(worst_sigma(covariance), SIGMA), unknown, unknown)

@@ -14,8 +14,8 @@ import numpy as np
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.loop_closure import detection
-from pipeline.loop_closure.correction import LoopClosure, Relocalisation, Restart, SearchFailure
-from pipeline.loop_closure.stem_matching import Stems, find_constellation
+from pipeline.loop_closure.correction import LoopClosure, RelocalisedPose, Restart, SearchFailure
+from pipeline.loop_closure.stem_matching import MapStems, find_constellation
 from pipeline.loop_closure.stem_matching.stem_constellation import worst_sigma
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.types.records import Detections, Int, PoseEstimate
@@ -54,7 +54,7 @@ class RelocaliserState(Generic[S]):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Match:
+class LocalMapMatch:
     """Pose of the base in the map, the covariance of x, y [m], yaw [rad], shape (3, 3), and the numbers of
     the trees that agree, int64, shape (K,)."""
 
@@ -107,7 +107,7 @@ class Relocaliser(Generic[S]):
         free: Float,
         parameters: Parameters,
         run: detection.RunHistory,
-    ) -> Relocalisation | LoopClosure | SearchFailure | None:
+    ) -> RelocalisedPose | LoopClosure | SearchFailure | None:
         """Take a scan into the local map, and look for the local map among the trees of the map.
 
         Args:
@@ -130,7 +130,7 @@ class Relocaliser(Generic[S]):
             run, match.numbers, match.T_map_base, match.covariance, last, run.estimate.covariance
         )
         if loop is None:
-            return Relocalisation(match.T_map_base, match.covariance, stems)
+            return RelocalisedPose(match.T_map_base, match.covariance, stems)
         return LoopClosure(loop, stems)
 
     def _map_locally(
@@ -153,25 +153,25 @@ class Relocaliser(Generic[S]):
 
 def _match(
     slam: FastSlam, estimate: PoseEstimate, parameters: Parameters, run: detection.RunHistory
-) -> Match | None:
+) -> LocalMapMatch | None:
     trees = run.trees
     match = find_constellation(
-        _stems(slam, parameters), Stems.of_trees(trees), parameters.relocalisation, hypotheses=HYPOTHESES
+        _stems(slam, parameters), MapStems.of_trees(trees), parameters.relocalisation, hypotheses=HYPOTHESES
     )
     if match.pose is None:
         return None
     numbers = trees.number[trees.confirmed][match.reference]
     relative = detection.nearby(estimate)
     pose, covariance = detection.through(match.pose, match.covariance, estimate.T_map_base, relative)
-    return Match(pose, covariance, numbers)
+    return LocalMapMatch(pose, covariance, numbers)
 
 
-def _stems(slam: FastSlam, parameters: Parameters) -> Stems:
+def _stems(slam: FastSlam, parameters: Parameters) -> MapStems:
     """The landmarks of the local map that were seen more than once."""
     landmarks = slam.state.map_of(slam.state.best)
     known = landmarks.hits >= parameters.slam.hits_to_weigh
     unknown = np.full(int(np.count_nonzero(known)), np.nan)
-    return Stems(landmarks.mean[known], worst_sigma(landmarks.covariance[known]), unknown, unknown)
+    return MapStems(landmarks.mean[known], worst_sigma(landmarks.covariance[known]), unknown, unknown)
 
 
 def local_seed(seed: int) -> int:

@@ -17,7 +17,7 @@ from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.loop_closure.stem_matching.alignment import aligned, alignment_covariance
 from pipeline.loop_closure.stem_matching.hypotheses import cells_of, crowding, pairs_within, partners, search
-from pipeline.loop_closure.stem_matching.stem_constellation import Stems
+from pipeline.loop_closure.stem_matching.stem_constellation import MapStems
 from pipeline.types.records import Int, Int32
 
 Refusal = Literal[
@@ -63,7 +63,7 @@ class Match:
 
 
 def find_constellation(
-    local: Stems, reference: Stems, parameters: Relocalisation, *, hypotheses: int = 300_000
+    local: MapStems, reference: MapStems, parameters: Relocalisation, *, hypotheses: int = 300_000
 ) -> Match:
     """Return the pose of local stems in a reference map, without an initial pose.
 
@@ -108,11 +108,11 @@ class _Candidate:
 class _Search:
     """One search. The local stems are centred at their mean, which decouples rotation and translation."""
 
-    def __init__(self, local: Stems, reference: Stems, parameters: Relocalisation, most: int) -> None:
+    def __init__(self, local: MapStems, reference: MapStems, parameters: Relocalisation, most: int) -> None:
         self.reason: Refusal = "too few stems"
         self._p = parameters
         self._mean: Float = local.position.mean(axis=0) if len(local) else np.zeros(2)
-        self._local = Stems(local.position - self._mean, local.sigma, local.dbh, local.dbh_sigma)
+        self._local = MapStems(local.position - self._mean, local.sigma, local.dbh, local.dbh_sigma)
         self._reference = reference
         self._most, self._looked = most, 0
 
@@ -191,7 +191,7 @@ class _Search:
         return _Candidate(pose, of, found)
 
     @staticmethod
-    def _columns(stems: Stems) -> tuple[Float, Float, Float, Float]:
+    def _columns(stems: MapStems) -> tuple[Float, Float, Float, Float]:
         return stems.position, stems.sigma, stems.dbh, stems.dbh_sigma
 
 

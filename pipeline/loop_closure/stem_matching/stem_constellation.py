@@ -11,7 +11,7 @@ from pipeline.types.records import Bool, Int, Trees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Stems:
+class MapStems:
     """Columns of N stems in the frame of one map.
 
     Attributes:
@@ -30,14 +30,14 @@ class Stems:
         return len(self.position)
 
     @classmethod
-    def at(cls, position: Float, sigma: float = 0.05) -> Stems:
+    def at(cls, position: Float, sigma: float = 0.05) -> MapStems:
         """Return stems of unknown diameter at positions of shape (N, 2) [m]."""
         n = len(position)
         unknown = np.full(n, np.nan)
         return cls(np.asarray(position, np.float64).reshape(n, 2), np.full(n, sigma), unknown, unknown)
 
     @classmethod
-    def of_trees(cls, trees: Trees) -> Stems:
+    def of_trees(cls, trees: Trees) -> MapStems:
         """Return the confirmed trees of a map."""
         kept = trees.confirmed
         unknown = np.isnan(trees.dbh[kept])
@@ -53,9 +53,9 @@ class Stems:
         finite: Bool = np.isfinite(self.position).all(axis=1) & np.isfinite(self.sigma) & (self.sigma >= 0.0)
         return finite
 
-    def take(self, rows: Int | Bool) -> Stems:
+    def take(self, rows: Int | Bool) -> MapStems:
         """Return the stems of some rows."""
-        return Stems(self.position[rows], self.sigma[rows], self.dbh[rows], self.dbh_sigma[rows])
+        return MapStems(self.position[rows], self.sigma[rows], self.dbh[rows], self.dbh_sigma[rows])
 
 
 def worst_sigma(covariance: Float) -> Float:

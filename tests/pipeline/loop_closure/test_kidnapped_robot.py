@@ -13,7 +13,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers import open_source
-from pipeline.loop_closure.correction import LoopClosure, Relocalisation
+from pipeline.loop_closure.correction import LoopClosure, RelocalisedPose
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState, local_seed
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
@@ -207,5 +207,5 @@ def test_a_loop_that_the_graph_contradicts_is_not_reported(stems, monkeypatch):
         assert applied is None
         assert estimate is frame.estimate
     else:
-        assert isinstance(applied, Relocalisation)
+        assert isinstance(applied, RelocalisedPose)
         assert estimate.T_map_base.x == pytest.approx(loop.T_map_base.x, abs=0.05)

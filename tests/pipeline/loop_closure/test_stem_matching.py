@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.loop_closure.stem_matching import Stems, find_constellation
+from pipeline.loop_closure.stem_matching import MapStems, find_constellation
 from pipeline.loop_closure.stem_matching.alignment import aligned, alignment_covariance
 from pipeline.loop_closure.stem_matching.hypotheses import pairs_within
 from pipeline.loop_closure.stem_matching.stem_constellation import worst_sigma
@@ -48,7 +48,7 @@ def test_no_loop_is_false_in_a_forest(seed, missing, false):
     stems = forest(rng)
     local, T = view(rng, stems, missing=missing, false=false)
     known = stems[rng.random(len(stems)) >= missing]
-    match = find_constellation(Stems.at(local), Stems.at(known), P)
+    match = find_constellation(MapStems.at(local), MapStems.at(known), P)
     assert match.pose is None or is_right(match, T, local)
     assert (match.pose is None) == (match.reason is not None)
 
@@ -59,7 +59,7 @@ def test_most_views_of_a_forest_are_found():
         rng = np.random.default_rng(seed)
         stems = forest(rng)
         local, T = view(rng, stems)
-        match = find_constellation(Stems.at(local), Stems.at(stems), P)
+        match = find_constellation(MapStems.at(local), MapStems.at(stems), P)
         found += match.pose is not None and is_right(match, T, local)
     assert found >= 28
 
@@ -68,7 +68,7 @@ def test_most_views_of_a_forest_are_found():
 def test_a_forest_that_is_not_in_the_map_is_not_found_there(seed):
     rng = np.random.default_rng(seed)
     local, _ = view(rng, forest(rng))
-    match = find_constellation(Stems.at(local), Stems.at(forest(rng)), P)
+    match = find_constellation(MapStems.at(local), MapStems.at(forest(rng)), P)
     assert match.pose is None
     assert match.reason in ("could be chance", "no agreement", "too few stems", "ambiguous")
 
@@ -81,7 +81,7 @@ def test_a_plantation_is_refused(seed, spacing, ratio, jitter, missing):
     stems = rows + rng.normal(0.0, jitter, rows.shape)
     stems = stems[rng.random(len(stems)) >= missing]
     local, _ = view(rng, stems, radius=max(10.0, 3 * spacing), missing=missing)
-    match = find_constellation(Stems.at(local), Stems.at(stems), P)
+    match = find_constellation(MapStems.at(local), MapStems.at(stems), P)
     assert match.pose is None
     assert match.second >= 0.6 * len(match.local)
 
@@ -93,11 +93,11 @@ def test_diameters_can_tell_the_rows_of_a_plantation_apart():
     sigma = np.full(len(rows), 0.01)
     there = np.flatnonzero(np.hypot(*(rows - [15.0, 18.0]).T) < 9.0)
     T = Pose2(15.0, 18.0, 0.4)
-    local = Stems(T.inverse().apply(rows[there]), np.full(len(there), 0.05), dbh[there], sigma[there])
-    match = find_constellation(local, Stems(rows, np.full(len(rows), 0.05), dbh, sigma), P)
+    local = MapStems(T.inverse().apply(rows[there]), np.full(len(there), 0.05), dbh[there], sigma[there])
+    match = find_constellation(local, MapStems(rows, np.full(len(rows), 0.05), dbh, sigma), P)
     assert match.pose is not None
     assert is_right(match, T, local.position)
-    blind = find_constellation(Stems.at(local.position), Stems.at(rows), P)
+    blind = find_constellation(MapStems.at(local.position), MapStems.at(rows), P)
     assert blind.reason == "ambiguous"
 
 
@@ -107,8 +107,8 @@ def test_the_pose_turns_with_the_local_frame(seed, yaw, x, y):
     stems = forest(rng)
     local, _ = view(rng, stems, missing=0.0, false=0.0)
     T = Pose2(x, y, yaw)
-    one = find_constellation(Stems.at(local), Stems.at(stems), P)
-    other = find_constellation(Stems.at(T.apply(local)), Stems.at(stems), P)
+    one = find_constellation(MapStems.at(local), MapStems.at(stems), P)
+    other = find_constellation(MapStems.at(T.apply(local)), MapStems.at(stems), P)
     if one.pose is None or other.pose is None:
         return
     np.testing.assert_array_equal(one.reference, other.reference)
@@ -123,7 +123,7 @@ def test_the_covariance_is_honest():
         stems = forest(rng)
         local, T = view(rng, stems, noise=sigma, false=0.0)
         exact = P.model_copy(update={"slack": 0.0})
-        match = find_constellation(Stems.at(local, sigma), Stems.at(stems, 0.0), exact)
+        match = find_constellation(MapStems.at(local, sigma), MapStems.at(stems, 0.0), exact)
         if match.pose is None:
             continue
         off = match.pose.as_array() - T.as_array()
@@ -137,7 +137,7 @@ def test_the_covariance_is_honest():
 @pytest.mark.parametrize("stems", [0, 1, 2, 5])
 def test_few_stems_are_refused(stems):
     local = np.random.default_rng(0).uniform(0, 10, (stems, 2))
-    match = find_constellation(Stems.at(local), Stems.at(forest(np.random.default_rng(1))), P)
+    match = find_constellation(MapStems.at(local), MapStems.at(forest(np.random.default_rng(1))), P)
     assert match.pose is None
     assert match.reason == "too few stems"
 
@@ -154,14 +154,14 @@ def test_few_stems_are_refused(stems):
 )
 def test_poor_stems_are_refused(place):
     for local, reference in ((place, place), (place, forest(np.random.default_rng(1)))):
-        assert find_constellation(Stems.at(local), Stems.at(reference), P).pose is None
+        assert find_constellation(MapStems.at(local), MapStems.at(reference), P).pose is None
 
 
 def test_the_same_stems_give_the_same_bytes():
     rng = np.random.default_rng(3)
     stems = forest(rng)
     local, _ = view(rng, stems)
-    one, two = (find_constellation(Stems.at(local), Stems.at(stems), P) for _ in range(2))
+    one, two = (find_constellation(MapStems.at(local), MapStems.at(stems), P) for _ in range(2))
     assert one.pose == two.pose
     assert one.covariance.tobytes() == two.covariance.tobytes()
 
