@@ -25,12 +25,10 @@ _X = ("x_m", "x", "treelocationx", "easting", "easting_m", "east", "utm_x")
 _Y = ("y_m", "y", "treelocationy", "northing", "northing_m", "north", "utm_y")
 _AZIMUTH = ("azimuth_deg", "azimuth")
 _DISTANCE = ("distance_m", "distance", "dist_m")
-_DBH_CM = ("dbh_cm",)
-_DBH_M = ("dbh_m",)
-_DBH_MM = ("dbh_mm",)
+#: Names of diameters with their units [m].
+_DBH = {"dbh_cm": 0.01, "dbh_m": 1.0, "dbh_mm": 0.001}
 _DBH_OF_UNKNOWN_UNIT = ("dbh", "diameter")
 _KIND = ("class", "kind", "type")
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
@@ -145,26 +143,17 @@ def _positions(table: _Table) -> tuple[Float, ...]:
 
 
 def _diameters(table: _Table, dbh_unit: str | None) -> Float:
-    for names, unit in ((_DBH_CM, "cm"), (_DBH_M, "m"), (_DBH_MM, "mm")):
-        name = table.find(names)
-        if name is not None:
-            return _measured(table.numbers(name, required=False)) * _UNITS[unit]
-    name = table.find(_DBH_OF_UNKNOWN_UNIT)
+    """Return diameters [m]; NaN for 0 and negative numbers, which other programs write for unmeasured
+    ones."""
+    name = table.find((*_DBH, *_DBH_OF_UNKNOWN_UNIT))
     if name is None:
         return np.full(len(table.rows), np.nan)
-    if dbh_unit is None:
-        raise SourceError(
-            f"column {name!r} does not say its unit",
-            where=table.where,
-            remedy="Give --dbh-unit m, cm or mm",
-        )
-    return _measured(table.numbers(name, required=False)) * _UNITS[dbh_unit]
-
-
-def _measured(diameter: Float) -> Float:
-    """Return diameters [m] with NaN for 0 and negative numbers, which other programs write for unmeasured
-    ones."""
-    return np.where(diameter > 0.0, diameter, np.nan)
+    unit = name if name in _DBH else f"dbh_{dbh_unit}"
+    if unit not in _DBH:
+        what = f"column {name!r} does not say its unit"
+        raise SourceError(what, where=table.where, remedy="Give --dbh-unit m, cm or mm")
+    diameter = table.numbers(name, required=False)
+    return np.where(diameter > 0.0, diameter, np.nan) * _DBH[unit]
 
 
 def _kinds(table: _Table) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -33,7 +33,7 @@ from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import SECOND_NS, header_stamp
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
-from pipeline.io.readers.ros_messages import CAMERA_INFO, MessageDecoder, standard_types
+from pipeline.io.readers.ros_messages import MessageDecoder, standard_types
 from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed
 from pipeline.io.readers.transforms import Extrinsics
 from pipeline.types.records import Notice, Record
@@ -45,6 +45,7 @@ OPENING_SCANS = 10
 #: Most messages that are kept before the first scan.
 OPENING_LIMIT = 4000
 _TRIES = 5
+T = TypeVar("T")
 
 
 class MessageList(Container):
@@ -192,7 +193,7 @@ class LiveCamera:
     """
 
     def __init__(self, channels: Sequence[Channel], fixed: Sequence[Channel]) -> None:
-        self._pictures_of, self._infos = channels[0], [c for c in channels if c.msgtype == CAMERA_INFO]
+        self._pictures_of = channels[0]
         self._channels = {channel.number: channel for channel in (*channels, *fixed)}
         self._numbers = {channel.number for channel in channels}
         self._decoder = MessageDecoder(self._channels.values())
@@ -436,24 +437,15 @@ class LiveRecording(MessageSource):
                 yield message
 
     def _revisions(self) -> Iterator[Revision]:
-        """Yield the parameters of the live run, in order."""
-        for text in self._notes(PARAMETERS):
-            try:
-                yield msgspec.json.decode(text, type=Revision)
-            except msgspec.DecodeError:
-                count_loss(self._losses, "revisions of the parameters that cannot be read")
+        """Return the parameters of the live run, in order."""
+        return self._notes(PARAMETERS, Revision)
 
     def _read_skipped(self) -> dict[int, set[int]]:
         """Return the log times of the messages that the live run did not map, by channel."""
         skipped: dict[int, set[int]] = {c.number: set() for c in self._channels}
         numbers = {c.topic: c.number for c in self._channels}
         total = 0
-        for text in self._notes(SKIPPED):
-            try:
-                times_by_topic = msgspec.json.decode(text, type=dict[str, list[int]])
-            except msgspec.DecodeError:
-                count_loss(self._losses, "lists of skipped messages that cannot be read")
-                continue
+        for times_by_topic in self._notes(SKIPPED, dict[str, list[int]]):
             total += sum(map(len, times_by_topic.values()))
             if total > _MOST_SKIPPED:
                 break
@@ -462,17 +454,20 @@ class LiveRecording(MessageSource):
                     skipped[numbers[topic]].update(times)
         return {number: times for number, times in skipped.items() if times}
 
-    def _notes(self, topic: str) -> Iterator[str]:
-        """Yield the JSON texts of a channel of the recorder; damaged ones are counted."""
+    def _notes(self, topic: str, kind: type[T]) -> Iterator[T]:
+        """Yield the JSON values of a channel of the recorder; damaged ones are counted."""
         numbers = [c.number for c in self._container.channels if c.topic == topic]
         types: Any = standard_types("cdr")
         for count, message in enumerate(self._container.messages(numbers, None, {})):
             if count >= _MOST_NOTES or len(message.payload) > _LIMIT:
                 break
             try:
-                yield types.deserialize_cdr(message.payload, "std_msgs/msg/String").data
+                text = types.deserialize_cdr(message.payload, "std_msgs/msg/String").data
+                note = msgspec.json.decode(text, type=kind)
             except Exception:  # the generated decoders of rosbags raise many kinds
                 count_loss(self._losses, "notes of the recorder that cannot be read")
+            else:
+                yield note
 
 
 def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,13 +21,14 @@ from pipeline.types.records import Int, Odometry, Record, Scan, Sensor
 
 #: Period of scans without times: 10 Hz.
 STEP_NS = 100_000_000
-#: Usual names of files with poses.
+#: Usual names of files with times and with poses.
+TIMES = ("times.txt", "timestamps.txt")
 POSES = ("poses.txt", "poses.tum", "trajectory.txt", "trajectory.tum", "groundtruth.txt")
 _TIME_NAME = re.compile(r"(?:[A-Za-z]+[_-])?([0-9]{10}[._][0-9]{1,9}|[0-9]{16}|[0-9]{19})", re.ASCII)
 #: Number of unreadable files at the start after which the folder is refused.
 _TRIES = 20
 
-
+T = TypeVar("T")
 #: Reads one file: (path, stamp_ns, losses) -> scan. Raises ScanFileError or OSError.
 Loader = Callable[[Path, int, dict[str, int]], Scan]
 
@@ -136,34 +138,31 @@ class ScanFolder(FileSource):
             reason = reason or f"{file.name} holds no points"
         raise SourceError(reason, where=uri, remedy=f"Files must be {self._form.kind} scans.")
 
-    def _read_stamps(self, places: list[Path], numbers: Int) -> Int:
-        for place in places:
-            for name in ("times.txt", "timestamps.txt"):
-                try:
-                    times = read_times(place / name)
-                except FileNotFoundError:
-                    continue
-                except (TextError, OSError) as error:
-                    self._warnings.append(f"{name} is not used: {error}")
-                    continue
-                rows = self._rows(name, len(times), numbers)
-                if rows is not None:
-                    self._texts.append(place / name)
-                    self._timed = True
-                    return times[rows]
-        named = _times_in_names(self._files)
-        self._timed = named is not None
-        return numbers * STEP_NS if named is None else named
-
-    def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3 | None] | None:
-        for path in [place / name for place in places for name in POSES]:
+    def _read_texts(
+        self, places: list[Path], names: Iterable[str], read: Callable[[Path], T]
+    ) -> Iterator[tuple[Path, T]]:
+        """Yield the files of some names that exist and can be read, each with its contents."""
+        for path in [place / name for place in places for name in names]:
             try:
-                times, poses = read_any_poses(path)
+                yield path, read(path)
             except FileNotFoundError:
                 continue
             except (TextError, OSError) as error:
                 self._warnings.append(f"{path.name} is not used: {error}")
-                continue
+
+    def _read_stamps(self, places: list[Path], numbers: Int) -> Int:
+        for path, times in self._read_texts(places, TIMES, read_times):
+            rows = self._rows(path.name, len(times), numbers)
+            if rows is not None:
+                self._texts.append(path)
+                self._timed = True
+                return times[rows]
+        in_names = _times_in_names(self._files)
+        self._timed = in_names is not None
+        return numbers * STEP_NS if in_names is None else in_names
+
+    def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3 | None] | None:
+        for path, (times, poses) in self._read_texts(places, POSES, read_any_poses):
             found = self._fitting(path.name, times, poses, numbers)
             if found is not None:
                 self._texts.append(path)
@@ -244,12 +243,8 @@ def _name_ns(stem: str) -> int:
 
 def _number(file: Path) -> int:
     """Return the number at the end of the name of a file, -1 when there is none."""
-    digits = ""
-    for letter in reversed(file.stem):
-        if not letter.isdecimal() or not letter.isascii():
-            break
-        digits = letter + digits
-    return int(digits) if 0 < len(digits) <= 9 else int(digits[-9:]) if digits else -1
+    match = re.search(r"[0-9]{1,9}$", file.stem)
+    return int(match.group()) if match else -1
 
 
 # --- formats ---------------------------------------------------------------------------------------
