@@ -81,7 +81,7 @@ class McapFile(ChunkedFile):
             try:
                 raw = self._bytes_of(chunk)
                 stream = io.BytesIO(raw)
-                for record in StreamReader(stream, skip_magic=True).records:
+                for record in StreamReader(stream, skip_magic=True, emit_chunks=True).records:
                     yield record
                     if stream.tell() >= len(raw):
                         break
@@ -102,12 +102,7 @@ class McapFile(ChunkedFile):
             body, after = at + RECORD.size, at + RECORD.size + length
             if after > end or opcode == 0 or strange > STRANGE_LIMIT:
                 break
-            try:
-                self._take(opcode, body, length)
-                strange += opcode > Opcode.DATA_END
-            except DAMAGE:
-                count_loss(self.damage, "damaged records of the recording")
-                strange += 1
+            strange += not self._take_or_count(opcode, body, length) or opcode > Opcode.DATA_END
             whole |= opcode in (Opcode.DATA_END, Opcode.FOOTER)
             at = after
             if opcode == Opcode.FOOTER:
@@ -132,10 +127,19 @@ class McapFile(ChunkedFile):
             if channel.id not in self._known:
                 self._add_channel(channel)
         starts = sorted((c.chunk_start_offset, c.chunk_length) for c in summary.chunk_indexes)
-        behind = [(start, length) for start, length in starts if start > after]
+        behind = [(start, length) for start, length in starts if start > after and length > RECORD.size]
         for start, length in behind:
-            self._take(Opcode.CHUNK, start + RECORD.size, length - RECORD.size)
+            self._take_or_count(Opcode.CHUNK, start + RECORD.size, length - RECORD.size)
         return behind[0][0] if behind else 0
+
+    def _take_or_count(self, opcode: int, body: int, length: int) -> bool:
+        """Store the contents of a record, see `_take`; return False and count it if it is damaged."""
+        try:
+            self._take(opcode, body, length)
+        except DAMAGE:
+            count_loss(self.damage, "damaged records of the recording")
+            return False
+        return True
 
     def _take(self, opcode: int, body: int, length: int) -> None:
         """Store the contents of a record.
