@@ -23,6 +23,7 @@ STEP_NS = 2 * SECOND_NS
 SAME_STEP_NS = SECOND_NS
 
 T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
 def header_stamp(channel: Channel, payload: bytes) -> int | None:
@@ -145,12 +146,12 @@ class ClockStepFilter(Clock):
 
 
 @dataclass(frozen=True, slots=True)
-class Stamped(Generic[T]):
+class Stamped(Generic[T_co]):
     """Contents with a time; of two with the same time the lower rank comes first."""
 
     stamp_ns: int
     rank: int
-    content: T
+    content: T_co
 
 
 def by_stamp(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -> Iterator[Stamped[T]]:

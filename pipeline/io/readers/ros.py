@@ -170,7 +170,7 @@ class RosSource(MessageSource):
         elif record is not None:
             yield record
 
-    def _stamped(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
+    def _stamped(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message]]:
         time_ns = self._clock.time_of(header_stamp(self._channels[message.channel], message.payload), message)
         if time_ns is None:
             count_loss(losses, "messages with an impossible time stamp")
@@ -224,9 +224,7 @@ class RosSource(MessageSource):
 
     def _scan_arrivals(self, log_start: int | None) -> Iterator[Stamped[Message]]:
         for message in self._container.messages(self._topics.numbers("scan"), log_start, {}):
-            for arrival in self._stamped(message, {}):
-                if isinstance(arrival.content, Message):
-                    yield Stamped(arrival.stamp_ns, arrival.rank, arrival.content)
+            yield from self._stamped(message, {})
 
     def _last_stamp(self) -> int | None:
         tail_ns = self._container.tail_ns(self._topics.numbers("scan"))
