@@ -12,22 +12,15 @@ from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Protocol
+from itertools import islice
 
 from app.robot.source import LiveSource
 from app.sources.opening import ChosenOdometry
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
 from pipeline.odometry.odometry_override import OdometryOverride
-from pipeline.odometry.synchroniser import Synchroniser
-from pipeline.types.records import Learnt, Record, Step
-
-
-class StepsFunction(Protocol):
-    """Joins records to steps; see `pipeline.odometry.synchroniser.steps`."""
-
-    def __call__(self, records: Iterator[Record], *, after: Learnt | None = None) -> Iterator[Step]: ...
-
+from pipeline.odometry.synchroniser import OdometryChoice, Synchroniser, steps
+from pipeline.types.records import Learnt, Step
 
 _LEAD_IN_NS = 1_000_000_000
 
@@ -37,12 +30,12 @@ class Cursor:
 
     Args:
         source: Source that is read; the cursor does not close it.
-        synchronise: Joins records to steps; it is called for every position from which the source is read.
+        odometry: Choice of the odometry.
     """
 
-    def __init__(self, source: Source, synchronise: StepsFunction) -> None:
+    def __init__(self, source: Source, odometry: OdometryChoice = "auto") -> None:
         self._source = source
-        self._synchronise = synchronise
+        self._odometry: OdometryChoice = odometry
         self._stamps = array("q")
         self._fingerprints = array("q")
         self._learnt: list[Learnt] = []
@@ -124,7 +117,7 @@ class Cursor:
         self._next = index
 
     def _read(self, start_ns: int | None, after: Learnt | None = None) -> Iterator[Step]:
-        return self._synchronise(self._source.records(start_ns), after=after)
+        return steps(self._source.records(start_ns), odometry=self._odometry, after=after)
 
     def _resumed(self, index: int) -> Iterator[Step] | None:
         """Return an iterator of the steps after step `index`, read from one second before it; None if the
@@ -132,14 +125,14 @@ class Cursor:
         stamp_ns = self._stamps[index]
         # Scans of equal time are distinguished by counting.
         wanted = index - bisect_left(self._stamps, stamp_ns)
-        steps = self._read(stamp_ns - _LEAD_IN_NS, self._learnt[index])
-        for step in steps:
+        read = self._read(stamp_ns - _LEAD_IN_NS, self._learnt[index])
+        for step in read:
             if step.scan.stamp_ns < stamp_ns:
                 continue
             if step.scan.stamp_ns > stamp_ns:
                 return None
             if wanted == 0:
-                return steps if _fingerprint(step) == self._fingerprints[index] else None
+                return read if _fingerprint(step) == self._fingerprints[index] else None
             wanted -= 1
         return None
 
@@ -149,12 +142,10 @@ class Cursor:
         Raises:
             SourceError: That step differs from the one that was read first.
         """
-        steps = self._read(None)
-        for index, step in enumerate(steps):
-            if index == index and _fingerprint(step) == self._fingerprints[index]:
-                return steps
-            if index == index:
-                break
+        read = self._read(None)
+        step = next(islice(read, index, None), None)
+        if step is not None and _fingerprint(step) == self._fingerprints[index]:
+            return read
         raise SourceError(
             "the source does not give the same scans again",
             where=self._source.description.uri,

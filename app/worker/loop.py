@@ -19,7 +19,6 @@ import msgspec
 from app.common.text import COMPILING
 from app.explain.build import cluster_story, tree_story
 from app.explain.history import RecentScans
-from app.worker.camera import camera_picture
 from app.worker.outbox import for_comparison
 from app.worker.protocol import (
     Advance,
@@ -46,7 +45,7 @@ from app.worker.protocol import (
     Status,
     ToWorker,
 )
-from app.worker.session import Session
+from app.worker.session import Session, camera_picture
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame

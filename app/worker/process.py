@@ -11,7 +11,7 @@ import queue
 import signal
 import sys
 import threading
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,7 +22,6 @@ from app.worker.codec import WireError, to_worker
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import Outbox
 from app.worker.protocol import ToWorker
-from app.worker.run import caches_in, unnamed_caches
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.jit import on_compiling
@@ -42,14 +41,12 @@ def new_session(folder: Path | None = None) -> Session:
     from app.robot.source import open_any
     from app.worker.mapper_factory import mapper_of
     from app.worker.numba_warmup import compile_ahead, warm_up
-    from pipeline.odometry.synchroniser import steps
 
     return Session(
         open_source=open_any,
-        make_mapper=lambda source, *rest: mapper_of(source.description, *rest),
-        make_synchroniser=lambda odometry: partial(steps, odometry=odometry),
+        make_mapper=mapper_of,
         parameters=Parameters(),
-        open_caches=unnamed_caches if folder is None else caches_in(folder),
+        folder=folder,
         compile_ahead=compile_ahead,
         warm_up=warm_up,
     )

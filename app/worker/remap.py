@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, fields, is_dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -17,25 +17,14 @@ from app.explain.history import TreeHistory
 from app.worker.map_changes import MapChanges, changes_between
 from pipeline.config import Parameters
 from pipeline.front_end import SegmentedScan
+from pipeline.mapper import Mapper, MapperState
 from pipeline.remapping import ClusterTable, Rerun
 from pipeline.remapping.rerun import Segment
 from pipeline.slam import Genealogy, KeyframeGraph
-from pipeline.types.records import Frame, Path, Step
+from pipeline.types.records import Frame, Step
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
 NS = 1_000_000_000
-
-
-class MapperLike(Protocol):
-    """The part of `pipeline.mapper.Mapper` that a run uses. The type of its snapshots is opaque here."""
-
-    parameters: Parameters
-
-    def process(self, step: Step) -> Frame: ...
-    def snapshot(self) -> Any: ...  # noqa: ANN401
-    def restore(self, state: Any) -> None: ...  # noqa: ANN401
-    @property
-    def path(self) -> Path: ...
 
 
 @dataclass(slots=True)
@@ -80,25 +69,26 @@ class RunMap:
         parameters: Parameters with which each scan was mapped.
         mapper: The mapper.
         snapshots: Earlier states of the mapper.
+        before: State of the mapper before the current scan.
         record: History of the mapped scans.
-        before: State of the mapper before the current scan; None before the first.
     """
 
     parameters: ParameterHistory
-    mapper: MapperLike
-    snapshots: Snapshots[Any]
+    mapper: Mapper
+    snapshots: Snapshots[MapperState]
+    before: MapperState
     record: MappingRecord = field(default_factory=MappingRecord)
-    before: Any = None
 
     @classmethod
-    def fresh(cls, mapper: MapperLike, parameters: Parameters) -> RunMap:
+    def fresh(cls, mapper: Mapper, parameters: Parameters) -> RunMap:
         """Return a map without scans.
 
         Args:
             mapper: A mapper before its first scan.
             parameters: Parameters from the first scan onwards.
         """
-        return cls(ParameterHistory(parameters), mapper, Snapshots(mapper.snapshot()))
+        state = mapper.snapshot()
+        return cls(ParameterHistory(parameters), mapper, Snapshots(state), state)
 
 
 class Remapping:

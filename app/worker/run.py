@@ -7,7 +7,6 @@ mapped. It does not depend on pauses, jumps, or which states of the mapper are k
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -16,10 +15,9 @@ from app.common.timers import Stopwatch
 from app.explain.history import TreeHistory
 from app.robot.source import LiveSource
 from app.sources.opening import with_odometry
-from app.worker.cursor import Cursor, LiveCursor, StepsFunction
+from app.worker.cursor import Cursor, LiveCursor
 from app.worker.remap import (
     NOT_OF_THE_MAP,
-    MapperLike,
     Remapping,
     RunMap,
     segment_ahead,
@@ -30,12 +28,14 @@ from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
-from pipeline.odometry.synchroniser import OdometryChoice
+from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import KnownMap, Reread, Rerun, Sample, ScanCaches, preview_trees
+from pipeline.stage_timer import StageTimer
 from pipeline.types.records import Float, Frame, Path, Step, Trees
 
-MakeMapper = Callable[[Source, Parameters, int, Stopwatch], MapperLike]
-Remake = Callable[[Parameters], MapperLike]
+#: Returns a mapper of a source for parameters and a seed, see `mapper_of`.
+MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
+_LARGE = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the file has no name
 
 
 class Run:
@@ -43,12 +43,11 @@ class Run:
 
     Args:
         source: The source; `close` closes it.
-        mapper: A mapper of this source before its first scan.
+        make_mapper: Returns a mapper of this source before its first scan.
         cursor: Reads the steps of the source.
         parameters: Parameters from the first scan onwards.
         stopwatch: Measures the stages of the mapper.
         odometry: Description of the source of motion.
-        remake: Returns a new mapper of this source for parameters; None if the run cannot be mapped again.
         reread: Returns the steps from the first scan; None for a live run.
         caches: Caches of the segmented scans of this source.
 
@@ -61,12 +60,11 @@ class Run:
     def __init__(
         self,
         source: Source,
-        mapper: MapperLike,
+        make_mapper: Callable[[Parameters], Mapper],
         cursor: Cursor | LiveCursor,
         parameters: Parameters,
         stopwatch: Stopwatch,
         odometry: str = "",
-        remake: Remake | None = None,
         reread: Reread | None = None,
         caches: ScanCaches | None = None,
     ) -> None:
@@ -77,10 +75,10 @@ class Run:
         self.current = -1
         self.is_bare = False
         self._cursor = cursor
-        self._map = RunMap.fresh(mapper, parameters)
+        self._map = RunMap.fresh(make_mapper(parameters), parameters)
         self._step: Step | None = None
         self._broken = False
-        self._remake, self._reread = remake, reread
+        self._make_mapper, self._reread = make_mapper, reread
         self._caches = ScanCaches() if caches is None else caches
         self._cache = self._caches.of(parameters)
         self._sample = Sample()
@@ -177,9 +175,7 @@ class Run:
         self._map.record.add(self.frame, self.start_ns)
         return self.frame
 
-    def _process(self, mapper: MapperLike, step: Step, *, hurried: bool) -> Frame:
-        if not isinstance(mapper, Mapper):
-            return mapper.process(step)
+    def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> Frame:
         cached = self._cache.read(step.index, step.scan.stamp_ns) if hurried else None
         self.is_bare = cached is not None
         scan = mapper.segment(step) if cached is None else cached[1]
@@ -192,9 +188,7 @@ class Run:
         self.cancel_remapping()
         if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
             return
-        mapper = self._remake(parameters) if self._remake else None
-        if not isinstance(mapper, Mapper):
-            return
+        mapper = self._make_mapper(parameters)
         self._preview = self._preview_of(parameters, mapper)
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
         self._remapping = Remapping(
@@ -331,84 +325,50 @@ class Run:
         self.source.close()
 
 
-MakeSynchroniser = Callable[[OdometryChoice], StepsFunction]
-OpenCaches = Callable[[Source | LiveSource, str, int], ScanCaches]
-
-_LARGE = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the file has no name
-
-
-def unnamed_caches(_source: Source | LiveSource, _odometry: str, _seed: int) -> ScanCaches:
-    """Return temporary scan caches, which are deleted when the run is closed. The arguments are not used."""
-    return ScanCaches(_LARGE if _LARGE.is_dir() else None)
-
-
-def caches_in(folder: FilePath) -> OpenCaches:
-    """Return a function that opens scan caches which the next opening of a recording uses again.
-
-    For a live source, and for a source without a digest, that function returns `unnamed_caches`.
+def open_run(
+    source: Source | LiveSource,
+    odometry: str,
+    seed: int,
+    parameters: Parameters,
+    make_mapper: MakeMapper,
+    folder: FilePath | None = None,
+) -> tuple[Run, tuple[str, ...]]:
+    """Return a run before its first scan, and warnings.
 
     Args:
-        folder: Folder of the caches of all recordings; it is created when it is needed.
+        source: The source; the run closes it.
+        odometry: Choice of the odometry, see `SourceRequest`.
+        seed: Random seed.
+        parameters: Parameters from the first scan onwards.
+        make_mapper: Returns a new mapper.
+        folder: Folder of scan caches that the next opening of the recording uses again; None deletes them
+            when the run is closed.
+
+    Raises:
+        SourceError: The odometry is not available for this source; the source is closed.
     """
-
-    def open_caches(source: Source | LiveSource, odometry: str, seed: int) -> ScanCaches:
-        digest = source.description.digest
-        if not digest or isinstance(source, LiveSource):
-            return unnamed_caches(source, odometry, seed)
-        return ScanCaches(folder, f"{digest}\n{source.description.uri}\n{odometry}\n{seed}")
-
-    return open_caches
-
-
-@dataclass(frozen=True, slots=True)
-class RunFactory:
-    """Makes runs of sources.
-
-    Attributes:
-        make_mapper: Returns a new mapper for a source, parameters, seed and stopwatch.
-        make_synchroniser: Returns the synchroniser for a choice of odometry.
-        open_caches: Opens the scan caches of a source for its odometry and seed.
-    """
-
-    make_mapper: MakeMapper
-    make_synchroniser: MakeSynchroniser
-    open_caches: OpenCaches
-
-    def __call__(
-        self, source: Source | LiveSource, odometry: str, seed: int, parameters: Parameters
-    ) -> tuple[Run, tuple[str, ...]]:
-        """Return a run before its first scan, and warnings.
-
-        Args:
-            source: The source; the run closes it.
-            odometry: Choice of the odometry, see `SourceRequest`.
-            seed: Random seed.
-            parameters: Parameters from the first scan onwards.
-
-        Raises:
-            SourceError: The odometry is not available for this source; the source is closed.
-        """
-        try:
-            moving, chosen = with_odometry(source, odometry)
-        except SourceError:
-            source.close()
-            raise
-        stopwatch, synchronise = Stopwatch(), self.make_synchroniser(chosen.steps)
-        is_live = isinstance(source, LiveSource)
-        run = Run(
-            moving,
-            self.make_mapper(moving, parameters, seed, stopwatch),
-            LiveCursor(source, chosen, moving)
-            if isinstance(source, LiveSource)
-            else Cursor(moving, synchronise),
-            parameters,
-            stopwatch,
-            chosen.words,
-            remake=lambda parameters: self.make_mapper(moving, parameters, seed, stopwatch),
-            reread=None if is_live else lambda: synchronise(moving.records(None)),
-            caches=self.open_caches(source, chosen.words, seed),
-        )
-        return run, (*source.description.warnings, *([chosen.warning] if chosen.warning else []))
+    try:
+        moving, chosen = with_odometry(source, odometry)
+    except SourceError:
+        source.close()
+        raise
+    stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
+    digest = source.description.digest
+    if folder is None or live is not None or not digest:
+        caches = ScanCaches(_LARGE if _LARGE.is_dir() else None)
+    else:
+        caches = ScanCaches(folder, f"{digest}\n{source.description.uri}\n{chosen.words}\n{seed}")
+    run = Run(
+        moving,
+        lambda parameters: make_mapper(moving.description, parameters, seed, stopwatch),
+        Cursor(moving, chosen.steps) if live is None else LiveCursor(live, chosen, moving),
+        parameters,
+        stopwatch,
+        chosen.words,
+        reread=None if live is not None else lambda: steps(moving.records(None), odometry=chosen.steps),
+        caches=caches,
+    )
+    return run, (*source.description.warnings, *([chosen.warning] if chosen.warning else []))
 
 
 def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Parameters], ...]:

@@ -17,14 +17,16 @@ from app.batch.summary import driven, health_word
 from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
-from app.worker.camera import has_camera
 from app.worker.map_changes import MapChanges
-from app.worker.protocol import LONGEST_S, Opened, State, Status
+from app.worker.protocol import LONGEST_S, CameraPicture, Opened, State, Status
 from app.worker.remap import MapComparison
-from app.worker.run import MakeMapper, MakeSynchroniser, OpenCaches, Run, RunFactory, unnamed_caches
+from app.worker.run import MakeMapper, Run, open_run
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers.base import Source, SourceOptions
+from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
+from pipeline.io.readers.camera import SHOWN_NS, PictureSource
+from pipeline.io.readers.ros_messages import COMPRESSED_IMAGE, IMAGE
+from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.types.records import Frame, Path, Trees
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
@@ -42,10 +44,9 @@ class Session:
 
     Args:
         open_source: Opens a source by its URI and options.
-        make_mapper: Returns a new mapper for a source, parameters, seed and stopwatch.
-        make_synchroniser: Returns the synchroniser for a choice of odometry.
+        make_mapper: Returns a new mapper.
         parameters: Parameters at the beginning.
-        open_caches: Opens the scan caches of a source.
+        folder: Folder of the scan caches, see `open_run`.
         compile_ahead: Compiles the kernels that are not compiled on this machine yet.
         warm_up: Loads the kernels; called while a robot is already received and recorded.
 
@@ -58,16 +59,15 @@ class Session:
         self,
         open_source: OpenSource,
         make_mapper: MakeMapper,
-        make_synchroniser: MakeSynchroniser,
         parameters: Parameters,
-        open_caches: OpenCaches = unnamed_caches,
+        folder: FilePath | None = None,
         compile_ahead: Callable[[], None] = lambda: None,
         warm_up: Callable[[], None] = lambda: None,
     ) -> None:
         self._open_source = open_source
         self._warm_up = warm_up
         self._compile_ahead = compile_ahead
-        self._make_run = RunFactory(make_mapper, make_synchroniser, open_caches)
+        self._make_mapper, self._folder = make_mapper, folder
         self._parameters = parameters
         self._revision = 0
         self._requested: tuple[str, str, int] | None = None
@@ -171,7 +171,9 @@ class Session:
         return self._begin(self._robot, *self._requested[1:]) if is_heard else None
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
-        self._run, warnings = self._make_run(source, odometry, seed, self._parameters)
+        self._run, warnings = open_run(
+            source, odometry, seed, self._parameters, self._make_mapper, self._folder
+        )
         self._state, self._detail = "paused", ""
         self._warn(warnings)
         return opened_of(self._run)
@@ -538,3 +540,31 @@ def clock(seconds: float) -> str:
     """Return a time [s] as minutes and seconds, for example "1:05"."""
     whole = int(seconds)
     return f"{whole // 60}:{whole % 60:02d}"
+
+
+def has_camera(description: SourceDescription) -> bool:
+    """Return whether a source has camera pictures."""
+    return any(t.read_as == "camera" and t.type in (IMAGE, COMPRESSED_IMAGE) for t in description.topics)
+
+
+def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
+    """Return the camera picture of a source that is closest to a time.
+
+    Args:
+        source: The open source; None where no run is open.
+        stamp_ns: The time [ns].
+
+    Raises:
+        StemmapError: The source has no camera, or no picture within `SHOWN_NS` of the time.
+    """
+    origin: object = source.source if isinstance(source, OdometryOverride) else source
+    if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
+        raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
+    picture = origin.picture_near(stamp_ns, SHOWN_NS)
+    if picture is None:
+        raise StemmapError(
+            f"no picture was taken within {SHOWN_NS / 1e9:g} s of this scan",
+            remedy="Play on, or go to another scan",
+        )
+    received = origin.picture_counts if isinstance(origin, LiveSource) else ""
+    return CameraPicture(picture, *origin.camera(), received)

@@ -12,8 +12,7 @@ from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source, SourceOptions
-from pipeline.odometry.synchroniser import steps
-from tests.app.fakes import FakeMapper, FakeSource
+from tests.app.fakes import FakeSource, make_mapper
 
 
 def open_source(uri: str, _options: SourceOptions) -> Source:
@@ -31,8 +30,7 @@ if __name__ == "__main__":
     run_as_worker(
         Session(
             open_source=open_source,
-            make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
-            make_synchroniser=lambda _odometry: steps,
+            make_mapper=make_mapper,
             parameters=Parameters(),
         )
     )

@@ -5,19 +5,21 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, cast
 from zlib import crc32
 
 import numpy as np
 
-from app.common.timers import Stopwatch
 from app.worker.protocol import Opened, ToWorker
 from app.worker.session import Session
 from pipeline.config import Parameters
+from pipeline.detection.free_space import BINS
 from pipeline.errors import ParameterError, SourceError
+from pipeline.front_end import SegmentedScan
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
-from pipeline.odometry.synchroniser import steps
+from pipeline.mapper import Mapper
+from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.types.records import (
     Clusters,
     Detections,
@@ -106,14 +108,31 @@ class FakeState:
 class FakeMapper:
     """Its pose is a checksum over all steps and parameters so far: any difference in history shows."""
 
-    def __init__(self, parameters: Parameters, seed: int, watch: Stopwatch | None = None) -> None:
+    def __init__(self, parameters: Parameters, seed: int, timer: StageTimer = no_timer) -> None:
         self.parameters = parameters
         self._state = FakeState(seed, ())
-        self._watch = watch or Stopwatch()
+        self._timer = timer
 
-    def process(self, step: Step) -> Frame:
+    def segment(self, step: Step) -> SegmentedScan:
+        nothing = np.zeros((0, 3), np.float32)
+        clusters = frame(step.index, step.scan.stamp_ns).clusters
+        return SegmentedScan(
+            nothing,
+            nothing,
+            np.zeros(0, np.int32),
+            clusters,
+            None,
+            np.zeros(BINS),
+            np.zeros(3),
+            None,
+            None,
+            (),
+            {},
+        )
+
+    def process(self, step: Step, _scan: SegmentedScan | None = None) -> Frame:
         odometry = step.T_odom_base or Pose2()
-        with self._watch("chain"):
+        with self._timer("chain"):
             seen = struct.pack(
                 "<qqqdd",
                 self._state.chain,
@@ -137,6 +156,10 @@ class FakeMapper:
     @property
     def path(self) -> Path:
         return path([x for _, x in self._state.path], [stamp for stamp, _ in self._state.path])
+
+
+def make_mapper(_source: SourceDescription, parameters: Parameters, seed: int, timer: StageTimer) -> Mapper:
+    return cast(Mapper, FakeMapper(parameters, seed, timer))
 
 
 def path(x: list[float], stamps: list[int] | None = None) -> Path:
@@ -239,8 +262,7 @@ def make_session(source: FakeSource, parameters: Parameters | None = None) -> Se
 
     return Session(
         open_source=open_source,
-        make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
-        make_synchroniser=lambda _odometry: steps,
+        make_mapper=make_mapper,
         parameters=parameters or Parameters(),
     )
 

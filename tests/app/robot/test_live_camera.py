@@ -24,7 +24,7 @@ from app.robot.picture_store import FULL, REFUSED, SPARED, PictureStore
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.robot.topics import PICTURE_TYPES, Publisher, choose
-from app.worker.camera import camera_picture, has_camera
+from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.camera import SHOWN_NS, Picture

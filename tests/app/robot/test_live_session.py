@@ -25,8 +25,7 @@ from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.ros_messages import POINT_CLOUD
-from pipeline.odometry.synchroniser import steps
-from tests.app.fakes import FakeMapper
+from tests.app.fakes import make_mapper
 from tests.app.robot.conftest import SCANS, until
 
 URI = "zenoh:tcp/robot:7447"
@@ -72,8 +71,7 @@ class Stage:
         self.compiled.set()
         self.session = Session(
             open_source=lambda uri, _options: LiveSource(parse_address(uri), SourceOptions(), self._link),
-            make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
-            make_synchroniser=lambda _odometry: steps,
+            make_mapper=make_mapper,
             parameters=Parameters(),
             warm_up=self.warm_up,
         )

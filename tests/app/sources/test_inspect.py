@@ -25,9 +25,8 @@ from pipeline.io.readers.base import Source, SourceOptions
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.ros_messages import IMAGE, NAV_SAT_FIX, POINT_CLOUD
 from pipeline.io.recording import write_recording
-from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Sensor
-from tests.app.fakes import FakeMapper, FakeSource, FakeWorker
+from tests.app.fakes import FakeSource, FakeWorker, make_mapper
 from tests.app.robot.conftest import clouds
 from tests.app.server_for_tests import BEARER, Running, running
 
@@ -164,8 +163,7 @@ def test_a_run_that_failed_is_opened_again_with_the_same_choice():
 
     session = Session(
         open_source=open_source,
-        make_mapper=lambda _source, p, seed, watch: FakeMapper(p, seed, watch),
-        make_synchroniser=lambda _odometry: steps,
+        make_mapper=make_mapper,
         parameters=Parameters(),
     )
     session.open("fake:", "auto", 5, options=SourceOptions({"scan": "/other"}))

@@ -7,7 +7,7 @@ from typing import cast
 
 from app.worker.cursor import Cursor
 from pipeline.io.readers.base import Source
-from pipeline.odometry.synchroniser import steps
+from pipeline.types.records import Scan
 from tests.pipeline.odometry.test_gyro import told_by_robot
 
 
@@ -34,10 +34,28 @@ def taken(cursor):
 
 def test_going_back_gives_the_same_turns_without_reading_all_again():
     recording = Recording(told_by_robot(0.32, 0.3))
-    cursor = Cursor(cast(Source, recording), steps)
+    cursor = Cursor(cast(Source, recording))
     whole = taken(cursor)
     assert any(turn is not None for *_, turn, _ in whole)
     for index in (30, 25, 14, 37):
         cursor.go_to(index)
         assert taken(cursor) == whole[index:]
     assert all(start_ns is not None for start_ns in recording.read_from[1:])
+
+
+class Forgetful(Recording):
+    """A recording that gives other motion when it is not read from the start."""
+
+    def records(self, start_ns=None):
+        kept = list(super().records(start_ns))
+        return iter(kept if start_ns is None else [r for r in kept if isinstance(r, Scan)])
+
+
+def test_where_reading_from_the_middle_gives_other_steps_all_is_read_again():
+    recording = Forgetful(told_by_robot(0.32, 0.3))
+    cursor = Cursor(cast(Source, recording))
+    whole = taken(cursor)
+    for index in (30, 14):
+        cursor.go_to(index)
+        assert taken(cursor) == whole[index:]
+    assert recording.read_from.count(None) == 3

@@ -16,7 +16,6 @@ from pipeline.config import Parameters
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.base import SourceDescription
 from pipeline.mapper import Mapper
-from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Frame, Record, Truth
 from tests.benchmarks.troubled import AFTER, KNOWN, PLACES, SENSOR, TROUBLES, Drive, drive, parameters
 from tests.pipeline.strategies import first_of
@@ -76,10 +75,9 @@ def lived(place: str, seed: int, name: str, p: Parameters | None = None) -> Day:
     driven = drive(PLACES[place], seed, trouble)
     session = Session(
         open_source=lambda _uri, _options: Told(driven),
-        make_mapper=lambda source, p, seed, watch: Mapper(
-            p, sensor=source.description.sensor, T_base_lidar=Pose3.identity(), seed=seed, timer=watch
+        make_mapper=lambda source, p, seed, timer: Mapper(
+            p, sensor=source.sensor, T_base_lidar=Pose3.identity(), seed=seed, timer=timer
         ),
-        make_synchroniser=lambda _odometry: steps,
         parameters=parameters() if p is None else p,
     )
     session.open("told:", "auto", seed)
