@@ -9,11 +9,10 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from app.common.timers import Throttle
 from app.common.user import SOMEBODY, current_user
@@ -22,7 +21,7 @@ from app.dashboard.broadcast import Broadcast
 from app.dashboard.camera_view import CameraView
 from app.dashboard.events import Events
 from app.dashboard.parameters import ParameterSets, ParameterState
-from app.dashboard.payload import BeforeAfter, Counts, counts_of, map_payload, truth_payload
+from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import RunRecorder, RunState
 from app.dashboard.scores import Scores, score_map
 from app.dashboard.selection import Selector
@@ -50,44 +49,13 @@ from app.worker.protocol import (
     ToWorker,
     WorkerBusyError,
 )
-from pipeline.config import Parameters, preset
+from pipeline.config import preset
 from pipeline.config.model import Value
-from pipeline.types.records import Frame, Path, Trees, TruthTrees
+from pipeline.types.records import Path, Trees, TruthTrees
 
-
-class SceneLike(Protocol):
-    """What the dashboard needs of `app.scene.Scene`."""
-
-    @property
-    def port(self) -> int: ...
-
-    secret: str
-
-    def show(self, frame: Frame, path: NDArray[np.float64], /) -> None: ...
-    def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None: ...
-    def show_truth(self, trees: TruthTrees | None, /) -> None: ...
-    def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None: ...
-    def choose(self, name: str, value: str | bool, /) -> None: ...
-    @property
-    def view(self) -> dict[str, Any]: ...
-    @property
-    def counts(self) -> dict[str, int]: ...
-    def clear(self) -> None: ...
-    def close(self) -> None: ...
-
-
-class WorkerLike(Protocol):
-    """What the dashboard needs of `app.worker.supervisor.WorkerProcess`."""
-
-    restarts: int
-
-    @property
-    def pid(self) -> int | None: ...
-
-    async def start(self) -> None: ...
-    async def send(self, command: ToWorker, /) -> None: ...
-    async def close(self) -> None: ...
-
+if TYPE_CHECKING:
+    from app.scene import Scene
+    from app.worker.supervisor import WorkerProcess
 
 # A little less than a tenth of a second, so that a sensor of 10 Hz never waits for the next round.
 _SCENE_PAUSE_S = 0.09
@@ -102,8 +70,8 @@ class Dashboard:
         store: Access to the store; None keeps everything in memory.
     """
 
-    worker: WorkerLike
-    scene: SceneLike
+    worker: WorkerProcess
+    scene: Scene
 
     def __init__(self, parameters: ParameterState, live: Broadcast, store: AsyncStore | None = None) -> None:
         self.parameters = parameters
@@ -436,7 +404,8 @@ class Dashboard:
         self.path_xy = np.column_stack([self.path.x, self.path.y])
         path_xy = self.path_xy
         distance = self.parameters.parameters.evaluation.match_distance
-        payload, counted = await asyncio.to_thread(_map_and_counts, shown, self.truth, distance)
+        payload = await asyncio.to_thread(map_payload, shown)
+        counted = await asyncio.to_thread(counts_of, shown.frame, self.truth, distance)
         if number != self._opens:  # another source was requested meanwhile
             return
         counts = self._before_after.shown(counted)
@@ -471,19 +440,6 @@ class Dashboard:
         self.live.tell("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
             self._tell_events()
-
-
-def _map_and_counts(
-    shown: Shown, truth: TruthTrees | None, match_distance: float
-) -> tuple[dict[str, Any], Counts]:
-    """Return the message "map" without its path, and the verdict counts of the scan.
-
-    Args:
-        shown: Shown frame.
-        truth: Ground truth, or None.
-        match_distance: Maximum distance between a detection and its true tree [m].
-    """
-    return map_payload(shown), counts_of(shown.frame, truth, match_distance)
 
 
 def _open_command(request: SourceRequest) -> Open:

@@ -9,6 +9,7 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -19,7 +20,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from app.common.settings import Settings
 from app.dashboard.broadcast import Broadcast
-from app.dashboard.dashboard import Dashboard, SceneLike, WorkerLike
+from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.dashboard.parameters import ParameterState
 from app.store.async_store import AsyncStore, StoreBusyError
@@ -36,6 +37,10 @@ from app.web.uploads import Uploads
 from app.worker.protocol import Open, WorkerBusyError
 from pipeline.errors import ParameterError, StemmapError
 
+if TYPE_CHECKING:
+    from app.scene import Scene
+    from app.worker.supervisor import WorkerProcess
+
 _log = logging.getLogger(__name__)
 
 ROUTERS = tuple(
@@ -43,8 +48,8 @@ ROUTERS = tuple(
     for module in (page, run, runs, parameters, results, annotation_routes, tuning, upload_routes, sockets)
 )
 
-MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], SceneLike]
-MakeWorker = Callable[[Dashboard], WorkerLike]
+MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], "Scene"]
+MakeWorker = Callable[[Dashboard], "WorkerProcess"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,14 +208,14 @@ def _answer_errors(app: FastAPI) -> None:
         return error_reply(500, "this is a fault in stemmap", remedy="The terminal shows where it happened")
 
 
-def _worker(folder: Path | None, dashboard: Dashboard) -> WorkerLike:
+def _worker(folder: Path | None, dashboard: Dashboard) -> WorkerProcess:
     from app.worker.supervisor import WORKER, WorkerProcess
 
     kept = () if folder is None else (str(folder / "kept"),)
     return WorkerProcess(dashboard.receive, (*WORKER, *kept))
 
 
-def _scene(dashboard: Dashboard, loop: asyncio.AbstractEventLoop) -> SceneLike:
+def _scene(dashboard: Dashboard, loop: asyncio.AbstractEventLoop) -> Scene:
     from app.scene import Scene
 
     return Scene(dashboard, loop)

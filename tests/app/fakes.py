@@ -10,8 +10,10 @@ from zlib import crc32
 
 import numpy as np
 
+from app.scene import Scene
 from app.worker.protocol import Opened, ToWorker
 from app.worker.session import Session
+from app.worker.supervisor import WorkerProcess
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
 from pipeline.errors import ParameterError, SourceError
@@ -267,45 +269,48 @@ def make_session(source: FakeSource, parameters: Parameters | None = None) -> Se
     )
 
 
-class FakeWorker:
+class FakeWorker(WorkerProcess):
     """Remembers what it was told."""
+
+    pid: int | None = 1
 
     def __init__(self) -> None:
         self.commands: list[ToWorker] = []
         self.restarts = 0
-        self.pid: int | None = 1
         self.closed = False
 
     async def start(self) -> None:
         pass
 
-    async def send(self, command: ToWorker, /) -> None:
+    async def send(self, command: ToWorker) -> None:
         self.commands.append(command)
 
     async def close(self) -> None:
         self.closed = True
 
 
-class FakeScene:
+class FakeScene(Scene):
     """Remembers what it was shown."""
+
+    port = 1
 
     def __init__(self, port: int = 1) -> None:
         self.port = port
         self.secret = "secret"
         self.calls: list[tuple[str, Any]] = []
 
-    def show(self, frame: Frame, path: Any, /) -> None:
+    def show(self, frame: Frame, path: Any) -> None:
         assert path.shape[1] == 2
         self.calls.append(("show", frame.index))
 
-    def show_parameters(self, parameters: Parameters, preset_name: str, /) -> None:
+    def show_parameters(self, parameters: Parameters, preset_name: str) -> None:
         assert isinstance(parameters, Parameters)
         self.calls.append(("parameters", preset_name))
 
-    def show_truth(self, trees: TruthTrees | None, /) -> None:
+    def show_truth(self, trees: TruthTrees | None) -> None:
         self.calls.append(("truth", trees is not None))
 
-    def select(self, tree: int | None, ring: tuple[float, float, float] | None, /) -> None:
+    def select(self, tree: int | None, ring: tuple[float, float, float] | None = None) -> None:
         self.calls.append(("select", tree if ring is None else (tree, ring)))
 
     @property
@@ -316,7 +321,7 @@ class FakeScene:
     def counts(self) -> dict[str, int]:
         return {"voxels": 0}
 
-    def choose(self, name: str, value: str | bool, /) -> None:
+    def choose(self, name: str, value: str | bool) -> None:
         if name == "nothing":
             raise ParameterError("there is no such layer")
         self.calls.append(("choose", (name, value)))

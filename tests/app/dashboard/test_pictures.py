@@ -137,7 +137,7 @@ async def test_the_page_asks_for_stages_and_for_a_comparison(both: Running) -> N
         if isinstance(command, AskCompare):
             await dashboard.receive(Answer(command.ticket, frames=[picture for _ in command.sets]))
 
-    worker.send = answer  # type: ignore[method-assign]
+    worker.send = answer  # type: ignore[method-assign, assignment]
     block = await client.post("/api/compare", json={"a": "", "b": "paper"})
     header, arrays = unpacked(block.content)
     assert {name for name, _, _ in header["differences"]} == set(preset("paper").changes_from(Parameters()))

@@ -489,7 +489,7 @@ async def test_a_command_while_the_worker_restarts_is_answered_503(both: Running
     async def refuse(_: object) -> None:
         raise WorkerBusyError("the mapping process is not ready for commands")
 
-    dashboard.worker.send = refuse  # type: ignore[method-assign]
+    dashboard.worker.send = refuse  # type: ignore[method-assign, assignment]
     answer = await client.post("/api/command", json={"type": "seek", "time_s": 1.0})
     assert (answer.status_code, answer.headers["Retry-After"]) == (503, "3")
 

@@ -157,7 +157,7 @@ def answering(dashboard: Dashboard, *pictures: CameraPicture | str) -> list[int]
             told_of: dict[str, Any] = {"missing": told} if isinstance(told, str) else {"camera": told}
             await dashboard.receive(Answer(command.ticket, **told_of))
 
-    worker.send = answer  # type: ignore[method-assign]
+    worker.send = answer  # type: ignore[method-assign, assignment]
     return asked
 
 
