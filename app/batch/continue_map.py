@@ -295,22 +295,18 @@ def localise(
         StemmapError: No match was found; the message has the last reason.
     """
     mapper = mapper_of(source.description, parameters, seed)
-    due, frame, match = float(FIRST_TRY), None, None
-    for step in steps(source.records(), odometry=odometry):
-        frame = mapper.process(step)
-        if step.index + 1 < due:
-            continue
-        due = NEXT_TRY * (step.index + 1)
-        match = find_constellation(
-            MapStems.of_trees(frame.trees), reference, parameters.relocalisation, hypotheses=HYPOTHESES
-        )
-        if match.pose is not None:
-            return match
-    if frame is not None:
-        stems = MapStems.of_trees(frame.trees)
-        match = find_constellation(stems, reference, parameters.relocalisation, hypotheses=HYPOTHESES)
-        if match.pose is not None:
-            return match
+    due, match = float(FIRST_TRY), None
+    coming = steps(source.records(), odometry=odometry)
+    step = next(coming, None)
+    while step is not None:
+        frame, following = mapper.process(step), next(coming, None)
+        if step.index + 1 >= due or following is None:
+            due = NEXT_TRY * (step.index + 1)
+            stems = MapStems.of_trees(frame.trees)
+            match = find_constellation(stems, reference, parameters.relocalisation, hypotheses=HYPOTHESES)
+            if match.pose is not None:
+                return match
+        step = following
     raise StemmapError(
         f"the robot was not found in the saved map: {match.reason if match else 'the source has no scan'}",
         where=source.description.uri,

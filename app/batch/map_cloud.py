@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 
 from app.batch.map_run import MappingResult
-from app.batch.run_folder import as_written
+from app.batch.run_folder import NO_PATH, as_written, score_map
 from app.batch.summary import evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
 from app.training.learned_forests import kept_forests
 from pipeline.config import Parameters
-from pipeline.evaluation import MapScores, evaluate
+from pipeline.evaluation import MapScores
 from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap, map_plot
 from pipeline.inventory.cloud import WholeCloud
 from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson
-from pipeline.types.records import Path, Trees, TruthTrees, Verdict
+from pipeline.types.records import Trees, TruthTrees, Verdict
 
 SLICE_COLUMNS = (
     "tree",
@@ -77,7 +77,7 @@ def _map(
     trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
     evaluation = None
     if truth is not None:
-        evaluation = evaluate(as_written(trees, _NO_PATH, 0)[0], truth, parameters.evaluation)
+        evaluation = score_map(*as_written(trees, NO_PATH, 0), truth, parameters)
     losses = {reason: n for reason, n in cloud.losses.items() if n}
     if plot.counts["apart from the plot"]:
         losses["points far from the plot"] = plot.counts["apart from the plot"]
@@ -88,7 +88,7 @@ def _map(
     run = _run_record(cloud, plot, preset, parameters, evaluation, warnings, losses)
     files.finish(
         trees,
-        _NO_PATH,
+        NO_PATH,
         0,
         run,
         None,
@@ -103,8 +103,6 @@ def _map(
 
 
 _OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}
-_NOTHING = np.zeros(0)
-_NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
 
 
 def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:

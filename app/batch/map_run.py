@@ -19,17 +19,17 @@ from app.batch.continue_map import (
     at_origin,
     continue_map,
 )
-from app.batch.run_folder import as_written
-from app.batch.summary import breaks_of, driven, start_lines, summary_lines
+from app.batch.run_folder import as_written, score_map
+from app.batch.summary import breaks_of, driven, far_truth, start_lines, summary_lines
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
 from app.common.text import changed_values, count, preset_words, version
 from app.common.timers import Stopwatch
-from app.sources.opening import ChosenOdometry, with_odometry
+from app.sources.request import ChosenOdometry, with_odometry
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
-from pipeline.evaluation import MapScores, PathError, evaluate, path_error
+from pipeline.evaluation import MapScores, PathError, path_error
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers.base import Source
 from pipeline.io.result_files import RunFiles, terrain_text
@@ -55,7 +55,7 @@ class OfflineRun:
     """A run to be mapped.
 
     Attributes:
-        odometry: Source of the motion, see `app.sources.opening`.
+        odometry: Source of the motion, see `app.sources.request`.
         stop_after: Maximum number of scans.
         revisions: Parameter changes: first scan and parameters.
         on_frame: Called with the results of each scan.
@@ -146,12 +146,15 @@ def _map(
     )
     tally = begun.tally
     path, truth = mapper.path, _truth(plan, begun)
-    evaluation = _evaluate(*as_written(frame.trees, path, start_ns), truth, plan.parameters)
+    evaluation = None
+    if truth.trees is not None:
+        evaluation = score_map(*as_written(frame.trees, path, start_ns), truth.trees, plan.parameters)
     error = path_error(path, truth.path) if truth.path else None
     counted = begun.losses + left_out + Counter(plan.source.losses)
     losses = {reason: n for reason, n in counted.items() if n}
     state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
-    tally.warn_of_far_truth(evaluation)
+    if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
+        tally.warned[far_truth(evaluation.reach)] += 1
     if plan.parameters.classification.method == "none":  # else a track is classified by more than its hits
         tally.warn_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
     seconds, metres = driven(path, breaks_of(begun.sources))
@@ -273,12 +276,6 @@ def _saved(
 def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
-
-
-def _evaluate(trees: Trees, path: Path, truth: Truth, parameters: Parameters) -> MapScores | None:
-    if truth.trees is None:
-        return None
-    return evaluate(trees, truth.trees, parameters.evaluation, np.stack([path.x, path.y], axis=1))
 
 
 def _run_record(

@@ -14,9 +14,10 @@ import numpy as np
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.evaluation import MapScores, evaluate
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import PATH_COLUMNS, TREE_COLUMNS, path_rows, tree_rows
-from pipeline.types.records import Int, Path, Trees
+from pipeline.types.records import Int, Path, Trees, TruthTrees
 
 LARGEST_FILE = 256 << 20
 _FILES = (
@@ -104,6 +105,23 @@ def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
         _table(tree_rows(trees, start_ns), TREE_COLUMNS),
     )
     return _trees(columns[1]), _path(columns[0])
+
+
+_NOTHING = np.zeros(0)
+#: Path of the map of a whole cloud.
+NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING)
+
+
+def score_map(trees: Trees, path: Path, truth: TruthTrees, parameters: Parameters) -> MapScores:
+    """Return the scores of a map. With an empty path, as that of a whole cloud, all true trees count.
+
+    Args:
+        trees, path: The map, see `as_written`.
+        truth: True trees in the frame of the map.
+        parameters: Parameters, of which those of the stage `evaluation` are used.
+    """
+    path_xy = np.stack([path.x, path.y], axis=1) if len(path.x) else None
+    return evaluate(trees, truth, parameters.evaluation, path_xy)
 
 
 def _text(file: FilePath) -> str:

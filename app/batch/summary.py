@@ -178,11 +178,6 @@ class RunTotals:
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
 
-    def warn_of_far_truth(self, evaluation: MapScores | None) -> None:
-        """Add a warning if no true tree is near the path."""
-        if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
-            self.warned[far_truth(evaluation.reach)] += 1
-
     def warn_of_unconfirmed(self, frame: Frame, hits: int) -> None:
         """Add a warning if trees were seen in too few scans.
 
@@ -210,6 +205,18 @@ def far_truth(reach: float) -> str:
         "with the first pose as the origin and x along its heading "
         "(evaluation.reach includes trees at a larger distance)"
     )
+
+
+def far_map(scores: MapScores, match_distance: float) -> str:
+    """Return the message for a map without any of the true trees; empty if it has one, or there are none.
+
+    Args:
+        scores: Scores of the map.
+        match_distance: Largest distance between a tree and its ground truth [m].
+    """
+    if scores.TA.count or not scores.TA.of:
+        return ""
+    return f"none of {count(scores.TA.of, 'true tree')} has a mapped tree within {match_distance:g} m"
 
 
 def breaks_of(sources: Iterable[RunSource]) -> list[int]:

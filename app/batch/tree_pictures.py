@@ -101,7 +101,8 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
     Raises:
         OSError: The folder cannot be written.
     """
-    _clear(folder / FOLDER)
+    for old in (folder / FOLDER).glob("tree_*.jpg"):
+        old.unlink()
     origin: object = source.source if isinstance(source, OdometryOverride) else source
     if not isinstance(origin, PictureSource):
         return 0, ""
@@ -121,8 +122,3 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
                 partial.write_bytes(content)
             kept += 1
     return kept, f"{refused} pictures could not be decoded" if refused else ""
-
-
-def _clear(folder: FilePath) -> None:
-    for old in folder.glob("tree_*.jpg") if folder.is_dir() else ():
-        old.unlink()

@@ -13,18 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import (
-    add_dbh_unit_flag,
-    add_parameter_flags,
-    add_run_flags,
-    add_source_flags,
-    cannot_write,
-    chosen_parameters,
-    plain,
-    says_parameters,
-    source,
-    whole_number,
-)
+from app.cli import flags
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
@@ -48,7 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "runs",
         metavar="RUN",
         nargs="+",
-        type=source,
+        type=flags.source,
         help="folders that `stemmap map` wrote; with --param-grid recordings and simulated runs too",
     )
     parser.add_argument(
@@ -60,7 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="true trees (CSV) in the frame of the map, one FILE for all runs or one each "
         "(default: those of the source)",
     )
-    add_dbh_unit_flag(parser)
+    flags.add_dbh_unit_flag(parser)
     parser.add_argument(
         "--match-distance", metavar="M", help="largest distance between a tree and its ground truth [m]"
     )
@@ -88,13 +77,13 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             evaluation, whole = _score(arguments, number)
         except StemmapError as error:  # the other runs are scored all the same
-            print(f"stemmap: {plain(name)}: {error}", file=sys.stderr)
+            print(f"stemmap: {flags.plain(name)}: {error}", file=sys.stderr)
             failed += 1
             continue
         if arguments.json:
             plains[name] = asdict(evaluation)
             continue
-        print(f"{plain(name)}:")
+        print(f"{flags.plain(name)}:")
         _print(arguments, evaluation, whole)
     if arguments.json:
         print(json.dumps(plains, indent=1))
@@ -114,31 +103,25 @@ def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) ->
 
 def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]:
     """Return the scores of a run, and whether it is a whole cloud."""
-    import numpy as np
-
-    from app.batch.run_folder import read_run
-    from app.batch.summary import far_truth
-    from app.common.text import count
+    from app.batch.run_folder import read_run, score_map
+    from app.batch.summary import far_map, far_truth
     from pipeline.config import assign
-    from pipeline.evaluation import evaluate
 
     folder = Path(arguments.runs[number])
     finished = read_run(folder)
     parameters = assign(finished.parameters, distances(arguments))
     truth = _truth(arguments, finished, number)
-    # A whole cloud has no path: all true trees count.
-    path = None if finished.of_cloud else np.stack([finished.path.x, finished.path.y], axis=1)
-    evaluation = evaluate(finished.trees, truth, parameters.evaluation, path)
+    evaluation = score_map(finished.trees, finished.path, truth, parameters)
     if evaluation.TA.of + evaluation.TR.of == 0:
-        raise StemmapError("the ground truth has no trees" if path is None else far_truth(evaluation.reach))
-    if evaluation.TA.of and not evaluation.TA.count:
+        nothing = "the ground truth has no trees" if finished.of_cloud else far_truth(evaluation.reach)
+        raise StemmapError(nothing)
+    if no_tree := far_map(evaluation, parameters.evaluation.match_distance):
         raise StemmapError(
-            f"none of {count(evaluation.TA.of, 'true tree')} has a mapped tree within "
-            f"{parameters.evaluation.match_distance:g} m",
+            no_tree,
             where=str(folder),
             remedy="Check that the ground truth is in the frame of the map: the first pose is its origin",
         )
-    return evaluation, path is None
+    return evaluation, finished.of_cloud
 
 
 def _given_truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
@@ -193,7 +176,7 @@ def add_grid_flags(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--jobs",
         metavar="N",
-        type=whole_number(1, 1024),
+        type=flags.whole_number(1, 1024),
         help="processes on this machine (default: one per core)",
     )
     group.add_argument(
@@ -213,9 +196,9 @@ def add_grid_flags(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="folder that stores results, so that they are computed once (default: in STEMMAP_FOLDER)",
     )
-    add_parameter_flags(parser)
-    add_run_flags(parser)
-    add_source_flags(parser)
+    flags.add_parameter_flags(parser)
+    flags.add_run_flags(parser)
+    flags.add_source_flags(parser)
 
 
 def refuse_without_grid(arguments: argparse.Namespace) -> None:
@@ -229,7 +212,7 @@ def refuse_without_grid(arguments: argparse.Namespace) -> None:
         "--dask": arguments.dask,
         "--out": arguments.out,
         "--keep": arguments.keep,
-        "--preset, --config and --set": says_parameters(arguments),
+        "--preset, --config and --set": flags.says_parameters(arguments),
         "--topic and --mount": arguments.topics or arguments.mount,
     }
     for flag, value in given.items():
@@ -249,7 +232,7 @@ def run_grid(arguments: argparse.Namespace) -> int:
 
     sets = combinations(read_axes(arguments.param_grid))
     arguments.assignments = [*arguments.assignments, *distances(arguments)]
-    chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
+    flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
     if len(sets) * len(arguments.runs) > MOST_JOBS:
         raise ParameterError(
             f"{len(sets):,} sets on {len(arguments.runs)} runs are more than {MOST_JOBS:,} results",
@@ -287,7 +270,7 @@ def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
             )
             runs.append(prepare_run(source, truth))
         except StemmapError as error:
-            print(f"stemmap: left out: {plain(str(error))}", file=sys.stderr)
+            print(f"stemmap: left out: {flags.plain(str(error))}", file=sys.stderr)
             refused += 1
     return runs, refused
 
@@ -299,13 +282,13 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
 
     suits = str(changes.get(PRESET, run.preset))
     present = preset(suits) if PRESET in changes else None
-    return chosen_parameters(arguments, suits, present)[1]
+    return flags.chosen_parameters(arguments, suits, present)[1]
 
 
 def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
     from tqdm import tqdm
 
-    from app.common.environment import from_environment
+    from app.common.settings import from_environment
     from app.tuning.sweep import ResultStore, sweep
 
     folder = from_environment().folder
@@ -346,22 +329,22 @@ def _print_comparison(
         print(json_text(comparison), end="")
     else:
         for line in lines(comparison):
-            print(plain(line))
+            print(flags.plain(line))
     if arguments.out is not None:
         try:
             names = files(comparison, arguments.out)
         except OSError as error:
-            raise cannot_write(error, arguments.out) from None
+            raise flags.cannot_write(error, arguments.out) from None
         print(f"{', '.join(names)} in {arguments.out}", file=sys.stderr)
     if outcome.known:
         print(f"{count(outcome.known, 'stored result')} used", file=sys.stderr)
     for warning in outcome.warnings:
-        print(f"warning: {plain(warning)}", file=sys.stderr)
+        print(f"warning: {flags.plain(warning)}", file=sys.stderr)
     for reason, times in sorted(outcome.lost.items()):
-        print(f"warning: {count(times, 'worker')} lost during a job: {plain(reason)}", file=sys.stderr)
+        print(f"warning: {count(times, 'worker')} lost during a job: {flags.plain(reason)}", file=sys.stderr)
     failed = comparison.failed
     for why, times in Counter(row.error for row in failed).items():
-        print(f"left out: {count(times, 'result')}: {plain(why)}", file=sys.stderr)
+        print(f"left out: {count(times, 'result')}: {flags.plain(why)}", file=sys.stderr)
     if len(failed) == len(comparison.rows):
         return 1
     return 3 if failed or refused else 0

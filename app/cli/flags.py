@@ -152,8 +152,7 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
         return ""
     if arguments.record:
         return str(Path(arguments.record).expanduser().absolute())
-    from app.common.environment import from_environment
-    from app.common.settings import recordings_place
+    from app.common.settings import from_environment, recordings_place
 
     return str(recordings_place(from_environment(), time.time()))
 

@@ -77,7 +77,7 @@ def _record(opened: Source) -> dict[str, Any]:
 
 def _lines(opened: Source) -> list[str]:
     from app.common.text import count
-    from app.sources.opening import choose_odometry
+    from app.sources.request import choose_odometry
 
     d, truth = opened.description, opened.truth()
     x, y, z = d.T_base_lidar.t

@@ -12,23 +12,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.cli.flags import (
-    SOURCE_HELP,
-    add_dbh_unit_flag,
-    add_force_flag,
-    add_live_flags,
-    add_parameter_flags,
-    add_run_flags,
-    add_source_flags,
-    cannot_write,
-    chosen_parameters,
-    compilation_notice,
-    recording_place,
-    says_parameters,
-    source,
-    source_options,
-    whole_number,
-)
+from app.cli import flags
 from pipeline.errors import ParameterError, SourceError
 
 if TYPE_CHECKING:
@@ -43,15 +27,15 @@ HELP = "map a run without a browser and write its files"
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("source", metavar="SOURCE", type=source, help=SOURCE_HELP)
+    parser.add_argument("source", metavar="SOURCE", type=flags.source, help=flags.SOURCE_HELP)
     parser.add_argument("--out", metavar="DIR", type=Path, required=True, help="folder for the files")
-    add_force_flag(parser)
-    add_parameter_flags(parser)
-    add_run_flags(parser)
-    add_source_flags(parser)
-    add_live_flags(parser)
+    flags.add_force_flag(parser)
+    flags.add_parameter_flags(parser)
+    flags.add_run_flags(parser)
+    flags.add_source_flags(parser)
+    flags.add_live_flags(parser)
     parser.add_argument("--truth", metavar="FILE", type=Path, help="ground truth trees (CSV) for the scores")
-    add_dbh_unit_flag(parser)
+    flags.add_dbh_unit_flag(parser)
     parser.add_argument(
         "--continue",
         dest="continued",
@@ -74,7 +58,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stop-after",
         metavar="N",
-        type=whole_number(1, (1 << 31) - 1),
+        type=flags.whole_number(1, (1 << 31) - 1),
         help="map N scans; --start resume maps the rest",
     )
     parser.add_argument(
@@ -93,12 +77,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
-@compilation_notice()
+@flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
     """Map the run; return the exit code."""
     if arguments.start is not None and arguments.continued is None:
         raise ParameterError("--start needs a continued map", remedy="Add --continue DIR")
-    chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
+    flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
     from app.batch.data_folders import partial_output_warnings
     from pipeline.io.readers.clouds import is_cloud
@@ -120,17 +104,19 @@ def _run_plot(arguments: argparse.Namespace) -> int:
     from pipeline.io.readers.clouds import open_cloud
 
     truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
-    name, parameters = chosen_parameters(arguments, "forest")
+    name, parameters = flags.chosen_parameters(arguments, "forest")
     cloud = open_cloud(arguments.source)
     replaces = check_folder(arguments.out, cloud.description.digest, force=arguments.force)
     try:
         outcome = map_plot_run(cloud, name, parameters, truth, arguments.out)
     except OSError as error:
-        raise cannot_write(error, arguments.out) from None
+        raise flags.cannot_write(error, arguments.out) from None
     return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses, replaces=replaces)
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
+    from tqdm import tqdm
+
     from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run
     from app.batch.run_folder import check_folder
@@ -144,16 +130,18 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
     with (
-        closing(open_any(arguments.source, source_options(arguments))) as opened,
+        closing(open_any(arguments.source, flags.source_options(arguments))) as opened,
         _listening(
             opened,
-            recording_place(arguments, arguments.source),
+            flags.recording_place(arguments, arguments.source),
             publish=arguments.publish,
             pictures=arguments.out,
         ),
     ):
-        revisions = () if saved or says_parameters(arguments) else recorded_parameters(opened.description)
-        preset_name, parameters = chosen_parameters(
+        revisions = (
+            () if saved or flags.says_parameters(arguments) else recorded_parameters(opened.description)
+        )
+        preset_name, parameters = flags.chosen_parameters(
             arguments,
             saved.preset if saved else opened.description.preset,
             saved.chosen_parameters() if saved else revisions[0][1] if revisions else None,
@@ -178,10 +166,13 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
         try:
-            bar = _MapProgress(opened.description.scans)
+            bar = tqdm(
+                total=opened.description.scans, unit="scan", desc="mapping", file=sys.stderr,
+                disable=not sys.stderr.isatty(), leave=False,
+            )  # fmt: skip
             outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
         except OSError as error:
-            raise cannot_write(error, arguments.out) from None
+            raise flags.cannot_write(error, arguments.out) from None
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
     return _tell(
@@ -193,7 +184,7 @@ def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
     """Return the topics and the mounting that the flags give, for run.json."""
     from app.sources.request import request_of_options
 
-    kept = request_of_options(arguments.source, source_options(arguments)).kept_choices()
+    kept = request_of_options(arguments.source, flags.source_options(arguments)).kept_choices()
     return {**(kept or {}), "as_live": True} if arguments.as_live else kept
 
 
@@ -237,34 +228,6 @@ def _start(text: str) -> str | tuple[float, float, float]:
     except ValueError:
         pass
     raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or three numbers x,y,yaw")
-
-
-class _MapProgress:
-    """A progress bar on a terminal; without a terminal it prints nothing."""
-
-    def __init__(self, scans: int | None) -> None:
-        from tqdm import tqdm
-
-        self._bar = tqdm(
-            total=scans,
-            unit="scan",
-            desc="preparing",
-            file=sys.stderr,
-            disable=not sys.stderr.isatty(),
-            leave=False,
-        )
-        self._begun = False
-
-    def update(self, n: int = 1, /) -> object:
-        """Add completed scans."""
-        if not self._begun:
-            self._bar.set_description("mapping", refresh=False)
-            self._begun = True
-        return self._bar.update(n)
-
-    def close(self) -> None:
-        """End the bar."""
-        self._bar.close()
 
 
 # --- live sources ------------------------------------------------------------------------------------

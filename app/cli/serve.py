@@ -8,16 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import (
-    SOURCE_HELP,
-    add_live_flags,
-    add_parameter_flags,
-    add_run_flags,
-    chosen_parameters,
-    recording_place,
-    source,
-    whole_number,
-)
+from app.cli import flags
 from app.common.settings import DEFAULT_PORT, VARIABLES, Settings
 from pipeline.errors import SourceError
 
@@ -35,14 +26,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         metavar="SOURCE",
-        type=source,
+        type=flags.source,
         nargs="*",
-        help=f"{SOURCE_HELP} (default: {_DEFAULT_SOURCE}); several sources, or a router with several robots, "
-        "get one dashboard each and a common page",
+        help=f"{flags.SOURCE_HELP} (default: {_DEFAULT_SOURCE}); several sources, or a router with several "
+        "robots, get one dashboard each and a common page",
     )
     parser.add_argument(
         "--port",
-        type=whole_number(0, 65535),
+        type=flags.whole_number(0, 65535),
         metavar="N",
         help=f"port to listen on, 0 for any free one (default: {DEFAULT_PORT}, or one of the next)",
     )
@@ -51,9 +42,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="address to listen on (default: this machine only; other addresses are open to the network)",
     )
-    add_parameter_flags(parser)
-    add_run_flags(parser)
-    add_live_flags(parser)
+    flags.add_parameter_flags(parser)
+    flags.add_run_flags(parser)
+    flags.add_live_flags(parser)
     parser.add_argument("--viewer", action="store_true", help="also print a view-only link")
     parser.add_argument("--no-browser", action="store_true", help="print the link without opening a browser")
     width = max(map(len, VARIABLES))
@@ -66,7 +57,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until Ctrl-C; return the exit code."""
-    from app.common.environment import from_environment
+    from app.common.settings import from_environment
 
     settings = from_environment()
     if arguments.host is not None:
@@ -77,8 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
     for uri in uris:
         _check_source(uri)
     _report_partial_outputs(settings)
-    record = recording_place(arguments, *uris)
-    chosen_parameters(arguments, "forest")  # reports a mistyped flag here and not on the page
+    record = flags.recording_place(arguments, *uris)
+    flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag here and not on the page
 
     from app.dashboard.parameters import ParameterState
     from app.web.serving import serve
@@ -90,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     ]
 
     def make_parameters() -> ParameterState:
-        return ParameterState(lambda suggested: chosen_parameters(arguments, suggested))
+        return ParameterState(lambda suggested: flags.chosen_parameters(arguments, suggested))
 
     watched = _watched(sources)
     if watched is not None or len(sources) > 1:

@@ -186,10 +186,10 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
     """
     from contextlib import closing
 
-    from app.common.environment import from_environment
+    from app.common.settings import from_environment
     from app.store.store import Store
     from app.training.learned_forests import Forests, name_of, write_forest
-    from app.training.learning import LearningOptions, learn, table_lines
+    from app.training.learning import learn, table_lines
     from pipeline.config import preset
 
     settings = from_environment()
@@ -199,23 +199,20 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
         raise StemmapError("the folder for --out does not exist", where=str(out.parent))
     with closing(Store(settings.folder, database=settings.database)) as store:
         runs = _chosen(store, names)
-    forests = Forests(settings.folder)
-    options = LearningOptions(
-        in_force=preset("forest").classification,
-        forests=forests,
-        seen=(),
-        seed=seed,
+    learned = learn(
+        runs,
+        preset("forest").classification,
+        settings.folder,
         date=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
-        kept=settings.folder and settings.folder / "examples",
+        seed=seed,
         progress=lambda words: print(plain(words), file=sys.stderr) if sys.stderr.isatty() else None,
     )
-    learned = learn(runs, options)
     for line in table_lines(learned):
         print(plain(line))
     for warning in learned.warnings:
         print(f"warning: {plain(warning)}", file=sys.stderr)
     if out is None:
-        name = forests.keep(learned.data)
+        name = Forests(settings.folder).keep(learned.data)
         print(f"stored as {name}; use it with --set classification.forest={name}")
     else:
         write_forest(learned.data, out)

@@ -8,18 +8,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import (
-    add_dbh_unit_flag,
-    add_parameter_flags,
-    add_run_flags,
-    cannot_write,
-    chosen_parameters,
-    compilation_notice,
-    positive_number,
-    share,
-    source,
-    whole_number,
-)
+from app.cli import flags
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
@@ -33,7 +22,7 @@ STOPPED = 3
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument(
-        "runs", metavar="RUN", nargs="+", type=source, help="recordings, folders, clouds or sim:"
+        "runs", metavar="RUN", nargs="+", type=flags.source, help="recordings, folders, clouds or sim:"
     )
     parser.add_argument(
         "--truth",
@@ -44,11 +33,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="true trees (CSV) of a run, in the frame of its map; repeated for each run, in their order "
         "or with RUN= in front (default: those of the source)",
     )
-    add_dbh_unit_flag(parser)
+    flags.add_dbh_unit_flag(parser)
     parser.add_argument(
         "--held-out",
         metavar="RUN",
-        type=source,
+        type=flags.source,
         action="append",
         default=[],
         help="a run that is only scored and does not guide the search; may be repeated",
@@ -67,21 +56,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "pair error with F1 not below that of the start",
     )  # fmt: skip
     parser.add_argument(
-        "--false-max", metavar="SHARE", type=share, default=0.1,
+        "--false-max", metavar="SHARE", type=flags.share, default=0.1,
         help="with --goal ta: largest share of false trees in the map (default: 0.1)",
     )  # fmt: skip
     parser.add_argument(
         "--trials",
         metavar="N",
-        type=whole_number(1, 1 << 20),
+        type=flags.whole_number(1, 1 << 20),
         default=200,
         help="number of trials in all (default: 200)",
     )
     parser.add_argument(
-        "--minutes", metavar="M", type=positive_number(1e6, "time in minutes"), default=0.0, help="time limit"
+        "--minutes",
+        metavar="M",
+        type=flags.positive_number(1e6, "time in minutes"),
+        default=0.0,
+        help="time limit",
     )
     parser.add_argument(
-        "--workers", metavar="N", type=whole_number(1, 1 << 20), default=1,
+        "--workers", metavar="N", type=flags.whole_number(1, 1 << 20), default=1,
         help="number of processes; with one, the same input gives the same result (default: 1)",
     )  # fmt: skip
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="TOML file for the best set")
@@ -95,12 +88,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="store the trials in PostgreSQL, where several machines share them: "
         "postgresql://name@host/database (without an address: that of STEMMAP_DATABASE)",
     )  # fmt: skip
-    add_parameter_flags(parser)
-    add_run_flags(parser)
+    flags.add_parameter_flags(parser)
+    flags.add_run_flags(parser)
     parser.epilog = "Ctrl-C stops the search and writes the best set so far; the same command continues it."
 
 
-@compilation_notice()
+@flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
     """Search and write the best set; return the exit code."""
     from app.tuning.search import Search, search_processes
@@ -130,7 +123,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
                 remedy="Record it, and name the recording",
             )
     with closing(open_run(SourceRequest(arguments.runs[0]))) as first:
-        preset_name, parameters = chosen_parameters(arguments, first.preset)
+        preset_name, parameters = flags.chosen_parameters(arguments, first.preset)
     if not arguments.out.absolute().parent.is_dir():
         raise StemmapError("the folder for --out does not exist", where=str(arguments.out.absolute().parent))
     return Plan(
@@ -202,7 +195,7 @@ def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
 
 
 def _storage(arguments: argparse.Namespace) -> str:
-    from app.common.environment import from_environment
+    from app.common.settings import from_environment
     from app.tuning.storage import is_server
 
     if arguments.storage is None:
@@ -253,7 +246,7 @@ def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool) -> 
         with write_beside(arguments.out) as file:
             file.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise cannot_write(error, arguments.out) from None
+        raise flags.cannot_write(error, arguments.out) from None
     for line in lines_of(plan, result):
         print(line)
     print(f"written to {arguments.out}; use it with --config {arguments.out}")

@@ -1,16 +1,20 @@
 """Settings of a deployment, separate from the mapping parameters.
 
-Each setting has an environment variable; command-line flags take precedence.
+Each setting has an environment variable; command-line flags take precedence over `from_environment`.
 """
 
 from __future__ import annotations
 
 import ipaddress
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
+
+import msgspec
+from msgspec import Meta
 
 from pipeline.errors import StemmapError
 
@@ -118,3 +122,51 @@ def data_folder(given: Mapping[str, str]) -> Path | None:
     home = given.get("HOME") or given.get("USERPROFILE")
     base = given.get("XDG_DATA_HOME") or given.get("LOCALAPPDATA") or (home and f"{home}/.local/share")
     return Path(base) / "stemmap" if base else None
+
+
+class Environment(msgspec.Struct, frozen=True, rename=lambda name: f"STEMMAP_{name.upper()}"):
+    """The variables of `app.common.settings.VARIABLES`, except that of the data folder."""
+
+    host: str = DEFAULT_HOST
+    port: Annotated[int, Meta(ge=0, le=65535)] | None = None
+    token: Annotated[str, Meta(pattern=r"\A([A-Za-z0-9_-]{16,200})?\Z")] = ""
+    hosts: str = ""
+    recordings: str = ""
+    database: str = ""
+    files: Files = ""
+    upload_gb: Annotated[float, Meta(gt=0.0, le=1e6)] = 20.0
+
+
+def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
+    """Return the settings from the environment variables STEMMAP_*.
+
+    Raises:
+        StemmapError: A variable has an invalid value.
+    """
+    variables = os.environ if environment is None else environment
+    try:
+        given = msgspec.convert(dict(variables), Environment, strict=False)
+    except msgspec.ValidationError as error:
+        what, _, name = str(error).partition(" - at `$.")
+        text = variables.get(name.rstrip("`"), "")
+        raise StemmapError(f"{text!r} is invalid: {what}", where=name.rstrip("`")) from None
+    if not is_loopback(given.host):
+        raise StemmapError(
+            f"{given.host} is not a loopback address",
+            where="STEMMAP_HOST",
+            remedy="Use the flag --host for it",
+        )
+    recordings = Path(given.recordings).expanduser() if given.recordings else None
+    if recordings is not None and not recordings.is_dir():
+        raise StemmapError(f"{recordings} is not a folder", where="STEMMAP_RECORDINGS")
+    return Settings(
+        host=given.host,
+        port=given.port,
+        token=given.token,
+        hosts=tuple(name.strip().lower() for name in given.hosts.split(",") if name.strip()),
+        recordings=recordings,
+        folder=data_folder(variables),
+        database=given.database,
+        files=given.files,
+        upload_limit=round(1e9 * given.upload_gb),
+    )

@@ -13,7 +13,7 @@ import numpy as np
 from app.batch.tree_pictures import stem_corners
 from app.common.draw_picture import Drawing, draw_safely
 from app.dashboard.payload import clusters_payload
-from app.explain.client import NoStoryError, WorkerClient
+from app.dashboard.selection import NoStoryError, WorkerClient
 from pipeline.geometry.poses import Pose2, interpolate
 from pipeline.io.readers.camera import Camera
 from pipeline.types.records import Float, Frame, Path

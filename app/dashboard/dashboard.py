@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,18 +24,17 @@ from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import RunRecorder, RunState
 from app.dashboard.scores import Scores, score_map
-from app.dashboard.selection import Selector
-from app.explain.client import WorkerClient
+from app.dashboard.selection import Selector, WorkerClient
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
 from app.tuning.sensitivity import Sensitivity, question_of
-from app.worker.map_changes import MapChanges
 from app.worker.outbox import joined
 from app.worker.protocol import (
     Answer,
     Begin,
     FromWorker,
+    MapChanges,
     Open,
     Opened,
     Play,
@@ -102,7 +101,7 @@ class Dashboard:
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
         self.search = TuneSearch(lambda state: live.tell("search", state))
-        self.loop = LoopPlayback(live, self._send_if_ready)
+        self.loop = LoopPlayback(self)
         self._run: int | None = None
         self._notice = ""
         self._restarts = 0
@@ -144,11 +143,6 @@ class Dashboard:
         # A worker that is down comes back with the source closed; then this is still to be done.
         self._go = isinstance(command, Play | Open) and self.worker.pid is None
         await self.worker.send(command)
-
-    async def _send_if_ready(self, command: ToWorker) -> None:
-        """Send a command unless the worker is being restarted."""
-        with contextlib.suppress(WorkerBusyError):
-            await self.worker.send(command)
 
     async def choose_view(self, name: str, value: str | bool) -> None:
         """Set a choice of the 3D scene for all browsers.
@@ -265,9 +259,7 @@ class Dashboard:
             StemmapError: The run cannot be scored; the message has the reason.
         """
         state = self.parameters.parameters
-        self.sensitivity.ask(
-            question_of(self.source, self.digest, self.status, self.truth, state, name, values)
-        )
+        self.sensitivity.ask(question_of(self.source, self.digest, self.truth, state, name, values))
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree in all views by its number; None clears the selection."""
@@ -456,22 +448,21 @@ class LoopPlayback:
     """Repeats a part of the run.
 
     Args:
-        live: Broadcast to the browsers.
-        send: Sends a command to the worker.
+        dashboard: State of the run, with its worker.
 
     Attributes:
         span: First and last time of the part [s since the first scan]; None without repetition.
     """
 
-    def __init__(self, live: Broadcast, send: Callable[[ToWorker], Awaitable[None]]) -> None:
+    def __init__(self, dashboard: Dashboard) -> None:
         self.span: Span | None = None
-        self._live, self._send = live, send
+        self._dashboard = dashboard
         self._turning = False
 
     def choose(self, span: Span | None) -> None:
         """Set the part that is repeated; None ends the repetition."""
         self.span, self._turning = span, False
-        self._live.tell("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
+        self._dashboard.live.tell("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
 
     async def shown(self, time_s: float, status: Status) -> None:
         """Seek to the beginning of the part if the shown scan is at its end and the run plays.
@@ -486,6 +477,7 @@ class LoopPlayback:
             self._turning = False
         elif not self._turning and status.state in ("playing", "finished"):
             self._turning = True  # pictures that are under way must not turn it once more
-            await self._send(Seek(self.span[0]))
-            if status.state == "finished":
-                await self._send(Play())
+            with contextlib.suppress(WorkerBusyError):  # the worker is being restarted
+                await self._dashboard.worker.send(Seek(self.span[0]))
+                if status.state == "finished":
+                    await self._dashboard.worker.send(Play())

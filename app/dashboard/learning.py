@@ -19,7 +19,7 @@ from pipeline.classification.forest import PACKAGE
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 
-LEARN = python_module("app.training.learn_process")
+LEARN = python_module("app.training.learning")
 LONGEST_LINE = 1 << 20
 # As in app.training.learning, which the web process does not load.
 LEAST_TREES, LEAST_OTHERS = 10, 5
@@ -38,7 +38,7 @@ class Learning:
     Attributes:
         state: "idle", "working", "done" or "failed".
         words: Progress or reason of the failure, as text.
-        learned: Result of the training, see `app.training.learn_process.as_plain`; None before.
+        learned: Result of the training, see `app.training.learning.as_plain`; None before.
     """
 
     def __init__(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from app.dashboard.payload import trees_payload, truth_payload
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
-from app.store.book import Change, NewRun, RunFigures
+from app.store.records import Change, NewRun, RunFigures
 from app.store.store import Store
 from app.worker.protocol import Opened, Shown
 from pipeline.config.model import Value
@@ -150,14 +150,7 @@ class RunRecorder:
         page = self._page
         if page is None or page.newest is None or not changes:
             return
-        change = Change(revision, page.newest.shown.time_s, who, preset, changes)
-        last = page.changes[-1] if page.changes else None
-        if last is not None and last.who == who and last.changes.keys() == changes.keys():
-            # A slider drag is one change from its first value to its newest.
-            merged = {name: [last.changes[name][0], after] for name, (_, after) in changes.items()}
-            page.changes[-1] = replace(change, changes=merged)
-        else:
-            page.changes.append(change)
+        page.changes.append(Change(revision, page.newest.shown.time_s, who, preset, changes))
         if page.reviser is None or page.reviser.done():
             page.reviser = self._start(self._revise_soon(page))
 
@@ -217,15 +210,14 @@ class RunRecorder:
         return done
 
     def _start(self, work: Any) -> asyncio.Task[None]:  # noqa: ANN401 - any coroutine
-        task: asyncio.Task[None] = asyncio.create_task(_quietly(work), name="run_recorder entry")
+        async def quiet() -> None:
+            with contextlib.suppress(StemmapError):  # the error was logged
+                await work
+
+        task = asyncio.create_task(quiet(), name="run_recorder entry")
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
-
-
-async def _quietly(work: Any) -> None:  # noqa: ANN401 - any coroutine
-    with contextlib.suppress(StemmapError):  # the error was logged
-        await work
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:

@@ -57,7 +57,7 @@ class TreeHistory:
         if len(mine) > _MOST_RETURNED:  # closer together where it is young
             place = np.unique(np.geomspace(1, len(mine), _MOST_RETURNED).astype(np.int64) - 1)
             mine = mine[place]
-        ellipse = half_axes(_matrices(mine[:, 6:9]))
+        ellipse = half_axes(mine[:, [[6, 7], [7, 8]]])
         return History(
             time_s=mine[:, _TIME].tolist(),
             x=mine[:, 4].tolist(),
@@ -93,10 +93,6 @@ def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     values, vectors = np.linalg.eigh(covariance)
     minor, major = np.sqrt(np.maximum(values, 0.0)).T
     return np.stack([major, minor, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])], axis=1)
-
-
-def _matrices(xx_xy_yy: NDArray[np.float64]) -> NDArray[np.float64]:
-    return xx_xy_yy[:, [[0, 1], [1, 2]]]
 
 
 def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:

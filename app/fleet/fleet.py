@@ -333,7 +333,9 @@ class Fleet:
             parameter_state=self._make_parameters(),
             make_scene=self._make[0],
             make_worker=self._make[1],
-            fleet=FleetLink(self._port, self._open_records),
+            fleet=FleetLink(
+                self._port, lambda: {each.dashboard.run_recorder.record for each in self.members.values()}
+            ),
         )
         self.members[name] = Member(name, source, listening, app, self._settings)
         if self._is_warm:
@@ -391,9 +393,6 @@ class Fleet:
                 shown |= {"state": "failed", "detail": "Its dashboard ended; the terminal shows why"}
         cards += [shown for shown, _ in self.remote.values()]
         self.live.tell("fleet", {"members": cards, "notice": self.notice})
-
-    def _open_records(self) -> set[int | None]:
-        return {member.dashboard.run_recorder.record for member in self.members.values()}
 
     def send_maps(self) -> None:
         """Send the maps to the pages."""

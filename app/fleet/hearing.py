@@ -20,7 +20,7 @@ import numpy as np
 
 from app.common.child_process import ParentConnection, run_child
 from app.robot.address import ZenohAddress, parse_address
-from app.robot.inbox import Inbox
+from app.robot.link import Inbox
 from app.robot.zenoh import ZenohLink
 from pipeline.io.readers.container import Channel
 from pipeline.io.recording import outputs

@@ -11,8 +11,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 
 from app.robot.address import DdsAddress
-from app.robot.inbox import Inbox
-from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, Link, first_line
+from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, Inbox, Link, first_line
 from app.robot.topics import MAX_ENDPOINTS, NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel

@@ -1,17 +1,242 @@
-"""Base of the connections to a robot: a thread that connects, tries again and fills the inbox."""
+"""Base of the connections to a robot: a thread that connects and tries again, and the inbox that it fills.
+
+Messages are recorded when they arrive, then queued in bounded memory for the mapping.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from app.robot.inbox import ArrivalTimes, Inbox
+from app.robot.recorder import Recorder
 from app.robot.topics import MAX_ENDPOINTS, PICTURE_TYPES, SCAN_TYPES, Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
+
+#: Two seconds of a usual LiDAR: an older scan shows nothing of the present.
+MAX_SCANS = 20
+MAX_BYTES = 128 << 20
+#: Odometry and IMU messages are small, and all of them are needed.
+MAX_OTHERS = 20_000
+#: Fixed transforms are sent once and must outlast a long wait, e.g. for the compiler.
+MAX_FIXED = 1000
+
+#: A picture every 0.15 s is close enough to every scan; more of them fill the disk.
+PICTURE_PAUSE_NS = 150_000_000
+MAX_PICTURES, MAX_PICTURE_BYTES, LARGEST_PICTURE = 10, 64 << 20, 32 << 20
+
+SKIPPED = "scans skipped because mapping was behind"
+OTHERS_SKIPPED = "other messages skipped because mapping was behind"
+PICTURES_SKIPPED = "pictures skipped because mapping was behind"
+PICTURES_TOO_LARGE = f"pictures larger than {LARGEST_PICTURE >> 20} MB"
+
+_Lane = deque[tuple[int, Message]]
+
+
+class ArrivalTimes:
+    """Times of arrival that always increase, even if the system clock is set back."""
+
+    def __init__(self) -> None:
+        self._wall_ns, self._start_ns = time.time_ns(), time.monotonic_ns()
+        self._last_ns = 0
+
+    def now_ns(self) -> int:
+        """Return the present time [ns since 1970]; never less than an earlier result."""
+        return self._wall_ns + time.monotonic_ns() - self._start_ns
+
+    def next_ns(self) -> int:
+        """Return the present time [ns since 1970], greater than every earlier result of this method."""
+        self._last_ns = max(self.now_ns(), self._last_ns + 1)
+        return self._last_ns
+
+
+class Inbox:
+    """Queue between the threads of a network library, which fill it, and the mapping loop, which empties it.
+
+    Each message goes to the recorder first. When the queue is full, the oldest scans are skipped, because a
+    live map needs the newest; the recorder stores which were skipped. The publisher is never delayed, since
+    it may be the robot's own driver. Pictures have a queue of their own.
+
+    Attributes:
+        losses: Number of skipped messages, by reason.
+        early_scans: Number of scans that were skipped before the first call of `take`.
+        pictures_arrived, pictures_accepted: Number of pictures that arrived, and that the rate limit
+            accepted.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._recorder: Recorder | None = None
+        self._scans: _Lane = deque()
+        self._others: _Lane = deque()
+        self._fixed: _Lane = deque()
+        self._fixed_channels: frozenset[int] = frozenset()
+        self._pictures: _Lane = deque()
+        self._bytes = self._picture_bytes = 0
+        self._serial = 0
+        self._picture_ns: int | None = None
+        self._mapping = False
+        self.losses: dict[str, int] = {}
+        self.early_scans = 0
+        self.pictures_arrived = self.pictures_accepted = 0
+
+    @property
+    def scans_waiting(self) -> int:
+        """Number of queued scans."""
+        return len(self._scans)
+
+    def begin(self, recorder: Recorder | None, fixed: Iterable[int]) -> None:
+        """Record each message from now on.
+
+        Args:
+            recorder: None records nothing.
+            fixed: Numbers of the channels of fixed transforms.
+        """
+        self._recorder, self._fixed_channels = recorder, frozenset(fixed)
+
+    def put(self, message: Message, *, is_scan: bool) -> None:
+        """Record and queue a message; without room, the oldest messages are skipped.
+
+        Args:
+            message: The message.
+            is_scan: Whether it is a scan; other messages are skipped last.
+        """
+        with self._lock:
+            if self._recorder is not None:
+                self._recorder.add(message)
+            self._serial += 1
+            is_fixed = message.channel in self._fixed_channels and len(self._fixed) < MAX_FIXED
+            lane = self._scans if is_scan else self._fixed if is_fixed else self._others
+            lane.append((self._serial, message))
+            self._bytes += len(message.payload)
+            while len(self._scans) > MAX_SCANS or (self._bytes > MAX_BYTES and self._scans):
+                self._bytes -= self._skip(self._scans, SKIPPED)
+            while len(self._others) > MAX_OTHERS or (self._bytes > MAX_BYTES and self._others):
+                self._bytes -= self._skip(self._others, OTHERS_SKIPPED)
+
+    def wants_picture(self, arrival_ns: int, size: int) -> bool:
+        """Count a picture; return whether the rate limit accepts it. Called before its bytes are copied.
+
+        Args:
+            arrival_ns: Time of arrival [ns].
+            size: Number of bytes.
+        """
+        with self._lock:
+            self.pictures_arrived += 1
+            if size > LARGEST_PICTURE:
+                count_loss(self.losses, PICTURES_TOO_LARGE)
+                return False
+            if self._picture_ns is not None and arrival_ns < self._picture_ns + PICTURE_PAUSE_NS:
+                return False
+            self._picture_ns = arrival_ns
+            self.pictures_accepted += 1
+            return True
+
+    def put_picture(self, message: Message) -> None:
+        """Record and queue an accepted picture; the oldest ones are skipped where there is no room."""
+        with self._lock:
+            if self._recorder is not None:
+                self._recorder.add(message)
+            self._serial += 1
+            self._pictures.append((self._serial, message))
+            self._picture_bytes += len(message.payload)
+            while len(self._pictures) > MAX_PICTURES or self._picture_bytes > MAX_PICTURE_BYTES:
+                _, oldest = self._pictures.popleft()
+                self._picture_bytes -= len(oldest.payload)
+                count_loss(self.losses, PICTURES_SKIPPED)
+
+    def take(self) -> Message | None:
+        """Remove and return the message that arrived first; None when the queue is empty."""
+        with self._lock:
+            self._mapping = True
+            lanes = [lane for lane in (self._scans, self._others, self._fixed, self._pictures) if lane]
+            if not lanes:
+                return None
+            first = min(lanes, key=lambda lane: lane[0][0])
+            _, message = first.popleft()
+            if first is self._pictures:
+                self._picture_bytes -= len(message.payload)
+            else:
+                self._bytes -= len(message.payload)
+            return message
+
+    def end(self) -> None:
+        """Stop recording. Messages that are still queued are recorded as skipped."""
+        with self._lock:
+            recorder, self._recorder = self._recorder, None
+            if recorder is not None:
+                for lane in (self._scans, self._others, self._fixed):
+                    for _, message in lane:
+                        recorder.skip(message)
+
+    def _skip(self, lane: _Lane, reason: str) -> int:
+        """Skip the oldest message of a lane; return its size [bytes]."""
+        _, skipped = lane.popleft()
+        if self._recorder is not None:
+            self._recorder.skip(skipped)
+        if self._mapping:
+            count_loss(self.losses, reason)
+        else:
+            self.early_scans += lane is self._scans
+        return len(skipped.payload)
+
+
+@dataclass(slots=True)
+class Heard:
+    """Number of messages of a topic, and times of the first and the last one [ns]."""
+
+    messages: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Mean rate from the first to the last message; None with fewer than two."""
+        seconds = 1e-9 * (self.last_ns - self.first_ns)
+        return round((self.messages - 1) / seconds, 1) if self.messages > 1 and seconds > 0.0 else None
+
+
+class CountingInbox(Inbox):
+    """Counts messages by channel and keeps none of them."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._guard = threading.Lock()
+        self._heard: dict[int, Heard] = {}
+
+    def heard(self, number: int) -> Heard:
+        """Return the count of a channel so far."""
+        with self._guard:
+            known = self._heard.get(number, Heard())
+            return Heard(known.messages, known.first_ns, known.last_ns)
+
+    def wants_picture(self, arrival_ns: int, size: int) -> bool:
+        """Accept all pictures."""
+        del arrival_ns, size
+        return True
+
+    def put_picture(self, message: Message) -> None:
+        """Count the message."""
+        self.put(message, is_scan=False)
+
+    def put(self, message: Message, *, is_scan: bool) -> None:
+        """Count the message.
+
+        Args:
+            message: The message.
+            is_scan: Not used.
+        """
+        del is_scan
+        with self._guard:
+            known = self._heard.setdefault(message.channel, Heard(0, message.log_ns))
+            known.messages += 1
+            known.last_ns = message.log_ns
+
 
 #: Largest message that is assembled; a cloud of 2 million points is smaller.
 MESSAGE_LIMIT = 64 << 20

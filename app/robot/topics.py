@@ -96,7 +96,8 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
     mine = [p for p in there if p.robot in (scan.robot, "")]
     wheels = [p for p in mine if p.topic != topics.get("pose")]
     odometry = _of_role(wheels, topics, "odometry", (ODOMETRY,), _odometry_rank, where)
-    imu = _of_role(mine, topics, "imu", (IMU,), _imu_rank, where)
+    # Raw topics have no orientation.
+    imu = _of_role(mine, topics, "imu", (IMU,), lambda p: ("raw" in p.topic.lower(), p.topic), where)
     gnss = _of_role(mine, topics, "gnss", (NAV_SAT_FIX,), lambda p: (p.topic,), where)
     pose = _pose(mine, topics, where)
     transforms = sorted({p.topic: p for p in mine if p.msgtype == TRANSFORMS}.values(), key=lambda p: p.topic)
@@ -128,7 +129,10 @@ def _camera(there: list[Publisher], topics: dict[str, str], where: str) -> list[
     if topics.get("camera") == NO_CAMERA:
         return []
     seen = there if "camera" in topics else [p for p in there if not _has_word(p, _NO_SCENE)]
-    pictures = _of_role(seen, topics, "camera", PICTURE_TYPES, _picture_rank, where)
+    # Compressed pictures have a tenth of the size.
+    pictures = _of_role(
+        seen, topics, "camera", PICTURE_TYPES, lambda p: (p.msgtype != COMPRESSED_IMAGE, p.topic), where
+    )
     if pictures is None:
         return []
     infos = sorted(
@@ -166,35 +170,20 @@ def _refuse_wrong_type(
         )
 
 
-def _derived(publisher: Publisher) -> bool:
-    """Return whether the name of a topic suggests that its clouds are not raw sweeps of a LiDAR."""
-    return _has_word(publisher, _DERIVED)
-
-
 def _has_word(publisher: Publisher, words: tuple[str, ...]) -> bool:
     return any(word in publisher.topic.lower() for word in words)
 
 
 def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
     """Return the sort key of a scan topic. A planar laser comes last, because with a LiDAR it is a safety
-    sensor."""
-    kind = publisher.msgtype
-    return kind == LASER_SCAN, _derived(publisher), kind == VELODYNE_SCAN, publisher.robot, publisher.topic
+    sensor; before it, topics whose name suggests that their clouds are not raw sweeps."""
+    kind, is_derived = publisher.msgtype, _has_word(publisher, _DERIVED)
+    return kind == LASER_SCAN, is_derived, kind == VELODYNE_SCAN, publisher.robot, publisher.topic
 
 
 def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:
     name = publisher.topic.lower()
     return any(word in name for word in ("gps", "map", "slam")), not name.endswith("odom"), publisher.topic
-
-
-def _imu_rank(publisher: Publisher) -> tuple[object, ...]:
-    return "raw" in publisher.topic.lower(), publisher.topic  # raw ones have no orientation
-
-
-def _picture_rank(publisher: Publisher) -> tuple[object, ...]:
-    """Return the sort key of a picture topic. Compressed pictures come first; they have a tenth of the
-    size."""
-    return publisher.msgtype != COMPRESSED_IMAGE, publisher.topic
 
 
 def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | None) -> list[str]:

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from app.robot.address import VelodyneAddress
-from app.robot.inbox import Inbox
-from app.robot.link import Link
+from app.robot.link import Inbox, Link
 from app.robot.topics import Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from app.common.arrays import first_difference
 from app.scene import colours, nodes
+from app.scene.colours import ViewSettings
 from app.scene.labels import NUMBER_WIDTH, Label, LabelNodes, apart
-from app.scene.layers import ViewSettings
 from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
 from pipeline.types.records import Frame, Trees, TruthTrees

@@ -7,7 +7,7 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours, nodes
-from app.scene.layers import ViewSettings
+from app.scene.colours import ViewSettings
 from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Segments
 from app.scene.viser_server import add_posed
 from pipeline.config.stages import Obstacles

@@ -10,9 +10,8 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene import colours, nodes
-from app.scene.colours import Colours
+from app.scene.colours import Colours, ViewSettings
 from app.scene.labels import LabelNodes, cluster_labels, shown_height
-from app.scene.layers import ViewSettings
 from app.scene.nodes import Batch, CloudNode, Float
 from app.scene.viser_server import add_posed
 from pipeline.types.records import Frame

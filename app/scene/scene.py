@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.scene.layers import ViewSettings
+from app.scene.colours import ViewSettings
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
 from app.scene.panel import PanelCommands, SceneCommands, TunePanel, Value
 from app.scene.robot import ROBOT, RobotNodes, WayNode

@@ -20,7 +20,7 @@ import msgspec
 
 from app.common.child_process import ChildProcess, ParentConnection, ProtocolError, python_module, run_child
 from app.robot.address import is_live, parse_address
-from app.robot.inbox import CountingInbox, Heard
+from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
 from app.sources.request import LONGEST_URI

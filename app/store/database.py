@@ -6,55 +6,33 @@ import sqlite3
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import (
-    JSON,
-    URL,
-    BigInteger,
-    Boolean,
-    Column,
-    Connection,
-    Engine,
-    Float,
-    ForeignKey,
-    Index,
-    Integer,
-    MetaData,
-    StaticPool,
-    String,
-    Table,
-    Text,
-    UniqueConstraint,
-    create_engine,
-    event,
-    insert,
-    inspect,
-    make_url,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from pipeline.errors import StemmapError
 
 # Version of the tables, in a table that keeps the name under which Alembic reads it.
 VERSION = "0005"
-_version = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
+_version = sa.Table(
+    "alembic_version", sa.MetaData(), sa.Column("version_num", sa.String(32), primary_key=True)
+)
 
 
-def _prepare_tables(connection: Connection) -> None:
+def _prepare_tables(connection: sa.Connection) -> None:
     """Create the tables of a new database, or check the version of an existing one.
 
     Raises:
         StemmapError: The tables are of another version or of another program.
     """
-    names = inspect(connection).get_table_names()
+    names = sa.inspect(connection).get_table_names()
     if not names:
         metadata.create_all(connection)
         _version.create(connection)
-        connection.execute(insert(_version).values(version_num=VERSION))
+        connection.execute(sa.insert(_version).values(version_num=VERSION))
         return
     if _version.name not in names:
         raise StemmapError("this database belongs to another program")
-    version = str(connection.execute(select(_version.c.version_num)).scalar())
+    version = str(connection.execute(sa.select(_version.c.version_num)).scalar())
     if version != VERSION:
         author = "a newer stemmap" if version > VERSION else "an older stemmap"
         raise StemmapError(
@@ -70,7 +48,7 @@ _PATIENCE_S = 5
 _LOCK = 7_330_117
 
 
-def open_engine(folder: Path | None, database: str = "") -> Engine:
+def open_engine(folder: Path | None, database: str = "") -> sa.Engine:
     """Return the engine of a database with current tables.
 
     Args:
@@ -97,10 +75,10 @@ def open_engine(folder: Path | None, database: str = "") -> Engine:
     return _checked(_sqlite(str(path)), str(path))
 
 
-def _open_server(database: str) -> Engine:
+def _open_server(database: str) -> sa.Engine:
     remedy = "Give STEMMAP_DATABASE as postgresql://name@host/database"
     try:
-        url = make_url(database)
+        url = sa.make_url(database)
     except (ArgumentError, ValueError):
         raise StemmapError("this is not the address of a database", remedy=remedy) from None
     if url.drivername not in ("postgresql", "postgresql+psycopg"):
@@ -115,31 +93,31 @@ def _open_server(database: str) -> Engine:
     return _checked(engine, where)
 
 
-def _sqlite(database: str) -> Engine:
+def _sqlite(database: str) -> sa.Engine:
     # One connection, used by one thread at a time; an in-memory database exists as long as it.
-    engine = create_engine(
+    engine = sa.create_engine(
         "sqlite+pysqlite://",
         creator=lambda: sqlite3.connect(database, isolation_level=None, check_same_thread=False),
-        poolclass=StaticPool,
+        poolclass=sa.StaticPool,
     )
 
-    @event.listens_for(engine, "connect")
+    @sa.event.listens_for(engine, "connect")
     def _(connection: sqlite3.Connection, _record: Any) -> None:  # noqa: ANN401
         connection.execute(f"PRAGMA busy_timeout = {_PATIENCE_MS}")
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA foreign_keys = ON")
 
-    @event.listens_for(engine, "begin")
-    def _(connection: Connection) -> None:
+    @sa.event.listens_for(engine, "begin")
+    def _(connection: sa.Connection) -> None:
         # Writes depend on the reads before them: no other writer may come between.
         connection.exec_driver_sql("BEGIN IMMEDIATE")
 
     return engine
 
 
-def _postgresql(url: URL) -> Engine:
-    engine = create_engine(
+def _postgresql(url: sa.URL) -> sa.Engine:
+    engine = sa.create_engine(
         url.set(drivername="postgresql+psycopg"),
         pool_size=1,
         max_overflow=0,
@@ -147,8 +125,8 @@ def _postgresql(url: URL) -> Engine:
         connect_args={"connect_timeout": _PATIENCE_S, "application_name": "stemmap"},
     )
 
-    @event.listens_for(engine, "begin")
-    def _(connection: Connection) -> None:
+    @sa.event.listens_for(engine, "begin")
+    def _(connection: sa.Connection) -> None:
         # Equivalent to BEGIN IMMEDIATE above. A lock that is not granted in time is an error.
         connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_PATIENCE_MS}")
         connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")
@@ -156,7 +134,7 @@ def _postgresql(url: URL) -> Engine:
     return engine
 
 
-def _checked(engine: Engine, where: str) -> Engine:
+def _checked(engine: sa.Engine, where: str) -> sa.Engine:
     keep = "It was not changed: move it away to start with an empty one, or restore a copy"
     try:
         with engine.begin() as connection:
@@ -187,127 +165,135 @@ def reason_of(error: Exception) -> str:
     return " ".join(str(getattr(error, "orig", None) or error).lower().split())[:300]
 
 
-metadata = MetaData()
+metadata = sa.MetaData()
 
 # Sources: all runs of a recording share its annotations.
-runs = Table(
+runs = sa.Table(
     "runs",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("source", String(4200), nullable=False, comment="digest of what was recorded, else the URI"),
-    Column("uri", String(4096), nullable=False),
-    Column("name", String(200), nullable=False),
-    Column("opened_ns", BigInteger, nullable=False),
-    UniqueConstraint("source"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("source", sa.String(4200), nullable=False, comment="digest of what was recorded, else the URI"),
+    sa.Column("uri", sa.String(4096), nullable=False),
+    sa.Column("name", sa.String(200), nullable=False),
+    sa.Column("opened_ns", sa.BigInteger, nullable=False),
+    sa.UniqueConstraint("source"),
 )
 
-annotated = Table(
+annotated = sa.Table(
     "annotations",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("run", ForeignKey("runs.id"), nullable=False, index=True),
-    Column("x", Float, nullable=False),
-    Column("y", Float, nullable=False),
-    Column("kind", String(10), nullable=False),
-    Column("dbh", Float),
-    Column("who", String(60), nullable=False),
-    Column("at_ns", BigInteger, nullable=False),
-    Column("version", Integer, nullable=False),
-    Column("deleted", Boolean, nullable=False),
-    Column("made_by", Integer, nullable=False, comment="the change that led to the current content; 0 none"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("run", sa.ForeignKey("runs.id"), nullable=False, index=True),
+    sa.Column("x", sa.Float, nullable=False),
+    sa.Column("y", sa.Float, nullable=False),
+    sa.Column("kind", sa.String(10), nullable=False),
+    sa.Column("dbh", sa.Float),
+    sa.Column("who", sa.String(60), nullable=False),
+    sa.Column("at_ns", sa.BigInteger, nullable=False),
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("deleted", sa.Boolean, nullable=False),
+    sa.Column(
+        "made_by", sa.Integer, nullable=False, comment="the change that led to the current content; 0 none"
+    ),
     sqlite_autoincrement=True,
 )
 
-steps = Table(
+steps = sa.Table(
     "steps",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("run", ForeignKey("runs.id"), nullable=False),
-    Column("browser", String(60), nullable=False),
-    Column("who", String(60), nullable=False),
-    Column("at_ns", BigInteger, nullable=False),
-    Column("state", String(10), nullable=False, comment="done, undone, or left: no longer to be undone"),
-    Index("steps_of_a_browser", "run", "browser", "state", "id"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("run", sa.ForeignKey("runs.id"), nullable=False),
+    sa.Column("browser", sa.String(60), nullable=False),
+    sa.Column("who", sa.String(60), nullable=False),
+    sa.Column("at_ns", sa.BigInteger, nullable=False),
+    sa.Column(
+        "state", sa.String(10), nullable=False, comment="done, undone, or left: no longer to be undone"
+    ),
+    sa.Index("steps_of_a_browser", "run", "browser", "state", "id"),
     sqlite_autoincrement=True,
 )
 
-changes = Table(
+changes = sa.Table(
     "changes",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("step", ForeignKey("steps.id"), nullable=False, index=True),
-    Column("annotation", ForeignKey("annotations.id"), nullable=False),
-    Column("before", JSON(none_as_null=True)),
-    Column("after", JSON(none_as_null=True)),
-    Column("made_before", Integer, nullable=False, comment="the change that led to `before`"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("step", sa.ForeignKey("steps.id"), nullable=False, index=True),
+    sa.Column("annotation", sa.ForeignKey("annotations.id"), nullable=False),
+    sa.Column("before", sa.JSON(none_as_null=True)),
+    sa.Column("after", sa.JSON(none_as_null=True)),
+    sa.Column("made_before", sa.Integer, nullable=False, comment="the change that led to `before`"),
     sqlite_autoincrement=True,
 )
 
-parameter_sets = Table(
+parameter_sets = sa.Table(
     "parameter_sets",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("name", String(60), nullable=False),
-    Column("toml", Text, nullable=False, comment="the file that --config takes"),
-    Column("who", String(60), nullable=False),
-    Column("at_ns", BigInteger, nullable=False),
-    UniqueConstraint("name"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("name", sa.String(60), nullable=False),
+    sa.Column("toml", sa.Text, nullable=False, comment="the file that --config takes"),
+    sa.Column("who", sa.String(60), nullable=False),
+    sa.Column("at_ns", sa.BigInteger, nullable=False),
+    sa.UniqueConstraint("name"),
 )
 
 # Runs: one row for each time that a source was opened and mapped.
-records = Table(
+records = sa.Table(
     "run_records",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("run", ForeignKey("runs.id"), nullable=False, index=True),
-    Column("name", String(200), nullable=False),
-    Column("uri", String(4096), nullable=False),
-    Column("kind", String(200), nullable=False),
-    Column("odometry", String(4096), nullable=False),
-    Column("seed", BigInteger, nullable=False),
-    Column("chosen", JSON(none_as_null=True), comment="topics and mounting, see SourceRequest.kept_choices"),
-    Column("begun_ns", BigInteger, nullable=False),
-    Column("changed_ns", BigInteger, nullable=False),
-    Column("deleted_ns", BigInteger),
-    Column("scans", Integer, nullable=False, comment="mapped; figures, parameters and map are of the last"),
-    Column("all_scans", Integer),
-    Column("time_s", Float, nullable=False),
-    Column("distance_m", Float, nullable=False),
-    Column("trees", Integer, nullable=False),
-    Column("preset", String(100), nullable=False),
-    Column("parameters", JSON(none_as_null=True), nullable=False),
-    Column("scores", JSON(none_as_null=True)),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("run", sa.ForeignKey("runs.id"), nullable=False, index=True),
+    sa.Column("name", sa.String(200), nullable=False),
+    sa.Column("uri", sa.String(4096), nullable=False),
+    sa.Column("kind", sa.String(200), nullable=False),
+    sa.Column("odometry", sa.String(4096), nullable=False),
+    sa.Column("seed", sa.BigInteger, nullable=False),
+    sa.Column(
+        "chosen", sa.JSON(none_as_null=True), comment="topics and mounting, see SourceRequest.kept_choices"
+    ),
+    sa.Column("begun_ns", sa.BigInteger, nullable=False),
+    sa.Column("changed_ns", sa.BigInteger, nullable=False),
+    sa.Column("deleted_ns", sa.BigInteger),
+    sa.Column(
+        "scans", sa.Integer, nullable=False, comment="mapped; figures, parameters and map are of the last"
+    ),
+    sa.Column("all_scans", sa.Integer),
+    sa.Column("time_s", sa.Float, nullable=False),
+    sa.Column("distance_m", sa.Float, nullable=False),
+    sa.Column("trees", sa.Integer, nullable=False),
+    sa.Column("preset", sa.String(100), nullable=False),
+    sa.Column("parameters", sa.JSON(none_as_null=True), nullable=False),
+    sa.Column("scores", sa.JSON(none_as_null=True)),
     sqlite_autoincrement=True,
 )
 
 # Separate from the records, so that their list is small.
-maps = Table(
+maps = sa.Table(
     "run_maps",
     metadata,
-    Column("record", ForeignKey("run_records.id"), primary_key=True),
-    Column("map", JSON(none_as_null=True), nullable=False),
+    sa.Column("record", sa.ForeignKey("run_records.id"), primary_key=True),
+    sa.Column("map", sa.JSON(none_as_null=True), nullable=False),
 )
 
-revisions = Table(
+revisions = sa.Table(
     "parameter_revisions",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("record", ForeignKey("run_records.id"), nullable=False, index=True),
-    Column("revision", Integer, nullable=False),
-    Column("at_ns", BigInteger, nullable=False),
-    Column("time_s", Float, nullable=False, comment="of the scan that stood in the run"),
-    Column("who", String(60), nullable=False),
-    Column("preset", String(100), nullable=False),
-    Column("changes", JSON(none_as_null=True), nullable=False, comment="name: [before, after]"),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("record", sa.ForeignKey("run_records.id"), nullable=False, index=True),
+    sa.Column("revision", sa.Integer, nullable=False),
+    sa.Column("at_ns", sa.BigInteger, nullable=False),
+    sa.Column("time_s", sa.Float, nullable=False, comment="of the scan that stood in the run"),
+    sa.Column("who", sa.String(60), nullable=False),
+    sa.Column("preset", sa.String(100), nullable=False),
+    sa.Column("changes", sa.JSON(none_as_null=True), nullable=False, comment="name: [before, after]"),
     sqlite_autoincrement=True,
 )
 
-uploads = Table(
+uploads = sa.Table(
     "uploads",
     metadata,
-    Column("file", String(100), primary_key=True, comment="name in the folder of uploads"),
-    Column("name", String(200), nullable=False, comment="that it had where it came from"),
-    Column("kind", String(200), nullable=False),
-    Column("bytes", BigInteger, nullable=False),
-    Column("at_ns", BigInteger, nullable=False),
+    sa.Column("file", sa.String(100), primary_key=True, comment="name in the folder of uploads"),
+    sa.Column("name", sa.String(200), nullable=False, comment="that it had where it came from"),
+    sa.Column("kind", sa.String(200), nullable=False),
+    sa.Column("bytes", sa.BigInteger, nullable=False),
+    sa.Column("at_ns", sa.BigInteger, nullable=False),
 )

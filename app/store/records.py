@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from typing import Any
 
+from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 
 KINDS = ("tree", "pole", "person", "bush", "other")
@@ -83,6 +85,62 @@ class SavedSet:
     toml: str
     who: str
     at_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class NewRun:
+    """Start of a run: number of its source in the store, name, format, and the request that opened it."""
+
+    run: int
+    name: str
+    kind: str
+    request: SourceRequest
+
+
+@dataclass(frozen=True, slots=True)
+class RunFigures:
+    """Current result of a run.
+
+    Attributes:
+        scans: Number of mapped scans.
+        all_scans: Number of scans of the source, None if unknown.
+        time_s: Time of the last mapped scan since the first [s].
+        distance_m: Driven distance [m].
+        trees: Number of confirmed trees.
+        preset: Name of the preset.
+        parameters: All values by dotted name.
+        scores: Scores as shown on the page, or None.
+        map: Trees, path and ground truth as plain lists.
+    """
+
+    scans: int
+    all_scans: int | None
+    time_s: float
+    distance_m: float
+    trees: int
+    preset: str
+    parameters: dict[str, Any]
+    scores: dict[str, Any] | None
+    map: dict[str, Any] = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A change of parameters by a person.
+
+    Attributes:
+        revision: Revision after the change.
+        time_s: Time of the current scan [s since the first scan].
+        who: Name of the person.
+        preset: Name of the preset.
+        changes: [before, after] by parameter name.
+    """
+
+    revision: int
+    time_s: float
+    who: str
+    preset: str
+    changes: dict[str, list[Any]]
 
 
 def moment(at_ns: int) -> str:

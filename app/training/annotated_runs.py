@@ -15,8 +15,7 @@ import numpy as np
 
 from app.common.text import version
 from app.robot.source import LiveSource, open_any
-from app.sources.opening import with_odometry
-from app.sources.request import SourceRequest
+from app.sources.request import SourceRequest, with_odometry
 from app.store.records import Content
 from app.store.store import AnnotatedSource
 from app.training.examples import Examples, stored_or_computed

@@ -9,7 +9,7 @@ forests", 2017).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -95,21 +95,10 @@ SETTINGS = {
 }
 # The forest that separates poles from trees that end in free air. It is trained on augmented scans only;
 # there all poles together have `upright` times the weight of all trees (see `fit_free_end`).
-FREE_END_SETTINGS = ForestSettings(
-    "extra",
-    60,
-    8,
-    15,
-    None,
-    0.3,
-    same=0.0,
-    other=0.0,
-    simulated=1.0,
-    wild=0.0,
-    tree=1.0,
-    upright=1.5,
-    rays=False,
-)
+FREE_END_SETTINGS = replace(
+    SETTINGS[ONE_WAY], trees=60, depth=8, least=15,
+    same=0.0, other=0.0, simulated=1.0, wild=0.0, tree=1.0, upright=1.5,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,19 +1,28 @@
-"""Training of a random forest with annotations, and its comparison with the forest in force."""
+"""Training of a random forest with annotations, and its comparison with the forest in force.
+
+The page trains in a process of its own, `python -m app.training.learning`. It receives a `LearningRequest`
+and sends `{"progress": text}` messages, then `{"learned": ...}` or `{"error": text}`. Recordings are read
+there and not in the server.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
+from app.common.child_process import ParentConnection, run_child
 from app.common.text import count, version
-from app.training.annotated_runs import AnnotatedRun, Progress, examples_of
+from app.store.store import AnnotatedSource
+from app.training.annotated_runs import AnnotatedRun, Progress, annotated_run, examples_of
 from app.training.examples import Examples, object_numbers
 from app.training.fit_forest import all_expanded
+from app.training.learned_forests import Forests
 from app.training.validation import Rates, Validation, groups_of, validate
 from pipeline.classification.forest import (
     ALL_AROUND,
@@ -21,7 +30,6 @@ from pipeline.classification.forest import (
     FILE,
     ONE_WAY,
     PACKAGE,
-    ForestOf,
     read_forests,
 )
 from pipeline.config.stages import Classification
@@ -31,29 +39,6 @@ from pipeline.evaluation import Rate
 LEAST_TREES, LEAST_OTHERS = 10, 5
 
 _ABOUT = "Random forest of the package, extended with annotations."
-
-
-@dataclass(frozen=True, slots=True)
-class LearningOptions:
-    """Options of a training.
-
-    Attributes:
-        in_force: The parameters in force, with the name of the present forest and its threshold.
-        forests: Finds the present forest.
-        seen: Digests of the runs with which the present forest was trained.
-        seed: Random seed.
-        date: Date that is stored with the forest.
-        kept: Folder that stores the examples of each run.
-        progress: Called with progress messages.
-    """
-
-    in_force: Classification
-    forests: ForestOf
-    seen: tuple[str, ...]
-    seed: int
-    date: str
-    kept: Path | None
-    progress: Progress = lambda _: None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +60,24 @@ class LearningResult:
     warnings: list[str] = field(default_factory=list)
 
 
-def learn(runs: Sequence[AnnotatedRun], asked: LearningOptions) -> LearningResult:
+def learn(
+    runs: Sequence[AnnotatedRun],
+    in_force: Classification,
+    folder: Path | None,
+    *,
+    date: str,
+    seed: int = 0,
+    progress: Progress = lambda _: None,
+) -> LearningResult:
     """Extend the forest of the package with the annotations of runs.
+
+    Args:
+        runs: The annotated runs.
+        in_force: The parameters in force, with the name of the present forest and its threshold.
+        folder: Data folder, with the present forest and stored examples; None where there is none.
+        date: Date that is stored with the forest.
+        seed: Random seed.
+        progress: Called with progress messages.
 
     Raises:
         StemmapError: There are too few examples; the message names the numbers.
@@ -84,7 +85,8 @@ def learn(runs: Sequence[AnnotatedRun], asked: LearningOptions) -> LearningResul
     if lacking := too_few(each.kind for run in runs for each in run.annotations):
         raise StemmapError(f"too few annotations: {lacking}")
     warnings: list[str] = []
-    of_run = _examples(runs, asked, warnings)
+    forests, share = Forests(folder), in_force.tree_share
+    of_run = _examples(runs, folder and folder / "examples", progress, warnings)
     base, _ = read_forests(FILE, ALL_AROUND, ONE_WAY)
     grown, validated = dict[str, list[dict[str, Any]]](), dict[str, Validation]()
     things, used = Counter[str](), list[AnnotatedRun]()
@@ -95,32 +97,33 @@ def learn(runs: Sequence[AnnotatedRun], asked: LearningOptions) -> LearningResul
         if lacking:
             warnings += [f"sensors that see {kind}: {lacking}"] if examples else []
             continue
-        asked.progress("Scoring the present and the new forest")
-        old, share = asked.forests(asked.in_force.forest, kind == ALL_AROUND), asked.in_force.tree_share
-        validated[kind] = validate(examples, base, kind, old, share, asked.seed)
-        asked.progress("Training the new forest")
+        progress("Scoring the present and the new forest")
+        old = forests(in_force.forest, kind == ALL_AROUND)
+        validated[kind] = validate(examples, base, kind, old, share, seed)
+        progress("Training the new forest")
         figures, label = (
             np.concatenate([getattr(e, name) for e in examples]) for name in ("figures", "label")
         )
-        grown |= all_expanded(base, kind, figures, label, object_numbers(examples), asked.seed)
+        grown |= all_expanded(base, kind, figures, label, object_numbers(examples), seed)
         things += things_by_class(examples)
         used += [run for run, _ in some]
     if not validated:
         reasons = [what_lacks([e for _, e in of_run]) if not warnings else "", *warnings]
         raise StemmapError("too few annotations: " + "; ".join(w for w in reasons if w))
     about = {
-        "date": asked.date,
+        "date": date,
         "version": version(),
         "base": PACKAGE,
-        "seed": asked.seed,
+        "seed": seed,
         "runs": [{"name": run.name, "source": run.digest} for run in used],
         "things": dict(things),
-        "against": asked.in_force.forest,
-        "share": asked.in_force.tree_share,
+        "against": in_force.forest,
+        "share": share,
         "scores": {kind: asdict(each) for kind, each in validated.items()},
     }
     data = {**base, "about": _ABOUT, "learned": about, **grown}
-    old_saw = any(run.digest in asked.seen for run in used)
+    seen = () if in_force.forest == PACKAGE else seen_by(forests.read(in_force.forest))
+    old_saw = any(run.digest in seen for run in used)
     return LearningResult(data, validated, dict(things), old_saw, warnings)
 
 
@@ -159,14 +162,14 @@ def what_lacks(examples: Sequence[Examples]) -> str:
 
 
 def _examples(
-    runs: Sequence[AnnotatedRun], asked: LearningOptions, warnings: list[str]
+    runs: Sequence[AnnotatedRun], kept: Path | None, progress: Progress, warnings: list[str]
 ) -> list[tuple[AnnotatedRun, Examples]]:
     """The examples of each run that can be mapped."""
     found = []
     for run in runs:
-        asked.progress(f"Mapping {run.name}")
+        progress(f"Mapping {run.name}")
         try:
-            examples = examples_of(run, asked.kept, asked.progress)
+            examples = examples_of(run, kept, progress)
         except SourceError as error:
             warnings.append(f"{run.name} is left out: {error}")
             continue
@@ -206,3 +209,56 @@ def _cell(rate: Rate) -> str:
 
 def _row(*cells: str) -> str:
     return "  " + cells[0].ljust(5) + "".join(cell.rjust(18) for cell in cells[1:])
+
+
+class LearningRequest(msgspec.Struct, frozen=True):
+    """Request for a training.
+
+    Attributes:
+        sources: The annotated runs.
+        classification: Parameters of the classification in force, with the name of the present forest.
+        folder: The data folder, where the new forest is stored.
+        date: Date of the training.
+        seed: Random seed.
+    """
+
+    sources: list[AnnotatedSource]
+    classification: dict[str, Any]
+    folder: str
+    date: str
+    seed: int = 0
+
+
+def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str, Any]:
+    """Train a forest and store it under its name. It is not in force yet."""
+    folder, present = Path(request.folder), Classification.model_validate(request.classification)
+    runs = [annotated_run(source) for source in request.sources]
+    learned = learn(runs, present, folder, date=request.date, seed=request.seed, progress=progress)
+    return as_plain(learned, Forests(folder).keep(learned.data), present.forest)
+
+
+def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
+    """Return the result for the page."""
+    return {
+        "name": name,
+        "against": old,
+        "things": learned.things,
+        "old_saw": learned.old_saw,
+        "warnings": learned.warnings[:20],
+        "tables": [{"kind": kind, **msgspec.to_builtins(each)} for kind, each in learned.validated.items()],
+    }
+
+
+def serve(parent: ParentConnection) -> None:
+    """Answer one request."""
+    try:
+        request = parent.receive(LearningRequest)
+        parent.send({"learned": train(request, lambda text: parent.send({"progress": text}))})
+    except StemmapError as error:
+        parent.send({"error": str(error)})
+    except MemoryError:
+        parent.send({"error": "this needs more memory than this machine has"})
+
+
+if __name__ == "__main__":
+    run_child(serve)

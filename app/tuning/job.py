@@ -22,7 +22,7 @@ from app.common.timers import cancel
 from app.robot.address import is_live
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.store import AnnotatedSource
-from app.tuning.jobs import TruthTable
+from app.tuning.jobs import TruthTable, check_run
 from app.tuning.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
 from app.tuning.result import Result, SearchMessage, SearchStart, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
@@ -287,7 +287,9 @@ def other_runs(
         why = "from another machine it cannot be opened" if uri is None else _why_gone(uri)
         found[digest] = OtherRun([row["id"]], row["name"], digest, opened, table, why)
     return [
-        msgspec.structs.replace(run, why_not=run.why_not or _why_no_truth(run, digest in scored))
+        run
+        if run.why_not or digest in scored or "tree" in run.annotations.kind
+        else msgspec.structs.replace(run, why_not="no true trees are known of it")
         for digest, run in found.items()
     ]
 
@@ -312,15 +314,10 @@ def plan_of(
     Raises:
         StemmapError: The request cannot be searched.
     """
-    if not digest:
-        raise StemmapError("no run is open", remedy="Open one")
-    if is_live(source.uri):
-        raise StemmapError("a live run cannot be mapped again", where=source.uri, remedy="Open its recording")
-    if truth is None or "tree" not in truth.kind:
-        raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
+    known = check_run(digest, source.uri, truth)
     axes = axes_of(request.over)
     check(axes, parameters)
-    shown = PlannedRun(source.request(), TruthTable.of(truth), "annotations")
+    shown = PlannedRun(source.request(), TruthTable.of(known), "annotations")
     return Plan(
         runs=(shown, *_planned(request, others)),
         axes=axes,
@@ -401,7 +398,3 @@ def _why_gone(uri: str) -> str:
     except (OSError, ValueError, RuntimeError):  # RuntimeError: unknown home directory
         there = False
     return "" if there else "its recording does not exist any more"
-
-
-def _why_no_truth(run: OtherRun, scored: bool) -> str:
-    return "" if scored or "tree" in run.annotations.kind else "no true trees are known of it"

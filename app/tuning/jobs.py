@@ -17,7 +17,9 @@ import numpy as np
 import pipeline
 from app.batch.summary import far_truth
 from app.common.text import version
+from app.robot.address import is_live
 from app.sources.request import SourceRequest
+from pipeline.errors import StemmapError
 from pipeline.evaluation import MapScores
 from pipeline.types.records import TruthTrees
 
@@ -119,3 +121,23 @@ def code_digest() -> str:
         if file.suffix in (".py", ".json"):
             state.update(f"{file.relative_to(folder).as_posix()}\0".encode() + file.read_bytes() + b"\0")
     return f"{version()}+{state.hexdigest()[:16]}"
+
+
+def check_run(digest: str, uri: str, truth: TruthTrees | None) -> TruthTrees:
+    """Return the true trees of the open run, if it can be mapped again and scored.
+
+    Args:
+        digest: Digest of the run; empty where none is open.
+        uri: URI of its source.
+        truth: Its true trees, with the annotations.
+
+    Raises:
+        StemmapError: No run is open, it is live, or no true trees are known of it.
+    """
+    if not digest:
+        raise StemmapError("no run is open", remedy="Open one")
+    if is_live(uri):
+        raise StemmapError("a live run cannot be mapped again", where=uri, remedy="Open its recording")
+    if truth is None or "tree" not in truth.kind:
+        raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
+    return truth

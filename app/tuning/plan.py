@@ -423,7 +423,7 @@ class Plan(msgspec.Struct, frozen=True):
         preset: Name of the preset from which the parameters come.
         goal, false_max: See `app.tuning.plan.Goal`.
         seed: Random seed of the mapping and of the sampler.
-        odometry: Default source of the motion, see `app.sources.opening`.
+        odometry: Default source of the motion, see `app.sources.request`.
         trials: Number of trials in all, earlier ones included.
         seconds: Time limit [s]; 0 for none.
     """

@@ -6,11 +6,9 @@ parameters, wherever they were computed.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from app.tuning.jobs import JobResult
 from app.tuning.sweep import SweepPlan
 from pipeline.evaluation import MapScores
 from pipeline.io.atomic_files import write_beside
+from pipeline.io.result_files import csv_text
 
 Figures = dict[str, float | int | None]
 
@@ -227,7 +226,13 @@ def lines(comparison: Comparison) -> list[str]:
         left_out = len(rows) - MOST_LINES
         rows = sorted(rows, key=lambda row: -(row.figures.get("f1") or -1.0))[:MOST_LINES]
         notes.append(f"{count(left_out, 'set')} with a smaller F1 not shown; --out DIR writes all of them")
-    heads = ["set", "parameters", *([] if one else ["run"]), *(_head(h, u) for _, h, u, _ in SHOWN), "s"]
+    heads = [
+        "set",
+        "parameters",
+        *([] if one else ["run"]),
+        *(f"{h} {u}".strip() for _, h, u, _ in SHOWN),
+        "s",
+    ]
     cells = [_cells(comparison, row, one=one) for row in rows]
     return [*_aligned([heads, *cells]), *notes, *_best_lines(comparison)]
 
@@ -288,47 +293,36 @@ def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
     axes = list(plan.sets[0]) if plan.sets else []
     of_runs = any(row.run for row in rows)
     head = ["set", *axes, *(["run", "source"] if of_runs else []), *COLUMNS, "error"]
-    return _csv(
-        head,
-        (
-            [
-                row.set_number,
-                *(plan.sets[row.set_number - 1][axis] for axis in axes),
-                *([row.run, plan.runs[row.run - 1].name] if of_runs else []),
-                *(row.figures.get(name) for name in COLUMNS),
-                row.error,
-            ]
-            for row in rows
-        ),
+    cells = (
+        [
+            row.set_number,
+            *(plan.sets[row.set_number - 1][axis] for axis in axes),
+            *([row.run, plan.runs[row.run - 1].name] if of_runs else []),
+            *(row.figures.get(name) for name in COLUMNS),
+            row.error,
+        ]
+        for row in rows
     )
+    return csv_text(head, ([_cell(cell) for cell in row] for row in cells))
 
 
 def _times(comparison: Comparison) -> str:
-    rows = ([r.set_number, r.run, f"{r.seconds:.3f}", r.looked] for r in comparison.rows if not r.error)
-    return _csv(["set", "run", "seconds", "scans_looked_at"], rows)
+    rows = [
+        [str(r.set_number), str(r.run), f"{r.seconds:.3f}", str(r.looked).lower()]
+        for r in comparison.rows
+        if not r.error
+    ]
+    return csv_text(["set", "run", "seconds", "scans_looked_at"], rows)
 
 
-def _csv(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(head)
-    for row in rows:
-        table.writerow([_cell(cell) for cell in row])
-    return text.getvalue()
-
-
-def _cell(cell: object) -> object:
+def _cell(cell: object) -> str:
     """Return a cell as it is written: empty for None, and with an apostrophe in front of a text that a
     spreadsheet would compute, such as a file name `=1+1.mcap`."""
     if cell is None:
         return ""
     if isinstance(cell, bool):
         return str(cell).lower()
-    return f"'{cell}" if isinstance(cell, str) and cell.startswith(_COMPUTED) else cell
-
-
-def _head(heading: str, unit: str) -> str:
-    return f"{heading} {unit}".strip()
+    return f"'{cell}" if isinstance(cell, str) and cell.startswith(_COMPUTED) else str(cell)
 
 
 def _cells(comparison: Comparison, row: Row, *, one: bool) -> list[str]:

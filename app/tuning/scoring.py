@@ -19,20 +19,17 @@ from pathlib import Path as FilePath
 from typing import IO
 
 import msgspec
-import numpy as np
 
 import pipeline.jit
-from app.batch.run_folder import as_written
+from app.batch.run_folder import NO_PATH, as_written, score_map
 from app.common.child_process import ParentConnection, run_child
-from app.sources.opening import with_odometry
-from app.sources.request import SourceRequest
+from app.sources.request import SourceRequest, with_odometry
 from app.training.learned_forests import kept_forests
 from app.tuning.jobs import Fault, Job, JobResult, RunWithTruth, code_digest
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
-from pipeline.evaluation import evaluate
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import is_cloud, open_cloud
 from pipeline.jit import on_compiling
@@ -173,7 +170,7 @@ class OpenCloud:
         cloud = open_cloud(self._uri)
         found = map_plot(cloud, parameters, kept_forests()).trees
         placed = replace(found, position=found.position + cloud.description.offset[:2])
-        trees, path = as_written(placed, _NO_PATH, 0)
+        trees, path = as_written(placed, NO_PATH, 0)
         return MappedRun(trees, path, 0, True)
 
     def close(self) -> None:
@@ -182,10 +179,6 @@ class OpenCloud:
 
 class _DamagedCacheError(Exception):
     """A cached scan cannot be read."""
-
-
-_EMPTY = np.zeros(0)
-_NO_PATH = Path(_EMPTY.astype(np.int64), _EMPTY, _EMPTY, _EMPTY, _EMPTY)
 
 
 OpenRun = OpenDrive | OpenCloud
@@ -234,8 +227,7 @@ class Scorer:
             return _failed("this needs more memory than the machine has")
         except Exception as error:  # a fault with one set must not end the others
             return _failed(f"this is a fault in stemmap: {type(error).__name__}: {error}")
-        path = np.stack([mapped.path.x, mapped.path.y], axis=1) if mapped.scans else None
-        scores = evaluate(mapped.trees, job.run.truth.trees(), parameters.evaluation, path)
+        scores = score_map(mapped.trees, mapped.path, job.run.truth.trees(), parameters)
         seconds = time.perf_counter() - begun
         return JobResult(scores, mapped.scans, len(mapped.trees.number), seconds, mapped.front_end_ran)
 

@@ -15,9 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from app.batch.summary import far_truth
+from app.batch.summary import far_map, far_truth
 from app.common.child_process import ParentConnection, python_module, run_child
-from app.common.text import count
 from app.dashboard.annotations import contents_of, laid_over
 from app.store.records import Annotation
 from app.tuning.jobs import Job, RunWithTruth, TruthTable, code_digest
@@ -124,10 +123,9 @@ def check_start(uri: str, scores: MapScores, match_distance: float) -> None:
         others = scores.TR.of > 0
         what = "the ground truth near the path has no trees" if others else far_truth(scores.reach)
         raise StemmapError(what, where=uri)
-    if not scores.TA.count:
+    if no_tree := far_map(scores, match_distance):
         raise StemmapError(
-            f"none of {count(scores.TA.of, 'true tree')} has a mapped tree within {match_distance:g} m, with "
-            "the parameters that the search begins with",
+            f"{no_tree}, with the parameters that the search begins with",
             where=uri,
             remedy="Check that the true trees are in the frame of the map (the first pose is its origin), or "
             "begin with another --preset",

@@ -13,8 +13,7 @@ from typing import Any
 
 from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.sources.request import SourceRequest
-from app.tuning.jobs import Job, JobResult, RunWithTruth, TruthTable, code_digest
-from app.worker.protocol import Status
+from app.tuning.jobs import Job, JobResult, RunWithTruth, TruthTable, check_run, code_digest
 from pipeline.config import Parameters, field_specs
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
@@ -47,7 +46,6 @@ class Question:
 def question_of(
     source: SourceRequest,
     digest: str,
-    status: Status,
     truth: TruthTrees | None,
     parameters: Parameters,
     name: str,
@@ -56,7 +54,7 @@ def question_of(
     """Return the sensitivity curve of the open run that is to be computed.
 
     Args:
-        source, digest, status: The open run; the digest is empty if none is open.
+        source, digest: The open run; the digest is empty if none is open.
         truth: True trees, with the annotations.
         parameters: The parameters in force.
         name: Dotted name of the parameter.
@@ -65,16 +63,8 @@ def question_of(
     Raises:
         StemmapError: The run cannot be read again, or has no true trees.
     """
-    if not digest:
-        raise StemmapError("no run is open", remedy="Open one")
-    if status.live:
-        raise StemmapError("a live run cannot be read again", remedy="Open its recording")
-    if truth is None or not len(truth.x):
-        raise StemmapError(
-            "the run has no true trees to score by",
-            remedy="Annotate some trees in the tab Annotate, or import a table",
-        )
-    run = RunWithTruth(source.request(), digest, TruthTable.of(truth))
+    known = check_run(digest, source.uri, truth)
+    run = RunWithTruth(source.request(), digest, TruthTable.of(known))
     return Question(run, parameters, name, tuple(values))
 
 

@@ -288,12 +288,13 @@ class _Sweep:
         the largest; None if no remaining job suits the worker."""
         if self._groups.get(worker) in self._waiting:
             return self._groups[worker]
-        fit = [g for g, jobs in self._waiting.items() if worker not in self._unfit_for(jobs[0])]
+        fit = [
+            g
+            for g, jobs in self._waiting.items()
+            if worker not in self._unfit.get(self._jobs[jobs[0]].run.digest, ())
+        ]
         others = {self._groups[w] for w in self._doing}
         return max(fit, key=lambda g: (g not in others, len(self._waiting[g])), default=None)
-
-    def _unfit_for(self, number: int) -> set[str]:
-        return self._unfit.get(self._jobs[number].run.digest, set())
 
     def _hear(self, event: Done | Lost) -> None:
         number = self._doing.pop(event.worker, None)

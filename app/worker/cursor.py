@@ -15,7 +15,7 @@ from dataclasses import replace
 from itertools import islice
 
 from app.robot.source import LiveSource
-from app.sources.opening import ChosenOdometry
+from app.sources.request import ChosenOdometry
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
 from pipeline.odometry.odometry_override import OdometryOverride

@@ -19,38 +19,14 @@ import msgspec
 from app.common.text import COMPILING
 from app.explain.build import cluster_story, tree_story
 from app.explain.history import RecentScans
+from app.worker import protocol
 from app.worker.outbox import for_comparison
-from app.worker.protocol import (
-    Advance,
-    Answer,
-    AskCamera,
-    AskCluster,
-    AskCompare,
-    AskTree,
-    Begin,
-    Command,
-    FromWorker,
-    Open,
-    Opened,
-    Pause,
-    Play,
-    Question,
-    Remapped,
-    Report,
-    Rough,
-    Seek,
-    SetParameters,
-    SetSpeed,
-    Shown,
-    Status,
-    ToWorker,
-)
 from app.worker.session import Session, camera_picture
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame
 
-Put = Callable[[FromWorker], None]
+Put = Callable[[protocol.FromWorker], None]
 T = TypeVar("T")
 
 # Interval of status reports while a run plays, and of frames on the way to a sought scan; on a short way none
@@ -83,23 +59,23 @@ class WorkerLoop:
     def __init__(
         self,
         session: Session,
-        commands: queue.Queue[ToWorker | None],
+        commands: queue.Queue[protocol.ToWorker | None],
         put: Put,
         clock: Callable[[], float] = time.monotonic,
         recent: RecentScans | None = None,
     ) -> None:
         self._session = session
-        session.on_preview = lambda revision, trees: put(Rough(self._run, revision, trees))
+        session.on_preview = lambda revision, trees: put(protocol.Rough(self._run, revision, trees))
         self._commands = commands
         self._put = put
         self._clock = clock
         self._recent = recent or RecentScans()
-        self._taken: deque[ToWorker | None] = deque()
+        self._taken: deque[protocol.ToWorker | None] = deque()
         self._replay = ReplayClock()
         self._run, self._requested = 0, ""
         self._held = False
         self._prepared = False
-        self._reported: tuple[Status, float] | None = None
+        self._reported: tuple[protocol.Status, float] | None = None
         self._glimpse_at = 0.0
         self._long_way_at = 0.0
         self._compiling_since_s, self._compiled_at = 0.0, -math.inf
@@ -118,14 +94,14 @@ class WorkerLoop:
             if command is None:
                 self._session.close()
                 return
-            if isinstance(command, Question):
+            if isinstance(command, protocol.Question):
                 self._put(answer(self._session, self._recent, command, self._run))
                 if self._says_compiling:  # an answer may compile other kernels than the run
                     self._report()
             else:
                 self._obey(command)
 
-    def _next_command(self) -> ToWorker | None:
+    def _next_command(self) -> protocol.ToWorker | None:
         """Return the next command, and wait for it until the next scan is due. Of successive parameter
         changes (a slider drag) the last one is returned.
 
@@ -139,7 +115,9 @@ class WorkerLoop:
                 self._taken.append(self._commands.get_nowait())
         command = self._taken.popleft()
         while (
-            isinstance(command, SetParameters) and self._taken and isinstance(self._taken[0], SetParameters)
+            isinstance(command, protocol.SetParameters)
+            and self._taken
+            and isinstance(self._taken[0], protocol.SetParameters)
         ):
             command = self._taken.popleft()
         return command
@@ -217,7 +195,7 @@ class WorkerLoop:
             return
         frame, changes = done
         self._recent.forget()  # their verdicts are of other parameters
-        self._put(Remapped(self._run, changes))
+        self._put(protocol.Remapped(self._run, changes))
         self._show(frame)
         self._report()
 
@@ -233,38 +211,38 @@ class WorkerLoop:
             self._tell_opened(opened)
         self._report_when_due(self._clock())
 
-    def _obey(self, command: Command | Begin) -> None:
+    def _obey(self, command: protocol.Command | protocol.Begin) -> None:
         self._replay.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
         self._guarded(lambda: self._carry_out(command))
         self._report()
 
-    def _carry_out(self, command: Command | Begin) -> None:
+    def _carry_out(self, command: protocol.Command | protocol.Begin) -> None:
         session = self._session
         match command:
-            case Play():
+            case protocol.Play():
                 self._play()
-            case Pause():
+            case protocol.Pause():
                 self._held = True
                 session.pause()
-            case Advance(scans=scans):
+            case protocol.Advance(scans=scans):
                 self._held = True
                 session.advance(scans)
-            case Seek(time_s=time_s):
+            case protocol.Seek(time_s=time_s):
                 session.seek(time_s)
-            case SetSpeed(factor=factor):
+            case protocol.SetSpeed(factor=factor):
                 self._replay.speed = factor
-            case SetParameters(values=values, revision=revision, whole=whole, step=step):
+            case protocol.SetParameters(values=values, revision=revision, whole=whole, step=step):
                 self._show(session.set_parameters(validated(values), revision, whole=whole, step=step))
-            case Open():
+            case protocol.Open():
                 self._open(command)
-            case Begin():
+            case protocol.Begin():
                 self._begin(command)
 
-    def _open(self, command: Open) -> None:
+    def _open(self, command: protocol.Open) -> None:
         self._run, self._requested = self._run + 1, command.uri
         opening = f"Opening {command.uri}"
-        self._put(Report(Status(state="starting", detail=opening, source=command.uri)))
+        self._put(protocol.Report(protocol.Status(state="starting", detail=opening, source=command.uri)))
         opened = self._session.open(
             command.uri,
             command.odometry,
@@ -283,11 +261,11 @@ class WorkerLoop:
             self._run += 1
             self._tell_opened(opened_again)
 
-    def _tell_opened(self, opened: Opened) -> None:
+    def _tell_opened(self, opened: protocol.Opened) -> None:
         self._prepared = self._held = False
         self._put(msgspec.structs.replace(opened, run=self._run, requested=self._requested))
 
-    def _begin(self, command: Begin) -> None:
+    def _begin(self, command: protocol.Begin) -> None:
         if command.run != self._run:  # another run was opened since
             return
         self._show(self._session.set_parameters(validated(command.values), command.revision))
@@ -306,7 +284,7 @@ class WorkerLoop:
         self._replay.release()
         self._report()
 
-    def _preparing(self) -> Status:
+    def _preparing(self) -> protocol.Status:
         return replace(self._session.status(), state="starting", detail="Preparing the mapper")
 
     def compiling(self) -> None:
@@ -323,7 +301,7 @@ class WorkerLoop:
         if status.state == "playing":
             status = replace(status, state="waiting")
         self._reported = (status, -math.inf)  # so that the next status is sent at once
-        self._put(Report(status))
+        self._put(protocol.Report(status))
 
     @property
     def _says_compiling(self) -> bool:
@@ -333,7 +311,7 @@ class WorkerLoop:
         run, path = self._session.run, self._session.path
         if frame is not None and run is not None and path is not None:
             confirmed_s = run.confirmed_s(frame.trees)
-            self._put(Shown(self._run, self._session.time_s, frame, 0, path, confirmed_s))
+            self._put(protocol.Shown(self._run, self._session.time_s, frame, 0, path, confirmed_s))
 
     def _report(self) -> None:
         now = self._clock()
@@ -353,11 +331,11 @@ class WorkerLoop:
         )
         self._tell(status, now)
 
-    def _tell(self, status: Status, now: float) -> None:
+    def _tell(self, status: protocol.Status, now: float) -> None:
         self._reported = (status, now)
-        self._put(Report(status))
+        self._put(protocol.Report(status))
 
-    def _behind(self, status: Status, now: float) -> int:
+    def _behind(self, status: protocol.Status, now: float) -> int:
         if status.live:
             return status.scans_behind
         behind = self._replay.behind(now)
@@ -384,7 +362,7 @@ class WorkerLoop:
         self._session.fail(detail)
 
 
-def answer(session: Session, recent: RecentScans, question: Question, run: int) -> Answer:
+def answer(session: Session, recent: RecentScans, question: protocol.Question, run: int) -> protocol.Answer:
     """Return the answer to a question, or an answer with the reason why there is none. The run does not
     change.
 
@@ -399,30 +377,32 @@ def answer(session: Session, recent: RecentScans, question: Question, run: int) 
             raise StemmapError("the run was left")
         return _answer(session, recent, question)
     except StemmapError as error:
-        return Answer(question.ticket, missing=str(error))
+        return protocol.Answer(question.ticket, missing=str(error))
     except Exception as error:  # an answer that fails must not stop the run
         traceback.print_exc(file=sys.stderr)
         fault = f"this is a fault in stemmap: {type(error).__name__}: {error}"
-        return Answer(question.ticket, missing=f"{fault}. The terminal shows where")
+        return protocol.Answer(question.ticket, missing=f"{fault}. The terminal shows where")
 
 
-def _answer(session: Session, recent: RecentScans, question: Question) -> Answer:
+def _answer(session: Session, recent: RecentScans, question: protocol.Question) -> protocol.Answer:
     ticket, run = question.ticket, session.run
     match question:
-        case AskCompare(sets=sets):
+        case protocol.AskCompare(sets=sets):
             frames = session.compare([validated(values) for values in sets])
-            return Answer(ticket, frames=[for_comparison(frame) for frame in frames])
-        case AskCamera(stamp_ns=stamp_ns):
-            return Answer(ticket, camera=camera_picture(None if run is None else run.source, stamp_ns))
-        case AskTree(tree=tree):
-            return Answer(ticket, tree=tree_story(run, tree))
-        case AskCluster(scan=scan, cluster=cluster):
+            return protocol.Answer(ticket, frames=[for_comparison(frame) for frame in frames])
+        case protocol.AskCamera(stamp_ns=stamp_ns):
+            return protocol.Answer(
+                ticket, camera=camera_picture(None if run is None else run.source, stamp_ns)
+            )
+        case protocol.AskTree(tree=tree):
+            return protocol.Answer(ticket, tree=tree_story(run, tree))
+        case protocol.AskCluster(scan=scan, cluster=cluster):
             frame = recent.find(question.run, scan)
             if frame is None:
                 raise StemmapError(
                     f"scan {scan} was shown too long ago", remedy="Click a cluster of the newest one"
                 )
-            return Answer(ticket, cluster=cluster_story(run, frame, cluster))
+            return protocol.Answer(ticket, cluster=cluster_story(run, frame, cluster))
 
 
 NS = 1_000_000_000

@@ -13,8 +13,7 @@ from msgspec import structs
 
 from app.common.arrays import evenly_spaced, first_difference
 from app.explain.history import RecentScans
-from app.worker.codec import WireError, from_worker
-from app.worker.protocol import FromWorker, Opened, Report, Shown
+from app.worker.protocol import FromWorker, Opened, Report, Shown, WireError, from_worker
 from pipeline.types.records import Frame, HeightMap, Path
 
 # A higher frame rate is not visible and would only fill the pipe and the sockets.

@@ -1,7 +1,7 @@
 """The process that owns the source and the mapper: `python -m app.worker.process [FOLDER]`.
 
 The scan caches are stored in the folder. Commands arrive on stdin and messages are written to stdout, both
-encoded by `app.worker.codec`. The process ends when stdin ends, so it never outlives the web process.
+encoded by `app.worker.protocol`. The process ends when stdin ends, so it never outlives the web process.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from typing import BinaryIO
 from app.common.child_process import private_streams
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
-from app.worker.codec import WireError, to_worker
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import Outbox
-from app.worker.protocol import ToWorker
+from app.worker.protocol import ToWorker, WireError, to_worker
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.jit import on_compiling

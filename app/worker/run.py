@@ -14,7 +14,7 @@ import numpy as np
 from app.common.timers import Stopwatch
 from app.explain.history import TreeHistory
 from app.robot.source import LiveSource
-from app.sources.opening import with_odometry
+from app.sources.request import with_odometry
 from app.worker.cursor import Cursor, LiveCursor
 from app.worker.remap import (
     NOT_OF_THE_MAP,

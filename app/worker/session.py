@@ -17,8 +17,7 @@ from app.batch.summary import driven, health_word
 from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
-from app.worker.map_changes import MapChanges
-from app.worker.protocol import LONGEST_S, CameraPicture, Opened, State, Status
+from app.worker.protocol import LONGEST_S, CameraPicture, MapChanges, Opened, State, Status
 from app.worker.remap import MapComparison
 from app.worker.run import MakeMapper, Run, open_run
 from pipeline.config import Parameters

@@ -13,8 +13,8 @@ from typing import Literal
 from app.common.child_process import exit_reason, python_module
 from app.common.timers import cancel
 from app.robot.address import is_live
-from app.worker.codec import LENGTH_BYTES, WireError, check_size, from_worker, to_worker
 from app.worker.protocol import (
+    LENGTH_BYTES,
     Begin,
     FromWorker,
     Open,
@@ -27,7 +27,11 @@ from app.worker.protocol import (
     Shown,
     Status,
     ToWorker,
+    WireError,
     WorkerBusyError,
+    check_size,
+    from_worker,
+    to_worker,
 )
 
 WORKER = python_module("app.worker.process")

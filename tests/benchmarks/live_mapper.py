@@ -16,7 +16,7 @@ from typing import Any
 
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource, open_live
-from app.sources.opening import with_odometry
+from app.sources.request import with_odometry
 from app.worker.cursor import LiveCursor
 from app.worker.numba_warmup import warm_up
 from pipeline.config import preset

@@ -11,7 +11,7 @@ from starlette.responses import Response
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.payload import comparison_payload, doubts_of, stages_payload, trees_payload
 from app.dashboard.scores import pairs_payload
-from app.explain.client import NoStoryError
+from app.dashboard.selection import NoStoryError
 from app.web.responses import (
     LARGEST_NUMBER,
     Body,

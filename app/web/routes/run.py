@@ -16,8 +16,7 @@ from starlette.responses import Response
 
 from app.common.settings import Settings
 from app.sources.inspection import ask
-from app.sources.opening import FILE
-from app.sources.request import LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
+from app.sources.request import FILE, LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
 from app.web.responses import BadRequestError, Body, Value, Word, json_reply
 from app.web.routes.access import AnyFile, Dash, Deployment
 from app.worker.protocol import FASTEST, LONGEST_S, MOST_SCANS, Command

@@ -16,8 +16,8 @@ from app.batch.data_folders import delete_partial_output, finished_folders, part
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.sources.request import request_of_kept
-from app.store.book import RunRecords
 from app.store.records import UnknownError
+from app.store.store import RunRecords
 from app.web.responses import LARGEST_NUMBER, BadRequestError, Body, Number, error_reply, json_reply
 from app.web.routes.access import AnyFile, Dash, Deployment, ViewerTurn
 from app.web.routes.run import permitted_request

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from app.common.environment import from_environment
-from app.common.settings import VARIABLES, Settings, is_loopback
+from app.common.settings import VARIABLES, Settings, from_environment, is_loopback
 from pipeline.errors import StemmapError
 
 

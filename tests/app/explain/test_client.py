@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from app.explain.client import NoStoryError, WorkerClient
+from app.dashboard.selection import NoStoryError, WorkerClient
 from app.worker.protocol import Answer, WorkerBusyError
 from tests.app.explain.stories import cluster_story, tree_story
 

@@ -21,7 +21,7 @@ from app.fleet import fleet as fleet_module
 from app.fleet.fleet import Fleet, Frames
 from app.fleet.server import build_fleet, named, warm_kernels
 from app.sources.request import SourceRequest
-from app.store.book import NewRun
+from app.store.records import NewRun
 from app.web.auth import viewer_token
 from app.web.serving import bind
 from app.worker.protocol import Open

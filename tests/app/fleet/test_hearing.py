@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 
 from app.fleet.hearing import UNREADABLE, ResultReceiver, Results
-from app.robot.inbox import Inbox
+from app.robot.link import Inbox
 from app.robot.topics import Publisher
 from app.robot.zenoh import ZenohLink
 from pipeline.io.readers.container import Channel, Message

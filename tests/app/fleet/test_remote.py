@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from app.fleet import remote as module
-from app.fleet.remote import RemoteRobots
+from app.fleet import server as module
+from app.fleet.server import RemoteRobots
 from tests.app.fleet.test_fleet import make
 
 RED = {

@@ -11,7 +11,7 @@ import pytest
 
 from app.batch.tree_pictures import keep_pictures
 from app.robot.address import parse_address
-from app.robot.inbox import (
+from app.robot.link import (
     LARGEST_PICTURE,
     MAX_PICTURE_BYTES,
     MAX_PICTURES,
@@ -20,9 +20,8 @@ from app.robot.inbox import (
     PICTURES_TOO_LARGE,
     Inbox,
 )
-from app.robot.picture_store import FULL, REFUSED, SPARED, PictureStore
 from app.robot.recorder import Recorder
-from app.robot.source import LiveSource
+from app.robot.source import FULL, REFUSED, SPARED, LiveSource, PictureStore
 from app.robot.topics import PICTURE_TYPES, Publisher, choose
 from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
@@ -171,7 +170,7 @@ def test_each_tree_gets_a_picture_of_those_that_were_put_aside(run: Path, tmp_pa
 
 
 def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("app.robot.picture_store.MOST_BYTES", 25)
+    monkeypatch.setattr("app.robot.source.MOST_BYTES", 25)
     with closing(PictureStore(tmp_path)) as kept:
         for k in range(1, 5):
             assert kept.is_due(way(list(range(1, 3 * k))))
@@ -184,7 +183,7 @@ def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: p
 
 def test_the_disk_keeps_its_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     free = [SPARE_BYTES + 10, SPARE_BYTES + 9]
-    monkeypatch.setattr("app.robot.picture_store.free_space", lambda _: free.pop(0))
+    monkeypatch.setattr("app.robot.source.free_space", lambda _: free.pop(0))
     with closing(PictureStore(tmp_path)) as kept:
         for stamp_ns in (1, 2):
             kept.add(Picture(stamp_ns, "", 0, 0, 0, bytes(10)), way([1]))
@@ -198,7 +197,7 @@ def test_a_full_disk_costs_pictures_and_nothing_else(tmp_path: Path, monkeypatch
         del dir
         return Path("/dev/full").open("w+b", **how)
 
-    monkeypatch.setattr("app.robot.picture_store.tempfile.TemporaryFile", full)
+    monkeypatch.setattr("app.robot.source.tempfile.TemporaryFile", full)
     with closing(PictureStore(tmp_path)) as kept:
         kept.add(Picture(1, "", 0, 0, 0, bytes(10)), way([1]))
         assert kept.losses == {REFUSED: 1}

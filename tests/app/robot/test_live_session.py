@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from app.robot.address import ZenohAddress, parse_address
-from app.robot.inbox import Inbox
-from app.robot.link import Link
+from app.robot.link import Inbox, Link
 from app.robot.source import LiveSource
 from app.robot.topics import Publisher
 from app.worker.loop import WorkerLoop

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_address
-from app.robot.inbox import MAX_BYTES, MAX_OTHERS, MAX_SCANS, SKIPPED, Inbox
+from app.robot.link import MAX_BYTES, MAX_OTHERS, MAX_SCANS, SKIPPED, Inbox
 from app.robot.topics import Publisher, choose
 from app.robot.velodyne import VelodyneLink
 from app.robot.zenoh import RosGraph, ZenohLink, data_key, publisher_of

@@ -18,7 +18,7 @@ from app.batch.map_run import OfflineRun, map_run
 from app.cli import main
 from app.robot import recorder as recorder_module
 from app.robot.address import parse_address
-from app.robot.inbox import SKIPPED
+from app.robot.link import SKIPPED
 from app.robot.recorder import NOT_RECORDED, RawFile, Recorder
 from app.robot.source import LiveSource
 from app.worker.run import recorded_parameters
@@ -204,7 +204,7 @@ def count_messages(path: Path) -> dict[str, int]:
 def test_a_mapper_five_times_slower_than_the_robot_loses_nothing_in_the_recording(
     stand: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):
-    monkeypatch.setattr("app.robot.inbox.MAX_SCANS", 3)
+    monkeypatch.setattr("app.robot.link.MAX_SCANS", 3)
     recording = Recorder(tmp_path / "live.mcap")
     heard = Heard(stand, recording, take_every=5)
     played = Played(heard)

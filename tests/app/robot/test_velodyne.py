@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.robot.inbox import SKIPPED
+from app.robot.link import SKIPPED
 from app.robot.velodyne import NO_DATA, OTHERS, Sweeps
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.container import Channel, Message

@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from app.cli import serve
 from app.fleet.hearing import TOPICS, UNREADABLE, Results, results_topic
-from app.fleet.remote import RemoteRobots
+from app.fleet.server import RemoteRobots
 from app.robot.source import open_live
 from app.worker.numba_warmup import warm_up
 from app.worker.protocol import Open

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from app.common.settings import Settings
-from app.robot.inbox import Inbox
+from app.robot.link import Inbox
 from app.robot.source import open_any
 from app.robot.topics import Publisher
 from app.sources import inspection

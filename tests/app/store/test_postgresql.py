@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from app.sources.request import SourceRequest
-from app.store.book import Change, NewRun, RunFigures
-from app.store.records import Author, Content, StaleError
+from app.store.records import Author, Change, Content, NewRun, RunFigures, StaleError
 from app.store.store import Store
 from pipeline.errors import StemmapError
 from tests.postgresql import empty, running

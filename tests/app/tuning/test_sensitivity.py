@@ -18,7 +18,6 @@ import pytest_asyncio
 from app.sources.request import SourceRequest
 from app.tuning.sensitivity import Question, Sensitivity, question_of
 from app.web.auth import viewer_token
-from app.worker.protocol import Status
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.types.records import TruthTrees
@@ -173,24 +172,23 @@ TRUTH = TruthTrees(np.zeros(1), np.zeros(1), np.full(1, np.nan), ("tree",))
 
 
 @pytest.mark.parametrize(
-    ("digest", "live", "truth", "says"),
+    ("digest", "uri", "truth", "says"),
     [
-        ("", False, TRUTH, "no run is open"),
-        ("d", True, TRUTH, "Open its recording"),
-        ("d", False, None, "tab Annotate"),
+        ("", "sim:stand", TRUTH, "no run is open"),
+        ("d", "zenoh:tcp/10.0.0.1:7447", TRUTH, "Open its recording"),
+        ("d", "sim:stand", None, "tab Annotate"),
     ],
 )
-def test_a_run_that_cannot_be_scored_says_what_to_do(digest, live, truth, says):
-    status = Status(state="playing", live=live)
+def test_a_run_that_cannot_be_scored_says_what_to_do(digest, uri, truth, says):
     with pytest.raises(StemmapError, match=says):
-        question_of(SourceRequest("sim:stand"), digest, status, truth, preset("forest"), NAME, [0.1])
+        question_of(SourceRequest(uri), digest, truth, preset("forest"), NAME, [0.1])
 
 
 def test_the_run_that_is_asked_of_is_the_one_that_is_shown():
     source = SourceRequest(
         "sim:stand", "static", 7, {"scan": "/other"}, (0.1, 0.2, 0.9, 0.0, 0.0, math.pi / 2)
     )
-    made = question_of(source, "d", Status(state="playing"), TRUTH, preset("paper"), NAME, [0.1])
+    made = question_of(source, "d", TRUTH, preset("paper"), NAME, [0.1])
     assert (made.run.source, made.run.digest) == (source, "d")
     assert (
         msgspec.json.decode(msgspec.json.encode(made.run.truth), type=type(made.run.truth)) == made.run.truth

@@ -17,11 +17,11 @@ from app.common.settings import Files, Settings
 from app.dashboard.dashboard import Dashboard
 from app.web.auth import viewer_token
 from app.web.routes.run import permitted_uri
-from app.worker.map_changes import MapChanges
 from app.worker.protocol import (
     Advance,
     Answer,
     AskCluster,
+    MapChanges,
     Open,
     Pause,
     Play,

@@ -13,8 +13,7 @@ from PIL import Image
 
 from app.dashboard.camera_view import marks_of
 from app.dashboard.dashboard import Dashboard
-from app.worker.codec import from_worker
-from app.worker.protocol import Answer, AskCamera, CameraPicture, Shown, ToWorker
+from app.worker.protocol import Answer, AskCamera, CameraPicture, Shown, ToWorker, from_worker
 from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2

@@ -14,9 +14,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from app.worker.codec import LARGEST_MESSAGE, LENGTH_BYTES, WireError, from_worker, to_worker
 from app.worker.protocol import (
     FASTEST,
+    LARGEST_MESSAGE,
+    LENGTH_BYTES,
     LONGEST_S,
     MOST_SCANS,
     Advance,
@@ -32,6 +33,9 @@ from app.worker.protocol import (
     SetSpeed,
     Shown,
     Status,
+    WireError,
+    from_worker,
+    to_worker,
 )
 from pipeline.config import Parameters
 from pipeline.types.records import Path, TruthTrees

@@ -16,7 +16,6 @@ import pytest
 
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
-from app.worker.codec import from_worker
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import MOST_POINTS, Outbox, joined, picture_of, rows_in_common
 from app.worker.protocol import (
@@ -38,6 +37,7 @@ from app.worker.protocol import (
     State,
     Status,
     ToWorker,
+    from_worker,
 )
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
@@ -375,7 +375,7 @@ def test_a_huge_scan_is_thinned_evenly_in_the_picture_and_only_there() -> None:
 
 
 def test_a_picture_that_cannot_be_sent_is_told_and_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("app.worker.codec.LARGEST_MESSAGE", 100_000)
+    monkeypatch.setattr("app.worker.protocol.LARGEST_MESSAGE", 100_000)
     stream = io.BytesIO()
     mailbox = Outbox(stream)
     first, second = path([0.0, 1.0]), path([0.0, 1.0, 2.0])

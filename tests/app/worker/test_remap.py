@@ -11,8 +11,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from app.worker.map_changes import MapChanges
 from app.worker.process import new_session
+from app.worker.protocol import MapChanges
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError

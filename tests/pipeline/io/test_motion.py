@@ -12,7 +12,7 @@ import pytest
 
 from app.batch.map_run import OfflineRun, map_run
 from app.cli import main
-from app.sources.opening import choose_odometry, with_odometry
+from app.sources.request import choose_odometry, with_odometry
 from pipeline.config import preset
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
