@@ -23,8 +23,6 @@ Counted = Literal["none", "source", "annotations", "both"]
 
 # Largest distance between an annotation and the object of the source's ground truth that it is of [m].
 SAME_THING = 0.5
-# Objects of the source that are compared with an annotation; no more stems fit within SAME_THING.
-_MOST_NEAR = 8
 
 
 def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> TruthTrees | None:
@@ -133,24 +131,12 @@ def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
 def _nearest(own: TruthTrees, rows: Sequence[Annotation]) -> NDArray[np.int64]:
     """Return the row of the source for each annotation, shape (A,); -1 where none is within SAME_THING.
 
-    A row belongs to one annotation at most; the nearest pairs are assigned first.
+    A row belongs to one annotation at most, see `pipeline.evaluation.match`.
     """
-    from scipy.spatial import cKDTree
+    from pipeline.evaluation import match
 
     places = np.array([(row.content.x, row.content.y) for row in rows])
-    ranks = np.arange(1, min(_MOST_NEAR, len(own.x)) + 1)
-    gaps, near = cKDTree(np.column_stack([own.x, own.y])).query(places, ranks)
-    found = np.full(len(rows), -1, dtype=np.int64)
-    taken: set[int] = set()
-    for flat in np.argsort(gaps, axis=None, kind="stable").tolist():
-        a, rank = divmod(flat, len(ranks))
-        if gaps[a, rank] > SAME_THING:
-            break
-        k = int(near[a, rank])
-        if found[a] < 0 and k not in taken:
-            taken.add(k)
-            found[a] = k
-    return found
+    return match(places, np.column_stack([own.x, own.y]), SAME_THING)
 
 
 T = TypeVar("T")

@@ -104,7 +104,7 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
     Args:
         frame: Results of the scan.
         numbers: Persistent number of each cluster, shape (K,).
-        label_by: One of layers.LABEL_BY.
+        label_by: One of colours.LABEL_BY.
     """
     if label_by == "none":
         return []

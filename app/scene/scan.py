@@ -14,6 +14,7 @@ from app.scene.colours import Colours, ViewSettings
 from app.scene.labels import LabelNodes, cluster_labels, shown_height
 from app.scene.nodes import Batch, CloudNode, Float
 from app.scene.viser_server import add_posed
+from pipeline.evaluation import match
 from pipeline.types.records import Frame
 
 Vector = tuple[float, float, float]
@@ -148,7 +149,7 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
     Args:
         frame: Results of the scan.
         numbers: Persistent number of each cluster, shape (K,).
-        colour_by: One of layers.COLOUR_BY.
+        colour_by: One of colours.COLOUR_BY.
     """
     clusters = frame.clusters
     if colour_by == "height":
@@ -223,29 +224,13 @@ class ClusterNumbers:
             Different numbers, shape (K,).
         """
         numbers = np.full(len(places), -1, dtype=np.int64)
-        if len(places) and len(self._places):
-            gaps = np.linalg.norm(places[:, None, :] - self._places[None, :, :], axis=2)
-            for row, column in _nearest_first(gaps, REACH):
-                numbers[row] = self._numbers[column]
+        before = match(places, self._places, REACH)
+        numbers[before >= 0] = self._numbers[before[before >= 0]]
         new = numbers < 0
         numbers[new] = self._next + np.arange(int(new.sum()))
         self._next += int(new.sum())
         self._places, self._numbers = np.array(places, dtype=np.float64), numbers
         return numbers
-
-
-def _nearest_first(gaps: Float, reach: float) -> list[tuple[int, int]]:
-    rows, columns = np.nonzero(gaps <= reach)
-    order = np.argsort(gaps[rows, columns], kind="stable")
-    taken_rows: set[int] = set()
-    taken_columns: set[int] = set()
-    pairs = []
-    for row, column in zip(rows[order].tolist(), columns[order].tolist(), strict=True):
-        if row not in taken_rows and column not in taken_columns:
-            taken_rows.add(row)
-            taken_columns.add(column)
-            pairs.append((row, column))
-    return pairs
 
 
 NEAR = 0.5  # [m]; a ray that misses a marker by more hit a marker of another scan
