@@ -56,13 +56,17 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
+def _start(half: str) -> BlockingChildProcess:
+    return BlockingChildProcess(python_module("app.worker.numba_warmup", half))
+
+
 def _compile() -> None:
     from pipeline.jit import others_compile
 
     with contextlib.ExitStack() as stack:
         children = []
         for half in _HALVES:
-            children.append(BlockingChildProcess(python_module("app.worker.numba_warmup", half)))
+            children.append(_start(half))
             stack.callback(children[-1].end)
         until_s = time.monotonic() + PATIENCE_S
         while any(child.returncode is None for child in children) and time.monotonic() < until_s:
