@@ -29,25 +29,8 @@ from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
 from app.tuning.sensitivity import Sensitivity, question_of
+from app.worker import protocol
 from app.worker.outbox import joined
-from app.worker.protocol import (
-    Answer,
-    Begin,
-    FromWorker,
-    MapChanges,
-    Open,
-    Opened,
-    Play,
-    Remapped,
-    Report,
-    Rough,
-    Seek,
-    SetParameters,
-    Shown,
-    Status,
-    ToWorker,
-    WorkerBusyError,
-)
 from pipeline.config import preset
 from pipeline.config.model import Value
 from pipeline.types.records import Path, Trees, TruthTrees
@@ -81,8 +64,8 @@ class Dashboard:
         self.live = live
         self.scores = Scores(self._tell_score)
         self.sensitivity = Sensitivity(lambda state: live.tell("sensitivity", state))
-        self.status = Status(state="starting", detail="Starting")
-        self.shown: Shown | None = None
+        self.status = protocol.Status(state="starting", detail="Starting")
+        self.shown: protocol.Shown | None = None
         self.path: Path | None = None
         self.path_xy = np.zeros((0, 2))
         self.truth: TruthTrees | None = None
@@ -137,11 +120,11 @@ class Dashboard:
 
     # --- actions of users ------------------------------------------------------------------------
 
-    async def command(self, command: ToWorker) -> None:
+    async def command(self, command: protocol.ToWorker) -> None:
         """Send a command to the worker."""
         self._notice = ""
         # A worker that is down comes back with the source closed; then this is still to be done.
-        self._go = isinstance(command, Play | Open) and self.worker.pid is None
+        self._go = isinstance(command, protocol.Play | protocol.Open) and self.worker.pid is None
         await self.worker.send(command)
 
     async def choose_view(self, name: str, value: str | bool) -> None:
@@ -184,7 +167,7 @@ class Dashboard:
 
     async def _leave_for(self, source: SourceRequest) -> None:
         """Close the run; from now on, `source` is the source that is expected to open."""
-        self._set_status(Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
+        self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self._run, self.source, self.digest = None, source, ""
         self.live.tell("source", source.for_page())
         self.camera.forget()
@@ -290,27 +273,27 @@ class Dashboard:
     async def _send_parameters(self) -> None:
         state = self.parameters
         values = state.parameters.model_dump()
-        await self.worker.send(SetParameters(values, state.revision, state.whole, state.step))
+        await self.worker.send(protocol.SetParameters(values, state.revision, state.whole, state.step))
 
     # --- messages of the worker ------------------------------------------------------------------
 
-    async def receive(self, message: FromWorker) -> None:
+    async def receive(self, message: protocol.FromWorker) -> None:
         """Process a message of the worker."""
         match message:
-            case Report(status=status):
+            case protocol.Report(status=status):
                 self._set_status(status)
-            case Opened() if message.requested in (
+            case protocol.Opened() if message.requested in (
                 "",
                 self.source.uri,
             ):  # else it was left before it was open
                 await self._begin(message)
-            case Shown():
+            case protocol.Shown():
                 await self._show(message)
-            case Answer():
+            case protocol.Answer():
                 self.worker_client.take(message)
-            case Remapped(run=run, changes=changes) if run == self._run:
+            case protocol.Remapped(run=run, changes=changes) if run == self._run:
                 self._remapped(changes)
-            case Rough(run=run, revision=revision, trees=trees) if run == self._run:
+            case protocol.Rough(run=run, revision=revision, trees=trees) if run == self._run:
                 await self._tell_rough(run, revision, trees)
 
     async def _tell_rough(self, run: int, revision: int, trees: Trees) -> None:
@@ -324,14 +307,14 @@ class Dashboard:
         places = np.round(trees.position, 3).tolist()
         self.live.tell("rough", {"revision": revision, "places": places, "score": score})
 
-    def _remapped(self, changes: MapChanges) -> None:
+    def _remapped(self, changes: protocol.MapChanges) -> None:
         """Broadcast the differences after the run was mapped again, and renumber the selection."""
         self.live.tell("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
         self._tell_events()
         self.selector.renamed(dict(changes.followed))
 
-    async def _begin(self, opened: Opened) -> None:
+    async def _begin(self, opened: protocol.Opened) -> None:
         """Send the parameters for an opened source; then it plays."""
         self._run, self.digest = opened.run, opened.digest or opened.uri
         number = self._opens
@@ -349,7 +332,9 @@ class Dashboard:
         self._go = False
         state = self.parameters
         # Always with the parameters: those sent for a run that was left since did not reach the worker.
-        await self.worker.send(Begin(opened.run, state.parameters.model_dump(), state.revision, play))
+        await self.worker.send(
+            protocol.Begin(opened.run, state.parameters.model_dump(), state.revision, play)
+        )
 
     async def _forget(self) -> None:
         """Show an empty map, and the ground truth of the run that begins."""
@@ -383,7 +368,7 @@ class Dashboard:
             self.events.annotated(who, number, self.shown.time_s)
             self._tell_events()
 
-    async def _show(self, shown: Shown) -> None:
+    async def _show(self, shown: protocol.Shown) -> None:
         if shown.run != self._run:  # of a run that was left
             return
         number = self._opens
@@ -410,7 +395,7 @@ class Dashboard:
         self._show_scene(shown.frame, self.path_xy)
         await self.loop.shown(shown.time_s, self.status)
 
-    def _run_state(self, shown: Shown) -> RunState:
+    def _run_state(self, shown: protocol.Shown) -> RunState:
         state = self.parameters
         return RunState(
             shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
@@ -425,7 +410,7 @@ class Dashboard:
             evaluation = self.parameters.parameters.evaluation
             self.scores.ask(self.shown.frame.trees, self.truth, evaluation, self.path_xy)
 
-    def _set_status(self, status: Status) -> None:
+    def _set_status(self, status: protocol.Status) -> None:
         if self._notice and status.state == "paused":
             status = replace(status, detail=self._notice)
         self.status = status
@@ -434,11 +419,11 @@ class Dashboard:
             self._tell_events()
 
 
-def _open_command(request: SourceRequest) -> Open:
+def _open_command(request: SourceRequest) -> protocol.Open:
     """Return the command that opens a source. Only the command line can request a recording or publishing."""
-    if isinstance(request, Open):
+    if isinstance(request, protocol.Open):
         return request
-    return Open(**{name: getattr(request, name) for name in SourceRequest.__struct_fields__})
+    return protocol.Open(**{name: getattr(request, name) for name in SourceRequest.__struct_fields__})
 
 
 Span = tuple[float, float]
@@ -464,7 +449,7 @@ class LoopPlayback:
         self.span, self._turning = span, False
         self._dashboard.live.tell("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
 
-    async def shown(self, time_s: float, status: Status) -> None:
+    async def shown(self, time_s: float, status: protocol.Status) -> None:
         """Seek to the beginning of the part if the shown scan is at its end and the run plays.
 
         Args:
@@ -477,7 +462,7 @@ class LoopPlayback:
             self._turning = False
         elif not self._turning and status.state in ("playing", "finished"):
             self._turning = True  # pictures that are under way must not turn it once more
-            with contextlib.suppress(WorkerBusyError):  # the worker is being restarted
-                await self._dashboard.worker.send(Seek(self.span[0]))
+            with contextlib.suppress(protocol.WorkerBusyError):  # the worker is being restarted
+                await self._dashboard.worker.send(protocol.Seek(self.span[0]))
                 if status.state == "finished":
-                    await self._dashboard.worker.send(Play())
+                    await self._dashboard.worker.send(protocol.Play())

@@ -7,7 +7,7 @@ import asyncio
 import itertools
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 from app.dashboard.broadcast import Broadcast
 from app.explain.records import ClusterStory, TreeStory
@@ -29,6 +29,9 @@ PATIENCE_S = 15.0
 _MOST_WAITING = 100
 
 Send = Callable[[Question], Awaitable[None]]
+
+
+T = TypeVar("T")
 
 
 class NoStoryError(StemmapError):
@@ -69,31 +72,23 @@ class WorkerClient:
         if scan is None:
             raise _nothing_mapped()
         answer = await self._ask(AskCluster(next(self._tickets), run, scan, cluster))
-        if answer.cluster is None:
-            raise NoStoryError(answer.missing or "there is no such cluster")
-        return answer.cluster
+        return _known(answer.cluster)
 
     async def tree(self, number: int) -> TreeStory:
         """Return the explanation of a tree, by its number, after the current scan."""
         answer = await self._ask(AskTree(next(self._tickets), self._shown_run(), number))
-        if answer.tree is None:
-            raise NoStoryError(answer.missing or "there is no such tree")
-        return answer.tree
+        return _known(answer.tree)
 
     async def compare(self, sets: list[Parameters]) -> list[Frame]:
         """Return the results of the current scan under each of several parameter sets."""
         plain = [each.model_dump() for each in sets]
         answer = await self._ask(AskCompare(next(self._tickets), self._shown_run(), plain))
-        if answer.frames is None:
-            raise NoStoryError(answer.missing or "there is nothing to compare")
-        return answer.frames
+        return _known(answer.frames)
 
     async def camera(self, stamp_ns: int) -> CameraPicture:
         """Return the camera picture of the run nearest to a time [ns]."""
         answer = await self._ask(AskCamera(next(self._tickets), self._shown_run(), stamp_ns))
-        if answer.camera is None:
-            raise NoStoryError(answer.missing or "there is no picture")
-        return answer.camera
+        return _known(answer.camera)
 
     def _shown_run(self) -> int:
         run = self._run()
@@ -107,11 +102,20 @@ class WorkerClient:
         waiting = self._waiting[question.ticket] = asyncio.get_running_loop().create_future()
         try:
             await self._send(question)
-            return await asyncio.wait_for(waiting, self._patience_s)
+            answer: Answer = await asyncio.wait_for(waiting, self._patience_s)
         except TimeoutError:
             raise WorkerBusyError("the mapping process is busy", remedy="Try again in a moment") from None
         finally:
             del self._waiting[question.ticket]
+        if answer.missing:
+            raise NoStoryError(answer.missing)
+        return answer
+
+
+def _known(found: T | None) -> T:
+    if found is None:
+        raise NoStoryError("there is no answer")
+    return found
 
 
 def _nothing_mapped() -> NoStoryError:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import errno
 import logging
 import socket
 from collections.abc import Awaitable, Callable, Iterator
@@ -25,7 +24,7 @@ from app.dashboard.parameters import ParameterState
 from app.dashboard.payload import clearance_payload, trees_payload
 from app.web.app import FleetLink, MakeScene, MakeWorker, build
 from app.web.routes.access import ConnectionLimit
-from app.web.serving import bound, uvicorn_config
+from app.web.serving import first_free, uvicorn_config
 from app.worker.protocol import Open
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
@@ -245,18 +244,11 @@ def next_port(settings: Settings, after: int) -> socket.socket:
     Raises:
         StemmapError: No port is free.
     """
-    reason = OSError("no port was tried")
-    for port in range(after + 1, min(after + 1 + PORTS_TRIED, 1 << 16)):
-        try:
-            return bound(settings.host, port)
-        except OSError as error:
-            reason = error
-            if error.errno not in (errno.EADDRINUSE, errno.EACCES):
-                break
-    where = f"{settings.host}, ports after {after}"
-    raise StemmapError(
-        "no port is free for another robot", where=where, remedy=str(reason.strerror or reason)
-    )
+    listening = first_free(settings.host, range(after + 1, min(after + 1 + PORTS_TRIED, 1 << 16)))
+    if isinstance(listening, OSError):
+        where, reason = f"{settings.host}, ports after {after}", str(listening.strerror or listening)
+        raise StemmapError("no port is free for another robot", where=where, remedy=reason)
+    return listening
 
 
 COMPILING = "Getting ready; on a new machine this compiles for some minutes, and only the first time"

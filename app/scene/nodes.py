@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
+import trimesh
 import viser
 from numpy.typing import NDArray
 
@@ -27,26 +28,16 @@ Precision = Literal["float16", "float32"]
 
 def cylinder() -> Mesh:
     """Return a closed cylinder of radius 1 and height 1 whose base is centred on the origin."""
-    sides = 20
-    angle = np.linspace(0.0, 2.0 * np.pi, sides, endpoint=False)
-    rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    low = np.column_stack([rim, np.zeros(sides)])
-    high = np.column_stack([rim, np.ones(sides)])
-    vertices = np.vstack([low, high, [[0, 0, 0], [0, 0, 1]]])
-    faces: list[tuple[int, int, int]] = []
-    for i in range(sides):
-        j = (i + 1) % sides
-        faces += [(i, j, sides + i), (j, sides + j, sides + i)]
-        faces += [(j, i, 2 * sides), (sides + i, sides + j, 2 * sides + 1)]
-    return vertices.astype(np.float32), np.array(faces, dtype=np.uint32)
+    return _mesh(trimesh.creation.cylinder(radius=1.0, height=1.0, sections=20), (0.0, 0.0, 0.5))
 
 
 def box() -> Mesh:
     """Return a cube of side 1 with a corner at the origin."""
-    vertices = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float32)
-    squares = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    faces = [face for a, b, c, d in squares for face in ((a, b, c), (a, c, d))]
-    return vertices, np.array(faces, dtype=np.uint32)
+    return _mesh(trimesh.creation.box(extents=(1.0, 1.0, 1.0)), (0.5, 0.5, 0.5))
+
+
+def _mesh(shape: trimesh.Trimesh, moved: tuple[float, float, float]) -> Mesh:
+    return (shape.vertices + moved).astype(np.float32), shape.faces.astype(np.uint32)
 
 
 def circles(

@@ -62,6 +62,19 @@ def read_axes(words: Iterable[str]) -> tuple[GridAxis, ...]:
     return tuple(axes.values())
 
 
+def spec_of(name: str) -> FieldSpec:
+    """Return the declaration of a parameter.
+
+    Raises:
+        ParameterError: There is no such parameter; the error names the nearest one.
+    """
+    spec = next((spec for spec in field_specs() if spec.name == name), None)
+    if spec is None:
+        Parameters().replace({name: 0})
+        raise ParameterError(f"there is no parameter {name!r}")
+    return spec
+
+
 def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
     """Return every combination of the values as dicts by parameter name; the last axis changes fastest."""
     return [
@@ -112,10 +125,7 @@ def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
                 f"there is no preset {unknown[0]!r}", remedy=f"Presets: {', '.join(PRESETS)}"
             )
         return GridAxis(PRESET, tuple(dict.fromkeys(values)))
-    spec = next((spec for spec in field_specs() if spec.name == name), None)
-    if spec is None:
-        Parameters().replace({name: None})  # raises an error that names the nearest parameter
-        raise ParameterError(f"there is no parameter {name!r}")
+    spec = spec_of(name)
     values = [value for entry in entries for part in _parts(_text(entry)) for value in _values(spec, part)]
     if not values or len(values) > MOST_VALUES:
         raise ParameterError(f"{name} has {len(values):,} values, not 1 to {MOST_VALUES:,}", remedy=_EXAMPLE)

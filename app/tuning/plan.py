@@ -13,8 +13,9 @@ import msgspec
 
 from app.common.text import value_text, version
 from app.sources.request import SourceRequest
+from app.tuning.grid import spec_of
 from app.tuning.jobs import TruthTable
-from pipeline.config import FieldSpec, Parameters, field_specs
+from pipeline.config import FieldSpec, Parameters
 from pipeline.config.model import Value, validated
 from pipeline.errors import ParameterError
 from pipeline.evaluation import MapScores
@@ -313,10 +314,7 @@ def values_of(axes: Iterable[SearchAxis], suggested: Mapping[str, Any]) -> dict[
 
 def _axis(text: str) -> SearchAxis:
     name, given, bounds = (part.strip() for part in text.partition("="))
-    spec = next((spec for spec in field_specs() if spec.name == name), None)
-    if spec is None:
-        Parameters().replace({name: 0})  # raises an error that names the nearest parameter
-        raise ParameterError(f"there is no parameter {name!r}")
+    spec = spec_of(name)
     why = _NO_PART_OF_THE_MAP.get(name.partition(".")[0])
     if why is not None:
         raise ParameterError(f"{name} {why}; it cannot be searched over", remedy="Set it with --set")

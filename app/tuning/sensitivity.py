@@ -13,8 +13,9 @@ from typing import Any
 
 from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.sources.request import SourceRequest
+from app.tuning.grid import spec_of
 from app.tuning.jobs import Job, JobResult, RunWithTruth, TruthTable, check_run, code_digest
-from pipeline.config import Parameters, field_specs
+from pipeline.config import Parameters
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.types.records import TruthTrees
@@ -97,8 +98,7 @@ class Sensitivity:
         Raises:
             ParameterError: There is no such parameter, or there are too many values.
         """
-        if question.name not in {spec.name for spec in field_specs()}:
-            raise ParameterError(f"there is no parameter {question.name!r}")
+        spec_of(question.name)
         if not 1 <= len(question.values) <= MOST_VALUES:
             raise ParameterError(f"{len(question.values)} values are not between 1 and {MOST_VALUES}")
         self._question = question

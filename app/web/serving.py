@@ -12,7 +12,7 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import uvicorn
@@ -156,29 +156,37 @@ def bind(settings: Settings) -> socket.socket:
         StemmapError: No port is free.
     """
     first = DEFAULT_PORT if settings.port is None else settings.port
-    ports = [first] if settings.port is not None else range(first, first + _PORTS_TRIED)
-    reason = OSError("no port was tried")
-    for port in ports:
-        try:
-            listening = bound(settings.host, port)
-        except socket.gaierror as error:
-            raise StemmapError(
-                f"no address is known by this name: {error.strerror}",
-                where=settings.host,
-                remedy=_OTHER_HOST,
-            ) from None
-        except OSError as error:
-            reason = error
-            continue
-        if port != first:
+    listening = first_free(
+        settings.host, range(first, first + (_PORTS_TRIED if settings.port is None else 1))
+    )
+    if isinstance(listening, socket.socket):
+        if first not in (0, port := listening.getsockname()[1]):
             print(f"Port {first} is in use; {port} is taken instead.", flush=True)  # noqa: T201
         return listening
+    reason = listening
+    if isinstance(reason, socket.gaierror):
+        raise StemmapError(
+            f"no address is known by this name: {reason.strerror}", where=settings.host, remedy=_OTHER_HOST
+        )
     other_port = "Give another port with --port, or 0 for any free one"
     raise StemmapError(
         f"cannot listen: {(reason.strerror or str(reason)).lower()}",
         where=f"{settings.host}:{first}",
         remedy=other_port if reason.errno in _OF_THE_PORT else _OTHER_HOST,
     )
+
+
+def first_free(host: str, ports: Iterable[int]) -> socket.socket | OSError:
+    """Return a listening socket on the first free of some ports, or the reason why there is none."""
+    reason = OSError("no port was tried")
+    for port in ports:
+        try:
+            return bound(host, port)
+        except OSError as error:
+            reason = error
+            if error.errno not in _OF_THE_PORT:
+                break
+    return reason
 
 
 def bound(host: str, port: int) -> socket.socket:

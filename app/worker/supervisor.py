@@ -13,26 +13,7 @@ from typing import Literal
 from app.common.child_process import exit_reason, python_module
 from app.common.timers import cancel
 from app.robot.address import is_live
-from app.worker.protocol import (
-    LENGTH_BYTES,
-    Begin,
-    FromWorker,
-    Open,
-    Opened,
-    Pause,
-    Play,
-    Report,
-    SetParameters,
-    SetSpeed,
-    Shown,
-    Status,
-    ToWorker,
-    WireError,
-    WorkerBusyError,
-    check_size,
-    from_worker,
-    to_worker,
-)
+from app.worker import protocol
 
 WORKER = python_module("app.worker.process")
 
@@ -52,7 +33,14 @@ _WRITE_LIMIT_S = 5.0
 # Ends without a result in between, after which the playback speed is reset, because it may be the cause.
 _SUSPICIOUS_ENDS = 2
 # What is remembered over a restart, or has no meaning for a new process.
-_REMEMBERED = (SetParameters, SetSpeed, Open, Play, Pause, Begin)
+_REMEMBERED = (
+    protocol.SetParameters,
+    protocol.SetSpeed,
+    protocol.Open,
+    protocol.Play,
+    protocol.Pause,
+    protocol.Begin,
+)
 
 
 class WorkerProcess:
@@ -74,7 +62,7 @@ class WorkerProcess:
 
     def __init__(
         self,
-        on_message: Callable[[FromWorker], Awaitable[None]],
+        on_message: Callable[[protocol.FromWorker], Awaitable[None]],
         command: Sequence[str] = WORKER,
         clock: Callable[[], float] = time.monotonic,
         opening_limit_s: float = OPENING_LIMIT_S,
@@ -82,12 +70,12 @@ class WorkerProcess:
         self._on_message = on_message
         self._command = command
         self._clock = clock
-        self._codec_in, self._codec_out = from_worker(), to_worker()
+        self._codec_in, self._codec_out = protocol.from_worker(), protocol.to_worker()
         self._process: asyncio.subprocess.Process | None = None
         self._task: asyncio.Task[None] | None = None
         self._closing = False
-        self._open: Open | None = None
-        self._settings: dict[type, ToWorker] = {}
+        self._open: protocol.Open | None = None
+        self._settings: dict[type, protocol.ToWorker] = {}
         self._pauses_s = _PAUSES_S
         self._deaths: deque[float] = deque(maxlen=len(_PAUSES_S))
         self._wanted = asyncio.Event()
@@ -110,25 +98,25 @@ class WorkerProcess:
         await self._spawn()
         self._task = asyncio.create_task(self._watch(), name="worker")
 
-    async def send(self, command: ToWorker) -> None:
+    async def send(self, command: protocol.ToWorker) -> None:
         """Send a command. Parameters, speed and source are stored and sent again after a restart.
 
         Raises:
             WorkerBusyError: The worker does not run or accepts no commands, and this command is not sent
                 again later.
         """
-        if isinstance(command, SetParameters | SetSpeed):
+        if isinstance(command, protocol.SetParameters | protocol.SetSpeed):
             self._settings[type(command)] = command
-        elif isinstance(command, Open):
+        elif isinstance(command, protocol.Open):
             self._open = command
             if self._opening and self._clock() - self._opening_since > _REPLACE_AFTER_S:
                 self._kill_while_opening()
                 return
             self._await_opening()
-        if isinstance(command, Open | Play):
+        if isinstance(command, protocol.Open | protocol.Play):
             self._wanted.set()
         if not await self._write(command) and not isinstance(command, _REMEMBERED):
-            raise WorkerBusyError(
+            raise protocol.WorkerBusyError(
                 "the mapping process is not ready for commands", remedy="Try again in some seconds"
             )
 
@@ -156,7 +144,7 @@ class WorkerProcess:
         if self._open is not None:
             self._await_opening()
 
-    async def _write(self, command: ToWorker) -> bool:
+    async def _write(self, command: protocol.ToWorker) -> bool:
         """Write a command to the worker; returns whether the worker accepted it in time."""
         process = self._process
         if process is None or process.stdin is None or process.stdin.is_closing():
@@ -208,13 +196,13 @@ class WorkerProcess:
             self._opening_timer.cancel()
             self._opening_timer = None
 
-    def _note_opening(self, message: FromWorker) -> None:
+    def _note_opening(self, message: protocol.FromWorker) -> None:
         """Update from a message of the worker whether the source is still being opened."""
         if not self._opening or self._open is None:
             return
-        if isinstance(message, Opened) and message.requested in ("", self._open.uri):
+        if isinstance(message, protocol.Opened) and message.requested in ("", self._open.uri):
             self._stop_opening_timer()
-        elif isinstance(message, Report) and message.status.source == self._open.uri:
+        elif isinstance(message, protocol.Report) and message.status.source == self._open.uri:
             if message.status.state == "starting":
                 self._opening = "begun"
                 self._restart_opening_timer()
@@ -246,23 +234,23 @@ class WorkerProcess:
             return "it could not be started"
         try:
             while True:
-                size = int.from_bytes(await process.stdout.readexactly(LENGTH_BYTES), "little")
-                check_size(size)
+                size = int.from_bytes(await process.stdout.readexactly(protocol.LENGTH_BYTES), "little")
+                protocol.check_size(size)
                 await self._hand_on(self._codec_in.decode(await process.stdout.readexactly(size)))
         except asyncio.IncompleteReadError:
             return exit_reason(await process.wait())
-        except WireError as error:
+        except protocol.WireError as error:
             return f"protocol error: {error}"
 
-    async def _hand_on(self, message: FromWorker) -> None:
+    async def _hand_on(self, message: protocol.FromWorker) -> None:
         self._note_opening(message)
-        if isinstance(message, Shown):
+        if isinstance(message, protocol.Shown):
             self._ends_without_result = 0
         try:
             await self._on_message(message)
         except Exception as error:  # must not end the watch over the worker, and must not pass unseen
             _log.exception("a message of the worker could not be handled")
-            if not isinstance(message, Report):
+            if not isinstance(message, protocol.Report):
                 await self._tell(
                     f"A result could not be shown: {type(error).__name__}: {error}. This is a fault in "
                     "stemmap; the terminal shows where"
@@ -272,8 +260,8 @@ class WorkerProcess:
         """Report the end and wait before the next start, longer each time; after several ends, wait for a
         command."""
         what = f"The mapping process ended ({reason})"
-        if self._ends_without_result >= _SUSPICIOUS_ENDS and SetSpeed in self._settings:
-            del self._settings[SetSpeed]
+        if self._ends_without_result >= _SUSPICIOUS_ENDS and protocol.SetSpeed in self._settings:
+            del self._settings[protocol.SetSpeed]
             what += "; the playback speed was reset"
         recent = [t for t in self._deaths if self._clock() - t < _FORGIVEN_AFTER_S]
         if len(recent) < len(self._pauses_s):
@@ -293,7 +281,7 @@ class WorkerProcess:
 
     async def _tell(self, detail: str) -> None:
         source = self._open.uri if self._open else ""
-        await self._hand_on(Report(Status(state="failed", detail=detail, source=source)))
+        await self._hand_on(protocol.Report(protocol.Status(state="failed", detail=detail, source=source)))
 
     async def _end(self) -> None:
         process, self._process = self._process, None
