@@ -143,7 +143,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
 
 def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
     from app.sources.request import SourceRequest
-    from app.tuning.jobs import TruthTable
+    from app.store.records import contents_of
     from app.tuning.plan import PlannedRun
     from pipeline.io.ground_truth import read_truth_trees
 
@@ -155,7 +155,7 @@ def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
             raise ParameterError("a run is named twice", where=uri, remedy="Name it once")
         truth = None
         if uri in files:
-            truth = TruthTable.of(read_truth_trees(Path(files[uri]), dbh_unit=arguments.dbh_unit))
+            truth = tuple(contents_of(read_truth_trees(Path(files[uri]), dbh_unit=arguments.dbh_unit)))
         source = SourceRequest(uri, arguments.odometry, arguments.seed)
         planned.append(PlannedRun(source, truth, files.get(uri, ""), k >= len(arguments.runs)))
     return tuple(planned)

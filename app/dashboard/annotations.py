@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.store.async_store import AsyncStore
-from app.store.records import Annotation, Content, StaleError
+from app.store.records import Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
 
@@ -33,11 +33,11 @@ def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Agains
         rows: The annotations.
         against: "own" ignores the annotations, "annotations" the ground truth of the source.
     """
-    used = counted(own, rows, against)
+    used, contents = counted(own, rows, against), [row.content for row in rows]
     if used == "both":
-        return laid_over(own, rows)
+        return laid_over(own, contents)
     if used == "annotations":
-        return _as_truth([row.content for row in rows])
+        return as_truth(contents)
     return own if used == "source" else None
 
 
@@ -56,7 +56,7 @@ def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against
     return against
 
 
-def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees | None:
+def laid_over(own: TruthTrees | None, contents: Sequence[Content]) -> TruthTrees | None:
     """Return the ground truth of the source with the annotations applied.
 
     An annotation replaces the object within SAME_THING that has another class. One of the same class keeps
@@ -65,15 +65,14 @@ def laid_over(own: TruthTrees | None, rows: Sequence[Annotation]) -> TruthTrees 
 
     Args:
         own: Ground truth of the source, if any.
-        rows: The annotations.
+        contents: The annotations.
     """
-    if not rows:
+    if not contents:
         return own
     if own is None or not len(own.x):
-        return _as_truth([row.content for row in rows])
-    nearest = _nearest(own, rows)
-    contents = [_agreed(own, k, row.content) for k, row in zip(nearest.tolist(), rows, strict=True)]
-    annotated = _as_truth(contents)
+        return as_truth(contents)
+    nearest = _nearest(own, contents)
+    annotated = as_truth([_agreed(own, k, each) for k, each in zip(nearest.tolist(), contents, strict=True)])
     # An annotation replaces one object only; a neighbouring stem stays.
     keep = np.setdiff1d(np.arange(len(own.x)), nearest)
     return TruthTrees(
@@ -94,23 +93,8 @@ def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
     """
     if own is None or not rows or not len(own.x):
         return 0
-    near = zip(_nearest(own, rows).tolist(), rows, strict=True)
+    near = zip(_nearest(own, [row.content for row in rows]).tolist(), rows, strict=True)
     return sum(k >= 0 and own.kind[k] != row.content.kind for k, row in near)
-
-
-def contents_of(truth: TruthTrees) -> list[Content]:
-    """Return the rows of a table of true trees as contents of annotations; a DBH of NaN becomes None."""
-    columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
-    return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
-
-
-def _as_truth(contents: Sequence[Content]) -> TruthTrees:
-    return TruthTrees(
-        np.array([c.x for c in contents]),
-        np.array([c.y for c in contents]),
-        np.array([np.nan if c.dbh is None else c.dbh for c in contents]),
-        tuple(c.kind for c in contents),
-    )
 
 
 def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
@@ -128,14 +112,14 @@ def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
     return Content(float(own.x[k]), float(own.y[k]), content.kind, dbh)
 
 
-def _nearest(own: TruthTrees, rows: Sequence[Annotation]) -> NDArray[np.int64]:
+def _nearest(own: TruthTrees, contents: Sequence[Content]) -> NDArray[np.int64]:
     """Return the row of the source for each annotation, shape (A,); -1 where none is within SAME_THING.
 
     A row belongs to one annotation at most, see `pipeline.evaluation.match`.
     """
     from pipeline.evaluation import match
 
-    places = np.array([(row.content.x, row.content.y) for row in rows])
+    places = np.array([(content.x, content.y) for content in contents])
     return match(places, np.column_stack([own.x, own.y]), SAME_THING)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.common.arrays import evenly_spaced
-from app.explain.history import TreeHistory, half_axes
+from app.explain.history import half_axes
 from app.explain.records import CheckResult, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
 from app.training.learned_forests import kept_forests
 from pipeline.classification.features import NAMES
@@ -62,8 +62,35 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
     """
     if run is None or not 0 <= cluster < len(frame.clusters.size):
         raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
-    parameters = run.parameters_at(frame.index)
-    return cluster_of_frame(frame, cluster, parameters, run.source.description.sensor, run.start_ns)
+    parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
+    clusters, pose = frame.clusters, frame.estimate.T_map_base
+    points = frame.filtered[frame.labels == cluster].astype(np.float64)
+    # Presets without circle fit have no sigma; the story shows only what the verdict used.
+    fit = fit_one(points, sensor) if np.isfinite(clusters.radius_sigma[cluster]) else None
+    to_picture = _to_picture(clusters.centre[cluster])
+    offset = points[:, :2] - clusters.centre[cluster] if fit is None else fit.offset
+    some = evenly_spaced(len(points), _MOST_POINTS)
+    place = pose.apply(clusters.centre[cluster] + frame.sensor_offset[:2])
+    tree, tree_distance = _nearest_tree(frame, place, parameters.slam.distance_max)
+    return ClusterStory(
+        scan=frame.index,
+        cluster=cluster,
+        time_s=(frame.stamp_ns - run.start_ns) / _NS,
+        verdict=Verdict(int(clusters.verdict[cluster])).label,
+        checks=checks_of(clusters, cluster, parameters),
+        size=int(clusters.size[cluster]),
+        eccentricity=float(clusters.eccentricity[cluster]),
+        position=(float(place[0]), float(place[1])),
+        distance=float(np.hypot(*clusters.centre[cluster])),
+        sensor_sigma=sensor.range_sigma,
+        points=[(float(x), float(y)) for x, y in offset[some] @ to_picture.T],
+        residual=[] if fit is None else fit.residual[some].tolist(),
+        circle=None if fit is None else _circle(fit, clusters.covariance[cluster], to_picture),
+        axes=_axes(points[:, :2], to_picture),
+        tree=tree,
+        tree_distance=tree_distance,
+        column=column_story(frame, place, parameters, sensor),
+    )
 
 
 def tree_story(run: Run | None, number: int) -> TreeStory:
@@ -77,73 +104,20 @@ def tree_story(run: Run | None, number: int) -> TreeStory:
         StemmapError: The run has no such tree at this time.
     """
     frame = run.frame if run else None
-    row = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
-    if run is None or frame is None or not len(row):
+    rows = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
+    if run is None or frame is None or not len(rows):
         raise StemmapError(
             f"tree {number} is not known at this time of the run", remedy="Play on, or select another"
         )
     parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
-    return tree_of_frame(frame, int(row[0]), parameters, sensor, run.start_ns, run.history)
-
-
-def cluster_of_frame(
-    frame: Frame, row: int, parameters: Parameters, sensor: Sensor, start_ns: int
-) -> ClusterStory:
-    """Return the story of a cluster.
-
-    Args:
-        frame: Results of the scan; `raw` is not used.
-        row: Row of the cluster in the frame.
-        parameters: Parameters with which the scan was mapped.
-        sensor: The LiDAR.
-        start_ns: Time of the first scan of the run [ns].
-    """
-    clusters, pose = frame.clusters, frame.estimate.T_map_base
-    points = frame.filtered[frame.labels == row].astype(np.float64)
-    # Presets without circle fit have no sigma; the story shows only what the verdict used.
-    fit = fit_one(points, sensor) if np.isfinite(clusters.radius_sigma[row]) else None
-    to_picture = _to_picture(clusters.centre[row])
-    offset = points[:, :2] - clusters.centre[row] if fit is None else fit.offset
-    some = evenly_spaced(len(points), _MOST_POINTS)
-    place = pose.apply(clusters.centre[row] + frame.sensor_offset[:2])
-    tree, tree_distance = _nearest_tree(frame, place, parameters.slam.distance_max)
-    return ClusterStory(
-        scan=frame.index,
-        cluster=row,
-        time_s=(frame.stamp_ns - start_ns) / _NS,
-        verdict=Verdict(int(clusters.verdict[row])).label,
-        checks=checks_of(clusters, row, parameters),
-        size=int(clusters.size[row]),
-        eccentricity=float(clusters.eccentricity[row]),
-        position=(float(place[0]), float(place[1])),
-        distance=float(np.hypot(*clusters.centre[row])),
-        sensor_sigma=sensor.range_sigma,
-        points=[(float(x), float(y)) for x, y in offset[some] @ to_picture.T],
-        residual=[] if fit is None else fit.residual[some].tolist(),
-        circle=None if fit is None else _circle(fit, clusters.covariance[row], to_picture),
-        axes=_axes(points[:, :2], to_picture),
-        tree=tree,
-        tree_distance=tree_distance,
-        column=column_story(frame, place, parameters, sensor),
-    )
-
-
-def tree_of_frame(
-    frame: Frame,
-    row: int,
-    parameters: Parameters,
-    sensor: Sensor,
-    start_ns: int,
-    history: TreeHistory,
-) -> TreeStory:
-    """Return the story of the tree in row `row` of the frame's trees; arguments as in `cluster_of_frame`."""
+    row = int(rows[0])
     trees = frame.trees
     major, minor, angle = half_axes(trees.covariance[row : row + 1])[0].tolist()
     sides = [] if trees.sides is None else [bool(int(trees.sides[row]) >> k & 1) for k in range(_SIDES)]
     return TreeStory(
         tree=int(trees.number[row]),
         scan=frame.index,
-        time_s=(frame.stamp_ns - start_ns) / _NS,
+        time_s=(frame.stamp_ns - run.start_ns) / _NS,
         confirmed=bool(trees.confirmed[row]),
         position=(float(trees.position[row, 0]), float(trees.position[row, 1])),
         ellipse=(major, minor, angle),
@@ -154,11 +128,11 @@ def tree_of_frame(
         sides=sides,
         eccentricity=float(trees.eccentricity[row]),
         observations=int(trees.observations[row]),
-        first_seen_s=(int(trees.first_seen_ns[row]) - start_ns) / _NS,
-        last_seen_s=(int(trees.last_seen_ns[row]) - start_ns) / _NS,
+        first_seen_s=(int(trees.first_seen_ns[row]) - run.start_ns) / _NS,
+        last_seen_s=(int(trees.last_seen_ns[row]) - run.start_ns) / _NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
         column=column_story(frame, trees.position[row], parameters, sensor),
-        history=history.of(int(trees.number[row])),
+        history=run.history.of(int(trees.number[row])),
     )
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
+import numpy as np
+
 from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
+from pipeline.types.records import TruthTrees
 
 KINDS = ("tree", "pole", "person", "bush", "other")
 MOST_ANNOTATIONS = 5000
@@ -38,6 +42,22 @@ class Content:
     y: float
     kind: str = "tree"
     dbh: float | None = None
+
+
+def contents_of(truth: TruthTrees) -> list[Content]:
+    """Return the rows of a table of true trees as contents of annotations; a DBH of NaN becomes None."""
+    columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
+    return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
+
+
+def as_truth(contents: Sequence[Content]) -> TruthTrees:
+    """Return contents of annotations as a table of true trees; an unknown DBH becomes NaN."""
+    return TruthTrees(
+        np.array([c.x for c in contents], np.float64),
+        np.array([c.y for c in contents], np.float64),
+        np.array([np.nan if c.dbh is None else c.dbh for c in contents], np.float64),
+        tuple(c.kind for c in contents),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,8 +21,9 @@ from app.common.text import count
 from app.common.timers import cancel
 from app.robot.address import is_live
 from app.sources.request import SourceRequest, request_of_kept
+from app.store.records import Content
 from app.store.store import AnnotatedSource
-from app.tuning.jobs import TruthTable, check_run
+from app.tuning.jobs import check_run
 from app.tuning.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
 from app.tuning.result import Result, SearchMessage, SearchStart, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
@@ -241,12 +242,12 @@ class OtherRun(msgspec.Struct, frozen=True):
     name: str
     digest: str
     opened: SourceRequest
-    annotations: TruthTable
+    annotations: tuple[Content, ...]
     why_not: str
 
     def as_plain(self) -> dict[str, Any]:
         """Return the run for the browsers."""
-        truth = count(len(self.annotations.x), "annotation") if self.annotations.x else "its own true trees"
+        truth = count(len(self.annotations), "annotation") if self.annotations else "its own true trees"
         return {"record": self.records[0], "name": self.name, "truth": truth, "why_not": self.why_not}
 
 
@@ -281,14 +282,11 @@ def other_runs(
             uri or row["uri"], odometry=row["odometry"], seed=row["seed"], choices=row["chosen"]
         )
         known = contents.get(digest, ())
-        table = TruthTable(
-            [c.x for c in known], [c.y for c in known], [c.dbh for c in known], [c.kind for c in known]
-        )
         why = "from another machine it cannot be opened" if uri is None else _why_gone(uri)
-        found[digest] = OtherRun([row["id"]], row["name"], digest, opened, table, why)
+        found[digest] = OtherRun([row["id"]], row["name"], digest, opened, known, why)
     return [
         run
-        if run.why_not or digest in scored or "tree" in run.annotations.kind
+        if run.why_not or digest in scored or any(each.kind == "tree" for each in run.annotations)
         else msgspec.structs.replace(run, why_not="no true trees are known of it")
         for digest, run in found.items()
     ]
@@ -317,7 +315,7 @@ def plan_of(
     known = check_run(digest, source.uri, truth)
     axes = axes_of(request.over)
     check(axes, parameters)
-    shown = PlannedRun(source.request(), TruthTable.of(known), "annotations")
+    shown = PlannedRun(source.request(), tuple(known), "annotations")
     return Plan(
         runs=(shown, *_planned(request, others)),
         axes=axes,
@@ -377,7 +375,7 @@ def _planned(request: SearchRequest, others: Sequence[OtherRun]) -> list[Planned
         if run.digest in named:
             raise StemmapError("a run is named twice", where=run.name, remedy="Name it once")
         named.add(run.digest)
-        name = "annotations" if run.annotations.x else ""
+        name = "annotations" if run.annotations else ""
         digest = "" if run.digest == run.opened.uri else run.digest  # a source without digest has its URI
         planned.append(PlannedRun(run.opened, None, name, held_out, run.annotations, digest))
     if len(planned) > MOST_OTHERS:

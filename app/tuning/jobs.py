@@ -6,46 +6,24 @@ Jobs and results are sent to the workers and back as JSON: paths, parameters and
 from __future__ import annotations
 
 import hashlib
-import math
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-import numpy as np
 
 import pipeline
 from app.batch.summary import far_truth
 from app.common.text import version
 from app.robot.address import is_live
 from app.sources.request import SourceRequest
+from app.store.records import Content, contents_of
 from pipeline.errors import StemmapError
 from pipeline.evaluation import MapScores
 from pipeline.types.records import TruthTrees
 
 #: Reason of a failure: "job" is the same on every worker; "worker" and "version" concern only this worker.
 Fault = Literal["", "job", "worker", "version"]
-
-
-class TruthTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """True trees as columns, for JSON. Lengths are metres; an unknown diameter is None."""
-
-    x: list[float]
-    y: list[float]
-    dbh: list[float | None]
-    kind: list[str]
-
-    @classmethod
-    def of(cls, trees: TruthTrees) -> TruthTable:
-        """Return the table of true trees given as arrays."""
-        dbh = [value if math.isfinite(value) else None for value in trees.dbh.tolist()]
-        return cls(trees.x.tolist(), trees.y.tolist(), dbh, list(trees.kind))
-
-    def trees(self) -> TruthTrees:
-        """Return the true trees as arrays."""
-        dbh = [math.nan if value is None else value for value in self.dbh]
-        x, y, diameter = (np.array(column, np.float64) for column in (self.x, self.y, dbh))
-        return TruthTrees(x, y, diameter, tuple(self.kind))
 
 
 class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,7 +37,7 @@ class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     source: SourceRequest
     digest: str
-    truth: TruthTable
+    truth: list[Content]
 
 
 class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -123,7 +101,7 @@ def code_digest() -> str:
     return f"{version()}+{state.hexdigest()[:16]}"
 
 
-def check_run(digest: str, uri: str, truth: TruthTrees | None) -> TruthTrees:
+def check_run(digest: str, uri: str, truth: TruthTrees | None) -> list[Content]:
     """Return the true trees of the open run, if it can be mapped again and scored.
 
     Args:
@@ -140,4 +118,4 @@ def check_run(digest: str, uri: str, truth: TruthTrees | None) -> TruthTrees:
         raise StemmapError("a live run cannot be mapped again", where=uri, remedy="Open its recording")
     if truth is None or "tree" not in truth.kind:
         raise StemmapError("no true trees are known of this run", remedy="Annotate some in the tab Annotate")
-    return truth
+    return contents_of(truth)

@@ -13,8 +13,8 @@ import msgspec
 
 from app.common.text import value_text, version
 from app.sources.request import SourceRequest
+from app.store.records import Content, contents_of
 from app.tuning.grid import spec_of
-from app.tuning.jobs import TruthTable
 from pipeline.config import FieldSpec, Parameters
 from pipeline.config.model import Value, validated
 from pipeline.errors import ParameterError
@@ -403,10 +403,10 @@ class PlannedRun(msgspec.Struct, frozen=True):
     """
 
     source: SourceRequest
-    truth: TruthTable | None = None
+    truth: tuple[Content, ...] | None = None
     truth_name: str = ""
     held_out: bool = False
-    annotations: TruthTable | None = None
+    annotations: tuple[Content, ...] | None = None
     digest: str = ""
 
 
@@ -499,5 +499,5 @@ def digest_with_truth(plan: Plan, source: SourceRequest, digest: str, truth: Tru
     default = SourceRequest(source.uri, plan.odometry, plan.seed)
     chosen = [source.seed, source.odometry, source.topics, source.mount]
     differs = chosen != [default.seed, default.odometry, default.topics, default.mount]
-    text = msgspec.json.encode([digest, TruthTable.of(truth), *([chosen] if differs else [])])
+    text = msgspec.json.encode([digest, contents_of(truth), *([chosen] if differs else [])])
     return hashlib.sha256(text).hexdigest()

@@ -269,7 +269,7 @@ def json_text(comparison: Comparison) -> str:
                 "sha256": run.run.digest,
                 "seed": run.run.source.seed,
                 "odometry": run.run.source.odometry,
-                "true_trees": sum(kind == "tree" for kind in run.run.truth.kind),
+                "true_trees": sum(each.kind == "tree" for each in run.run.truth),
             }
             for k, run in enumerate(plan.runs)
         ],

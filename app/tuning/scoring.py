@@ -24,6 +24,7 @@ import pipeline.jit
 from app.batch.run_folder import NO_PATH, as_written, score_map
 from app.common.child_process import ParentConnection, run_child
 from app.sources.request import SourceRequest, with_odometry
+from app.store.records import as_truth
 from app.training.learned_forests import kept_forests
 from app.tuning.jobs import Fault, Job, JobResult, RunWithTruth, code_digest
 from app.worker.mapper_factory import mapper_of
@@ -227,7 +228,7 @@ class Scorer:
             return _failed("this needs more memory than the machine has")
         except Exception as error:  # a fault with one set must not end the others
             return _failed(f"this is a fault in stemmap: {type(error).__name__}: {error}")
-        scores = score_map(mapped.trees, mapped.path, job.run.truth.trees(), parameters)
+        scores = score_map(mapped.trees, mapped.path, as_truth(job.run.truth), parameters)
         seconds = time.perf_counter() - begun
         return JobResult(scores, mapped.scans, len(mapped.trees.number), seconds, mapped.front_end_ran)
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from app.batch.summary import far_map, far_truth
 from app.common.child_process import ParentConnection, python_module, run_child
-from app.dashboard.annotations import contents_of, laid_over
-from app.store.records import Annotation
-from app.tuning.jobs import Job, RunWithTruth, TruthTable, code_digest
+from app.dashboard.annotations import laid_over
+from app.store.records import as_truth, contents_of
+from app.tuning.jobs import Job, RunWithTruth, code_digest
 from app.tuning.plan import (
     Plan,
     PlannedRun,
@@ -77,7 +77,7 @@ def _prepared(plan: Plan, planned: PlannedRun) -> SearchRun:
             )
         digest = digest_with_truth(plan, planned.source, run.digest, truth)
         return SearchRun(
-            uri, planned.held_out, digest, RunWithTruth(planned.source, run.digest, TruthTable.of(truth))
+            uri, planned.held_out, digest, RunWithTruth(planned.source, run.digest, contents_of(truth))
         )
 
 
@@ -94,10 +94,9 @@ def _truth(planned: PlannedRun, own: TruthTrees | None) -> TruthTrees:
     """
     uri = planned.source.uri
     if planned.truth is not None:
-        return planned.truth.trees()
+        return as_truth(planned.truth)
     if planned.annotations is not None:
-        contents = contents_of(planned.annotations.trees())
-        truth = laid_over(own, [Annotation(k, content, "", 0, 1) for k, content in enumerate(contents)])
+        truth = laid_over(own, planned.annotations)
         if truth is None:
             remedy = "Open it and annotate some in the tab Annotate, or leave it out"
             raise SourceError("no true trees are known of this run", where=uri, remedy=remedy)

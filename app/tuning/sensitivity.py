@@ -14,7 +14,7 @@ from typing import Any
 from app.common.child_process import ChildProcess, ProtocolError, python_module
 from app.sources.request import SourceRequest
 from app.tuning.grid import spec_of
-from app.tuning.jobs import Job, JobResult, RunWithTruth, TruthTable, check_run, code_digest
+from app.tuning.jobs import Job, JobResult, RunWithTruth, check_run, code_digest
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
@@ -64,8 +64,7 @@ def question_of(
     Raises:
         StemmapError: The run cannot be read again, or has no true trees.
     """
-    known = check_run(digest, source.uri, truth)
-    run = RunWithTruth(source.request(), digest, TruthTable.of(known))
+    run = RunWithTruth(source.request(), digest, check_run(digest, source.uri, truth))
     return Question(run, parameters, name, tuple(values))
 
 

@@ -14,8 +14,9 @@ import msgspec
 from app.batch.run_folder import read_run, read_run_record
 from app.common.text import count
 from app.sources.request import SourceRequest, request_of_kept
+from app.store.records import contents_of
 from app.tuning.grid import PRESET, words_of
-from app.tuning.jobs import Job, JobResult, RunWithTruth, TruthTable, code_digest
+from app.tuning.jobs import Job, JobResult, RunWithTruth, code_digest
 from app.tuning.scoring import open_run
 from app.tuning.workers import Done, Lost, Workers
 from pipeline.config import Parameters
@@ -80,7 +81,7 @@ def prepare_run(source: SourceRequest, truth: TruthTrees | None) -> PreparedRun:
         if trees is None or not len(trees.x):
             raise StemmapError("the run has no true trees", where=name, remedy=NO_TRUTH)
         absolute = msgspec.structs.replace(source, uri=_absolute(source.uri))
-        return PreparedRun(name, RunWithTruth(absolute, run.digest, TruthTable.of(trees)), run.preset)
+        return PreparedRun(name, RunWithTruth(absolute, run.digest, contents_of(trees)), run.preset)
 
 
 def plan_jobs(

@@ -11,9 +11,9 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
-from app.dashboard.annotations import Against, contents_of, row_payload
+from app.dashboard.annotations import Against, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.store.records import MOST_ANNOTATIONS, Author, Content, moment
+from app.store.records import MOST_ANNOTATIONS, Author, Content, contents_of, moment
 from app.web.responses import BadRequestError, Body, Id, Number, UserName, file_reply, json_reply
 from app.web.routes.access import Dash
 from pipeline.errors import SourceError

@@ -17,10 +17,10 @@ from websockets.asyncio.client import connect
 from websockets.typing import Origin
 
 from app.common.settings import Settings
-from app.dashboard.annotations import AnnotationEditor, contents_of, counted, laid_over, truth_of
+from app.dashboard.annotations import AnnotationEditor, counted, laid_over, truth_of
 from app.dashboard.dashboard import Dashboard
 from app.store.async_store import AsyncStore
-from app.store.records import Annotation, Content
+from app.store.records import Annotation, Content, contents_of
 from app.web.auth import session_value
 from app.worker.protocol import Shown
 from pipeline.io.ground_truth import parse_truth_trees
@@ -282,19 +282,19 @@ def test_without_annotations_the_truth_is_that_of_the_source() -> None:
     assert laid_over(None, []) is None
     own = truth_trees()
     assert laid_over(own, []) is own
-    alone = laid_over(None, [Annotation(1, Content(1.0, 2.0, "tree", 0.3), "Ann", 0, 1)])
+    alone = laid_over(None, [Content(1.0, 2.0, "tree", 0.3)])
     assert alone is not None
     assert (alone.x.tolist(), alone.dbh.tolist()) == ([1.0], [0.3])
 
 
 def test_who_confirms_one_stem_of_two_says_nothing_of_the_other() -> None:
     own = TruthTrees(np.array([0.0, 0.4]), np.zeros(2), np.array([0.2, 0.3]), ("tree", "bush"))
-    one = Annotation(1, Content(0.05, 0.0, "tree", None), "Ann", 0, 1)
+    one = Content(0.05, 0.0, "tree", None)
     laid = laid_over(own, [one])
     assert laid is not None
     assert (laid.x.tolist(), laid.kind) == ([0.4, 0.0], ("bush", "tree"))
     # The second is of what the first, which is nearer, leaves.
-    both = laid_over(own, [Annotation(2, Content(0.15, 0.0, "bush", None), "Ann", 0, 1), one])
+    both = laid_over(own, [Content(0.15, 0.0, "bush", None), one])
     assert both is not None
     assert (both.x.tolist(), both.kind) == ([0.4, 0.0], ("bush", "tree"))
 

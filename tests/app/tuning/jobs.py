@@ -5,7 +5,8 @@ from __future__ import annotations
 import msgspec
 
 from app.sources.request import SourceRequest
-from app.tuning.jobs import Job, RunWithTruth, TruthTable, code_digest
+from app.store.records import Content
+from app.tuning.jobs import Job, RunWithTruth, code_digest
 from pipeline.config import preset
 from pipeline.evaluation import MapScores
 from tests.app.tuning.scores import scores as plain_scores
@@ -18,7 +19,7 @@ def scores(f1: float | None, *, found: int = 3, wrong: int = 0) -> MapScores:
 
 def job(eps: float, *, seed: int = 0, digest: str = "d", particles: int = 100) -> Job:
     """A job that differs by its eps, particles, seed and source."""
-    truth = TruthTable([1.0], [2.0], [None], ["tree"])
+    truth = [Content(1.0, 2.0)]
     parameters = preset("forest").replace({"clustering.eps": eps, "slam.particles": particles})
     run = RunWithTruth(SourceRequest("sim:nothing", seed=seed), digest, truth)
     return Job(run, parameters.model_dump(), code_digest())

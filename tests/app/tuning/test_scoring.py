@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import msgspec
 import pytest
@@ -91,7 +91,7 @@ def test_what_is_no_job_is_answered(text):
 
 def test_truth_far_from_the_path_is_no_score():
     run = ready(RUN)
-    far = msgspec.structs.replace(run.run.truth, x=[x + 900.0 for x in run.run.truth.x])
+    far = [replace(content, x=content.x + 900.0) for content in run.run.truth]
     asked = msgspec.structs.replace(run.run, truth=far)
     scorer = Scorer()
     answer = scorer.score(Job(asked, preset("forest").model_dump(), code_digest()))

@@ -17,7 +17,8 @@ from app.cli import main
 from app.cli.tune import files_of
 from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
-from app.tuning.jobs import Job, JobResult, TruthTable
+from app.store.records import Content, as_truth, contents_of
+from app.tuning.jobs import Job, JobResult
 from app.tuning.plan import Plan, PlannedRun, Trial, axes_of
 from app.tuning.result import result_of
 from app.tuning.search import Search, search_processes
@@ -269,5 +270,5 @@ def test_truths_are_given_in_order_or_by_name():
 
 
 def test_truth_goes_through_as_plain_values():
-    columns = TruthTable([1.0], [2.0], [None], ["tree"])
-    assert TruthTable.of(columns.trees()) == columns
+    contents = [Content(1.0, 2.0), Content(3.0, 4.0, "pole", 0.1)]
+    assert contents_of(as_truth(contents)) == contents

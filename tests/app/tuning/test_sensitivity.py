@@ -16,6 +16,7 @@ import pytest
 import pytest_asyncio
 
 from app.sources.request import SourceRequest
+from app.store.records import Content
 from app.tuning.sensitivity import Question, Sensitivity, question_of
 from app.web.auth import viewer_token
 from pipeline.config import preset
@@ -190,9 +191,7 @@ def test_the_run_that_is_asked_of_is_the_one_that_is_shown():
     )
     made = question_of(source, "d", TRUTH, preset("paper"), NAME, [0.1])
     assert (made.run.source, made.run.digest) == (source, "d")
-    assert (
-        msgspec.json.decode(msgspec.json.encode(made.run.truth), type=type(made.run.truth)) == made.run.truth
-    )
+    assert msgspec.json.decode(msgspec.json.encode(made.run.truth), type=list[Content]) == made.run.truth
     assert made.parameters == preset("paper")
 
 

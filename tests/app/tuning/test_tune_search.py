@@ -14,8 +14,8 @@ import pytest
 import pytest_asyncio
 
 from app.sources.request import SourceRequest
+from app.store.records import contents_of
 from app.tuning.job import TuneSearch
-from app.tuning.jobs import TruthTable
 from app.tuning.plan import Plan, PlannedRun, RunScore, Trial, axes_of
 from app.tuning.result import Result, SearchMessage, SearchStart
 from app.worker.protocol import Open
@@ -169,7 +169,7 @@ async def test_a_stopped_search_goes_on_with_its_trials_and_only_with_what_it_be
     await until(lambda: not search.is_under_way)
     await until(lambda: pages[-1] == search.as_plain())
     assert (pages[-1]["state"], pages[-1]["go_on"]) == ("done", True)
-    edited = msgspec.structs.replace(PLAN.runs[0], truth=TruthTable.of(truth_trees()))
+    edited = msgspec.structs.replace(PLAN.runs[0], truth=tuple(contents_of(truth_trees())))
     for changed, words in (
         ({"start": preset("paper").model_dump()}, r"parameters were changed since .*\(.* and \d+ more"),
         ({"runs": (edited,)}, "true trees were edited"),

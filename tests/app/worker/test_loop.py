@@ -440,7 +440,7 @@ def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None
     said: list[FromWorker] = []
     for message in (Open("fake:"), AskCluster(1, 1, 0, 0), AskCluster(2, 1, 0, 7), None):
         waiting.put(message)
-    monkeypatch.setattr("app.explain.build.cluster_of_frame", lambda *_: cluster_story())
+    monkeypatch.setattr("app.explain.build.ClusterStory", lambda **_: cluster_story())
     WorkerLoop(make_session(FakeSource(3)), waiting, said.append, recent=recent).run()
     answers = [message for message in said if isinstance(message, Answer)]
     assert answers[0].cluster == cluster_story()
