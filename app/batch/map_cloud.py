@@ -19,7 +19,7 @@ from app.batch.map_run import MappingResult
 from app.batch.run_folder import NO_PATH, as_written, score_map
 from app.batch.summary import evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
-from app.training.learned_forests import kept_forests
+from app.store.forests import kept_forests
 from pipeline.config import Parameters
 from pipeline.evaluation import MapScores
 from pipeline.geometry.poses import Float

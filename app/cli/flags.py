@@ -290,7 +290,7 @@ def chosen_parameters(
         parameters = from_toml(text, parameters, str(arguments.config))
     parameters = assign(parameters, arguments.assignments)
     if parameters.classification.forest != "package":
-        from app.training.learned_forests import kept_forests
+        from app.store.forests import kept_forests
 
         kept_forests().check(parameters)
     return name, parameters

@@ -79,8 +79,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is None:
         raise UsageError("--out is missing", remedy="Add --out FILE")
     arguments.labelled = [Path(place) for place in arguments.places]
+    from app.store.forests import write_forest
     from app.training.fit_forest import as_json, fit_all
-    from app.training.learned_forests import write_forest
     from app.training.validation import leave_one_out
     from pipeline.config import preset
 
@@ -187,8 +187,8 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
     from contextlib import closing
 
     from app.common.settings import from_environment
+    from app.store.forests import Forests, name_of, write_forest
     from app.store.store import Store
-    from app.training.learned_forests import Forests, name_of, write_forest
     from app.training.learning import learn, table_lines
     from pipeline.config import preset
 

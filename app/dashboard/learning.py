@@ -13,8 +13,8 @@ from typing import Any
 from app.common.child_process import ChildProcess, python_module
 from app.common.timers import cancel
 from app.store.async_store import AsyncStore
+from app.store.forests import Forests
 from app.store.store import AnnotatedSource
-from app.training.learned_forests import Forests
 from pipeline.classification.forest import PACKAGE
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError

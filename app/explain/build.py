@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from app.common.arrays import evenly_spaced
 from app.explain.history import half_axes
 from app.explain.records import CheckResult, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
-from app.training.learned_forests import kept_forests
+from app.store.forests import kept_forests
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import (
     CLASSES,

@@ -18,11 +18,11 @@ import numpy as np
 
 from app.common.child_process import ParentConnection, run_child
 from app.common.text import count, version
+from app.store.forests import Forests
 from app.store.store import AnnotatedSource
 from app.training.annotated_runs import AnnotatedRun, Progress, annotated_run, examples_of
 from app.training.examples import Examples, object_numbers
 from app.training.fit_forest import all_expanded
-from app.training.learned_forests import Forests
 from app.training.validation import Rates, Validation, groups_of, validate
 from pipeline.classification.forest import (
     ALL_AROUND,

@@ -24,8 +24,8 @@ import pipeline.jit
 from app.batch.run_folder import NO_PATH, as_written, score_map
 from app.common.child_process import ParentConnection, run_child
 from app.sources.request import SourceRequest, with_odometry
+from app.store.forests import kept_forests
 from app.store.records import as_truth
-from app.training.learned_forests import kept_forests
 from app.tuning.jobs import Fault, Job, JobResult, RunWithTruth, code_digest
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters

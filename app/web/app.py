@@ -24,8 +24,8 @@ from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.dashboard.parameters import ParameterState
 from app.store.async_store import AsyncStore, StoreBusyError
+from app.store.forests import Forests
 from app.store.records import UnknownError
-from app.training.learned_forests import Forests
 from app.web import uploads as upload_routes
 from app.web.auth import Guard, viewer_token
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply

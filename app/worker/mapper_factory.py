@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from app.training.learned_forests import kept_forests
+from app.store.forests import kept_forests
 from pipeline.config import Parameters
 from pipeline.io.readers import SourceDescription
 from pipeline.mapper import Mapper

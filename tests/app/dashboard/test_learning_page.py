@@ -18,8 +18,8 @@ from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import LEAST_OTHERS, LEAST_TREES, Learning
 from app.dashboard.payload import doubts_of
+from app.store.forests import Forests
 from app.training import learning as training
-from app.training.learned_forests import Forests
 from app.web.auth import viewer_token
 from pipeline.classification import no_columns
 from pipeline.classification.forest import ALL_AROUND, CLASSES, ONE_WAY

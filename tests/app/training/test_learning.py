@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from app.cli import main
 from app.dashboard.parameters import ParameterState
+from app.store.forests import FOLDER, Forests, name_of
 from app.store.records import Author, Content
 from app.store.store import Store
 from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector
 from app.training.examples import TREE, Examples, object_numbers
 from app.training.fit_forest import PRIOR, SETTINGS, all_expanded, expanded
-from app.training.learned_forests import FOLDER, Forests, name_of
 from app.training.learning import LEAST_OTHERS, LEAST_TREES, seen_by, what_lacks
 from app.training.validation import SAME_PLACE, Rates, fold_of, groups_of, validate
 from pipeline.classification import no_columns

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from app.training.learned_forests import Forests
+from app.store.forests import Forests
 from app.tuning.plan import RunScore, Trial
 from app.tuning.search import Search
 from app.tuning.storage import Journal
