@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--start needs a continued map", remedy="Add --continue DIR")
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
-    from app.batch.data_folders import partial_output_warnings
+    from app.batch.run_folder import partial_output_warnings
     from pipeline.io.readers.clouds import is_cloud
 
     for line in partial_output_warnings(arguments.out):

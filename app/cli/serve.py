@@ -126,7 +126,7 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
 
 
 def _report_partial_outputs(settings: Settings) -> None:
-    from app.batch.data_folders import partial_outputs
+    from app.batch.run_folder import partial_outputs
     from app.common.text import count
 
     if left := partial_outputs(settings):

@@ -12,7 +12,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from app.batch.compare import compare
-from app.batch.data_folders import delete_partial_output, finished_folders, partial_outputs, read_folder
+from app.batch.run_folder import delete_partial_output, finished_folders, partial_outputs, read_folder
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.sources.request import request_of_kept

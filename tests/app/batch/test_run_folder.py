@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from app.batch import data_folders
+from app.batch import run_folder
 from app.common.settings import Settings
 from app.store.records import UnknownError
 from pipeline.errors import StemmapError
@@ -15,7 +15,7 @@ from pipeline.io.result_files import RunFiles
 from tests.app.server_for_tests import BEARER, running
 
 LONG_AGO_S = 1_000_000.0
-NOW_S = LONG_AGO_S + data_folders.QUIET_S + 1.0
+NOW_S = LONG_AGO_S + run_folder.QUIET_S + 1.0
 
 
 def half_a_map(folder: Path, content: str = "scan,x_m\n") -> Path:
@@ -36,12 +36,12 @@ def settings(tmp_path: Path) -> Settings:
 
 def test_halves_are_found_where_runs_and_exports_are_written(settings: Settings) -> None:
     assert settings.recordings is not None
-    assert data_folders.partial_outputs(settings) == []
+    assert run_folder.partial_outputs(settings) == []
     half_a_map(settings.recordings)
     half_a_map(settings.recordings / "north")
     half_a_map(settings.recordings / "north" / "deeper")  # no data folder of ours
     (settings.recordings / "north" / ".unfinished-file").write_text("no folder")
-    found = data_folders.partial_outputs(settings, NOW_S)
+    found = run_folder.partial_outputs(settings, NOW_S)
     assert {each.name for each in found} == {".unfinished-abc", "north/.unfinished-abc"}
     assert [(each.size, each.changed_s, each.quiet) for each in found] == [(9, int(LONG_AGO_S), True)] * 2
 
@@ -56,8 +56,8 @@ def test_what_is_deleted_is_a_half_map_and_nothing_else(settings: Settings, tmp_
     (settings.recordings / ".unfinished-link").symlink_to(outside)
     for name in ("north", "", "../outside/.unfinished-abc", "link/.unfinished-abc", ".unfinished-link"):
         with pytest.raises(UnknownError):
-            data_folders.delete_partial_output(name, settings, NOW_S)
-    data_folders.delete_partial_output("north/.unfinished-abc", settings, NOW_S)
+            run_folder.delete_partial_output(name, settings, NOW_S)
+    run_folder.delete_partial_output("north/.unfinished-abc", settings, NOW_S)
     assert not left.exists()
     assert whole.exists()
     assert (outside / "detections.csv").exists()
@@ -67,7 +67,7 @@ def test_one_that_may_go_on_is_left_alone(settings: Settings) -> None:
     assert settings.recordings is not None
     left = half_a_map(settings.recordings)
     with pytest.raises(StemmapError, match="ten minutes"):
-        data_folders.delete_partial_output(left.name, settings, LONG_AGO_S + 1.0)
+        run_folder.delete_partial_output(left.name, settings, LONG_AGO_S + 1.0)
     assert left.exists()
 
 
@@ -104,10 +104,10 @@ def test_a_map_that_is_still_written_is_not_taken_away_however_silent_it_is(sett
     for path in (left / "detections.csv", left):
         os.utime(path, (LONG_AGO_S, LONG_AGO_S))
     name = f"north/{left.name}"
-    assert [each.quiet for each in data_folders.partial_outputs(settings, NOW_S)] == [False]
+    assert [each.quiet for each in run_folder.partial_outputs(settings, NOW_S)] == [False]
     with pytest.raises(StemmapError, match="a stemmap process writes to it"):
-        data_folders.delete_partial_output(name, settings, NOW_S)
+        run_folder.delete_partial_output(name, settings, NOW_S)
     assert left.is_dir()
     files._detections.close()  # as when the process ends
-    data_folders.delete_partial_output(name, settings, NOW_S)
+    run_folder.delete_partial_output(name, settings, NOW_S)
     assert not left.exists()
