@@ -1,4 +1,5 @@
-"""The whole mapper: the same bytes, a past that can be restored, and points that add up."""
+"""The mapper: reproducible bytes, snapshots and their restoration, and counts of points that sum to the
+scan."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Clouds of one thing each, for tests."""
+"""Point clouds of one trunk or one bush, for tests."""
 
 from __future__ import annotations
 

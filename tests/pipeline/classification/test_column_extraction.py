@@ -1,4 +1,5 @@
-"""Columns: a trunk's axis is found where it stands, and what is flat has none."""
+"""Extraction of columns: axis, lean and circle of a trunk are recovered; flat and low objects give no
+column."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules that decide before the votes."""
+"""Decision rule: verdicts by rays at breast height that do not depend on the votes."""
 
 from __future__ import annotations
 

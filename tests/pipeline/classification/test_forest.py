@@ -1,4 +1,4 @@
-"""The forest: it is read strictly, votes as it was grown, and says nothing else."""
+"""Random forest: files are validated, a forest votes as it was trained, and effects of features are exact."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Sight: a ray tells what it met and what it passed, and no more; what ends in free air is told."""
+"""Ray statistics: rays that end at a column, pass it or stop before it; features of free upper ends and of
+gaps below crowns."""
 
 from __future__ import annotations
 

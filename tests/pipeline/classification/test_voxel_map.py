@@ -1,4 +1,4 @@
-"""The memory: nothing is lost or counted twice, it is bounded, and copies do not know one another."""
+"""Voxel map: each return is counted once, memory is bounded, and copies are independent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""People in a simulated stand: who walks, waits and goes on, and who stands still, each by a timetable."""
+"""Persons in a simulated stand who walk, wait or stand still, each by a timetable."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Clouds that are no forest: a frame each time, and never a tree."""
+"""Clouds without trees, with invalid values or of millions of points: each gives a frame without a false
+tree."""
 
 from __future__ import annotations
 

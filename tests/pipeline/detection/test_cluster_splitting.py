@@ -1,4 +1,4 @@
-"""A trunk is taken out of what grows around it, and out of nothing else."""
+"""Splitting of clusters: a trunk is separated from a shrub at its foot, and other clusters stay unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tree's diameter from all its scans, and the sigma that is told with it."""
+"""Diameter of a tree over many scans, and the standard deviation that is reported with it."""
 
 from __future__ import annotations
 

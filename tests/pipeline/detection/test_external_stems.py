@@ -1,4 +1,4 @@
-"""Stems that another program found, through the mapper as if they had been found here."""
+"""Stems detected by another program: they pass through the mapper like own detections."""
 
 from __future__ import annotations
 

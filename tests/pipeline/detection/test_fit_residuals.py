@@ -1,4 +1,4 @@
-"""One cluster's fit with residuals: exact cylinders come back exactly."""
+"""Fit of one cluster with residuals: exact cylinders are recovered exactly."""
 
 from __future__ import annotations
 

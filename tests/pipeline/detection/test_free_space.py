@@ -1,4 +1,4 @@
-"""A missing tree is told from a hidden one."""
+"""Free space of a scan: directions and distances in which a missing tree would have been visible."""
 
 from __future__ import annotations
 

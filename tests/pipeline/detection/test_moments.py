@@ -1,4 +1,5 @@
-"""Covariance and eccentricity (Eq. 3-4): closed forms, numpy, and what may not change them."""
+"""Covariance and eccentricity of clusters (Eq. 3-4) against closed forms and NumPy, with their
+invariances."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Obstacles: closed forms of the way, laws, what counts, and what is not seen."""
+"""Obstacles: distances along the path ahead in closed form, symmetries, and unknown or invisible space."""
 
 from __future__ import annotations
 

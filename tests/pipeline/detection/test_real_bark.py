@@ -1,4 +1,4 @@
-"""The fit of single scans on real bark, branches and butts: a pine plot scanned virtually."""
+"""Fit of single scans on real bark, branches and buttresses: virtual scans of a real pine plot."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The residual of one return in closed form: which part of a beam of some width meets the trunk."""
+"""Residual of one return in closed form: the part of a wide beam that hits the trunk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The leaning cylinder through a trunk's arc: exact without noise, honest with it, whole with rubbish."""
+"""Fit of a leaning cylinder to the visible arc of a trunk: exact without noise, with consistent covariances
+with noise, and usable results for degenerate clusters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A trunk of which only a part could be seen is said to be at the border, and a whole one never."""
+"""Truncation: a partially visible trunk gets the verdict for the border of the view, a complete one never
+does."""
 
 from __future__ import annotations
 

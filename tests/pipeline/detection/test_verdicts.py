@@ -1,4 +1,4 @@
-"""Every rejected cluster has a reason, and nothing is dropped."""
+"""Verdicts: each reason is reachable, the first failed check decides, and each cluster keeps its row."""
 
 from __future__ import annotations
 

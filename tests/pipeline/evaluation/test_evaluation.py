@@ -1,4 +1,4 @@
-"""Scores whose counts sum to their wholes, matchings that are the best, and errors of pairs and paths."""
+"""Scores: optimal matching, counts that sum to their totals, distances between trees, and errors of paths."""
 
 from __future__ import annotations
 

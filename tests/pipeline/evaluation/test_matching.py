@@ -1,4 +1,4 @@
-"""Partners of points: as many pairs as possible, and among such matchings the shortest."""
+"""Matching of points: as many pairs as possible with the least total distance."""
 
 from __future__ import annotations
 

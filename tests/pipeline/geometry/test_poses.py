@@ -1,4 +1,4 @@
-"""Poses form groups, angles are wrapped, and quaternions and Euler angles are inverted."""
+"""Poses: group laws, wrapped angles, and conversion of quaternions and Euler angles."""
 
 from __future__ import annotations
 

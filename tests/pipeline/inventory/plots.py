@@ -1,4 +1,4 @@
-"""Plots in closed form: stems, ground and what else stands in them, as points and as LAS files."""
+"""Plots in closed form: stems, ground and bushes as points and as LAS files."""
 
 from __future__ import annotations
 

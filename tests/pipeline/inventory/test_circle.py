@@ -1,4 +1,4 @@
-"""Circles of slices in closed form: what scatter and lean add to a diameter is taken off."""
+"""Circle fit of slices: the effects of scatter and lean on a diameter are removed."""
 
 from __future__ import annotations
 

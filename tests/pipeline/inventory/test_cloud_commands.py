@@ -1,4 +1,4 @@
-"""A whole cloud in every command: told of, driven through, mapped, judged, and refused where nobody drove."""
+"""A whole cloud in each command: inspected, driven through, mapped, scored, or refused with a reason."""
 
 from __future__ import annotations
 

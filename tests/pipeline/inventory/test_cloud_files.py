@@ -1,4 +1,4 @@
-"""Whole clouds in PLY, NumPy and PCD files: what an independent library wrote, and nothing believed."""
+"""Whole clouds in PLY, NumPy and PCD files written by another library; sizes in headers are not trusted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LAS and LAZ files: read part by part, refused with one line where they are damaged."""
+"""LAS and LAZ files: read in parts; damaged files give one clear error."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whole clouds in closed form: stems, ground, refusals."""
+"""Inventory of whole clouds in closed form: stems, ground, and refused clouds."""
 
 from __future__ import annotations
 

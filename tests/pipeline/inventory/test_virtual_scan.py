@@ -1,4 +1,4 @@
-"""A simulated robot in a real cloud: the way, the beams, the truth, and what is refused."""
+"""A simulated robot in a real cloud: route, returns, ground truth, and refused requests."""
 
 from __future__ import annotations
 

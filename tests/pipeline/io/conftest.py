@@ -1,4 +1,4 @@
-"""Sources that are closed again at the end of a test."""
+"""A fixture that opens sources and closes them at the end of a test."""
 
 from __future__ import annotations
 

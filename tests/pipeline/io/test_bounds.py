@@ -1,4 +1,4 @@
-"""Files that would take memory or time without end are given up early."""
+"""Files whose headers promise too much data are refused in bounded time and memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings in which a clock was set on the way: nothing crashes, and what is left out is counted."""
+"""Recordings in which a clock was set: nothing crashes, and records left out are counted."""
 
 from __future__ import annotations
 

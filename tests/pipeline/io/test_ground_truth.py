@@ -1,4 +1,4 @@
-"""Ground truth from tables that other tools write; what does not fit is named by line and column."""
+"""Ground truth from tables of other programs; errors name line and column."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of .bin scans with the poses and times beside them."""
+"""Folders of .bin scans with files of poses and times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planar lasers and GNSS in recordings, and what `info` says of every topic; written by rosbags."""
+"""Planar lasers and GNSS in recordings, and the description of each topic by `info`; written by rosbags."""
 
 from __future__ import annotations
 

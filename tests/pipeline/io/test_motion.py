@@ -1,4 +1,4 @@
-"""Motion that a source does not tell itself: LiDAR odometry and files of poses."""
+"""Motion for sources without odometry: LiDAR odometry and files of poses."""
 
 from __future__ import annotations
 

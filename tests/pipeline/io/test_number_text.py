@@ -1,4 +1,4 @@
-"""Tables of numbers in text: the numbers that Python reads; damaged lines are left out and counted."""
+"""Text tables of numbers: the same numbers as Python reads; damaged lines are left out and counted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `open_source` says about what it cannot open."""
+"""Errors of `open_source` for files, folders and addresses that it cannot open."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Poses of another SLAM: how their frame is found, which are refused, and what they are worth to the path."""
+"""Poses of another SLAM system: alignment of their frame, refused covariances, and their effect on the
+path."""
 
 from __future__ import annotations
 

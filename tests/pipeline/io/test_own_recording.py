@@ -1,4 +1,4 @@
-"""A simulated run that was written as an MCAP is read back as what it was."""
+"""A simulated run written as MCAP is read back unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Velodyne captures: the real one, and what is made of it by cutting and mixing."""
+"""Velodyne captures: a real one, and cut or mixed copies of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PCD: the three kinds of data hold the same points, and sizes are not believed."""
+"""PCD: text, binary and compressed data give the same points, and sizes in headers are not trusted."""
 
 from __future__ import annotations
 

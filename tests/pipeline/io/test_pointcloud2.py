@@ -1,4 +1,4 @@
-"""PointCloud2: any layout of fields gives back what was put in, contradictions are refused."""
+"""PointCloud2: any layout of fields is read back, and contradictions are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of a run: empty where nothing is known, the same bytes, and whole or not at all."""
+"""Result files of a run: empty cells for unknown values, reproducible bytes, and atomic replacement."""
 
 from __future__ import annotations
 

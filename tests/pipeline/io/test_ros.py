@@ -1,4 +1,4 @@
-"""ROS recordings: real ones, and written ones whose content is known to the last number."""
+"""ROS recordings: real ones, and written ones of known content."""
 
 from __future__ import annotations
 

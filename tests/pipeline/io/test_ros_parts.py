@@ -1,4 +1,4 @@
-"""Parts of ROS recordings: definitions in the file, clocks, order, packed blocks, transforms."""
+"""Parts of ROS recordings: message definitions, clocks, order, compressed chunks, transforms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A saved map: the mapper goes on from it to the same bytes, and a damaged one is refused."""
+"""Saved maps: a mapper that continues from one gives the same bytes, and damaged files are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of scans in every format, written by other libraries, with times and poses beside them."""
+"""Folders of scans in each format, written by other libraries, with files of times and poses."""
 
 from __future__ import annotations
 

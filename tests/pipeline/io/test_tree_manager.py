@@ -1,4 +1,4 @@
-"""Folders of stems that another program found."""
+"""Folders of stems that another program detected."""
 
 from __future__ import annotations
 

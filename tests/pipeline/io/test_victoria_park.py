@@ -1,4 +1,4 @@
-"""Victoria Park: the real zip, the car's closed forms, and damaged zips."""
+"""Victoria Park: the real zip, closed forms of the car's motion, and damaged zips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Loop closure: path and map are corrected after a loop, and nowhere else."""
+"""Loop closure: path and map are corrected after a loop, and otherwise unchanged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A kidnapped robot: it reports that it is lost, finds itself again, and leaves no false tree behind."""
+"""Kidnapped robot: it is reported as lost, located again, and leaves no false tree."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-"""What a loop bends was driven: a jump of the path is no motion, lost scans are, and no bend goes over a
-place where the robot was put."""
+"""Motion and extent of a loop: jumps by earlier corrections are not motion, motion during lost scans is, and
+a loop ends where the robot was last placed."""
 
 from __future__ import annotations
 

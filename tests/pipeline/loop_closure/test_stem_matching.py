@@ -1,4 +1,4 @@
-"""Constellations: the pose is found where it can be, and never a wrong one where it cannot."""
+"""Matching of constellations: the pose is found where it is determined, and no wrong pose otherwise."""
 
 from __future__ import annotations
 

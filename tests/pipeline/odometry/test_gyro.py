@@ -1,4 +1,4 @@
-"""The gyroscope: integrals and biases in closed form, wheels put right by it, and wheels said to slip."""
+"""Gyroscope: integrals and biases in closed form, correction of the wheels' turns, and detection of slip."""
 
 from __future__ import annotations
 

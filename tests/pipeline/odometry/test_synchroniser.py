@@ -1,4 +1,4 @@
-"""Each scan is joined with the motion and the tilt at its time; what is left out is counted."""
+"""Synchroniser: each scan is joined with motion and tilt at its time; records left out are counted."""
 
 from __future__ import annotations
 

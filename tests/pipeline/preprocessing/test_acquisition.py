@@ -1,4 +1,4 @@
-"""De-skewing and levelling: a moving, tilted robot in a static world reproduces this world."""
+"""De-skewing and levelling: scans of a moving, tilted robot reproduce a static world."""
 
 from __future__ import annotations
 

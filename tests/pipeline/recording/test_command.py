@@ -1,4 +1,4 @@
-"""`stemmap simulate` as a person uses it."""
+"""The command `stemmap simulate` with its flags."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files are there whole or not at all."""
+"""Atomic files: a file appears complete or not at all."""
 
 from __future__ import annotations
 

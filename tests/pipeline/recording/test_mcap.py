@@ -1,4 +1,4 @@
-"""A recording, read back by libraries that know nothing of us."""
+"""A recording, read back by independent libraries."""
 
 from __future__ import annotations
 

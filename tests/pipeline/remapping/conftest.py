@@ -1,4 +1,4 @@
-"""The run of `mapped` as it is mapped with the preset."""
+"""The run of `mapped`, mapped with its preset."""
 
 from __future__ import annotations
 

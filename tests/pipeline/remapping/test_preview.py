@@ -1,4 +1,4 @@
-"""The preview shows the trees of the map that the rerun gives."""
+"""The preview has the trees of the map that the rerun gives."""
 
 from __future__ import annotations
 

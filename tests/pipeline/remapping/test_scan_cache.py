@@ -1,4 +1,4 @@
-"""The scan cache gives back what it stores, is found again, and never returns damaged scans."""
+"""Scan cache: stored scans are read back, caches are found again, and damaged scans are never returned."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A slow intersector in plain NumPy, written apart from the compiled one, to hold it to account."""
+"""A slow intersection of rays and solids in plain NumPy, written independently of the compiled one, as
+reference."""
 
 from __future__ import annotations
 

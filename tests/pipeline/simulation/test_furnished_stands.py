@@ -1,4 +1,5 @@
-"""Stands to learn from: the trees of the scenario, and more of all else; scans left out cost nothing."""
+"""Furnished stands for training: the trees of the scenario with more other objects; skipped scans do not
+change the others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Whole sweeps: nothing is missed by the intervals, noise is what it says, motion distorts."""
+"""Whole sweeps: each ray hits the nearest solid, range noise has the requested sigma, and motion distorts the
+scan."""
 
 from __future__ import annotations
 

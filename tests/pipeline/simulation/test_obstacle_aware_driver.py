@@ -1,4 +1,5 @@
-"""The simulated robot slows down and stops for what stands in its way, and goes on when it is free."""
+"""Obstacle-aware driver: the simulated robot slows down and stops for obstacles, and continues when the path
+is free."""
 
 from __future__ import annotations
 

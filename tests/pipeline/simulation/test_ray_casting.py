@@ -1,4 +1,4 @@
-"""Rays against shapes: closed forms, and the slow oracle for everything else."""
+"""Rays against solids: closed forms, and the slow reference for all others."""
 
 from __future__ import annotations
 

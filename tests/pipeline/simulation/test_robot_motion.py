@@ -1,4 +1,4 @@
-"""The drive, the tilt on the terrain, the wheels and the inertial unit."""
+"""Motion of the simulated robot: path, tilt on the terrain, wheels and inertial unit."""
 
 from __future__ import annotations
 

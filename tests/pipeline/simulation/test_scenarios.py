@@ -1,4 +1,4 @@
-"""What may be asked of a simulated run, and how everything else is refused."""
+"""Options of a simulated run: values, defaults, and refused requests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes: truth is what was built, nothing stands in the way, everything opens."""
+"""Scenes: the ground truth matches the solids, the path is free, and each scenario opens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated run as a source: order, random access, the same bytes."""
+"""The simulated run as a source: order, random access, reproducible bytes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Streets to learn from: the same seed gives the same scene, and its labels say what stands there."""
+"""Street scenes for training: the same seed gives the same scene, and labels match the objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""`sim:wild`: stems against closed forms, leaves against the law of absorption, figures in their bounds."""
+"""`sim:wild`: stems against closed forms, leaves against the law of absorption, drawn values within their
+bounds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which detection is which tree: one to one, by likelihood, within the gate."""
+"""Data association: one to one, by likelihood, within the gate."""
 
 from __future__ import annotations
 

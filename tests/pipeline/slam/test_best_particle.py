@@ -1,4 +1,4 @@
-"""Choice of the best particle: one hypothesis is kept while the particles are apart."""
+"""Choice of the best particle: one hypothesis is kept while the particles disagree."""
 
 from __future__ import annotations
 

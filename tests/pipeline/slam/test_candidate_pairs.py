@@ -1,4 +1,4 @@
-"""Cells and pairs: what is found by them is what a look at every landmark finds."""
+"""Hash grid and candidate pairs: the same pairs as a search over all landmarks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""FastSLAM: motion, landmarks, weights, and particles that share nothing."""
+"""FastSLAM: motion, landmarks, weights, resampling, and independence of the particles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Close choices are decided together: against all choices, and where the likeliest pair alone is wrong."""
+"""Joint association of ambiguous detections against all assignments, and where the most likely single pair is
+wrong."""
 
 from __future__ import annotations
 

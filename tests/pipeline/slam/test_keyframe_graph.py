@@ -1,4 +1,4 @@
-"""The graph of keyframes: exact without errors, a minimum by two other solvers, robust, and bounded."""
+"""Graph of keyframes: exact without errors, the same minimum as two other solvers, robust and bounded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The past of the particles: right, immutable, bounded."""
+"""Ancestry of the particles: paths of their ancestors, immutable and bounded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Trees in rows look the same a step further on: no honest odometry is overruled there, a stuck one is."""
+"""Trees in rows, which look the same one spacing further: correct odometry is kept, and stuck wheels are
+detected."""
 
 from __future__ import annotations
 

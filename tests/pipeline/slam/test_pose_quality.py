@@ -1,4 +1,4 @@
-"""The health of SLAM: honest figures, and a word that follows them."""
+"""Pose quality: consistent statistics, and the state that follows from them."""
 
 from __future__ import annotations
 

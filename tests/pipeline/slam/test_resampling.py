@@ -1,4 +1,4 @@
-"""Low-variance resampling gives the particles their due."""
+"""Low-variance resampling: each particle is drawn in proportion to its weight."""
 
 from __future__ import annotations
 

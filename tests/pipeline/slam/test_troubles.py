@@ -1,6 +1,5 @@
-"""Bad days, from the records to the page: each is warned of and told by a state there, leaves at most one
-false tree, and the robot is good again within fifty scans or says that it is lost.
-"""
+"""Runs with disturbances, from records to page: each disturbance is reported with a warning and a state, and
+adds at most one false tree; within fifty scans the pose is good again or reported as lost."""
 
 from __future__ import annotations
 

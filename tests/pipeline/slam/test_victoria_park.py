@@ -1,4 +1,4 @@
-"""Victoria Park from its raw laser: the whole way of a car, far and coarse circles, three seeds."""
+"""Victoria Park from its raw laser scans: the whole path of the car against GPS, for three seeds."""
 
 from __future__ import annotations
 

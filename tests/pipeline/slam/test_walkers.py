@@ -1,6 +1,5 @@
-"""People who walk side by side look as trees do from a robot whose wheels are stuck: they carry it nowhere.
-And a robot that is where it says is not told lost because what it sees changes.
-"""
+"""Walking people, whose clusters look like trees to a robot with stuck wheels: they do not move the pose. A
+robot with a correct pose is not reported as lost when its view changes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Assignment of a tree column to the track at its axis, against distance and number of hits."""
+"""Assignment of a tree column to the track at its axis, by distance and number of hits."""
 
 from __future__ import annotations
 

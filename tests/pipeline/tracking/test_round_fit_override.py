@@ -1,4 +1,4 @@
-"""Circle fits from most sides overrule votes for classes that are not round, and no other classes."""
+"""Circle fits from most sides override votes for classes that are not round, and no other classes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Leave-one-out training: a scene is classified by trees that saw neither it nor a copy of it."""
+"""Leave-one-out training: a scene is classified by trees that were trained without it and without its
+copies."""
 
 from __future__ import annotations
 
