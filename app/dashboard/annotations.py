@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Against = Literal["both", "own", "annotations"]
 Counted = Literal["none", "source", "annotations", "both"]
 
-# Largest distance between an annotation and the object of the source's ground truth that it is of [m].
+# Largest distance between an annotation and the same object in the ground truth of the source [m].
 SAME_THING = 0.5
 
 

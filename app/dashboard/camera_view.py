@@ -35,7 +35,7 @@ class CameraView:
         self._kept: OrderedDict[int, bytes] = OrderedDict()
         self._turn = asyncio.Lock()
         self._next_at = 0.0
-        # Runs may have pictures of the same time, as simulated ones do, also after a restart.
+        # Number of the run: simulated runs have pictures of equal times. It differs after a restart as well.
         self._of = time.time_ns() // 1_000_000
 
     def forget(self) -> None:
@@ -170,8 +170,8 @@ def _box(camera: Camera, points: Float) -> dict[str, float] | None:
     return {"left": left, "top": top, "width": width, "height": height}
 
 
-#: Beyond the ends of a path the robot goes on as it did so long before [ns]: corrections of single poses
-#: would look like speed over a shorter time.
+#: Time at an end of the path over which the velocity is averaged for extrapolation [ns]. Over a shorter time,
+#: corrections of single poses would appear as velocity.
 _STEADY_NS = 500_000_000
 
 

@@ -44,7 +44,9 @@ _SCENE_PAUSE_S = 0.09
 
 
 class Dashboard:
-    """What is shown, and the actions of users. `worker` and `scene` are set before `start`.
+    """State of the open run for the page, and the actions of users.
+
+    `worker` and `scene` are set before `start`.
 
     Args:
         parameters: Parameters at the beginning.
@@ -461,7 +463,7 @@ class LoopPlayback:
         if time_s < self.span[1]:
             self._turning = False
         elif not self._turning and status.state in ("playing", "finished"):
-            self._turning = True  # pictures that are under way must not turn it once more
+            self._turning = True  # frames that were sent before the seek must not cause a second one
             with contextlib.suppress(protocol.WorkerBusyError):  # the worker is being restarted
                 await self._dashboard.worker.send(protocol.Seek(self.span[0]))
                 if status.state == "finished":

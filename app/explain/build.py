@@ -55,10 +55,10 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
     Args:
         run: The open run, or None.
         frame: Results of the scan.
-        cluster: Row of the cluster.
+        cluster: Row of the cluster in the frame.
 
     Raises:
-        StemmapError: The scan has no such cluster.
+        StemmapError: No run is open, or the scan has no such cluster.
     """
     if run is None or not 0 <= cluster < len(frame.clusters.size):
         raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")

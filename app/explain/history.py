@@ -54,7 +54,7 @@ class TreeHistory:
         them."""
         known = self._rows[: self._count]
         mine = known[known[:, _NUMBER] == number]
-        if len(mine) > _MOST_RETURNED:  # closer together where it is young
+        if len(mine) > _MOST_RETURNED:  # denser for the first observations, where the ellipse changes fastest
             place = np.unique(np.geomspace(1, len(mine), _MOST_RETURNED).astype(np.int64) - 1)
             mine = mine[place]
         ellipse = half_axes(mine[:, [[6, 7], [7, 8]]])
@@ -98,7 +98,7 @@ def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:
     """Return a row for each tree that the scan detected, shape (R, _WIDTH)."""
     trees = frame.trees
-    # A tree that began as a voxel column has a place before any scan detects it.
+    # A tree that began as a voxel column has a position before any scan detects it.
     rows = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))
     return np.column_stack(
         [

@@ -95,7 +95,8 @@ class Inbox:
 
         Args:
             recorder: None records nothing.
-            fixed: Numbers of the channels of fixed transforms.
+            fixed: Numbers of the channels of fixed transforms. Up to MAX_FIXED of their messages have a queue
+                of their own and are never skipped.
         """
         self._recorder, self._fixed_channels = recorder, frozenset(fixed)
 
@@ -175,7 +176,11 @@ class Inbox:
                         recorder.skip(message)
 
     def _skip(self, lane: _Lane, reason: str) -> int:
-        """Skip the oldest message of a lane; return its size [bytes]."""
+        """Remove the oldest message of a queue, record that it was skipped, and return its size [bytes].
+
+        It is counted in `losses` under the reason. Before the first call of `take`, scans are counted in
+        `early_scans` instead, and other messages are not counted.
+        """
         _, skipped = lane.popleft()
         if self._recorder is not None:
             self._recorder.skip(skipped)

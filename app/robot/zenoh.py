@@ -170,7 +170,8 @@ class ZenohLink(Link):
         )
 
     def receive(self) -> None:
-        """Connect, and watch the connection until `close`."""
+        """Connect, and update `problem` until `close`. Zenoh delivers the messages in its own threads and
+        restores a lost connection. An exception means that the first connection failed, see `Link`."""
         try:
             self._connect()
             self._watch()

@@ -19,9 +19,9 @@ from pipeline.types.records import Frame, Trees, TruthTrees
 
 Ring = tuple[float, float, float] | None
 
-TREE_HEIGHT = 2.2  # what a robot sees of a trunk; the map knows no height of trees [m]
-UNKNOWN_RADIUS = 0.08  # drawn where no arc carried a diameter [m]
-NUMBERS = 20  # nearest trees that carry their number
+TREE_HEIGHT = 2.2  # height of a drawn trunk [m]; the map has no heights of trees
+UNKNOWN_RADIUS = 0.08  # radius of a drawn trunk whose diameter is unknown [m]
+NUMBERS = 20  # trees nearest to the robot that are labelled with their number
 
 
 class MapNodes:
@@ -70,7 +70,8 @@ class MapNodes:
         self.repaint(frame, selected, ring, view)
 
     def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
-        """Show the same map after a change of the view or the selection; arguments as in `show`."""
+        """Update visibility, labels and selection of the map that `show` drew; arguments as in `show`.
+        Trees are not drawn again."""
         self.ground.visible = view.layers["ground"]
         self._trees.visible = view.layers["trees"]
         self._truth.visible = view.layers["truth"]
@@ -329,7 +330,7 @@ class MapCloud:
         return len(self._gathered.points)
 
     def show(self, frame: Frame, visible: bool) -> None:
-        """Add the points of a scan, and show them if `visible`."""
+        """Add the filtered points of a scan (see `Accumulated.take`), and show all points if `visible`."""
         self._gathered.take(frame)
         self.repaint(visible)
 

@@ -32,7 +32,7 @@ class ScanNodes:
     decimetres far from the origin of a large map.
 
     Args:
-        scene: Where the nodes are added.
+        scene: Scene of viser to which the nodes are added.
         robot: Name of the node of the robot.
         on_cluster: Called in the thread of viser with the number of the clicked marker and the ray (origin,
             direction) in the world frame of viser.

@@ -170,7 +170,18 @@ def labelled_points(folder: Path) -> tuple[Float, Int]:
 
 
 def labelled_scans(folder: Path) -> list[tuple[Float32, Int]]:
-    """Return the points (N, 3) [m] of each scan of a place and their labels, as `labelled_points`."""
+    """Return points, float32, shape (N, 3) [m], and labels, int64, shape (N,), of each scan of a place.
+
+    Points are in the frame of the files; those at the origin, which are no returns, are left out. A label is
+    the class, the lower 16 bits of the number in the file.
+
+    Args:
+        folder: Folder with `velodyne/*.bin` and `labels/*.label`, read in the order of their names, or one
+            .bin file with a .label file next to it.
+
+    Raises:
+        OSError, ValueError, IndexError: A file cannot be read, or points and labels do not match.
+    """
     if folder.is_file():
         files = [(folder, folder.with_suffix(".label"))]
     else:

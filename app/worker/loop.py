@@ -29,16 +29,16 @@ from pipeline.types.records import Frame
 Put = Callable[[protocol.FromWorker], None]
 T = TypeVar("T")
 
-# Interval of status reports while a run plays, and of frames on the way to a sought scan; on a short way none
-# is shown, so that nothing flickers.
+# Interval of status reports while a run plays, and of frames during a seek. A short seek shows no frames
+# before its target, so that the page does not flicker.
 _REPORT_S = 0.25
 _GLIMPSE_S = 0.5
 _COMPILING = COMPILING.capitalize()
-_COMPILES_ON_S = 60.0  # kernels that are compiled so soon after one another count as one wait
+_COMPILES_ON_S = 60.0  # kernels compiled within this time of one another count as one wait
 # Interval at which messages of a live source are taken; it costs less than 1 % of a core.
 _LISTEN_S = 0.005
 # Time of a rerun between two checks for commands, and number of scans of a playing run that are mapped before
-# a rerun gets its turn, however late the run is.
+# the rerun continues, even if the replay is late.
 _REMAP_S = 0.02
 _SCANS_A_REMAP = 4
 # Scans that a rerun maps in one call; fewer where a scan takes long.

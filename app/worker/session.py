@@ -321,7 +321,7 @@ class Session:
         """Return the current scan mapped with other parameter sets, without a change of the run.
 
         Raises:
-            StemmapError: There is none, or a set cannot be mapped with.
+            StemmapError: There is no current scan, or a set cannot be used.
         """
         if self._run is None or self._state == "failed":
             raise StemmapError("nothing is mapped", remedy="Press play, or open a run")
@@ -517,7 +517,8 @@ class SeekTarget:
         return following is not None and following > self._stamp_ns
 
     def words(self, run: Run | None) -> str:
-        """Return a description of the sought scan, for example "scan 12" or "1:05"; empty without one."""
+        """Return a description of the sought scan: its time, for example "1:05", or "scan 12" if its time is
+        unknown. Empty without a run or without a sought scan."""
         if run is None or not self.sought:
             return ""
         time_s = self.time_s(run)

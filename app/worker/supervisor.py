@@ -25,14 +25,14 @@ _GRACE_S = 0.7
 #: Of a live run: the worker finishes the recording, then leaves the robot's network.
 _LIVE_GRACE_S = 10.0
 _BUFFER = 8 * 1024 * 1024
-# A large recording on a slow disk takes a minute to open; no message for so long means that it never will.
+# Longest time without a message while a source is opened; a large recording on a slow disk takes a minute.
 OPENING_LIMIT_S = 300.0
 # Another source may be opened before the first is open. A live recording that is left may need 10 s to close.
 _REPLACE_AFTER_S = 12.0
 _WRITE_LIMIT_S = 5.0
-# Ends without a result in between, after which the playback speed is reset, because it may be the cause.
+# Consecutive ends without a result after which the playback speed is reset, which may be the cause.
 _SUSPICIOUS_ENDS = 2
-# What is remembered over a restart, or has no meaning for a new process.
+# Commands that are stored and sent again after a restart, or that a new process does not need.
 _REMEMBERED = (
     protocol.SetParameters,
     protocol.SetSpeed,
@@ -248,7 +248,7 @@ class WorkerProcess:
             self._ends_without_result = 0
         try:
             await self._on_message(message)
-        except Exception as error:  # must not end the watch over the worker, and must not pass unseen
+        except Exception as error:  # logged; it must not end the supervision of the worker
             _log.exception("a message of the worker could not be handled")
             if not isinstance(message, protocol.Report):
                 await self._tell(

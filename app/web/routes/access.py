@@ -1,4 +1,4 @@
-"""What the routes depend on: the dashboard, the role of the request, and the limits of viewers."""
+"""Dependencies of the routes: the dashboard, the role of the request, and the limits of viewers."""
 
 from __future__ import annotations
 

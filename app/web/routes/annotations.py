@@ -85,7 +85,7 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 
 @router.post("/annotations")
 async def add(body: _Add, dashboard: Dash) -> Response:
-    """Add an annotation."""
+    """Add an annotation; return its number and the numbers of edits that can be undone and repeated."""
     (added,) = await dashboard.annotation_editor.edit(
         body.run, lambda store: store.add(body.run, body.author, [body.content])
     )
@@ -137,7 +137,8 @@ async def import_table(body: _Import, dashboard: Dash) -> Response:
 
 @router.put("/annotations/against")
 async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
-    """Choose the ground truth that the map is scored against; neither of the two is changed."""
+    """Choose whether the map is scored against the ground truth of the source, the annotations or both;
+    neither is changed. Return the annotations with this choice."""
     dashboard.annotation_editor.score_against(body.against)
     return json_reply(dashboard.annotation_editor.as_plain())
 

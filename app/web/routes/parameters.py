@@ -71,7 +71,7 @@ async def read(dashboard: Dash) -> Response:
 
 @router.patch("/parameters")
 async def change(body: _Changes, dashboard: Dash) -> Response:
-    """Change values by their dotted names."""
+    """Change values by their dotted names; return all values as `GET /api/parameters` does."""
     await dashboard.change_parameters(dict(body.changes), body.gesture)
     return await read(dashboard)
 
@@ -133,7 +133,7 @@ async def saved_sets(dashboard: Dash) -> Response:
 
 @router.post("/sets")
 async def save_set(body: SaveSet, dashboard: Dash) -> Response:
-    """Save the values in force under a name; a set of that name is replaced."""
+    """Save the values in force under a name; a set of that name is replaced. Return all saved sets."""
     state = dashboard.parameters
     await dashboard.sets.save(body.name, state.preset, state.parameters, body.who)
     return json_reply(dashboard.sets.as_plain(), 201)
@@ -149,7 +149,7 @@ async def use_set(body: _SetName, dashboard: Dash) -> Response:
 
 @router.post("/sets/delete")
 async def delete_set(body: _SetName, dashboard: Dash) -> Response:
-    """Delete a saved set."""
+    """Delete a saved set; return the others."""
     await dashboard.sets.delete(body.name)
     return json_reply(dashboard.sets.as_plain())
 

@@ -1,4 +1,4 @@
-"""Search for parameters, their sensitivity, and decision trees that learn from annotations."""
+"""Search for parameters, their sensitivity, and training of decision trees with annotations."""
 
 from __future__ import annotations
 
@@ -49,21 +49,22 @@ async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile)
 async def start_search(
     body: SearchRequest, dashboard: Dash, settings: Deployment, any_file: AnyFile
 ) -> Response:
-    """Search over the open run, from its first scan to its last, and over other recorded runs."""
+    """Start a search over the open run, from its first scan to its last, and over other recorded runs. Return
+    the state of the search."""
     await dashboard.search.start(await _plan(dashboard, settings, any_file, body), body)
     return json_reply(dashboard.search.as_plain(), 202)
 
 
 @router.post("/search/stop")
 async def stop_search(dashboard: Dash) -> Response:
-    """Stop the search; its results stay."""
+    """Stop the search; return its state with the results so far, which `GET /api/search` still returns."""
     await dashboard.search.stop()
     return json_reply(dashboard.search.as_plain(), 202)
 
 
 @router.post("/search/go-on")
 async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Continue the search that was stopped, with the same choices."""
+    """Continue the search that was stopped, with the same choices; return its state."""
     search = dashboard.search
     if search.request is None:
         raise StemmapError("there is no stopped search", remedy="Start a search")
@@ -81,7 +82,7 @@ async def use_found(dashboard: Dash) -> Response:
 
 @router.post("/search/save")
 async def save_found(body: SaveSet, dashboard: Dash) -> Response:
-    """Save the best set under a name, with its provenance."""
+    """Save the best set under a name, with its provenance; return all saved sets."""
     preset_name, values, text = dashboard.search.found()
     await dashboard.sets.save(body.name, preset_name, values, body.who, text)
     return json_reply(dashboard.sets.as_plain(), 201)
@@ -103,21 +104,22 @@ async def stop_sensitivity(dashboard: Dash) -> Response:
 
 @router.get("/learning")
 async def learning_state(request: Request, dashboard: Dash) -> Response:
-    """Return what there is to learn from, and the progress."""
+    """Return the numbers of annotations that a training can use, and its progress."""
     in_force = dashboard.parameters.parameters.classification.forest
     return json_reply(await _learning(request).known(in_force))
 
 
 @router.post("/learning")
 async def start_learning(request: Request, dashboard: Dash) -> Response:
-    """Grow new decision trees from all annotations; they are not used before `POST /api/learning/use`."""
+    """Start to train new decision trees with all annotations; they are not used before `POST
+    /api/learning/use`. Return the progress."""
     await _learning(request).begin(dashboard.parameters.parameters)
     return json_reply(_learning(request).as_plain(), 202)
 
 
 @router.delete("/learning")
 async def stop_learning(request: Request) -> Response:
-    """Stop learning, or discard its result; the decision trees in force stay."""
+    """Stop the training, or discard its result; the decision trees in force stay."""
     await _learning(request).forget()
     return json_reply(_learning(request).as_plain())
 
