@@ -1,4 +1,4 @@
-"""Classification of voxel columns: what all scans together show at each position of the map."""
+"""Classification of voxel columns: the returns of all scans accumulated by position in the map."""
 
 from pipeline.classification.column_classifier import ColumnClassifier, ColumnClassifierState, no_columns
 from pipeline.classification.decision_rule import ColumnVotes, column_votes

@@ -69,7 +69,8 @@ def _room(room: int, keys: Int) -> int:
 
 
 def corrected_columns(columns: Columns, memory: VoxelMap, correction: PathCorrection) -> Columns:
-    """Return the columns after a correction of the path: each moves with the voxels around it.
+    """Return the columns after a correction of the path: each moves with the scan that saw the
+    nearest voxel between LOW and HIGH last.
 
     Args:
         columns: The columns.
@@ -136,7 +137,7 @@ FOLD = 25  # scans that a state stores one by one, before they are folded into i
 class ColumnClassifierState:
     """State between two scans: packed voxels, the scans since, and the columns.
 
-    It shares the data with the classifier, so that taking it costs nothing.
+    It shares its arrays with the classifier, so that a snapshot copies nothing.
     """
 
     base: PackedVoxelMap

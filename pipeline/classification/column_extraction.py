@@ -210,11 +210,12 @@ def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: floa
 def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) -> None:
     """Fill `rows` of zeros, shape (SLICES, PROFILE), with the profile of a column.
 
-    Columns: returns inside, returns between, returns in the ring, voxels inside, filled octants of the ring,
-        middle of
-    the inside (x, y from the axis) [m], rms distance of the inside from the axis [m], and the second moments
-    xx, xy, yy of the inside about its middle [m^2]. From ARC onwards sums over the returns within RING_NEAR
-    for a circle fit (Kasa 1976), with z = x^2 + y^2 from the axis: 1, x, y, xx, xy, yy, xz, yz, zz.
+    By distance from the axis, returns are inside (up to INSIDE), between (up to RING_NEAR) or in the ring (up
+    to RING_FAR). Columns: returns inside, returns between, returns in the ring, voxels inside, filled octants
+    of the ring, middle of the inside (x, y from the axis) [m], rms distance of the inside from the axis [m],
+    and the second moments xx, xy, yy of the inside about its middle [m^2]. From ARC onwards sums over the
+    returns within RING_NEAR for a circle fit (Kasa 1976), with z = x^2 + y^2 from the axis: 1, x, y, xx, xy,
+    yy, xz, yz, zz.
 
     Args:
         axis: See `find_columns`.

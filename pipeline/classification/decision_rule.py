@@ -72,8 +72,8 @@ def is_transparent(columns: Columns, slices: slice) -> Bool:
     """Return which columns let most rays pass in a band of heights, shape (C,).
 
     A trunk is opaque: of 5,106 views of simulated and labelled trunks with at least `RAYS` rays between 1.2
-        and 2.2 m,
-    one stopped less than `STOPPED` of them. Above parked motorcycles rays pass.
+    and 2.2 m, only one stopped less than `STOPPED` of the rays. Above parked motorcycles rays pass. Columns
+    with fewer than `RAYS` rays in the band are not transparent.
 
     Args:
         columns: Columns with the numbers of rays that ended at them and that passed them, by slice.
@@ -85,6 +85,6 @@ def is_transparent(columns: Columns, slices: slice) -> Bool:
 
 
 def too_few(figures: Float) -> Bool:
-    """Return which columns have so few voxels that they may be there by chance, shape (C,)."""
+    """Return which columns have so few voxels that they may have been found by chance, shape (C,)."""
     few: Bool = figures[:, VOXELS] < LEAST_VOXELS
     return few

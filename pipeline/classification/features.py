@@ -1,4 +1,5 @@
-"""Features of columns for the classifier; none of them depends on the units of a sensor."""
+"""Features of columns for the classifier. None of them uses the reflectivity, whose unit depends on the
+sensor."""
 
 from __future__ import annotations
 
@@ -134,9 +135,10 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
 
 @compiled
 def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
-    """Fill in the features of rays: for each band the share of rays that ended at the column; the free height
-    above the clean slices up to the next return, and above the highest return; the height up to which there
-    are rays; and the gap between the clean slices and the next return, as far as there are rays [m]."""
+    """Write into `out` the features of rays: for each band the share of rays that ended at the column; the
+    free height above the clean slices up to the next return, and above the highest return; the height up to
+    which there are rays; and the gap between the clean slices and the next return, as far as there are rays
+    [m]."""
     n = BANDS.shape[0]
     for b in range(n):
         ended, went = 0.0, 0.0
@@ -164,7 +166,8 @@ def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None
 
 @compiled
 def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
-    """Share of the returns within 0.9 m that is within 0.45 m, and share of these at the axis."""
+    """Write into `out` the share of the returns within 0.9 m that is within 0.45 m, and the share of the
+    latter that is at the axis; UNSEEN without returns."""
     inside, near, ring = 0.0, 0.0, 0.0
     for s in range(first, end):
         inside += rows[s, 0]
@@ -204,8 +207,9 @@ def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
 
 @compiled
 def _circle(rows: Float, last: int, out: Float) -> None:
-    """Radius of the circle through all clean slices together, rms distance from it [m], and their ratio;
-    UNSEEN where the fit fails (Kasa 1976: z + B x + C y + D = 0 by least squares)."""
+    """Write into `out` the radius of the circle through the returns of all clean slices, at most 1 [m], their
+    rms distance from it [m], and the ratio of both; UNSEEN where the fit fails (Kasa 1976: z + B x + C y + D
+    = 0 by least squares)."""
     m = np.zeros(9)
     for s in range(1, min(last + 1, SLICES)):
         if rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2]):
@@ -234,7 +238,9 @@ def _circle(rows: Float, last: int, out: Float) -> None:
 
 @compiled
 def _band(rows: Float, first: int, end: int, out: Float) -> None:
-    """Share of filled slices, share of the returns at the axis, open share of the ring."""
+    """Write into `out` for the slices from `first` to `end` - 1 the share with returns at the axis, the share
+    of the returns that is at the axis (UNSEEN for 0), and the share of the octants of the ring without
+    returns."""
     inside, around, filled, octants = 0.0, 0.0, 0.0, 0.0
     for s in range(first, end):
         inside += rows[s, 0]

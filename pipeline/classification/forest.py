@@ -169,7 +169,7 @@ def vote(figures: Float, forest: Forest) -> Float:
     """Return the class shares in the order of CLASSES, mean over the trees, shape (K, classes).
 
     For columns with a free upper end, votes for a tree count for a pole where `free_end` decides so, because
-    among all other objects there are too few poles to learn from (docs/trunks.md).
+    the training examples of the main forest contain too few poles (docs/trunks.md).
     """
     votes = _vote(figures, forest.trees)
     poles = np.flatnonzero(tree_in_free_air(figures, forest) < TREE_IN_FREE_AIR)

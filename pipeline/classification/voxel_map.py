@@ -118,9 +118,8 @@ class VoxelMap:
     def empty(cls, room: int = 1 << 12, tile_room: int = 1 << 8) -> VoxelMap:
         """Return an empty map; `room` and `tile_room` are powers of two.
 
-        All columns are zero, so the system provides pages when rows are first used: room for a whole map
-            costs nothing
-        before it is filled.
+        All columns are zero, so the system provides pages when rows are first used: unused rows take no
+        memory.
         """
         return cls(
             key=zeros(room, np.int64),

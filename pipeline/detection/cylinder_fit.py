@@ -124,7 +124,14 @@ def normal_equations(
 
 @compiled
 def angular_width(rays: Float, n: int) -> tuple[float, float]:
-    """Return the bearing of the middle of a cluster and the angle between its outermost rays [rad]."""
+    """Return the bearing half-way between the outermost rays of a cluster, not wrapped, and the angle between
+    them [rad].
+
+    Args:
+        rays: Direction x, y of each return, its horizontal range [m] and height [m]; shape (RAY, capacity),
+            of which n columns are valid.
+        n: Number of returns.
+    """
     mean_x, mean_y = 0.0, 0.0
     for i in range(n):
         mean_x += rays[0, i] * rays[2, i]

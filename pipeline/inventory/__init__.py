@@ -1,7 +1,7 @@
-"""Stem inventory of a whole cloud of a plot, as a terrestrial or mobile scanner gives it.
+"""Stem inventory of a whole cloud of a plot by a terrestrial or mobile scanner.
 
 The steps of `map_plot` are extent, ground, thinned points above it, slices, circles, stems. The cloud is read
-three times in parts, so that its size decides the time and not the memory.
+three times in parts, so that the memory does not grow with its size.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ LEAST_HIGH, LEAST_SLICES = 1.2, 8  # least height of a stem [m], and least numbe
 BEGINS_BELOW = 2.2  # m; a stem begins below this height
 FILLED = 0.7  # least share of the slices between the lowest and the highest with a circle
 # Largest scatter of the points and unevenness of the slices, as shares of the radius, and offset of the
-# centres from the # axis, as a share of the radius and in m. They apply to a stem of `USUAL` slices and grow
-# with the number of # slices.
+# centres from the axis, as a share of the radius and in m. They apply to a stem of `USUAL` slices and grow
+# with the number of slices.
 ROUGH, UNEVEN, CROOKED, WOBBLE = 0.2, 0.08, 0.2, 0.04
 USUAL, FORGIVEN = 15.0, (0.8, 1.4)
 LEAST_CONTRAST = 2.5  # ratio of densities on the surface and next to it; uniform points give 1 to 1.5
@@ -125,13 +125,17 @@ def classify_stems(stems: Float, r_min: float, r_max: float) -> Int32:
 
 
 def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
-    """Return diameter at breast height and its sigma [m], shape (K,), NaN where the visible arc is too small.
+    """Return diameter at breast height and its sigma [m], shape (K,) each.
+
+    Both are NaN for a stem whose visible arc is less than `arc_min`, with fewer than three slices, without a
+    slice within CLOSE of breast height, or with a sigma of the diameter above half of the radius.
 
     The diameter is measured across the axis: a level slice of a trunk with lean theta is an ellipse, wider by
-    1 / cos theta along the lean, and the circle through it has the mean of both.
+    1 / cos theta along the lean, and the circle through it has the mean of both. The bias by the scatter of
+    the points is subtracted, see `without_scatter`.
 
     Args:
-        stems: See `describe_stems`.
+        stems: Result of `describe_stems`.
         arc_min: Least visible arc [rad].
     """
     known = (stems[:, COVERAGE] >= arc_min) & (stems[:, NEAR] <= CLOSE) & (stems[:, SLICES] >= 3)
@@ -143,7 +147,7 @@ def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
 
 
 def is_repeated(stems: Float, verdict: Int32) -> Bool:
-    """Return which stems repeat an earlier stem or a tree, shape (K,).
+    """Return which stems are duplicates of a stem with more slices or of a tree, shape (K,).
 
     Args:
         stems: Result of `describe_stems`.
@@ -164,7 +168,7 @@ def _again(stems: Float, tree: Bool) -> Bool:
         for j in range(i):
             if again[j]:
                 continue
-            # In the heights that both have, else half-way between them.
+            # At the middle of the heights that both have, else half-way between them.
             low, high = max(stems[i, 10], stems[j, 10]), min(stems[i, 11], stems[j, 11])
             at = 0.5 * (low + high) - BREAST
             dx = stems[i, 0] - stems[j, 0] + at * (stems[i, 2] - stems[j, 2])

@@ -3,7 +3,7 @@
 The lowest returns of each cell are kept. A single return below the others is noise, and so is a single cell
 below its neighbours. A cell that is steeper above a lower one than the terrain can be is a stem, a bush or a
 crown. Planes are fitted to the other cells, and holes are interpolated. Heights are relative to the plane of
-the plot, so that a hillside is no harder than flat ground.
+the plot, so that the checks have the same limits on a hillside and on flat ground.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ WINDOW = 2  # cells to each side to which a plane is fitted
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TerrainRaster:
-    """Heights of the ground at the corners and centres of a raster.
+    """Heights of the ground at the centres of the cells of a raster.
 
     Attributes:
         low: Corner of the raster, shape (2,) [m].
         cell: Side of a cell [m].
-        height: Heights at the centres of the cells, shape (columns, rows) [m].
+        height: Heights at the centres of the cells, shape (columns, rows) [m]; interpolated where a cell
+            has no ground returns.
         seen: Whether a cell has ground returns, shape (columns, rows).
     """
 
@@ -44,11 +45,12 @@ class TerrainRaster:
     seen: Bool
 
     def at(self, x: Float, y: Float) -> Float:
-        """Return heights [m] at positions of shape (N,) [m], by bilinear interpolation."""
+        """Return heights [m] at positions x, y of shape (N,) each [m], by bilinear interpolation. Outside of
+        the raster, the height at its border is returned."""
         return self.evaluate(x, y)[:, 0]
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
+        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m]; shape (N, 3)."""
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         return _evaluate(self.height, self.low, self.cell, np.ascontiguousarray(x), np.ascontiguousarray(y))
 
@@ -286,11 +288,14 @@ def _remove_overhanging(ground: Float, slope: float) -> None:
 
 @compiled
 def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
-    """Return the height at the centre of each cell with ground, by a plane through the lowest returns around
-    it, NaN elsewhere, and which cells have ground; shape (columns, rows) each.
+    """Return the height [m] at the centre of each cell with ground, NaN elsewhere, and which cells have
+    ground; shape (columns, rows) each.
+
+    The height is that of a plane fitted to the lowest returns of the cells up to WINDOW away; with fewer than
+    three of them it is that of the cell's own lowest return.
 
     Args:
-        ground: Lowest returns, shape (columns, rows, 3) [m].
+        ground: Lowest returns, shape (columns, rows, 3) [m], with infinite z in cells without ground.
         low: Corner of the raster, shape (2,) [m].
     """
     columns, rows = ground.shape[0], ground.shape[1]

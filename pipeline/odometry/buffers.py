@@ -13,7 +13,7 @@ from pipeline.geometry.poses import Pose2, Pose3, interpolate, wrap_angle
 from pipeline.types.records import Odometry, PoseMeasurement
 
 KEEP_NS = 2_000_000_000
-JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; nothing that maps trees moves this fast
+JUMP_SPEED, JUMP_TURN = 15.0, 6.0  # m/s, rad/s; a faster step of the odometry is a jump
 STANDSTILL = (0.005, 0.002)  # m, rad; the pose of a robot that does not move varies by less
 STILL = (0.0, 0.0, 0.0)
 
@@ -143,8 +143,8 @@ def _tilt(T_odom_base: Pose3) -> Tilt | None:
 
 
 SAME_TIME_NS = 50_000_000
-CARRIED_NS = 500_000_000  # a pose up to this age is predicted by the odometry, with an error of
-CARRIED = 0.05  # of the distance and of the turn
+CARRIED_NS = 500_000_000  # maximum time over which a pose is predicted by the odometry
+CARRIED = 0.05  # standard deviation of that prediction, as a share of the distance and of the turn
 NO_HEADING = 1.0  # rad^2; with a larger variance the heading is unknown
 MOST = 64
 

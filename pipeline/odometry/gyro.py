@@ -16,7 +16,7 @@ from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.types.records import Imu, Learnt, Turn
 
 KEEP_NS = 3_000_000_000
-GAP_NS = 60_000_000  # a longer time without a reading is a hole
+GAP_NS = 60_000_000  # longest time between two readings over which the rate is integrated
 AROUND_NS = 50_000_000  # half width of the interval for the rate at a stamp
 BLOCK = 50  # consecutive readings for one estimate of the bias
 BLOCKS_MOST = 20  # blocks that are averaged, because the bias drifts
@@ -85,13 +85,17 @@ class Gyro:
             self._scatter += (sigma - self._scatter) / self._blocks
 
     def learnt(self, stamp_ns: int) -> Learnt:
-        """Return the state of the estimates at a time [ns]."""
+        """Return the bias, the comparison with the wheels and the other estimates, for `go_on_from`.
+
+        Args:
+            stamp_ns: Time of the state [ns].
+        """
         block = tuple(self._block)
         of_bias = stamp_ns, self._bias, self._scatter, self._blocks, block
         return Learnt(*of_bias, self._same, self._turned, self._proven)
 
     def go_on_from(self, learnt: Learnt) -> None:
-        """Restore the state of the estimates; the readings stay."""
+        """Restore the estimates that `learnt` returned; the readings stay."""
         self._bias, self._scatter = learnt.bias, learnt.scatter
         self._blocks, self._block = learnt.blocks, list(learnt.block)
         self._same, self._turned, self._proven = learnt.same, learnt.turned, learnt.proven
@@ -102,7 +106,10 @@ class Gyro:
         return self._proven
 
     def compare(self, by_wheels: float, turn: Turn) -> None:
-        """Update the comparison of wheels and gyroscope (the slope of a line over all steps) with one step.
+        """Add one step to the comparison of wheels and gyroscope, the slope of a line through all steps.
+
+        The gyroscope is `proven` once the wheels have turned by PROOF while the slope is between 1 / ALIKE
+        and ALIKE.
 
         Args:
             by_wheels: Turn of the step by the wheels [rad].

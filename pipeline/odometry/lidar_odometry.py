@@ -15,11 +15,11 @@ from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers.base import count_loss
 from pipeline.types.records import Odometry, Record, Scan
 
-#: Farther points are sparse and would cost a tenth of the time [m].
+#: Largest and smallest range of a point [m]; farther points are sparse and would take a tenth of the time.
 RANGE_MAX, RANGE_MIN = 40.0, 0.5
 #: Side of the voxels of the map [m], the default of KISS-ICP for a LiDAR of 100 m.
 VOXEL = 1.0
-#: More iterations follow the rings on the ground, which move with the sensor.
+#: Maximum number of iterations; more would align the rings on the ground, which move with the sensor.
 ITERATIONS = 20
 #: Points lower than this above the ground are not used, because rings on the ground move with the sensor [m].
 GROUND = 0.3

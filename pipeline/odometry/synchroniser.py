@@ -84,7 +84,7 @@ class Synchroniser:
             self._gyro.go_on_from(after)
         self._stepped: Pose2 | None = None  # odometry of the last step
         self._turned_ns: int | None = None
-        self._gyro_tilt = (0, 0.0, 0.0)  # when [ns], roll and pitch [rad]
+        self._gyro_tilt = (0, 0.0, 0.0)  # time [ns], roll and pitch [rad]
         self._measured = PoseBuffer()
         self._slack = (0.0, 0.0)
         self._doubt = ""

@@ -47,7 +47,7 @@ class PlotGround:
     yaw: float
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
+        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m]; shape (N, 3)."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         there = self.height.evaluate(self.start[0] + c * x - s * y, self.start[1] + s * x + c * y)
         z, gx, gy = there.T
@@ -172,8 +172,8 @@ def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> SimulatedScene
 
 CELL = 0.1  # m
 LOW, HIGH = 0.25, 1.6  # m above the ground; points in this band are obstacles
-# Number of points that makes a cell an obstacle, as a share of that of the densest cells. Stems are dense;
-# through # sparse leaves a robot can push where there is no other path.
+# Number of points that makes a cell an obstacle, as a share of that of the densest cells. Stems are dense.
+# Where there is no other path, the robot drives through sparse leaves.
 DENSITIES = (0.02, 0.1, 0.25, 0.5)
 DENSE = 98  # percentile
 REACHES = 0.5  # share of the plot, along both axes, that the path must cover

@@ -471,7 +471,8 @@ def add_wall(scene: SceneBuilder, start: Float, end: Float, height: float, thick
 
 
 def _stations(start: Float, end: Float, spacing: float) -> Float:
-    """Places from `start` to `end` at a spacing [m], shape (N, 2)."""
+    """Return positions on the line from `start`, inclusive, to `end`, exclusive, both of shape (2,) [m], at
+    multiples of a spacing [m] from `start`; shape (N, 2)."""
     length = float(np.hypot(*(end - start)))
     along = np.arange(0.0, length, spacing)
     return start + along[:, None] * (end - start) / max(length, 0.1)

@@ -25,7 +25,7 @@ SPINNING = (
 HALF_LENGTH, HALF_PARK = 42.0, 30.0  # m; of a street, of a park
 
 # Probabilities of objects on a lawn and in a garden, and the parameters of the Dirichlet distribution from
-# which the # mixture of each verge is drawn.
+# which the mixture of each verge is drawn.
 LAWN = {
     "shrub": 0.28, "crown": 0.1, "lamp": 0.1, "sign": 0.08, "post": 0.1, "bin": 0.05, "person": 0.08,
     "motorcycle": 0.06, "hedge": 0.12, "drum": 0.03,
