@@ -98,7 +98,15 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def inside(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the topics of a source with their roles, and the mounting of the LiDAR."""
+    """Return the topics of a recording or a live robot with their roles, and the mounting of the LiDAR, as
+    JSON values.
+
+    Args:
+        question: The key "path" has the path of the recording or the address of the robot.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
     return (heard if is_live(question["path"]) else recorded)(question["path"])
 
 

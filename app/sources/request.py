@@ -169,6 +169,9 @@ class ChosenOdometry:
 def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
     """Return the source of motion for a choice of the user.
 
+    "auto" selects the odometry of the source; without it, registration of the scans (KISS-ICP); and where
+    that is impossible, for example with a planar laser, no motion, with a warning.
+
     Args:
         known: Description of the source.
         choice: "auto", "wheels", "kiss-icp", "static", or "file:" and a path.

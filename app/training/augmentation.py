@@ -68,7 +68,19 @@ class AugmentedScans:
 def copies(
     folder: Path, kept: Path | None, parameters: Parameters, reach: float, number: int = COPIES
 ) -> list[Examples]:
-    """Return the examples of all copies of labelled scans; they are stored in a folder under their digest."""
+    """Return the examples of copies of labelled scans into which objects are inserted.
+
+    Args:
+        folder: The labelled scans, see `labelled_scans`.
+        kept: Folder in which examples are stored by the digest of the scans and the number of the copy, and
+            from which they are read the next time; None stores nothing.
+        parameters: Parameters of the classification.
+        reach: Distance from the sensor within which columns become examples [m].
+        number: Number of copies.
+
+    Raises:
+        StemmapError: The stored examples are damaged.
+    """
     digest, found = digest_of(folder), list[Examples]()
     for copy in range(number):
         make = partial(pasted_examples, folder, copy, parameters, reach)

@@ -206,7 +206,8 @@ async def _look_at(part: Path, name: str) -> str:
 
 
 def _shown(name: str) -> str:
-    """Return the name without folders and without control characters."""
+    """Return the name without folders and control characters, cut to 200 characters; "recording" if it is
+    empty."""
     last = name.replace("\\", "/").rpartition("/")[2]
     return "".join(letter for letter in last if letter.isprintable())[:200] or "recording"
 

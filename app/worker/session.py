@@ -194,9 +194,10 @@ class Session:
             self._run.stopwatch.disturb()
 
     def work(self) -> Frame | None:
-        """Map the next scan and return its frame.
+        """Map the next scan and return its frame, or the frame of the seek target once it is reached.
 
-        None at the end of the run, or if the seek target was already reached.
+        None if no run is open, if nothing is to be mapped (`pace` is "idle"), and at the end of the run,
+        whose state then becomes "finished".
         """
         run = self._run
         if run is None or self.pace == "idle":
@@ -241,7 +242,8 @@ class Session:
             self._state = "paused"
 
     def advance(self, scans: int) -> None:
-        """Pause and step forward by a number of scans, or back if it is negative."""
+        """Pause and seek a number of scans forward, or back if it is negative, from the sought scan if there
+        is one, else from the current one. A live run only gets a message that it cannot seek."""
         if self._run is None or self._is_live():
             return
         here = self._run.current if self._target.index is None else self._target.index

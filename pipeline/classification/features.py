@@ -254,8 +254,8 @@ def _band(rows: Float, first: int, end: int, out: Float) -> None:
 
 @compiled
 def _stem(rows: Float) -> tuple[int, int, int, int, int]:
-    """Return slices: lowest with a return, first and last clean slice of the run, their number, highest with
-    a return.
+    """Return slices: lowest with a return, first and last clean slice of the run (see `_run`), their number,
+    highest with a return. Slice 0 is not used; without returns lowest is SLICES and highest 0.
 
     Next to a thick neighbour, which returns more than a thin stem, no slice would be clean; then only the
     returns nearer than the neighbour count.
@@ -273,7 +273,9 @@ def _stem(rows: Float) -> tuple[int, int, int, int, int]:
 
 @compiled
 def _run(rows: Float, part: float, ring: float) -> tuple[int, int, int]:
-    """Return first and last clean slice of the run, and their number.
+    """Return first and last clean slice of the lowest run, and their number; SLICES, 0 and 0 without one.
+
+    A slice is clean if enough of its returns are at the axis. The run ends at a gap of more than GAP slices.
 
     Args:
         rows: Profile of the column.

@@ -22,10 +22,16 @@ _APART = 5  # samples; turns on the spot that are nearer to one another, or to a
 
 
 def sharp_cells(s: Float, yaw: Float) -> Bool:
-    """Return where a line turns too sharply to be driven, between each of N samples and the next, shape (N -
-    1,).
+    """Return between which of N samples of a line and the next the robot turns on the spot, shape (N - 1,).
 
-    The yaw decides, because a cusp between two samples has no curvature at them."""
+    It does so where the turn exceeds YAW_RATE at the speed CREEP, and on cells between two such turns, or
+    between one and an end of the line, that are at most _APART apart. The difference of the yaw is used,
+    because a cusp between two samples has no curvature at them.
+
+    Args:
+        s: Distances along the line, shape (N,) [m].
+        yaw: Directions of the line, not wrapped, shape (N,) [rad].
+    """
     sharp = np.abs(np.diff(yaw)) > YAW_RATE / CREEP * np.diff(s)
     if sharp.any():
         rows = np.concatenate([[-1], np.flatnonzero(sharp), [sharp.size]])

@@ -94,7 +94,8 @@ async def add(body: _Add, dashboard: Dash) -> Response:
 
 @router.patch("/annotations/{number}")
 async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
-    """Change an annotation; 409 if it does not have this version any more."""
+    """Change an annotation; 409 if it does not have this version any more. Return its number and the numbers
+    of edits that can be undone and repeated."""
     await dashboard.annotation_editor.edit(
         body.run, lambda store: store.change(body.run, body.author, number, body.version, body.content)
     )
@@ -103,7 +104,8 @@ async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
 
 @router.delete("/annotations/{number}")
 async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
-    """Delete an annotation; 409 if it does not have this version any more."""
+    """Delete an annotation; 409 if it does not have this version any more. Return its number and the numbers
+    of edits that can be undone and repeated."""
     await dashboard.annotation_editor.edit(
         body.run, lambda store: store.delete(body.run, body.author, number, body.version)
     )
@@ -112,21 +114,23 @@ async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
 
 @router.post("/annotations/undo")
 async def undo(body: _Edit, dashboard: Dash) -> Response:
-    """Undo the last edit of the browser."""
+    """Undo the last edit of the browser; return the numbers of edits that can be undone and repeated."""
     await dashboard.annotation_editor.edit(body.run, lambda store: store.undo(body.run, body.author))
     return await _done(dashboard, body, {})
 
 
 @router.post("/annotations/redo")
 async def redo(body: _Edit, dashboard: Dash) -> Response:
-    """Repeat the edit that the browser undid last."""
+    """Repeat the edit that the browser undid last; return the numbers of edits that can be undone and
+    repeated."""
     await dashboard.annotation_editor.edit(body.run, lambda store: store.redo(body.run, body.author))
     return await _done(dashboard, body, {})
 
 
 @router.post("/annotations/import")
 async def import_table(body: _Import, dashboard: Dash) -> Response:
-    """Add the rows of a CSV table in one edit; rows that exist already are skipped and counted."""
+    """Add the rows of a CSV table in one edit. Return the number of added rows, and the number of rows that
+    were left out because they exist already."""
     contents = await asyncio.to_thread(_imported, body)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new = [content for content in contents if _key(content) not in existing]

@@ -78,42 +78,45 @@ async def change(body: _Changes, dashboard: Dash) -> Response:
 
 @router.post("/parameters/preset")
 async def use_preset(body: _PresetName, dashboard: Dash) -> Response:
-    """Use all values of a preset."""
+    """Use all values of a preset; return them as `GET /api/parameters` does."""
     await dashboard.use_preset(body.name)
     return await read(dashboard)
 
 
 @router.put("/parameters/reach")
 async def reach(body: _Reach, dashboard: Dash) -> Response:
-    """Choose whether changes apply to the whole run or from the current scan onwards."""
+    """Choose whether changes apply to the whole run or from the current scan onwards; return the parameters
+    as `GET /api/parameters` does."""
     await dashboard.reach(whole=body.whole)
     return await read(dashboard)
 
 
 @router.post("/parameters/undo")
 async def undo(dashboard: Dash) -> Response:
-    """Undo the last change."""
+    """Undo the last change of parameters; return them as `GET /api/parameters` does."""
     await dashboard.tune(lambda state: state.undo())
     return await read(dashboard)
 
 
 @router.post("/parameters/redo")
 async def redo(dashboard: Dash) -> Response:
-    """Repeat the change that was undone last."""
+    """Repeat the change that was undone last; return the parameters as `GET /api/parameters` does."""
     await dashboard.tune(lambda state: state.redo())
     return await read(dashboard)
 
 
 @router.post("/parameters/reset")
 async def reset(body: _Reset, dashboard: Dash) -> Response:
-    """Set the named parameters, or all without names, to the values of the preset."""
+    """Set the named parameters, or all without names, to the values of the preset; return the parameters as
+    `GET /api/parameters` does."""
     await dashboard.reset_parameters(list(body.names))
     return await read(dashboard)
 
 
 @router.patch("/view")
 async def choose_view(body: _ViewChoice, dashboard: Dash) -> Response:
-    """Show or hide a layer of the scene, or choose its colours, labels or the camera that follows."""
+    """Show or hide a layer of the scene, or choose colours, labels or whether the view follows the robot;
+    return the view."""
     await dashboard.choose_view(body.name, body.value)
     return json_reply(dashboard.scene.view)
 
@@ -141,7 +144,7 @@ async def save_set(body: SaveSet, dashboard: Dash) -> Response:
 
 @router.post("/sets/use")
 async def use_set(body: _SetName, dashboard: Dash) -> Response:
-    """Use all values of a saved set or a preset."""
+    """Use all values of a saved set or a preset. The response is empty."""
     preset_name, values = dashboard.sets.named(body.name)
     await dashboard.tune(lambda state: state.use(preset_name, values))
     return json_reply({})
@@ -156,7 +159,7 @@ async def delete_set(body: _SetName, dashboard: Dash) -> Response:
 
 @router.post("/sets/upload")
 async def upload_set(body: _ParameterFile, dashboard: Dash) -> Response:
-    """Use the values of a file as `--config` does."""
+    """Use the values of a parameter file, as the flag `--config` does. The response is empty."""
     preset_name, values = await asyncio.to_thread(
         read_file, body.text, body.file, dashboard.parameters.preset
     )

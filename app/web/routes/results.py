@@ -78,7 +78,8 @@ async def evaluation(dashboard: Dash) -> Response:
 
 @router.get("/pairs", dependencies=[ViewerTurn])
 async def pairs(dashboard: Dash) -> Response:
-    """Return the distances between the trees, and their errors where the ground truth is known."""
+    """Return the distances between the first confirmed trees as a matrix [m], with their errors [%] if there
+    is ground truth, see `pairs_payload`."""
     shown = dashboard.shown
     if shown is None:
         return json_reply({"numbers": [], "distance_m": [], "error_percent": None, "left_out": 0})
@@ -117,7 +118,8 @@ async def tree_story(number: Number, dashboard: Dash) -> Response:
 
 @router.get("/camera", dependencies=[ViewerTurn])
 async def camera(dashboard: Dash) -> Response:
-    """Return which camera picture belongs to the current scan, and where trees and clusters are in it."""
+    """Return the stamp of the camera picture of the current scan, and the boxes of trees and clusters in
+    it."""
     if dashboard.shown is None:
         return _nothing_mapped()
     return json_reply(await dashboard.camera.look(dashboard.shown.frame, dashboard.path))
@@ -125,7 +127,7 @@ async def camera(dashboard: Dash) -> Response:
 
 @router.get("/camera/{stamp_ns}.jpg")
 async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
-    """Return a picture that `GET /api/camera` named."""
+    """Return a camera picture by the stamp that `GET /api/camera` returned, as JPEG."""
     content = dashboard.camera.jpeg(stamp_ns)
     if content is None:
         return error_reply(404, "this picture is not kept any more", remedy="Ask for the newest one")
@@ -142,7 +144,7 @@ async def stages(dashboard: Dash) -> Response:
 
 @router.post("/compare", dependencies=[ViewerTurn])
 async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
-    """Return the current scan under two parameter sets."""
+    """Return the current scan, mapped with each of two parameter sets, as a binary block."""
     sets = [_parameters_of(dashboard, name) for name in (body.a, body.b)]
     async with bounds.comparisons.turn():
         frames = await dashboard.worker_client.compare(sets)

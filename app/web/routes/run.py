@@ -107,14 +107,14 @@ async def status(dashboard: Dash) -> Response:
 
 @router.post("/command")
 async def command(body: _AnyCommand, dashboard: Dash) -> Response:
-    """Play, pause, advance, seek or set the speed."""
+    """Play, pause, advance, seek or set the speed. The response is empty; the status reports the result."""
     await dashboard.command(msgspec.convert(body.model_dump(), Command))
     return json_reply({}, 202)
 
 
 @router.post("/loop")
 async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
-    """Repeat a part of the run, or end the repetition."""
+    """Repeat a part of the run, or end the repetition if a time is missing. The response is empty."""
     if body.from_s is None or body.to_s is None:
         dashboard.loop.choose(None)
     elif body.to_s - body.from_s < SHORTEST_LOOP_S:
@@ -126,8 +126,8 @@ async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
 
 @router.post("/open")
 async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Leave the run and open another source, with its parameters if any are given. The status reports the
-    result."""
+    """Close the run and open another source, with its parameters if any are given. The response is empty; the
+    status reports the result."""
     request = permitted_request(
         SourceRequest(
             body.uri,

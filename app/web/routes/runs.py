@@ -67,7 +67,7 @@ async def read_run(key: _Key, dashboard: Dash, settings: Deployment) -> Response
 
 @router.patch("/{number}")
 async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
-    """Rename a run."""
+    """Rename a run; return its number."""
     name = " ".join(body.name.split())
     if not name or not name.isprintable():
         raise BadRequestError("the name is empty or has characters that cannot be shown", where="name")
@@ -76,14 +76,16 @@ async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
 
 @router.delete("/unfinished")
 async def delete_remains(name: _KeyInQuery, settings: Deployment) -> Response:
-    """Delete what an ended run left in the data folder. This cannot be undone."""
+    """Delete the partial output of an ended run in the data folder, which cannot be undone; return its
+    name."""
     await asyncio.to_thread(delete_partial_output, name, settings)
     return json_reply({"name": name})
 
 
 @router.delete("/{number}")
 async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
-    """Delete a run; `restore` brings it back."""
+    """Delete a run that is not open, and return its number; `restore` undoes the deletion. 409 if it is
+    open."""
     if number in request.app.state.open_records():
         here = number == dashboard.run_recorder.record
         what = "this run is open" if here else "this run is open in the dashboard of another robot"
@@ -96,13 +98,14 @@ async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
 
 @router.post("/{number}/restore")
 async def restore(number: Number, dashboard: Dash) -> Response:
-    """Undo a deletion."""
+    """Undo the deletion of a run; return its number."""
     return await _done(dashboard, number, lambda book: book.bring_back(number))
 
 
 @router.post("/{key}/replay")
 async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Open the source of a run again, with its topics, mounting and final parameters."""
+    """Open the source of a run again, with its topics, mounting and final parameters. The response is empty;
+    the status reports the result."""
     run = await _whole(key, settings, dashboard)
     request = request_of_kept(
         run["uri"],

@@ -74,7 +74,7 @@ async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFi
 
 @router.post("/search/use")
 async def use_found(dashboard: Dash) -> Response:
-    """Use the values of the best set, as one change that can be undone."""
+    """Use the values of the best set, as one change that can be undone. The response is empty."""
     preset_name, values, _ = dashboard.search.found()
     await dashboard.tune(lambda state: state.use(preset_name, values))
     return json_reply({})
@@ -90,14 +90,15 @@ async def save_found(body: SaveSet, dashboard: Dash) -> Response:
 
 @router.post("/sensitivity")
 async def start_sensitivity(body: _Sensitivity, dashboard: Dash) -> Response:
-    """Score the whole run over values of a parameter, in their order, and broadcast each score."""
+    """Start to score the whole run over values of a parameter, in their order. The response is empty; each
+    score is broadcast."""
     dashboard.how_much_matters(body.name, list(body.values))
     return json_reply({}, 202)
 
 
 @router.delete("/sensitivity")
 async def stop_sensitivity(dashboard: Dash) -> Response:
-    """Stop the sensitivity analysis."""
+    """Stop the sensitivity analysis. The response is empty."""
     await dashboard.sensitivity.leave()
     return json_reply({})
 
@@ -111,22 +112,23 @@ async def learning_state(request: Request, dashboard: Dash) -> Response:
 
 @router.post("/learning")
 async def start_learning(request: Request, dashboard: Dash) -> Response:
-    """Start to train new decision trees with all annotations; they are not used before `POST
-    /api/learning/use`. Return the progress."""
+    """Start to train new decision trees with all annotations, and return the progress. They are not used
+    before `POST /api/learning/use`."""
     await _learning(request).begin(dashboard.parameters.parameters)
     return json_reply(_learning(request).as_plain(), 202)
 
 
 @router.delete("/learning")
 async def stop_learning(request: Request) -> Response:
-    """Stop the training, or discard its result; the decision trees in force stay."""
+    """Stop the training, or discard its result, and return the progress; the decision trees in force stay."""
     await _learning(request).forget()
     return json_reply(_learning(request).as_plain())
 
 
 @router.post("/learning/use")
 async def use_learned(request: Request, dashboard: Dash) -> Response:
-    """Classify with the new decision trees from now on."""
+    """Classify with the new decision trees from the next scan onwards; return the progress of the
+    training."""
     learned = _learning(request).learned
     if learned is None:
         raise StemmapError("no decision trees were grown", remedy="Grow them first")
