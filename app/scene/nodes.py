@@ -372,7 +372,8 @@ def raster(ground: HeightMap) -> tuple[Float, Float, float]:
 
     Heights have shape (I, J) [m] and are NaN where unknown; one NaN, shape (1, 1), for a map without cells.
     The corner, shape (2,) [m], is the outer corner of cell (0, 0). Two by two cells are averaged, and the
-    side doubles, until at most `MOST_CELLS` cells are known in a grid of at most 100 times as many."""
+    side doubles, until at most `MOST_CELLS` cells are known in a grid of at most 100 times as many.
+    """
     place, height, cell = ground.place.astype(np.int64), ground.height.astype(np.float64), ground.cell
     if len(place) == 0:
         return NOTHING, np.zeros(2), cell

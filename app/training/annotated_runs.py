@@ -65,8 +65,15 @@ class ExampleCollector:
                 marks.append(figures)
 
     def examples(self, scene: str, *, all_around: bool) -> Examples:
-        """Return the examples. Their axis is the position of the annotation, so that the examples of one
-        object can be recognised; its last one comes last. Annotations without a column are left out."""
+        """Return the examples of all annotations with a column, so far.
+
+        Their axis is the position of the annotation, by which the examples of one object can be recognised.
+        Of the examples of an object the newest is the last.
+
+        Args:
+            scene: Name of the scene.
+            all_around: Whether the sensor sees all around.
+        """
         axis, rows, label = [], [], []
         for a, marked, last in zip(self._annotations, self._marked, self._last, strict=True):
             taken = [] if last is None else [*marked, last]
@@ -129,6 +136,11 @@ def annotated_run(source: AnnotatedSource) -> AnnotatedRun:
 
 def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Examples:
     """Return the examples of a run: those stored in the folder, else the run is mapped and they are stored.
+
+    Args:
+        run: The run.
+        kept: Folder of the examples; None stores nothing.
+        progress: Called while the run is mapped.
 
     Raises:
         SourceError: The run cannot be read, or is another recording.

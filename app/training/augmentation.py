@@ -107,7 +107,14 @@ def digest_of(folder: Path) -> str:
 
 
 def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: float) -> Iterator[Examples]:
-    """Yield the examples of a copy of labelled scans, see `paste`."""
+    """Yield the examples of a copy of labelled scans with inserted objects, see `paste`.
+
+    Args:
+        folder: The labelled scans, see `labelled_scans`.
+        copy: Number of the copy, which seeds its objects.
+        parameters: See `columns_of`.
+        reach: Distance from the sensor within which columns become examples [m].
+    """
     made = paste(folder, copy)
     pose = made.pose
     run = [Step(k, Scan(k * PERIOD_NS, points), pose) for k, (points, _) in enumerate(made.scans)]
@@ -171,8 +178,16 @@ def _inserted(place: Float, tree: Bool, rng: np.random.Generator) -> tuple[Solid
 def _seen_with(
     points: Float32, label: Int, solids: Solids, classes: Int, rng: np.random.Generator
 ) -> tuple[Float32, Int]:
-    """Return a scan with objects inserted: without the returns that they hide, with their own visible
-    returns."""
+    """Return points and labels of a scan with inserted objects: without the returns that the objects hide,
+    and with the visible returns of the objects.
+
+    Args:
+        points: The scan, float32, shape (N, 3) [m], sensor frame.
+        label: Its labels, shape (N,).
+        solids: The objects in the sensor frame.
+        classes: Label of each owner of solids.
+        rng: Random numbers of the simulated sensor.
+    """
     lidar = SolidStateLidar(range_sigma=0.02, pattern=int(rng.integers(0, 2**31)))
     level = np.tile(np.eye(3), (lidar.columns, 1, 1)), np.zeros((lidar.columns, 3))
     sweep = sweep_scene(lidar, solids, _NO_GROUND, *level, 0, rng)

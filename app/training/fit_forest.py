@@ -169,7 +169,8 @@ def _class_weight(weight: Float, label: Int, settings: ForestSettings) -> Float:
 
 
 def of_free_end(figures: Float, label: Int) -> Bool:
-    """Return which examples are poles or trees that end in free air, shape (N,)."""
+    """Return which examples are poles or trees with a free upper end (`ends_in_free_air`), shape (N,), from
+    their features and labels."""
     of: Bool = np.isin(label, (TREE, POLE)) & ends_in_free_air(figures)
     return of
 
@@ -177,7 +178,17 @@ def of_free_end(figures: Float, label: Int) -> Bool:
 def fit_all(
     examples: list[Examples], augmented: list[Examples], kinds: Iterable[str] = SETTINGS, seed: int = 0
 ) -> dict[str, FittedForest]:
-    """Fit all forests for some kinds of sensors, by their key in the JSON."""
+    """Return the forests for some kinds of sensors, by their key in the JSON.
+
+    A kind without sufficient examples is left out. With the kind ONE_WAY, the forest FREE_END is added, if
+    the augmented examples are sufficient.
+
+    Args:
+        examples: Examples for the main forests.
+        augmented: Examples of scans with inserted objects, for the forest FREE_END.
+        kinds: Kinds of sensors.
+        seed: Random seed.
+    """
     fitted = {kind: fit(examples, kind, seed) for kind in kinds if can_fit(examples, kind)}
     free_end = fit_free_end(augmented, seed) if ONE_WAY in fitted else None
     return fitted if free_end is None else {**fitted, FREE_END: free_end}

@@ -50,8 +50,14 @@ _VERDICT_OF_KIND = {
 def columns_of(
     run: Iterable[Step], sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters
 ) -> Iterator[Columns]:
-    """Yield the columns of a run that is mapped with its own poses, after each of MARKS scans and at the
-    end."""
+    """Yield the columns of a run that is mapped with the poses of its odometry, each time that the number of
+    scans is one of MARKS, and at the end. A scan that is equal to the one before is skipped.
+
+    Args:
+        run: Steps with the poses.
+        sensor, T_base_lidar: The LiDAR and its pose on the robot.
+        parameters: Parameters of acquisition, ground and classification.
+    """
     taken = 0
     gathering = ColumnClassifier(parameters.classification, all_around=sensor.rings > 0, forests=_no_forest)
     before = b""
@@ -76,7 +82,14 @@ def columns_of(
 
 
 def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: float) -> Iterator[Examples]:
-    """Yield the examples of a simulated street or park; see `simulate_street`."""
+    """Yield the examples of a simulated street or park, see `simulate_street` and `examples_by_points`.
+
+    Args:
+        seed: Seed of the scene.
+        one_way: Whether the sensor looks one way, in a park; otherwise it sees all around, in a street.
+        parameters: See `columns_of`.
+        reach: Distance from the origin within which columns become examples [m].
+    """
     street = simulate_street(seed, one_way=one_way)
     name = f"{'park' if one_way else 'street'} {seed}"
     points, kinds = street.points, np.unique(street.kind)
@@ -89,8 +102,14 @@ def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: flo
 def stand_examples(
     uri: str, parameters: Parameters, every: int, *, furnished: bool = False
 ) -> Iterator[Examples]:
-    """Yield the examples of a simulated run; `furnished` adds objects that are not trees, and only every n-th
-    scan is simulated."""
+    """Yield the examples of a simulated run, with classes by its ground truth.
+
+    Args:
+        uri: Address of the run, `sim:`.
+        parameters: See `columns_of`.
+        every: Only each scan whose number is a multiple of it is simulated.
+        furnished: Whether objects that are not trees are added to the scene.
+    """
     source = SimulatedSource(uri, open_run(replace(parse_uri(uri), furnished=furnished)))
     about, truth = source.description, source.run.true_trees()
     run, around = steps(source.records(every=every)), about.sensor.rings > 0
@@ -198,7 +217,14 @@ def labelled_scans(folder: Path) -> list[tuple[Float32, Int]]:
 
 
 def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
-    """Return the middles (N, 2) [m] of the labelled trunks: points of TRUNK, linked at 0.3 m."""
+    """Return the middles, shape (N, 2) [m], of the labelled trunks: groups of points of class TRUNK, linked
+    at 0.3 m.
+
+    Args:
+        points, label: See `labelled_points`.
+        least: Minimum number of points of a trunk.
+        reach: Maximum distance of a middle from the origin [m].
+    """
     from sklearn.cluster import DBSCAN
 
     cloud = points[label == TRUNK]

@@ -113,7 +113,15 @@ def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
 
 
 def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
-    """Return the fold of each example. A group is in one fold, and the folds have similar shares of trees."""
+    """Return the fold of each example, shape (N,). A group is in one fold, and the folds have similar shares
+    of trees.
+
+    Args:
+        group: Number of the group of each example, shape (N,).
+        tree: Whether it is of a tree, shape (N,).
+        thing: Number of its object, shape (N,); an object counts once, however many examples it has.
+        seed: Random seed.
+    """
     from sklearn.model_selection import StratifiedGroupKFold
 
     _, first = np.unique(thing, return_index=True)  # an object counts once
@@ -154,8 +162,17 @@ def leave_one_out(examples: list[Examples], augmented: list[Examples], share: fl
 
 
 def count(scene: Examples, votes: Float, share: float) -> tuple[int, int, int]:
-    """Return the number of trees that are found, of all trees, and of false ones; columns of unknown class do
-    not count."""
+    """Return the number of trees that are found, of all trees, and of false trees.
+
+    Columns with the required share of votes are accepted, those with most votes first; of columns within
+    APART only the first counts. An accepted column is right within APART of a tree, and false elsewhere
+    unless its class is unknown.
+
+    Args:
+        scene: Examples of one scene.
+        votes: Share of the votes for a tree of each example, shape (N,).
+        share: Required share.
+    """
     place = scene.axis[:, :2]
     accepted = np.argsort(-votes, kind="stable")
     kept = _apart(place, accepted[votes[accepted] >= share])

@@ -61,7 +61,8 @@ def corrected_voxels(memory: VoxelMap, correction: PathCorrection) -> VoxelMap:
 
 
 def _room(room: int, keys: Int) -> int:
-    """Return the number of rows for tiles, at least as many as before: a rotated tile covers up to four."""
+    """Return the number of rows for the tiles of some voxels: `room`, doubled until they fit. A rotated tile
+    covers up to four tiles."""
     tiles = len(np.unique(tiles_of(keys)))
     while room <= tiles:
         room *= 2
@@ -117,7 +118,7 @@ def seen_higher(columns: Columns) -> Int:
 @compiled
 def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
     """Return the increase of the visible height of each column since its features were computed, shape (K,)
-    [m]."""
+    [m]; arguments are columns of `Columns`."""
     gain = np.zeros(viewed.shape[0])
     for k in range(gain.shape[0]):
         highest = 0
@@ -319,7 +320,16 @@ def _among(home: Int, tiles: Int) -> Bool:
 
 @compiled
 def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_max: float) -> Float32:
-    """Return x, y in the frame of the map and the height of the points in range, float32, shape (M, 3)."""
+    """Return x, y in the frame of the map and height above the ground [m] of the points in range and between
+    0 and SLICES * SLICE above the ground, float32, shape (M, 3).
+
+    Args:
+        points: Level sensor frame, shape (N, 3) [m].
+        height: Their heights above the ground, shape (N,) [m].
+        pose: x, y [m], yaw [rad] of the base.
+        offset: Position of the sensor in the base frame, shape (3,) [m].
+        range_max: Maximum horizontal distance from the base [m].
+    """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     kept = np.empty((points.shape[0], 3), np.float32)
     n = 0
@@ -334,7 +344,8 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
 
 @compiled
 def _nearest_before(old: Float, axis: Float, first: int) -> Int:
-    """Return for each column from a row onwards the nearest earlier one within SAME, -1 without."""
+    """Return for each column from row `first` of `axis` onwards the row of the nearest column of `old` within
+    SAME, -1 without; shape (K - first,)."""
     nearest = np.full(axis.shape[0] - first, -1, np.int64)
     for k in range(first, axis.shape[0]):
         best = SAME * SAME

@@ -70,8 +70,14 @@ def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
 
 @compiled
 def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) -> Float:
-    """Return the sum over the slices of the logarithm of the returns in a cell and its eight neighbours; 0
-    with returns in fewer than `LEAST` slices."""
+    """Return for each cell the sum over the slices of log(1 + n), where n is the number of returns in the
+    cell and its eight neighbours; 0 with returns in fewer than `LEAST` slices. Shape (cells, cells).
+
+    Args:
+        mean, returns, low: See `find_columns`.
+        cells: Number of cells per side of the tile with its margin.
+        high: One past the last slice; the first is LOW.
+    """
     block = np.zeros((cells, cells, high - LOW), np.float32)
     for i in range(mean.shape[0]):
         a = int(np.floor((mean[i, 0] - low[0] + MARGIN) / SIDE))
@@ -100,8 +106,8 @@ def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) 
 
 @compiled
 def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
-    """Sort the voxels into horizontal buckets of side `BUCKET`; return order (N,) and bounds (buckets +
-    1,)."""
+    """Sort the voxels into horizontal buckets of side `BUCKET`. Return the order of the voxels, shape (N,),
+    and the first row of each bucket in this order, shape (buckets + 1,). Arguments as in `find_columns`."""
     across = int(np.ceil((side + 2 * MARGIN) / BUCKET))
     bucket = np.empty(mean.shape[0], np.int64)
     for i in range(mean.shape[0]):
@@ -113,7 +119,14 @@ def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
 
 @compiled
 def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
-    """Return the runs of rows (first, one past the last) of the buckets around a position, shape (3, 2)."""
+    """Return the rows of the three by three buckets around a position as runs (first, one past the last),
+    shape (3, 2).
+
+    Args:
+        x, y: The position [m].
+        low: Corner of the tile, shape (2,) [m].
+        bounds: Second result of `in_buckets`.
+    """
     across = int(np.sqrt(bounds.shape[0] - 1) + 0.5)
     a = min(max(int((x - low[0] + MARGIN) / BUCKET), 0), across - 1)
     b = min(max(int((y - low[1] + MARGIN) / BUCKET), 0), across - 1)
@@ -157,7 +170,7 @@ def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Flo
 
 @compiled
 def _is_known(axis: Float, found: Float, kept: int) -> bool:
-    """Return whether the search over other heights has given the same axis."""
+    """Return whether one of the first `kept` rows of `found` is the same axis, within TWIN."""
     known = False
     for k in range(kept):
         known |= abs(axis[0] - found[k, 0]) < TWIN and abs(axis[1] - found[k, 1]) < TWIN
@@ -166,8 +179,15 @@ def _is_known(axis: Float, found: Float, kept: int) -> bool:
 
 @compiled
 def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: float) -> None:
-    """Refine an axis. The weight of a slice is the share of its returns that is at the axis, not their
-    number, so that foliage does not shift the axis. A weak prior keeps it upright."""
+    """Refine an axis, in place. The weight of a slice depends mainly on the share of its returns that is at
+    the axis, less on their number, so that foliage does not shift the axis. A weak prior keeps it upright.
+
+    Args:
+        axis: See `find_columns`; position and shift per metre are changed.
+        mean, returns: Voxels in the order of buckets.
+        runs: Result of `near_rows`.
+        reach: Distance within which a return is at the axis [m].
+    """
     w, x, y, around = np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES), np.zeros(SLICES)
     for run in range(runs.shape[0]):
         for i in range(runs[run, 0], runs[run, 1]):

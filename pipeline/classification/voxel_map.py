@@ -318,7 +318,16 @@ def _select_due(tables: _Tables, tiles: int, grown: float, most: int) -> Int:
 def _add(
     points: Float32, begin: int, scan: int, tables: _Tables, used: int, tiles: int
 ) -> tuple[int, int, int]:
-    """Return the first point without room (the number of points when all fit), voxels and tiles in use."""
+    """Add points from row `begin` onwards until the tables are full. Return the first point without room (the
+    number of points when all fit), and the numbers of voxels and tiles in use.
+
+    Args:
+        points: See `VoxelMap.add`.
+        begin: First point to add.
+        scan: Number of the scan.
+        tables: The tables, changed in place.
+        used, tiles: Voxels and tiles in use.
+    """
     keys, slot, mean, latest = tables.key, tables.slot, tables.mean, tables.latest
     returns, scans, home, tile_returns = tables.returns, tables.scans, tables.home, tables.tile_returns
     wanted = keys_of(points)
