@@ -366,7 +366,9 @@ class Mapper:
         p = self._parameters.relocalisation
         if self._relocaliser.is_searching:
             return None
-        if p.method != "none" and detection.is_due(index, self._path.sigma_xy):
+        if p.method != "none" and detection.is_due(
+            index, self._path.sigma_xy, self._slam.state.places.contradicted
+        ):
             with self._timer("slam"):
                 loop = detection.find_loop(self._history(estimate), p)
             if loop is not None:
@@ -377,6 +379,7 @@ class Mapper:
         return detection.RunHistory(
             self._path.stamp_ns, self._slam.path(), self._tracker.trees(), self._slam.begun_since, estimate,
             noise_of(self._parameters.slam), self._path.motion, self._placed, self._closed,
+            self._slam.state.places.contradicted,
         )  # fmt: skip
 
     def _apply(

@@ -53,6 +53,8 @@ class RunHistory:
         motion: x, y [m], yaw [rad] by odometry from each scan to the next, shape (N, 3).
         placed: Scan at which the pose was last set from outside; the path begins there.
         closed: Scan at which the last loop was closed; the path before it has no drift left.
+        contradicted: Whether the newest scan shows trees where known places have others; see
+            `slam.places`.
     """
 
     stamp_ns: Int
@@ -64,6 +66,7 @@ class RunHistory:
     motion: Float
     placed: int
     closed: int = 0
+    contradicted: bool = False
 
     def scan_of(self, stamp_ns: Int) -> Int:
         """Return the scan of each time, the newest scan for later times."""
@@ -71,7 +74,7 @@ class RunHistory:
         return scan
 
 
-def is_due(index: int, sigma_xy: Float) -> bool:
+def is_due(index: int, sigma_xy: Float, contradicted: bool) -> bool:
     """Return whether a search is due after a scan.
 
     A pose that was uncertain and is no longer may have been corrected by the wrong trees, so the search goes
@@ -80,8 +83,9 @@ def is_due(index: int, sigma_xy: Float) -> bool:
     Args:
         index: Number of the scan.
         sigma_xy: Standard deviation of the position at each scan so far, shape (N,) [m].
+        contradicted: See RunHistory.
     """
-    return index % EVERY == 0 and bool(sigma_xy[-RECENT:].max(initial=0.0) > UNSURE)
+    return index % EVERY == 0 and (contradicted or bool(sigma_xy[-RECENT:].max(initial=0.0) > UNSURE))
 
 
 def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
@@ -142,7 +146,7 @@ def loop_to(
     if first >= last_mapped:
         return None
     gap = _gap(T_map_base, path[-1])
-    if np.hypot(gap[0], gap[1]) < LEAST_GAP:
+    if np.hypot(gap[0], gap[1]) < LEAST_GAP and not run.contradicted:
         return None
     since = drift_of(path, first, run.noise)
     if _is_beyond(gap, (since if spread is None else spread) + R):

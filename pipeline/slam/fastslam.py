@@ -14,21 +14,14 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.config.stages import Slam
-from pipeline.geometry.gaussian import rows_of
+from pipeline.geometry.gaussian import pose_of, rows_of
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.best_particle import are_apart, best_after_resampling, select_best
 from pipeline.slam.frame_uncertainty import NOISE, FrameUncertainty, at_least
-from pipeline.slam.keyframe_graph import (
-    REVISIT_DISTANCE,
-    Keyframe,
-    KeyframeGraph,
-    ScanDetections,
-    Solution,
-    combined,
-)
+from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, ScanDetections, Solution, combined
 from pipeline.slam.loop_correction import (
     Loop,
     corrected_landmarks,
@@ -39,8 +32,9 @@ from pipeline.slam.loop_correction import (
 from pipeline.slam.measurement_update import against_slip, estimated, use_scan
 from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrapped
 from pipeline.slam.particle_ancestry import Genealogy
-from pipeline.slam.particle_maps import shared_map, take_ancestors
+from pipeline.slam.particle_maps import known_near, shared_map, take_ancestors
 from pipeline.slam.particle_update import Rules
+from pipeline.slam.places import ODDS, agreement
 from pipeline.slam.pose_quality import is_lost, pose_health
 from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
@@ -94,7 +88,10 @@ class FastSlam:
             )
         else:
             scan, weights, births = ScanStatistics(), normalised(state.log_weight), None
-        estimate, frame, by_trees = _estimate(state, weights, p, _farthest(detections) if used else 0.0)
+        reach = _farthest(detections) if used else 0.0
+        estimate, frame, by_trees = _estimate(state, weights, p, reach)
+        if births is not None:
+            state = self._with_places(state, births[state.best], detections.centre, R, estimate, reach)
         if used:
             at = estimate.T_map_base.as_array()
             corrected = state.shared.corrected(at, estimate.covariance if by_trees else None)
@@ -194,8 +191,6 @@ class FastSlam:
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        # Just before the loop, associations by the drifted path may be wrong.
-        graph = graph.without_revisits(state.distance - REVISIT_DISTANCE)
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance)
         solution = graph.solve(new_loop=True)
         if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
@@ -235,6 +230,7 @@ class FastSlam:
         self.state = replace(
             self.state,
             maps=shared_map(particles, moved if names is None else joined(moved, *names)),
+            places=before.places if names is None else before.places.with_seen(before.distance, names[1]),
             genealogy=Genealogy.of_path(after, particles),
             recent=before.recent,
             frame=frame.without_hidden(),
@@ -322,7 +318,7 @@ class FastSlam:
         )
         maps, weights, mean, odometry, births = use_scan(
             state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
-            state.detections, rules, shared.for_particles(measured),
+            state.detections, state.places.for_kernels(), rules, shared.for_particles(measured),
         )  # fmt: skip
         if trees.slipped:
             odometry = disagreement(motion, state.motion, state.motion_covariance)
@@ -342,6 +338,32 @@ class FastSlam:
             shared=shared,
         )
         return state, scan, weights, births
+
+    def _with_places(
+        self, state: SlamState, births: Int, centre: Float, R: Float, estimate: PoseEstimate, reach: float
+    ) -> SlamState:
+        """Return the state with the places that a scan shows, among them known ones that agree with it.
+
+        Args:
+            state: State after the scan.
+            births: Birth numbers of the landmarks of the detections in the best particle, shape (D,).
+            centre, R: The detections.
+            estimate: Pose after the scan.
+            reach: Distance of the farthest detection [m].
+        """
+        distance = state.distance
+        places = state.places.with_scan(distance, state.detections - len(centre), births[births >= 0])
+        if len(centre) and places.is_old(distance).any():
+            x, y, yaw = state.pose[state.best].tolist()
+            mean, covariance, hits, birth = known_near(state.maps, state.best, x, y, reach)
+            rows = (hits >= self.parameters.hits_to_weigh) & places.of_old(birth, distance)
+            pose = pose_of(np.array([x, y, yaw]), _relative(estimate))
+            odds, agrees, near = agreement(pose, centre, R, mean[rows], covariance[rows])
+            if odds > ODDS:
+                places = places.with_seen(distance, birth[rows][agrees])
+            elif odds < -ODDS:
+                places = places.with_contradiction(birth[rows][near])
+        return replace(state, places=places)
 
     def _with_keyframe(self, state: SlamState, detections: Detections, birth: Int) -> SlamState:
         """Return the state with the detections of this scan, and with a keyframe if the last one is far.
@@ -387,7 +409,8 @@ class FastSlam:
     def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> TreeMotion:
         return against_slip(
             state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
-            state.recent.odometry_trust(noise_of(self.parameters)), centre, R, rules,
+            state.recent.odometry_trust(noise_of(self.parameters)), centre, R,
+            state.places.for_kernels(), rules,
         )  # fmt: skip
 
     def _shared(
@@ -441,36 +464,35 @@ def rules_of(p: Slam) -> Rules:
 def _estimate(
     state: SlamState, weights: Float, p: Slam, reach: float
 ) -> tuple[PoseEstimate, FrameUncertainty, bool]:
-    """The pose, the memory of the frame after it, and, asked for only where poses of another source count,
-    whether landmarks within `reach` [m] told it."""
+    """Return the pose, the uncertainty of the frame after it, and whether landmarks within `reach` [m]
+    determine it (always False where no other source measures poses)."""
     pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
     landmarks = state.map_of(state.best)
+    active = state.places.is_active(landmarks.birth)
+    known = landmarks.take(active)
     covariance, frame = state.frame.with_pose(
-        mean, spread, n_eff, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
+        mean, spread, n_eff, known.mean, known.birth, known.hits, p.hits_to_weigh, reach
     )
     by_trees = False
     if state.shared.begun:
-        by_trees = frame.observes_known(
-            mean, landmarks.mean, landmarks.birth, landmarks.hits, p.hits_to_weigh, reach
-        )
+        by_trees = frame.observes_known(mean, known.mean, known.birth, known.hits, p.hits_to_weigh, reach)
         shared = state.shared.moved(state.motion, state.motion_covariance)
-        known = covariance if by_trees else None
+        by_landmarks = covariance if by_trees else None
         if not by_trees and len(shared.by_trees):
-            # What trees told last still holds, but for the odometry since then: a scan that shows none is no
-            # reason to know the place as badly as the other source does.
-            known = at_least(spread, shared.by_trees, NOISE / np.sqrt(n_eff))
-        covariance, frame = frame.with_measured_pose(spread, n_eff, shared.joint[:3, :3], known)
-    told = mean
+            # Without trees in view, the covariance by the last trees holds, enlarged by the odometry since.
+            by_landmarks = at_least(spread, shared.by_trees, NOISE / np.sqrt(n_eff))
+        covariance, frame = frame.with_measured_pose(spread, n_eff, shared.joint[:3, :3], by_landmarks)
+    reported = mean
     if are_apart(pose, weights, p.distance_max):
-        # Of hypotheses that trees tell apart the mean is none: where one of them stands, its trees fit. About
-        # another point than the mean a second moment is larger by the square of the way there (Steiner).
-        told = pose[state.best]
-        away = told - mean
+        # The mean of separate hypotheses agrees with no map, so the best particle is reported. The second
+        # moment about it is larger than the covariance by the square of its distance from the mean (Steiner).
+        reported = pose[state.best]
+        away = reported - mean
         away[2] = wrapped(away[2])
         steiner = np.outer(away, away)
         covariance, spread = covariance + steiner, spread + steiner
     estimate = PoseEstimate(
-        T_map_base=Pose2(float(told[0]), float(told[1]), float(told[2])),
+        T_map_base=Pose2(float(reported[0]), float(reported[1]), float(reported[2])),
         covariance=covariance,
         particles=pose,
         weights=weights,

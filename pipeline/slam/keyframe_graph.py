@@ -19,6 +19,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.motion import compounded
+from pipeline.slam.places import REVISIT_DISTANCE
 from pipeline.slam.poses import composed, inverse, rotated_rows
 from pipeline.types.records import Int
 
@@ -31,8 +32,6 @@ STEMS_MAX = 64
 GOLDEN = 0.6180339887498949  # golden ratio; its multiples modulo 1 order the stems evenly and reproducibly
 #: Keyframes of the graph; beyond it every second one is dropped, which bounds the cost of a solution.
 KEYFRAMES_MAX = 2000
-#: m of path without a view of a stem; a view after it is a revisit.
-REVISIT_DISTANCE = 30.0
 #: Growth of the graph between two solutions: a share of it, and at least so many keyframes. All solutions
 #: of a run together cost a bounded multiple of the last one.
 GROWTH, GROWTH_MIN = 0.1, 5
@@ -243,21 +242,6 @@ class KeyframeGraph:
             return replace(keyframe, birth=np.where(birth[row] == keyframe.birth, name[row], keyframe.birth))
 
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
-
-    def without_revisits(self, distance: float) -> KeyframeGraph:
-        """Return the graph without associations by a path that had drifted: keyframes from a distance driven
-        [m] on lose the detections of landmarks that were begun more than REVISIT_DISTANCE before it."""
-        recent = [k.first_birth for k in self.keyframes if k.distance >= distance - REVISIT_DISTANCE]
-
-        def cleaned(keyframe: Keyframe) -> Keyframe:
-            if keyframe.distance < distance:
-                return keyframe
-            keep = keyframe.birth >= recent[0]
-            return replace(
-                keyframe, birth=keyframe.birth[keep], centre=keyframe.centre[keep], R=keyframe.R[keep]
-            )
-
-        return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
 
     def thinned(self) -> KeyframeGraph:
         """Return the graph without every second keyframe and its detections; motions are compounded. The ends

@@ -10,6 +10,7 @@ from pipeline.slam.candidate_pairs import room_for
 from pipeline.slam.motion import OdometryTrust, moved_pose, moved_poses, weighted_pose
 from pipeline.slam.particle_maps import ROOM, Maps, blocks_in_reach, known_near, with_room
 from pipeline.slam.particle_update import Rules, near_for, observe, predict
+from pipeline.slam.places import Inactive, is_inactive
 from pipeline.slam.resampling import normalised
 from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
 from pipeline.slam.scan_statistics import STATISTICS, mean_statistics
@@ -29,6 +30,7 @@ def against_slip(
     wheels: OdometryTrust,
     centre: Float,
     R: Float,
+    places: Inactive,
     rules: Rules,
 ) -> TreeMotion:
     """Return the motion by odometry, corrected with the map of the best particle, see `motion_by_trees`. With
@@ -38,14 +40,17 @@ def against_slip(
         pose: Poses before the motion, shape (P, 3).
         maps: Maps of the particles.
         best: Row of the best particle.
-        motion, motion_covariance, centre, R, rules: See `particle_update.observe`.
+        motion, motion_covariance, centre, R, places, rules: See `particle_update.observe`.
         driven: Path length since the last used scan [m], see `drift_variances`.
         wheels: Trust in the odometry.
     """
     if centre.shape[0] < FEWEST_PAIRS:
         return TreeMotion(False, motion.copy(), motion_covariance.copy(), False)
     at = moved_pose(pose[best], motion)
-    known, spread, hits = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
+    known, spread, hits, birth = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
+    if places.inactive.shape[0]:
+        active = np.array([not is_inactive(b, places) for b in birth], np.bool_)
+        known, spread, hits = known[active], spread[active], hits[active]
     return motion_by_trees(
         pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,
         rules.hits_to_weigh, rules.gate,
@@ -64,6 +69,7 @@ def use_scan(
     R: Float,
     clear_range: Float,
     first_birth: int,
+    places: Inactive,
     rules: Rules,
     measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, float, Int]:
@@ -89,7 +95,7 @@ def use_scan(
     births = np.empty((pose.shape[0], found), np.int64)
     observe(
         pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
-        clear_range, reach, first_birth, rules, near, room, statistics, measured, births, np.empty(3),
+        clear_range, reach, first_birth, places, rules, near, room, statistics, measured, births, np.empty(3),
         np.zeros((3, 3)),
     )  # fmt: skip
     log_weight -= log_weight.max()

@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
-from pipeline.types.records import Float32, Int, Int32
+from pipeline.types.records import Bool, Float32, Int, Int32
 
 ROOM = 16  # landmarks per block; landmarks with successive births are near each other
 
@@ -57,6 +57,12 @@ class MapColumns(NamedTuple):
     hits: Int32
     score: Float32
     birth: Int
+
+    def take(self, rows: Int | Bool) -> MapColumns:
+        """Return some of the landmarks."""
+        return MapColumns(
+            self.mean[rows], self.covariance[rows], self.hits[rows], self.score[rows], self.birth[rows]
+        )
 
 
 def empty_maps(particles: int) -> Maps:
@@ -232,11 +238,12 @@ def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
 
 
 @compiled
-def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32]:
+def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32, Int]:
     """Return the landmarks of particle p within `reach` [m] of x, y [m]: positions, shape (L, 2) [m];
-    covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, shape (L,)."""
+    covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, and birth numbers, int64, shape (L,)."""
     places = maps.places[p]
     mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
+    birth = np.empty(places, np.int64)
     n = 0
     for k in range((maps.places[p] + ROOM - 1) // ROOM):
         b = maps.block[p, k]
@@ -250,9 +257,9 @@ def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Fl
                 mean[n, 0], mean[n, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
                 for a in range(3):
                     covariance[n, a] = maps.covariance[b, o, a]
-                hits[n] = maps.hits[b, o]
+                hits[n], birth[n] = maps.hits[b, o], maps.birth[b, o]
                 n += 1
-    return mean[:n], covariance[:n], hits[:n]
+    return mean[:n], covariance[:n], hits[:n], birth[:n]
 
 
 @compiled

@@ -15,6 +15,7 @@ from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.slam.candidate_pairs import Room
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.particle_maps import ROOM, Maps, own_block, widen
+from pipeline.slam.places import Inactive, is_inactive
 from pipeline.slam.proposal import recognise
 from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.shared_errors import MeasuredPose, correct_by_measured, update_shared_errors
@@ -133,6 +134,7 @@ def observe(
     clear_range: Float,
     reach: float,
     first_birth: int,
+    places: Inactive,
     rules: Rules,
     near: Near,
     room: Room,
@@ -158,6 +160,7 @@ def observe(
         clear_range: Free range per direction [m], see `FastSlam.process`.
         reach: Distance beyond which landmarks are not used [m].
         first_birth: Birth number of the first detection.
+        places: Places whose landmarks are not used.
         rules: Parameters.
         near, room: Work arrays for the landmarks in reach and for pairs.
         statistics: Statistics of the scan by particle, shape (P, STATISTICS); filled.
@@ -175,7 +178,7 @@ def observe(
             _turned_covariance(motion_covariance, before_c, before_s, P)
         if measured.z.shape[0] > 0:
             log_weight[p] += correct_by_measured(mu, P, measured, p)
-        known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, near)
+        known, free = _gather(maps, p, near_blocks, near_lengths[p], mu, reach, places, near)
         fill(near.cells, near.mean, known, scale)
         likelihood = recognise(
             mu, P, centre, R, near.mean, near.covariance, near.hits, near.cells, scale,
@@ -207,10 +210,17 @@ def observe(
 
 @compiled_within
 def _gather(
-    maps: Maps, p: int, near_blocks: Int32, blocks: int, mu: Float, reach: float, near: Near
+    maps: Maps,
+    p: int,
+    near_blocks: Int32,
+    blocks: int,
+    mu: Float,
+    reach: float,
+    places: Inactive,
+    near: Near,
 ) -> tuple[int, int]:
-    """Fill `near` with the landmarks of particle p within `reach` [m] of the pose mu; return their number and
-    the number of unused places."""
+    """Fill `near` with the active landmarks of particle p within `reach` [m] of the pose mu; return their
+    number and the number of unused rows of its blocks."""
     n, free = 0, 0
     count = maps.places[p]
     for i in range(blocks):
@@ -223,7 +233,7 @@ def _gather(
                 continue
             x, y = maps.mean[b, o, 0], maps.mean[b, o, 1]
             dx, dy = x - mu[0], y - mu[1]
-            if dx * dx + dy * dy > reach * reach:
+            if dx * dx + dy * dy > reach * reach or is_inactive(maps.birth[b, o], places):
                 continue
             near.block[n], near.place[n] = k, o
             near.mean[n, 0], near.mean[n, 1] = x, y

@@ -12,6 +12,7 @@ from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import KeyframeGraph, ScanDetections
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
+from pipeline.slam.places import Places
 from pipeline.slam.resampling import normalised
 from pipeline.slam.running_statistics import RunningStatistics
 from pipeline.slam.shared_errors import SharedErrors
@@ -38,6 +39,7 @@ class SlamState:
         keyframe_covariance: Covariance of `keyframe_motion`, shape (3, 3).
         distance: Distance driven, with 1 m per radian of turn [m].
         since_keyframe: Detections of the scans since the last keyframe.
+        places: Places of the path, and which of them are active.
         shared: Errors that the measured poses of one source share. They are not saved, because the source of
             a continued run has other errors.
     """
@@ -58,6 +60,7 @@ class SlamState:
     keyframe_covariance: Float = field(default_factory=lambda: np.zeros((3, 3)), metadata={ADDED: None})
     distance: float = field(default=0.0, metadata={ADDED: None})
     since_keyframe: tuple[ScanDetections, ...] = field(default=(), metadata={ADDED: None})
+    places: Places = field(default_factory=Places, metadata={ADDED: None})
     shared: SharedErrors = field(default_factory=SharedErrors, metadata={NOT_SAVED: True})
 
     @classmethod

@@ -1,0 +1,191 @@
+"""Places along the path, and whether their landmarks take part in the data association.
+
+Data association by distance needs a pose whose error is smaller than the distance between trees. After a
+long way this holds for the landmarks that the robot has just seen, but not always for those of a place that
+it left long ago: each detection is then associated with the old landmark next to it, and many such
+associations confirm a wrong pose. At a place that the robot has not seen for REVISIT_DISTANCE, the detections
+are therefore compared with the landmarks (`agreement`). If they agree about as often as by chance, the
+landmarks of the place are inactive until the pose is corrected, by a loop or by other places.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from pipeline.geometry.gaussian import Pose, expected_spread
+from pipeline.geometry.poses import Float
+from pipeline.jit import compiled, compiled_within
+from pipeline.types.records import Bool, Int
+
+#: m of path without a view of a place, after which a view of it is a revisit.
+REVISIT_DISTANCE = 30.0
+PLACE = 5.0  # m of path; the landmarks that are begun within it belong to one place
+GATE = 3.0  # sigma; a detection agrees with a landmark within it
+WINDOW = 8.0  # m; radius in which the density of landmarks is measured
+AGREEING = 0.4  # share of the landmarks of a known place that a scan shows at least; others are hidden
+ODDS = math.log(100.0)  # log odds of a known place, at which it is accepted, and below minus which it is not
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """M places along the path. Instances are immutable.
+
+    Attributes:
+        birth: int64, shape (M,), ascending. Landmarks with this birth number or a later one, up to the next
+            row, belong to the place.
+        distance: Distance driven at each place, shape (M,) [m].
+        seen: Distance driven when the place was last seen for certain, shape (M,) [m].
+        inactive: Which places the detections contradict, shape (M,).
+        contradicted: Whether the last scan contradicts a place.
+    """
+
+    birth: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+    distance: Float = field(default_factory=lambda: np.zeros(0))
+    seen: Float = field(default_factory=lambda: np.zeros(0))
+    inactive: Bool = field(default_factory=lambda: np.zeros(0, np.bool_))
+    contradicted: bool = False
+
+    def with_scan(self, distance: float, first_birth: int, birth: Int) -> Places:
+        """Return the places after a scan.
+
+        Args:
+            distance: Distance driven [m].
+            first_birth: Birth number of the first landmark that the scan may begin.
+            birth: Birth numbers of the landmarks that it shows, int64, shape (D,). A place that was not seen
+                for REVISIT_DISTANCE is not seen for certain by them; see `with_seen`.
+        """
+        places = self
+        if not len(self.birth) or distance - self.distance[-1] >= PLACE:
+            places = replace(
+                self,
+                birth=np.append(self.birth, first_birth),
+                distance=np.append(self.distance, distance),
+                seen=np.append(self.seen, distance),
+                inactive=np.append(self.inactive, False),
+            )
+        row = np.unique(places._row(birth))
+        row = row[row >= 0]
+        seen = places.seen.copy()
+        seen[row[~places.is_old(distance)[row]]] = distance
+        return replace(places, seen=seen, contradicted=False)
+
+    def with_seen(self, distance: float, birth: Int) -> Places:
+        """Return the places after landmarks of the given birth numbers were seen for certain: their places
+        and those within REVISIT_DISTANCE of them along the path are active."""
+        near = self._near(birth)
+        return replace(self, seen=np.where(near, distance, self.seen), inactive=self.inactive & ~near)
+
+    def with_contradiction(self, birth: Int) -> Places:
+        """Return the places after the detections contradicted landmarks of the given birth numbers: their
+        places are inactive."""
+        inactive = self.inactive.copy()
+        row = self._row(birth)
+        inactive[row[row >= 0]] = True
+        return replace(self, inactive=inactive, contradicted=True)
+
+    def is_old(self, distance: float) -> Bool:
+        """Return which places were not seen for REVISIT_DISTANCE at a distance driven [m], shape (M,)."""
+        old: Bool = self.seen < distance - REVISIT_DISTANCE
+        return old
+
+    def of_old(self, birth: Int, distance: float) -> Bool:
+        """Return which landmarks belong to old places, shape (L,), by birth numbers of shape (L,)."""
+        row = self._row(birth)
+        return (row >= 0) & self.is_old(distance)[row] if len(self.birth) else row >= 0
+
+    def is_active(self, birth: Int) -> Bool:
+        """Return which landmarks belong to active places, shape (L,), by birth numbers of shape (L,)."""
+        row = self._row(birth)
+        return (row < 0) | ~self.inactive[row] if len(self.birth) else row < 0
+
+    def for_kernels(self) -> Inactive:
+        """Return the inactive places."""
+        return Inactive(self.birth, self.inactive if self.inactive.any() else self.inactive[:0])
+
+    def _row(self, birth: Int) -> Int:
+        """Return the place of each landmark, -1 for those that precede all places."""
+        return np.searchsorted(self.birth, birth, side="right") - 1
+
+    def _near(self, birth: Int) -> Bool:
+        """Return which places are within REVISIT_DISTANCE along the path of those of some landmarks."""
+        row = np.unique(self._row(birth))
+        at = self.distance[row[row >= 0]]
+        change = np.zeros(len(self.birth) + 1, np.int64)
+        np.add.at(change, np.searchsorted(self.distance, at - REVISIT_DISTANCE), 1)
+        np.add.at(change, np.searchsorted(self.distance, at + REVISIT_DISTANCE, side="right"), -1)
+        near: Bool = np.cumsum(change[:-1]) > 0
+        return near
+
+
+class Inactive(NamedTuple):
+    """The inactive places as kernels take them.
+
+    Attributes:
+        birth: See Places.
+        inactive: See Places; empty if no place is inactive.
+    """
+
+    birth: Int
+    inactive: Bool
+
+
+@compiled_within
+def is_inactive(birth: int, places: Inactive) -> bool:
+    """Return whether the landmark of a birth number belongs to an inactive place."""
+    low, high = 0, places.inactive.shape[0]
+    while low < high:
+        middle = (low + high) // 2
+        if places.birth[middle] <= birth:
+            low = middle + 1
+        else:
+            high = middle
+    return low > 0 and places.inactive[low - 1]
+
+
+@compiled
+def agreement(
+    pose: Pose, centre: Float, R: Float, mean: Float, covariance: Float
+) -> tuple[float, Bool, Bool]:
+    """Return the log odds that detections show the given landmarks and not others, which landmarks agree with
+    a detection, and which have a detection within WINDOW, shape (L,).
+
+    A landmark agrees with one of the detections around it, which have the density rho, by chance with the
+    probability p = 1 - exp(-rho A), where A is the area of the gate, and at the right place with AGREEING (or
+    p, if that is larger). The odds are the product of the ratios of both over the landmarks with a detection
+    within WINDOW.
+
+    Args:
+        pose: Pose with its covariance relative to the active landmarks.
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        mean: Positions of the landmarks, shape (L, 2) [m].
+        covariance: Their covariances xx, xy, yy, shape (L, 3) [m^2].
+    """
+    c, s = np.cos(pose.yaw), np.sin(pose.yaw)
+    n = mean.shape[0]
+    agrees, close = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    area = np.zeros(n)
+    for d in range(centre.shape[0]):
+        ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
+        s0, s1, s2 = expected_spread(pose, c, s, ax, ay, R, d)
+        for j in range(n):
+            y0, y1 = mean[j, 0] - pose.x - ax, mean[j, 1] - pose.y - ay
+            if y0 * y0 + y1 * y1 > WINDOW * WINDOW:
+                continue
+            S0, S1, S2 = s0 + covariance[j, 0], s1 + covariance[j, 1], s2 + covariance[j, 2]
+            det = S0 * S2 - S1 * S1
+            area[j] += np.pi * GATE * GATE * np.sqrt(det)
+            d2 = (S2 * y0 * y0 - 2.0 * S1 * y0 * y1 + S0 * y1 * y1) / det
+            close[j] = True
+            agrees[j] |= d2 < GATE * GATE
+    odds = 0.0
+    for j in range(n):
+        if close[j]:
+            p = 1.0 - np.exp(-area[j] / (np.pi * WINDOW * WINDOW))
+            q = max(p, AGREEING)
+            odds += np.log(q / p) if agrees[j] else np.log((1.0 - q) / (1.0 - p)) if p < q else 0.0
+    return odds, agrees, close

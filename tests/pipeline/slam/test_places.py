@@ -1,0 +1,128 @@
+"""Known places: active while the detections agree with them, inactive while they contradict them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from pipeline.config import preset
+from pipeline.geometry.gaussian import Pose
+from pipeline.geometry.poses import Pose2
+from pipeline.slam import FastSlam
+from pipeline.slam.places import (
+    AGREEING,
+    GATE,
+    ODDS,
+    PLACE,
+    REVISIT_DISTANCE,
+    WINDOW,
+    Places,
+    agreement,
+    is_inactive,
+)
+from tests.pipeline.strategies import seeds
+
+R = [0.03**2, 0.0, 0.03**2]
+EXACT = Pose(0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-8)
+
+
+def line(scans: int = 31, step: float = PLACE) -> Places:
+    """Places of a straight path with one landmark at each scan, which only this scan shows."""
+    places = Places()
+    for k in range(scans):
+        places = places.with_scan(k * step, k, np.array([k]))
+    return places
+
+
+def of_stand(trees: np.ndarray, shown: np.ndarray, pose: Pose = EXACT) -> tuple[float, np.ndarray]:
+    """Log odds of the trees and which of them agree, for exact detections."""
+    odds, agrees, _ = agreement(
+        pose, shown, np.tile(R, (len(shown), 1)), trees, np.tile(R, (len(trees), 1))
+    )
+    return odds, agrees
+
+
+@given(seed=seeds)
+def test_the_same_trees_agree_and_shifted_ones_contradict(seed):
+    rng = np.random.default_rng(seed)
+    trees = rng.uniform(-20.0, 20.0, (120, 2))
+    odds, agrees = of_stand(trees, trees)
+    assert odds > ODDS
+    assert agrees.all()
+    shifted, agrees = of_stand(trees, trees + [0.0, 2.0])
+    assert shifted < -ODDS
+    assert agrees.sum() < 30
+
+
+def test_few_landmarks_do_not_decide():
+    trees = np.array([[5.0, 0.0]])
+    odds, _ = of_stand(trees, np.array([[6.0, 0.0]]))
+    assert -ODDS < odds < 0.0
+    assert of_stand(trees, np.array([[40.0, 0.0]]))[0] == 0.0, "too far away to say anything"
+    uncertain = EXACT._replace(xx=100.0, yy=100.0)
+    assert of_stand(trees, np.array([[6.0, 0.0]]), uncertain)[0] == 0.0, "any tree agrees with such a pose"
+
+
+def test_odds_of_one_tree_in_closed_form():
+    variance = 2.0 * R[0]
+    pose = EXACT._replace(xx=0.0, yy=0.0, tt=0.0)
+    p = 1.0 - math.exp(-(GATE**2) * variance / WINDOW**2)
+    tree = np.array([[3.0, 4.0]])
+    assert of_stand(tree, tree, pose)[0] == pytest.approx(math.log(AGREEING / p))
+    assert of_stand(tree, tree + 1.0, pose)[0] == pytest.approx(math.log((1.0 - AGREEING) / (1.0 - p)))
+
+
+def test_a_place_is_old_after_the_revisit_distance():
+    places = line()
+    last = 30 * PLACE
+    old = places.is_old(last)
+    assert old.tolist() == [last - k * PLACE > REVISIT_DISTANCE for k in range(31)]
+    assert places.of_old(np.array([0, 30, -1]), last).tolist() == [True, False, False]
+
+
+def test_an_old_place_is_seen_only_for_certain():
+    places, last = line(), 31 * PLACE
+    assert places.with_scan(last, 31, np.array([3])).is_old(last)[3]
+    near = ~places.with_seen(last, np.array([10])).is_old(last)[:20]
+    reach = int(REVISIT_DISTANCE / PLACE)
+    assert near.tolist() == [10 - reach <= k <= 10 + reach for k in range(20)]
+
+
+def test_a_contradicted_place_is_inactive_until_it_is_seen():
+    places = line().with_contradiction(np.array([4]))
+    assert places.contradicted
+    assert places.is_active(np.array([3, 4, 5])).tolist() == [True, False, True]
+    kernels = places.for_kernels()
+    assert [is_inactive(b, kernels) for b in (-1, 3, 4, 5, 40)] == [False, False, True, False, False]
+    assert places.with_seen(200.0, np.array([5])).is_active(np.array([4])).all()
+    assert not places.with_scan(200.0, 31, np.zeros(0, np.int64)).contradicted
+    assert not len(line().for_kernels().inactive), "kernels skip the test where no place is inactive"
+
+
+@settings(max_examples=3)
+@given(seed=seeds)
+def test_a_robot_that_returns_with_a_wrong_pose_begins_other_landmarks(seed):
+    """The robot drives 60 m out and back. The odometry misses 3 m on a stretch without trees: the trees of the
+    first 20 m are associated with none of the landmarks there, and none of these is moved."""
+    rng = np.random.default_rng(seed)
+    trees = np.column_stack([rng.uniform(-12.0, 20.0, 90), rng.uniform(-12.0, 12.0, 90)])
+    p = preset("stems").slam
+    slam = FastSlam(p, seed % 1000)
+    x = np.concatenate([np.arange(0.0, 60.0, 0.5), np.arange(60.0, 0.0, -0.5)])
+    known = None
+    for k in range(len(x)):
+        step = 0.0 if k == 0 else x[k] - x[k - 1]
+        seen = trees[np.abs(trees[:, 0] - x[k]) < 12.0] - [x[k], 0.0]
+        if k == len(x) // 2:
+            known = slam.landmarks()
+            step -= 3.0
+        slam.process(k, Pose2(step, 0.0, 0.0), detections_at(seen), np.zeros(128))
+    assert known is not None
+    places = slam.state.places
+    assert places.contradicted
+    now = slam.landmarks()
+    _, before, after = np.intersect1d(known.birth, now.birth, return_indices=True)
+    assert np.hypot(*(known.position[before] - now.position[after]).T).max() < 0.3
