@@ -12,6 +12,7 @@ wrong loop. Levenberg-Marquardt solves the sparse normal equations, starting at 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -80,7 +81,7 @@ class ScanDetections:
     R: Float
 
 
-def combined(scans: tuple[ScanDetections, ...], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
+def combined(scans: Sequence[ScanDetections | Keyframe], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
     """Return the weighted means of detections of the same landmark over several scans.
 
     Of more than STEMS_MAX landmarks those with the smallest value of a hash are taken. All keyframes use the
@@ -244,21 +245,29 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
     def thinned(self) -> KeyframeGraph:
-        """Return the graph without every second keyframe and its detections; motions are compounded. The ends
-        of loops and the newest keyframe stay."""
+        """Return the graph without every second keyframe. Motions are compounded, and the next keyframe takes
+        the detections at the present relative pose. The ends of loops and the newest keyframe stay."""
         ends = {scan for loop in self.loops for scan in loop.scans} | {self.newest_scan}
         rows, kept = list[int](), list[Keyframe]()
         motion, covariance = np.zeros(3), np.zeros((3, 3))
+        dropped = list[int]()
         for row, keyframe in enumerate(self.keyframes):
             x, y, yaw = keyframe.motion
             unknown = not (np.isfinite(covariance).all() and np.isfinite(keyframe.covariance).all())
             motion, covariance = compounded(motion, covariance, x, y, yaw, keyframe.covariance)
             if unknown:
                 covariance = np.full((3, 3), np.inf)
+                dropped.clear()  # their pose relative to this keyframe is unknown
+            dropped.append(row)
             if row % 2 == 0 or keyframe.scan in ends:
+                T_keyframe_base = composed(inverse(self.pose[row][None]), self.pose[dropped])
+                birth, centre, R = combined([self.keyframes[k] for k in dropped], T_keyframe_base)
                 rows.append(row)
-                kept.append(replace(keyframe, motion=motion, covariance=covariance))
+                kept.append(
+                    replace(keyframe, motion=motion, covariance=covariance, birth=birth, centre=centre, R=R)
+                )
                 motion, covariance = np.zeros(3), np.zeros((3, 3))
+                dropped.clear()
         solved = int(np.searchsorted(rows, self.solved))
         return replace(self, keyframes=tuple(kept), pose=self.pose[rows], solved=solved)
 

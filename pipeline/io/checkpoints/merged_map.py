@@ -18,6 +18,7 @@ from pipeline.slam.frame_uncertainty import FrameUncertainty, transported_covari
 from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
+from pipeline.slam.places import Places
 from pipeline.tracking.observation import SECTORS
 from pipeline.tracking.track_table import NO_LANDMARK, TrackTable, join
 from pipeline.types.records import Bool, Columns, Int, Verdict
@@ -156,6 +157,7 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
         detections=a.detections + b.detections,
         genealogy=Genealogy.of_path(path, P),
         graph=KeyframeGraph(),  # no odometry connects the two runs
+        places=Places(),  # all landmarks are active
         since_keyframe=(),
         keyframe_motion=np.zeros(3),
         keyframe_covariance=np.zeros((3, 3)),

@@ -21,6 +21,7 @@ from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import KEYFRAMES_MAX, Keyframe, LoopEdge, ScanDetections
 from pipeline.slam.particle_ancestry import BLOCK
 from pipeline.slam.particle_maps import is_sound
+from pipeline.slam.places import Places
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Columns, Int, Trees
@@ -144,6 +145,7 @@ def _check_slam(slam: SlamState) -> None:
         raise ValueError("the particles have other founders")
     _check_frame(slam.frame, len(past))
     _check_graph(slam, len(past))
+    _check_places(slam.places)
 
 
 def _check_frame(frame: FrameUncertainty, scans: int) -> None:
@@ -191,6 +193,15 @@ def _check_graph(slam: SlamState, scans: int) -> None:
         _check_finite(loop.covariance)
     if any(not np.isin(loop.scans, graph.scans).all() for loop in graph.loops):
         raise ValueError("a loop has no keyframe")
+
+
+def _check_places(places: Places) -> None:
+    M = len(places.birth)
+    if not places.birth.shape == places.distance.shape == places.seen.shape == places.inactive.shape == (M,):
+        raise ValueError("the places of the path have another shape")
+    _check_finite(places.distance, places.seen)
+    if np.any(np.diff(places.birth) < 0) or np.any(np.diff(places.distance) < 0.0):
+        raise ValueError("the places of the path are out of order")
 
 
 def _check_finite(*columns: Float) -> None:

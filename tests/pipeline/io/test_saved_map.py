@@ -177,6 +177,10 @@ def _with_keyframe(state, **changes: Any):
     return _with_graph(state, keyframes=(replace(first, **changes), *rest))
 
 
+def _with_places(state, **changes: Any):
+    return _with(state, places=replace(state.slam.places, **changes))
+
+
 def _with_maps(state, **changes: Any):
     return _with(state, maps=state.slam.maps._replace(**changes))
 
@@ -199,6 +203,9 @@ def _with_maps(state, **changes: Any):
         lambda s: _with_maps(s, mean=s.slam.maps.mean + np.nan),
         lambda s: _with_graph(s, pose=s.slam.graph.pose[:-1]),
         lambda s: _with_graph(s, solved=-1),
+        lambda s: _with_places(s, inactive=np.ones(100, np.bool_)),
+        lambda s: _with_places(s, birth=np.array([-1]), distance=np.zeros(1)),
+        lambda s: _with_places(s, seen=s.slam.places.seen * np.nan),
         lambda s: _with_keyframe(s, scan=-1),
         lambda s: _with_keyframe(s, birth=s.slam.graph.keyframes[0].birth[:-1]),
         lambda s: _with_keyframe(s, R=-s.slam.graph.keyframes[0].R),
