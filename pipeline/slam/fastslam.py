@@ -468,8 +468,9 @@ def _estimate(
     determine it (always False where no other source measures poses)."""
     pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
     landmarks = state.map_of(state.best)
-    active = state.places.is_active(landmarks.birth)
-    known = landmarks.take(active)
+    known = landmarks
+    if state.places.inactive.any():
+        known = landmarks.take(state.places.is_active(landmarks.birth))
     covariance, frame = state.frame.with_pose(
         mean, spread, n_eff, known.mean, known.birth, known.hits, p.hits_to_weigh, reach
     )
