@@ -221,6 +221,24 @@ def test_loops_stay_at_their_scans_when_the_graph_is_thinned():
     np.testing.assert_allclose(other.pose, one.pose[np.searchsorted(graph.scans, thin.scans)], atol=0.02)
 
 
+def test_a_thinned_graph_keeps_the_detections():
+    """Each landmark is seen by one keyframe of two, which is sometimes the one that is dropped."""
+    true = arc(21)
+    graph = KeyframeGraph()
+    for k, T in enumerate(true):
+        motion = composed(inverse(true[k - 1 : k]), T[None])[0] if k else np.zeros(3)
+        sees = np.arange(k % 2, len(STEMS), 2)
+        R = np.tile([SIGMA**2, 0.0, SIGMA**2], (len(sees), 1))
+        centre = Pose2(*T).inverse().apply(STEMS[sees])
+        graph = graph.with_keyframe(Keyframe(k, 0, float(k), motion, Q, sees, centre, R), T)
+    thin = graph.thinned()
+    assert len(thin.keyframes) == 11
+    assert all(len(k.birth) == len(STEMS) for k in thin.keyframes[1:])
+    for keyframe, T in zip(thin.keyframes, thin.pose, strict=True):
+        np.testing.assert_allclose(Pose2(*T).apply(keyframe.centre), STEMS[keyframe.birth], atol=1e-9)
+    np.testing.assert_allclose(thin.solve().pose, true[::2], atol=1e-6)
+
+
 def test_a_solution_is_due_when_trees_are_seen_again_after_long():
     def keyframe(k, birth, way):
         n = len(birth)
