@@ -191,7 +191,7 @@ class FastSlam:
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance)
+        graph = graph.certain(state.places).with_loop(loop.anchor, loop.T_map_base, loop.covariance)
         solution = graph.solve(new_loop=True)
         if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
             return None

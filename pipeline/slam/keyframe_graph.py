@@ -20,7 +20,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.motion import compounded
-from pipeline.slam.places import REVISIT_DISTANCE
+from pipeline.slam.places import REVISIT_DISTANCE, Places
 from pipeline.slam.poses import composed, inverse, rotated_rows
 from pipeline.types.records import Int
 
@@ -243,6 +243,20 @@ class KeyframeGraph:
             return replace(keyframe, birth=np.where(birth[row] == keyframe.birth, name[row], keyframe.birth))
 
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
+
+    def certain(self, places: Places) -> KeyframeGraph:
+        """Return the graph without associations with landmarks of places that were not seen for certain in
+        the last REVISIT_DISTANCE; the path may have drifted by more than the distance between trees."""
+
+        def cleaned(keyframe: Keyframe) -> Keyframe:
+            keep = places.last_seen(keyframe.birth) >= keyframe.distance - REVISIT_DISTANCE
+            if keep.all():
+                return keyframe
+            return replace(
+                keyframe, birth=keyframe.birth[keep], centre=keyframe.centre[keep], R=keyframe.R[keep]
+            )
+
+        return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
 
     def thinned(self) -> KeyframeGraph:
         """Return the graph without every second keyframe. Motions are compounded, and the next keyframe takes

@@ -204,7 +204,7 @@ def _with_maps(state, **changes: Any):
         lambda s: _with_graph(s, pose=s.slam.graph.pose[:-1]),
         lambda s: _with_graph(s, solved=-1),
         lambda s: _with_places(s, inactive=np.ones(100, np.bool_)),
-        lambda s: _with_places(s, birth=np.array([-1]), distance=np.zeros(1)),
+        lambda s: _with_places(s, birth=s.slam.places.birth[:-1]),
         lambda s: _with_places(s, seen=s.slam.places.seen * np.nan),
         lambda s: _with_keyframe(s, scan=-1),
         lambda s: _with_keyframe(s, birth=s.slam.graph.keyframes[0].birth[:-1]),

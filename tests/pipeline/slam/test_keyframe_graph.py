@@ -19,7 +19,7 @@ from pipeline.slam.keyframe_graph import (
     ScanDetections,
     combined,
 )
-from pipeline.slam.places import REVISIT_DISTANCE
+from pipeline.slam.places import REVISIT_DISTANCE, Places
 from pipeline.slam.poses import composed, inverse
 from tests.pipeline.strategies import seeds
 
@@ -159,6 +159,30 @@ def test_a_loop_corrects_the_drift_of_the_way_between():
     loop = bare.with_loop(0, Pose2(*true[-1]), 1e-6 * np.eye(3)).solve(new_loop=True)
     assert off(loop.pose, true)[-1] < 0.01
     assert off(loop.pose, true).mean() < 0.7 * off(bare.pose, true).mean()
+
+
+def test_a_loop_overrules_associations_by_the_drifted_path():
+    """The path had drifted by 3 m, and its last keyframes take stems for known ones 3 m away."""
+    true = arc(42, turn=2.0 * np.pi / 41.0, radius=40.0)
+    known = true[:4, :2] + [0.0, 3.0]
+    graph, places = KeyframeGraph(), Places()
+    drift = np.linspace(0.0, 1.0, 42)[:, None] * [0.0, 3.0, 0.0]
+    for k, T in enumerate(true + drift):
+        motion = composed(inverse((true + drift)[k - 1 : k]), T[None])[0] if k else np.zeros(3)
+        sees = known if k < 4 or k > 37 else STEMS[:0]
+        centre = Pose2(*T).inverse().apply(sees)
+        R = np.tile([SIGMA**2, 0.0, SIGMA**2], (len(sees), 1))
+        birth = np.arange(len(sees))
+        places = places.with_scan(6.0 * k, 4 * k, birth)
+        graph = graph.with_keyframe(Keyframe(k, 4 * k, 6.0 * k, motion, 4.0 * Q, birth, centre, R), T)
+    graph = graph.certain(places)
+    assert [len(k.birth) for k in graph.keyframes] == [4] * 4 + [0] * 38
+    solution = graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3)).solve(new_loop=True)
+    assert solution is not None
+    assert solution.loop_weight[0] > 0.9
+    assert off(solution.pose, true)[-1] < 0.1
+    seen = graph.certain(places.with_seen(246.0, np.arange(4)))
+    assert seen.keyframes == graph.keyframes, "what is left is certain"
 
 
 def test_two_names_of_one_tree_become_one():
