@@ -64,7 +64,7 @@ class Dashboard:
         self.annotation_editor = AnnotationEditor(self.store)
         self.annotation_editor.changed, self.annotation_editor.edited = self._use_truth, self._mark_edits
         self.live = live
-        self.scores = Scores(self._tell_score)
+        self.scores = Scores(self._broadcast_score)
         self.sensitivity = Sensitivity(lambda state: live.tell("sensitivity", state))
         self.status = protocol.Status(state="starting", detail="Starting")
         self.shown: protocol.Shown | None = None
@@ -220,7 +220,7 @@ class Dashboard:
         self._show_parameters()
         if self.shown is not None:
             self.events.changed(before.flat(), self.parameters.parameters.flat(), self.shown.time_s)
-            self._tell_events()
+            self._broadcast_events()
         state = self.parameters
         who = current_user.get() or SOMEBODY
         self.run_recorder.changed(before.flat(), state.parameters.flat(), state.preset, state.revision, who)
@@ -269,7 +269,7 @@ class Dashboard:
         self.live.tell("parameters", {**state.as_plain(), "set": name})
         self.scene.show_parameters(state.parameters, state.preset)
 
-    def _tell_events(self) -> None:
+    def _broadcast_events(self) -> None:
         self.live.tell("events", self.events.as_plain())
 
     async def _send_parameters(self) -> None:
@@ -296,9 +296,9 @@ class Dashboard:
             case protocol.Remapped(run=run, changes=changes) if run == self._run:
                 self._remapped(changes)
             case protocol.Rough(run=run, revision=revision, trees=trees) if run == self._run:
-                await self._tell_rough(run, revision, trees)
+                await self._broadcast_preview(run, revision, trees)
 
-    async def _tell_rough(self, run: int, revision: int, trees: Trees) -> None:
+    async def _broadcast_preview(self, run: int, revision: int, trees: Trees) -> None:
         """Broadcast the preview of a map that is being computed, with its score."""
         score = None
         if self.truth is not None:
@@ -313,7 +313,7 @@ class Dashboard:
         """Broadcast the differences after the run was mapped again, and renumber the selection."""
         self.live.tell("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
-        self._tell_events()
+        self._broadcast_events()
         self.selector.renamed(dict(changes.followed))
 
     async def _begin(self, opened: protocol.Opened) -> None:
@@ -346,7 +346,7 @@ class Dashboard:
         self.scores.forget()
         self._before_after.forget()
         self.events.forget()
-        self._tell_events()
+        self._broadcast_events()
         self.loop.choose(None)
         self.live.tell("remapped", {})
         self.live.tell("rough", {})
@@ -368,7 +368,7 @@ class Dashboard:
     def _mark_edits(self, who: str, number: int) -> None:
         if self.shown is not None:
             self.events.annotated(who, number, self.shown.time_s)
-            self._tell_events()
+            self._broadcast_events()
 
     async def _show(self, shown: protocol.Shown) -> None:
         if shown.run != self._run:  # of a run that was left
@@ -391,7 +391,7 @@ class Dashboard:
         payload["layers"] |= self.scene.counts
         self.live.show({**payload, **counts}, path_xy)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
-            self._tell_events()
+            self._broadcast_events()
         self.run_recorder.shown(self._run_state(shown))
         self._score()
         self._show_scene(shown.frame, self.path_xy)
@@ -403,7 +403,7 @@ class Dashboard:
             shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
         )
 
-    def _tell_score(self, score: dict[str, Any] | None) -> None:
+    def _broadcast_score(self, score: dict[str, Any] | None) -> None:
         self.live.tell("evaluation", score)
         self.run_recorder.scored(score)
 
@@ -418,7 +418,7 @@ class Dashboard:
         self.status = status
         self.live.tell("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
-            self._tell_events()
+            self._broadcast_events()
 
 
 def _open_command(request: SourceRequest) -> protocol.Open:

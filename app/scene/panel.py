@@ -243,7 +243,7 @@ class PanelCommands:
 
     def ask(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
         """Run another command; a refusal is shown in the browser of `client`."""
-        self._start(self._told(command, client))
+        self._start(self._run_command(command, client))
 
     def stop(self) -> None:
         """Cancel all commands in progress."""
@@ -257,11 +257,11 @@ class PanelCommands:
                 changes = {name: value for name, (value, of) in self._waiting.items() if of == origin}
                 self._waiting = {k: each for k, each in self._waiting.items() if k not in changes}
                 current_user.set(origin.user)  # of this task only
-                await self._told(self._commands.change_parameters(changes), origin.client)
+                await self._run_command(self._commands.change_parameters(changes), origin.client)
         finally:
             self._busy = False
 
-    async def _told(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
+    async def _run_command(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
         try:
             await command
         except StemmapError as error:

@@ -96,10 +96,10 @@ class WorkerLoop:
                 return
             if isinstance(command, protocol.Question):
                 self._put(answer(self._session, self._recent, command, self._run))
-                if self._says_compiling:  # an answer may compile other kernels than the run
+                if self._is_compiling_reported:  # an answer may compile other kernels than the run
                     self._report()
             else:
-                self._obey(command)
+                self._execute(command)
 
     def _next_command(self) -> protocol.ToWorker | None:
         """Return the next command, and wait for it until the next scan is due. Of successive parameter
@@ -208,10 +208,10 @@ class WorkerLoop:
         ones."""
         opened = self._session.listen()
         if opened is not None:
-            self._tell_opened(opened)
+            self._send_opened(opened)
         self._report_when_due(self._clock())
 
-    def _obey(self, command: protocol.Command | protocol.Begin) -> None:
+    def _execute(self, command: protocol.Command | protocol.Begin) -> None:
         self._replay.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
         self._guarded(lambda: self._carry_out(command))
@@ -252,16 +252,16 @@ class WorkerLoop:
             options=command.options(),
         )
         if opened is not None:
-            self._tell_opened(opened)
+            self._send_opened(opened)
 
     def _play(self) -> None:
         self._held = False
         opened_again = self._session.play()
         if opened_again is not None:
             self._run += 1
-            self._tell_opened(opened_again)
+            self._send_opened(opened_again)
 
-    def _tell_opened(self, opened: protocol.Opened) -> None:
+    def _send_opened(self, opened: protocol.Opened) -> None:
         self._prepared = self._held = False
         self._put(msgspec.structs.replace(opened, run=self._run, requested=self._requested))
 
@@ -278,7 +278,7 @@ class WorkerLoop:
 
     def _prepare(self) -> None:
         """Compile kernels before the first scan. At opening, the parameters are not known yet."""
-        self._tell(self._preparing(), self._clock())
+        self._send_status(self._preparing(), self._clock())
         self._prepared = True
         self._session.prepare()
         self._replay.release()
@@ -294,7 +294,7 @@ class WorkerLoop:
         if now > self._compiled_at + _COMPILES_ON_S:
             self._compiling_since_s = time.time()
         self._compiled_at = now
-        if self._reported is None or self._says_compiling:
+        if self._reported is None or self._is_compiling_reported:
             return
         # The last status, because the session is in the middle of its work.
         status = replace(self._reported[0], detail=_COMPILING, compiling_since_s=self._compiling_since_s)
@@ -304,7 +304,7 @@ class WorkerLoop:
         self._put(protocol.Report(status))
 
     @property
-    def _says_compiling(self) -> bool:
+    def _is_compiling_reported(self) -> bool:
         return self._reported is not None and self._reported[0].detail == _COMPILING
 
     def _show(self, frame: Frame | None) -> None:
@@ -317,11 +317,11 @@ class WorkerLoop:
         now = self._clock()
         if self._session.pace not in ("idle", "live") and not self._prepared:
             # Nothing plays yet: the first scan is read and the kernels are compiled before.
-            self._tell(self._preparing(), now)
+            self._send_status(self._preparing(), now)
             return
         playing = self._session.pace in ("replay", "live")
         status = self._session.status()
-        if status.going_to and now >= self._long_way_at:  # not on a short way, which would flicker
+        if status.going_to and now >= self._long_way_at:  # not for a short seek, which would flicker
             status = replace(status, detail=f"Going to {status.going_to} …", going_far=True)
         status = replace(
             status,
@@ -329,9 +329,9 @@ class WorkerLoop:
             scan_rate_hz=round(self._replay.rate_hz, 2) if playing and status.state != "waiting" else 0.0,
             scans_behind=self._behind(status, now) if playing else 0,
         )
-        self._tell(status, now)
+        self._send_status(status, now)
 
-    def _tell(self, status: protocol.Status, now: float) -> None:
+    def _send_status(self, status: protocol.Status, now: float) -> None:
         self._reported = (status, now)
         self._put(protocol.Report(status))
 

@@ -236,13 +236,13 @@ class WorkerProcess:
             while True:
                 size = int.from_bytes(await process.stdout.readexactly(protocol.LENGTH_BYTES), "little")
                 protocol.check_size(size)
-                await self._hand_on(self._codec_in.decode(await process.stdout.readexactly(size)))
+                await self._deliver(self._codec_in.decode(await process.stdout.readexactly(size)))
         except asyncio.IncompleteReadError:
             return exit_reason(await process.wait())
         except protocol.WireError as error:
             return f"protocol error: {error}"
 
-    async def _hand_on(self, message: protocol.FromWorker) -> None:
+    async def _deliver(self, message: protocol.FromWorker) -> None:
         self._note_opening(message)
         if isinstance(message, protocol.Shown):
             self._ends_without_result = 0
@@ -251,7 +251,7 @@ class WorkerProcess:
         except Exception as error:  # logged; it must not end the supervision of the worker
             _log.exception("a message of the worker could not be handled")
             if not isinstance(message, protocol.Report):
-                await self._tell(
+                await self._report_failure(
                     f"A result could not be shown: {type(error).__name__}: {error}. This is a fault in "
                     "stemmap; the terminal shows where"
                 )
@@ -265,7 +265,7 @@ class WorkerProcess:
             what += "; the playback speed was reset"
         recent = [t for t in self._deaths if self._clock() - t < _FORGIVEN_AFTER_S]
         if len(recent) < len(self._pauses_s):
-            await self._tell(f"{what}; it is being started again")
+            await self._report_failure(f"{what}; it is being started again")
             await asyncio.sleep(self._pauses_s[len(recent) - 1])
             return
         await self._wait_for_a_person(
@@ -276,12 +276,12 @@ class WorkerProcess:
     async def _wait_for_a_person(self, detail: str) -> None:
         """Report why the worker does not run, and wait for `Play` or `Open`."""
         self._wanted.clear()
-        await self._tell(detail)
+        await self._report_failure(detail)
         await self._wanted.wait()
 
-    async def _tell(self, detail: str) -> None:
+    async def _report_failure(self, detail: str) -> None:
         source = self._open.uri if self._open else ""
-        await self._hand_on(protocol.Report(protocol.Status(state="failed", detail=detail, source=source)))
+        await self._deliver(protocol.Report(protocol.Status(state="failed", detail=detail, source=source)))
 
     async def _end(self) -> None:
         process, self._process = self._process, None
