@@ -125,9 +125,14 @@ def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
 
 
 def _saved_by_one(file: Any, base: str) -> Callable[[Any, Any], None]:  # noqa: ANN401
-    """Return a replacement of Numba's `save` that lets one process at a time write the cache of a kernel, and
-    deletes files that no index refers to. Two processes that compile it for different types at once would
-    otherwise use the same file."""
+    """Return a replacement of the method `save` of Numba's cache file. It lets one process at a time write
+    the cache of a kernel, because two processes that compile for different types at once would otherwise use
+    the same file, and deletes machine code to which no index refers.
+
+    Args:
+        file: Numba's object for the files of one kernel (`IndexDataCacheFile`).
+        base: Name of these files without extension.
+    """
     save: Callable[[Any, Any, Any], None] = type(file).save
 
     def save_alone(key: Any, data: Any) -> None:  # noqa: ANN401

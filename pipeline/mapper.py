@@ -335,7 +335,9 @@ class Mapper:
     # --- corrections ----------------------------------------------------------------------------------
 
     def _remember(self, index: int, motion: Motion) -> None:
-        """Store what a robot that turns out to be lost returns to; call it before the scan is mapped."""
+        """Store the motion and, where `Relocaliser.needs_state`, the state to which a robot that turns out to
+        be lost returns; call it before the scan is mapped. Nothing is stored during a search, and all stored
+        states are removed where the parameter `relocalisation.method` is "none"."""
         relocaliser = self._relocaliser
         if self._parameters.relocalisation.method == "none":
             relocaliser.reset()

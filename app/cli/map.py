@@ -286,8 +286,8 @@ def _listening(
 
 @contextmanager
 def _notices(source: LiveSource) -> Iterator[None]:
-    """Print every five seconds why no scans arrive, and whether a robot was lost, in a thread while the
-    context is active."""
+    """Print the notices of a live source and the reason why no scans arrive to standard error, every five
+    seconds while the context is active, in a thread; notices that are left are printed at its end."""
     ended = threading.Event()
 
     def show(*lines: str) -> None:

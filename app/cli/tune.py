@@ -301,7 +301,8 @@ class _SearchProgress:
         self._line(line)
 
     def close(self, made: int, seconds: float) -> None:
-        """End the bar and print the speed of the search."""
+        """End the bar and, after at least two trials, print their number, the time and the trials per
+        hour."""
         self._bar.close()
         if made > 1:
             self._line(f"{made:,} trials in {seconds:,.0f} s: {3600.0 * made / seconds:,.0f} an hour")

@@ -37,7 +37,8 @@ _OTHER_FILE = "Name another file with --journal, or delete this one"
 
 
 def is_server(storage: str) -> bool:
-    """Whether this is the address of a database and not the path of a journal."""
+    """Return whether this is the address of a PostgreSQL database (one of the prefixes SERVER) and not the
+    path of a journal."""
     return storage.startswith(SERVER)
 
 

@@ -80,7 +80,8 @@ class Relocaliser(Generic[S]):
         self.state = RelocaliserState()
 
     def needs_state(self, index: int) -> bool:
-        """Whether `remember` stores the state of the mapper before a scan."""
+        """Return whether `remember` must get the state of the mapper before this scan: for scans whose index
+        is a multiple of SPACING, and while no state is stored."""
         return not self.state.kept or index % SPACING == 0
 
     def remember(self, index: int, motion: Motion, state: S | None) -> None:

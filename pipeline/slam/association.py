@@ -99,7 +99,14 @@ def associate(
 
 @compiled_borrowing
 def _count_pairs(cells: Cells, scale: float, centre: Float, mean: Float, distance_max: float) -> int:
-    """Return the number of pairs of a landmark and a detection within `distance_max` [m]."""
+    """Return the number of pairs of a landmark and a detection within `distance_max` [m].
+
+    Args:
+        cells, scale: Grid of the detections for searches within `distance_max`.
+        centre: Detections, shape (D, 2) [m].
+        mean: Landmarks in the same frame, shape (M, 2) [m].
+        distance_max: Maximum distance [m].
+    """
     n = 0
     for j in range(mean.shape[0]):
         u, v = first_of_four(mean[j, 0], mean[j, 1], scale)

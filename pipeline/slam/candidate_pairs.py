@@ -209,8 +209,8 @@ def _sort(cost: Float, order: Int, n: int) -> None:
 
 @compiled_within
 def _sort_sequence(room: Room, pairs: int, found: int) -> None:
-    """Write the detections in the order of their best pairs into `room.sequence`, since the costs of the next
-    particle have nearly the same order; `landmark_of` becomes -1."""
+    """Write the detections in the order of their best pairs, then those without a pair, into `room.sequence`,
+    since the costs of the next particle have nearly the same order; `landmark_of` becomes -1."""
     n = 0
     for i in range(pairs):
         d = room.detection[room.order[i]]

@@ -363,7 +363,8 @@ class LiveRecording(MessageSource):
         return time_beside(stamp_ns, message.log_ns, self._offset_ns)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of arrival; messages before `start_ns` are not decoded."""
+        """Yield records in the order of arrival; those with a stamp before `start_ns` [ns] are left out
+        without being decoded."""
         reader = self._reader()
         self._losses = reader.losses
         reader.from_ns = start_ns

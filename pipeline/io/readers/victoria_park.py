@@ -219,7 +219,12 @@ class VictoriaParkSource(FileSource):
 
 
 def _unpack(path: Path, uri: str) -> dict[str, bytes]:
-    """Return the text files of the zip by lower-case name; sizes are checked before unpacking."""
+    """Return the contents of laser.txt, drs.txt and, if it is there, gps.txt by lower-case name, from any
+    folder of the zip. Sizes are checked before unpacking.
+
+    Raises:
+        SourceError: The zip is damaged, has no LASER.txt or no DRS.txt, or a file in it is too large.
+    """
     wanted = {"laser.txt", "drs.txt", "gps.txt"}
     try:
         # A damaged zip may point before the start of the file, which raises an OSError.
