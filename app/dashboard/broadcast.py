@@ -38,7 +38,7 @@ class Broadcast:
         """Number of connected browsers."""
         return len(self._listeners)
 
-    def tell(self, kind: str, content: object) -> None:
+    def publish(self, kind: str, content: object) -> None:
         """Replace the message of a kind.
 
         Args:

@@ -65,7 +65,7 @@ class Dashboard:
         self.annotation_editor.changed, self.annotation_editor.edited = self._use_truth, self._mark_edits
         self.live = live
         self.scores = Scores(self._broadcast_score)
-        self.sensitivity = Sensitivity(lambda state: live.tell("sensitivity", state))
+        self.sensitivity = Sensitivity(lambda state: live.publish("sensitivity", state))
         self.status = protocol.Status(state="starting", detail="Starting")
         self.shown: protocol.Shown | None = None
         self.path: Path | None = None
@@ -85,7 +85,7 @@ class Dashboard:
         self.source = SourceRequest("")
         self.digest = ""  # of what is mapped, "" before it is open
         self.events = Events()
-        self.search = TuneSearch(lambda state: live.tell("search", state))
+        self.search = TuneSearch(lambda state: live.publish("search", state))
         self.loop = LoopPlayback(self)
         self._run: int | None = None
         self._notice = ""
@@ -103,7 +103,7 @@ class Dashboard:
     async def start(self, source: SourceRequest) -> None:
         """Start the worker and open a source, which plays as soon as it is open."""
         await self.sets.load()
-        self.live.tell("view", self.scene.view)
+        self.live.publish("view", self.scene.view)
         await self.worker.start()
         await self._send_parameters()
         await self.open(source)
@@ -140,7 +140,7 @@ class Dashboard:
             ParameterError: There is no such choice.
         """
         self.scene.choose(name, value)
-        self.live.tell("view", self.scene.view)
+        self.live.publish("view", self.scene.view)
 
     @property
     def request(self) -> SourceRequest:
@@ -171,7 +171,7 @@ class Dashboard:
         """Close the run; from now on, `source` is the source that is expected to open."""
         self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self._run, self.source, self.digest = None, source, ""
-        self.live.tell("source", source.for_page())
+        self.live.publish("source", source.for_page())
         self.camera.forget()
         self.run_recorder.leave()
         self.annotation_editor.leave()
@@ -265,12 +265,12 @@ class Dashboard:
     def _show_parameters(self) -> None:
         state = self.parameters
         name = self.sets.name_of(state.preset, state.parameters)
-        self.live.tell("sets", self.sets.as_plain())
-        self.live.tell("parameters", {**state.as_plain(), "set": name})
+        self.live.publish("sets", self.sets.as_plain())
+        self.live.publish("parameters", {**state.as_plain(), "set": name})
         self.scene.show_parameters(state.parameters, state.preset)
 
     def _broadcast_events(self) -> None:
-        self.live.tell("events", self.events.as_plain())
+        self.live.publish("events", self.events.as_plain())
 
     async def _send_parameters(self) -> None:
         state = self.parameters
@@ -307,11 +307,11 @@ class Dashboard:
             if run != self._run:  # another one was opened meanwhile
                 return
         places = np.round(trees.position, 3).tolist()
-        self.live.tell("rough", {"revision": revision, "places": places, "score": score})
+        self.live.publish("rough", {"revision": revision, "places": places, "score": score})
 
     def _remapped(self, changes: protocol.MapChanges) -> None:
         """Broadcast the differences after the run was mapped again, and renumber the selection."""
-        self.live.tell("remapped", msgspec.to_builtins(changes))
+        self.live.publish("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
         self._broadcast_events()
         self.selector.renamed(dict(changes.followed))
@@ -348,8 +348,8 @@ class Dashboard:
         self.events.forget()
         self._broadcast_events()
         self.loop.choose(None)
-        self.live.tell("remapped", {})
-        self.live.tell("rough", {})
+        self.live.publish("remapped", {})
+        self.live.publish("rough", {})
         self._show_scene.cancel()
         self.scene.clear()
         self._use_truth()
@@ -359,8 +359,8 @@ class Dashboard:
         """Show the ground truth and the annotations, and score the map against them."""
         self.truth = self.annotation_editor.truth
         self.scene.show_truth(self.truth)
-        self.live.tell("truth", truth_payload(self.truth))
-        self.live.tell("annotations", self.annotation_editor.as_plain())
+        self.live.publish("truth", truth_payload(self.truth))
+        self.live.publish("annotations", self.annotation_editor.as_plain())
         if self.truth is None:
             self.scores.forget()
         self._score()
@@ -404,7 +404,7 @@ class Dashboard:
         )
 
     def _broadcast_score(self, score: dict[str, Any] | None) -> None:
-        self.live.tell("evaluation", score)
+        self.live.publish("evaluation", score)
         self.run_recorder.scored(score)
 
     def _score(self) -> None:
@@ -416,7 +416,7 @@ class Dashboard:
         if self._notice and status.state == "paused":
             status = replace(status, detail=self._notice)
         self.status = status
-        self.live.tell("status", status)
+        self.live.publish("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
             self._broadcast_events()
 
@@ -449,7 +449,7 @@ class LoopPlayback:
     def choose(self, span: Span | None) -> None:
         """Set the part that is repeated; None ends the repetition."""
         self.span, self._turning = span, False
-        self._dashboard.live.tell("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
+        self._dashboard.live.publish("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
 
     async def shown(self, time_s: float, status: protocol.Status) -> None:
         """Seek to the beginning of the part if the shown scan is at its end and the run plays.

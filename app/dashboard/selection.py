@@ -242,10 +242,10 @@ class Selector:
         try:
             await self.cluster(scan, cluster)
         except NoStoryError as error:
-            self._live.tell("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
+            self._live.publish("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
 
     def _select(self, selection: Selection) -> None:
         self.selection = selection
         self._mark(selection.tree, selection.ring)
-        self._live.tell("selection", selection.as_plain())
-        self._live.tell("missing", None)
+        self._live.publish("selection", selection.as_plain())
+        self._live.publish("missing", None)

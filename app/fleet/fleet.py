@@ -384,7 +384,7 @@ class Fleet:
             if member.ended:
                 shown |= {"state": "failed", "detail": "Its dashboard ended; the terminal shows why"}
         cards += [shown for shown, _ in self.remote.values()]
-        self.live.tell("fleet", {"members": cards, "notice": self.notice})
+        self.live.publish("fleet", {"members": cards, "notice": self.notice})
 
     def send_maps(self) -> None:
         """Send the maps to the pages."""
@@ -392,7 +392,7 @@ class Fleet:
             name: drawn(own, self._frames.pose(name), self._frames.how(name))
             for name, (_, own) in self._maps().items()
         }
-        self.live.tell("maps", {"maps": maps})
+        self.live.publish("maps", {"maps": maps})
 
     def _maps(self) -> dict[str, tuple[str, dict[str, Any]]]:
         """Return digest and map of each robot that has a map, by name."""

@@ -103,7 +103,7 @@ def build(
     dashboard = Dashboard(parameter_state, Broadcast(), AsyncStore(settings.folder, settings.database))
 
     learning = Learning(
-        dashboard.store, settings.folder, lambda state: dashboard.live.tell("learning", state)
+        dashboard.store, settings.folder, lambda state: dashboard.live.publish("learning", state)
     )
     uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.store)
 

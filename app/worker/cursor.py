@@ -20,7 +20,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
 from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.odometry.synchroniser import OdometryChoice, Synchroniser, steps
-from pipeline.types.records import Learnt, Step
+from pipeline.types.records import Step, SynchroniserState
 
 _LEAD_IN_NS = 1_000_000_000
 
@@ -38,7 +38,7 @@ class Cursor:
         self._odometry: OdometryChoice = odometry
         self._stamps = array("q")
         self._fingerprints = array("q")
-        self._learnt: list[Learnt] = []
+        self._states: list[SynchroniserState] = []
         self._next = 0
         self._ahead: Step | None = None
         self._failure: Exception | None = None
@@ -91,7 +91,7 @@ class Cursor:
         if step.index == len(self._stamps):
             self._stamps.append(step.scan.stamp_ns)
             self._fingerprints.append(_fingerprint(step))
-            self._learnt.append(step.learnt)
+            self._states.append(step.synchroniser_state)
         return step
 
     def go_to(self, index: int) -> None:
@@ -116,7 +116,7 @@ class Cursor:
             raise
         self._next = index
 
-    def _read(self, start_ns: int | None, after: Learnt | None = None) -> Iterator[Step]:
+    def _read(self, start_ns: int | None, after: SynchroniserState | None = None) -> Iterator[Step]:
         return steps(self._source.records(start_ns), odometry=self._odometry, after=after)
 
     def _resumed(self, index: int) -> Iterator[Step] | None:
@@ -125,7 +125,7 @@ class Cursor:
         stamp_ns = self._stamps[index]
         # Scans of equal time are distinguished by counting.
         wanted = index - bisect_left(self._stamps, stamp_ns)
-        read = self._read(stamp_ns - _LEAD_IN_NS, self._learnt[index])
+        read = self._read(stamp_ns - _LEAD_IN_NS, self._states[index])
         for step in read:
             if step.scan.stamp_ns < stamp_ns:
                 continue

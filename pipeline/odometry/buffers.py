@@ -49,13 +49,13 @@ class OdometryBuffer:
     """The odometry of the last seconds, from which jumps are removed.
 
     Attributes:
-        stands: Time [ns] and pose since which the robot has not moved, None before the first reading.
+        standing_since: Time [ns] and pose since which the robot has not moved, None before the first reading.
     """
 
     def __init__(self) -> None:
         self._readings: deque[Reading] = deque()
         self._T_odom_jumped = Pose2()
-        self.stands: tuple[int, Pose2] | None = None
+        self.standing_since: tuple[int, Pose2] | None = None
 
     @property
     def newest(self) -> Reading | None:
@@ -81,11 +81,11 @@ class OdometryBuffer:
         return jump
 
     def _watch_standing(self, reading: Reading) -> None:
-        if self.stands is not None:
-            away = self.stands[1].inverse() @ reading.pose
+        if self.standing_since is not None:
+            away = self.standing_since[1].inverse() @ reading.pose
             if np.hypot(away.x, away.y) < STANDSTILL[0] and abs(away.yaw) < STANDSTILL[1]:
                 return
-        self.stands = (reading.stamp_ns, reading.pose)
+        self.standing_since = (reading.stamp_ns, reading.pose)
 
     def forget(self, needed_ns: int) -> None:
         """Drop readings that no scan from time `needed_ns` on needs."""

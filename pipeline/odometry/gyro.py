@@ -13,7 +13,7 @@ from collections import deque
 import numpy as np
 
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.types.records import Imu, Learnt, Turn
+from pipeline.types.records import Imu, SynchroniserState, Turn
 
 KEEP_NS = 3_000_000_000
 GAP_NS = 60_000_000  # longest time between two readings over which the rate is integrated
@@ -84,7 +84,7 @@ class Gyro:
             self._bias += (mean - self._bias) / self._blocks
             self._scatter += (sigma - self._scatter) / self._blocks
 
-    def learnt(self, stamp_ns: int) -> Learnt:
+    def state(self, stamp_ns: int) -> SynchroniserState:
         """Return the bias, the comparison with the wheels and the other estimates, for `go_on_from`.
 
         Args:
@@ -92,13 +92,13 @@ class Gyro:
         """
         block = tuple(self._block)
         of_bias = stamp_ns, self._bias, self._scatter, self._blocks, block
-        return Learnt(*of_bias, self._same, self._turned, self._proven)
+        return SynchroniserState(*of_bias, self._same, self._turned, self._proven)
 
-    def go_on_from(self, learnt: Learnt) -> None:
-        """Restore the estimates that `learnt` returned; the readings stay."""
-        self._bias, self._scatter = learnt.bias, learnt.scatter
-        self._blocks, self._block = learnt.blocks, list(learnt.block)
-        self._same, self._turned, self._proven = learnt.same, learnt.turned, learnt.proven
+    def go_on_from(self, state: SynchroniserState) -> None:
+        """Restore the estimates that `state` returned; the readings stay."""
+        self._bias, self._scatter = state.bias, state.scatter
+        self._blocks, self._block = state.blocks, list(state.block)
+        self._same, self._turned, self._proven = state.equal_readings, state.turn_sums, state.proven
 
     @property
     def proven(self) -> bool:

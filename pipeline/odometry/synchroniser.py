@@ -12,7 +12,17 @@ import numpy as np
 from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
 from pipeline.odometry.buffers import KEEP_NS, STILL, Jump, OdometryBuffer, PoseBuffer, Tilt
 from pipeline.odometry.gyro import Gyro
-from pipeline.types.records import Imu, Learnt, Notice, Odometry, PoseMeasurement, Record, Scan, Step, Turn
+from pipeline.types.records import (
+    Imu,
+    Notice,
+    Odometry,
+    PoseMeasurement,
+    Record,
+    Scan,
+    Step,
+    SynchroniserState,
+    Turn,
+)
 
 OdometryChoice = Literal["auto", "wheels", "static"]
 WAIT = 5  # most scans that wait for later odometry
@@ -36,7 +46,7 @@ def steps(
     odometry: OdometryChoice = "auto",
     first_index: int = 0,
     losses: Counter[str] | None = None,
-    after: Learnt | None = None,
+    after: SynchroniserState | None = None,
 ) -> Iterator[Step]:
     """Yield a step for each scan: the scan with the odometry interpolated to its time, the tilt, and more.
 
@@ -70,7 +80,7 @@ class Synchroniser:
     """
 
     def __init__(
-        self, *, use_odometry: bool, index: int, losses: Counter[str], after: Learnt | None = None
+        self, *, use_odometry: bool, index: int, losses: Counter[str], after: SynchroniserState | None = None
     ) -> None:
         self._losses = losses
         self._use_odometry = use_odometry
@@ -185,8 +195,8 @@ class Synchroniser:
         if np.abs(imu.angular_velocity).max() > FASTEST:
             self._leave_out("readings of the gyroscope that no robot turns as fast as")
             return
-        stands, newest = self._odometry.stands, self._odometry.newest
-        settled = stands is not None and imu.stamp_ns - stands[0] > SETTLES_NS
+        since, newest = self._odometry.standing_since, self._odometry.newest
+        settled = since is not None and imu.stamp_ns - since[0] > SETTLES_NS
         fresh = newest is not None and imu.stamp_ns - newest.stamp_ns < STALE_NS
         still = settled and fresh and self._after is None
         oldest = self._needed_ns(imu.stamp_ns)
@@ -232,14 +242,16 @@ class Synchroniser:
             measured=self._measured.at(scan.stamp_ns, pose, odometry_at),
             turn=turn if self._gyro.proven else None,
             turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
-            learnt=replace(
-                self._gyro.learnt(scan.stamp_ns), stands=self._odometry.stands, tilt=self._gyro_tilt
+            synchroniser_state=replace(
+                self._gyro.state(scan.stamp_ns),
+                standing_since=self._odometry.standing_since,
+                tilt=self._gyro_tilt,
             ),
         )
         if self._after is not None and scan.stamp_ns >= self._after.stamp_ns:
-            step = replace(step, learnt=self._after)
+            step = replace(step, synchroniser_state=self._after)
             self._gyro.go_on_from(self._after)
-            self._odometry.stands, self._gyro_tilt = self._after.stands, self._after.tilt
+            self._odometry.standing_since, self._gyro_tilt = self._after.standing_since, self._after.tilt
             self._after = None
         self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
         self._stepped = pose

@@ -34,7 +34,7 @@ from pipeline.front_end import ColumnInput, SegmentedScan
 from pipeline.geometry.quantisation import POINT
 from pipeline.io.atomic_files import hold, is_held
 from pipeline.io.checkpoints.codec import decode, encode
-from pipeline.types.records import Float, Float32, Int32, Learnt, Scan, Step, UInt16
+from pipeline.types.records import Float, Float32, Int32, Scan, Step, SynchroniserState, UInt16
 
 HIGHEST = SLICES * SLICE  # m above the ground; higher points are not integrated into the columns
 LARGEST = 1 << 28  # bytes of a block; the largest known clouds need a fiftieth
@@ -92,7 +92,7 @@ def pack(step: Step, scan: SegmentedScan) -> bytes:
         scan, raw=no_points, filtered=no_points, labels=scan.labels[:0], column_input=None, clearance=None
     )
     packed = _PackedScan(
-        replace(step, scan=Scan(step.scan.stamp_ns, no_points), learnt=Learnt()),
+        replace(step, scan=Scan(step.scan.stamp_ns, no_points), synchroniser_state=SynchroniserState()),
         lean,
         None if scan.column_input is None else _PackedColumnInput.of(scan.column_input),
     )

@@ -21,7 +21,6 @@ from pipeline.types.sensor_data import Float32 as Float32
 from pipeline.types.sensor_data import Imu as Imu
 from pipeline.types.sensor_data import Int as Int
 from pipeline.types.sensor_data import Int32 as Int32
-from pipeline.types.sensor_data import Learnt as Learnt
 from pipeline.types.sensor_data import Notice as Notice
 from pipeline.types.sensor_data import Odometry as Odometry
 from pipeline.types.sensor_data import PoseMeasurement as PoseMeasurement
@@ -29,6 +28,7 @@ from pipeline.types.sensor_data import Record as Record
 from pipeline.types.sensor_data import Scan as Scan
 from pipeline.types.sensor_data import Sensor as Sensor
 from pipeline.types.sensor_data import Stems as Stems
+from pipeline.types.sensor_data import SynchroniserState as SynchroniserState
 from pipeline.types.sensor_data import Truth as Truth
 from pipeline.types.sensor_data import TruthPath as TruthPath
 from pipeline.types.sensor_data import TruthTrees as TruthTrees
@@ -54,7 +54,7 @@ class Step:
         measured: Pose measurement of another source at this scan, or None.
         turn: Rotation by the gyroscope since the previous scan, or None.
         turn_rate: Rate of turn by the gyroscope at the scan [rad/s], or None.
-        learnt: Calibration of the gyroscope so far.
+        synchroniser_state: State from which the reading of the source can continue after this step.
     """
 
     index: int
@@ -70,7 +70,7 @@ class Step:
     measured: PoseMeasurement | None = None
     turn: Turn | None = None
     turn_rate: float | None = None
-    learnt: Learnt = field(default_factory=Learnt)
+    synchroniser_state: SynchroniserState = field(default_factory=SynchroniserState)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

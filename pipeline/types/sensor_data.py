@@ -142,8 +142,9 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class Learnt:
-    """Calibration of the gyroscope by the readings up to a step; reading can continue from it.
+class SynchroniserState:
+    """State of the synchroniser at a step, from which reading can continue: calibration of the gyroscope,
+    standstill and tilt.
 
     Attributes:
         stamp_ns: Time of the step.
@@ -151,11 +152,12 @@ class Learnt:
         scatter: Standard deviation of the readings around the bias [rad/s].
         blocks: Number of blocks of readings in the bias.
         block: Readings of the unfinished block [rad/s].
-        same: Number of equal readings in a row.
-        turned: Sums over the steps of the turns by wheels [rad], of their squares, and of their products with
-            the turns by gyroscope [rad^2].
+        equal_readings: Number of equal readings in a row.
+        turn_sums: Sums over the steps of the turns by wheels [rad], of their squares, and of their products
+            with the turns by gyroscope [rad^2].
         proven: Whether the gyroscope was observed to turn with the wheels.
-        stands: Time and odometry pose since which the robot is at rest; None before the first odometry.
+        standing_since: Time and odometry pose since which the robot is at rest; None before the first
+            odometry.
         tilt: Time of the last tilt [ns], roll and pitch [rad].
     """
 
@@ -164,10 +166,10 @@ class Learnt:
     scatter: float = 0.0
     blocks: int = 0
     block: tuple[float, ...] = ()
-    same: int = 0
-    turned: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    equal_readings: int = 0
+    turn_sums: tuple[float, float, float] = (0.0, 0.0, 0.0)
     proven: bool = False
-    stands: tuple[int, Pose2] | None = None
+    standing_since: tuple[int, Pose2] | None = None
     tilt: tuple[int, float, float] = (0, 0.0, 0.0)
 
 

@@ -23,9 +23,9 @@ async def following(stream: Any, n: int) -> list[dict[str, Any]]:
 
 async def test_a_late_browser_is_told_all_states_once_in_order() -> None:
     live = Broadcast()
-    live.tell("status", {"state": "playing"})
-    live.tell("truth", None)
-    live.tell("status", {"state": "paused"})
+    live.publish("status", {"state": "playing"})
+    live.publish("truth", None)
+    live.publish("status", {"state": "paused"})
     with live.listener() as listener:
         messages = await following(listener.messages(), 2)
     assert messages == [{"type": "truth", "value": None}, {"type": "status", "state": "paused"}]
@@ -54,10 +54,10 @@ async def test_what_did_not_change_is_not_told_again() -> None:
     live = Broadcast()
     with live.listener() as listener:
         stream = listener.messages()
-        live.tell("status", {"state": "paused"})
+        live.publish("status", {"state": "paused"})
         await following(stream, 1)
-        live.tell("status", {"state": "paused"})
-        live.tell("selection", {"tree": 3})
+        live.publish("status", {"state": "paused"})
+        live.publish("selection", {"tree": 3})
         assert await following(stream, 1) == [{"type": "selection", "tree": 3}]
 
 
@@ -68,7 +68,7 @@ async def test_maps_wait_for_their_round_and_states_do_not() -> None:
         live.show({"type": "map", "index": 0}, np.zeros((0, 2)))
         await following(stream, 1)
         live.show({"type": "map", "index": 1}, np.zeros((0, 2)))
-        live.tell("status", {"state": "paused"})
+        live.publish("status", {"state": "paused"})
         kinds = [message["type"] for message in await following(stream, 2)]
     assert kinds == ["status", "map"]
     assert live.listeners == 0

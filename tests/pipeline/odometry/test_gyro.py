@@ -264,13 +264,13 @@ def test_who_reads_on_from_a_scan_with_what_was_learnt_gets_the_same_steps(at, t
         for r in told_by_robot(0.32, 0.3)
     ]
     whole = list(steps(records))
-    learnt = whole[at].learnt
-    later = [r for r in records if r.stamp_ns >= learnt.stamp_ns - 1000 * MS]
-    again = [s for s in steps(later, after=learnt) if s.scan.stamp_ns >= learnt.stamp_ns]
-    wanted = [(s.turn, s.turn_rate, s.learnt) for s in whole[at:]]
-    assert [(s.turn, s.turn_rate, s.learnt) for s in again] == wanted
-    assert whole[-1].learnt.blocks > 0
-    assert whole[-1].learnt.proven
+    state = whole[at].synchroniser_state
+    later = [r for r in records if r.stamp_ns >= state.stamp_ns - 1000 * MS]
+    again = [s for s in steps(later, after=state) if s.scan.stamp_ns >= state.stamp_ns]
+    wanted = [(s.turn, s.turn_rate, s.synchroniser_state) for s in whole[at:]]
+    assert [(s.turn, s.turn_rate, s.synchroniser_state) for s in again] == wanted
+    assert whole[-1].synchroniser_state.blocks > 0
+    assert whole[-1].synchroniser_state.proven
 
 
 def test_scans_are_deskewed_by_the_rate_of_the_gyroscope():

@@ -80,7 +80,7 @@ def test_a_scan_comes_back_whole(cache):
         assert encode(found) == encode(wanted)
         wanted_step = replace(
             step, index=k, scan=Scan(step.scan.stamp_ns, nothing), T_odom_base=again.T_odom_base,
-            learnt=again.learnt,
+            synchroniser_state=again.synchroniser_state,
         )  # fmt: skip
         assert encode(again) == encode(wanted_step)
         assert (again.T_odom_base is None) == (k == 4)
