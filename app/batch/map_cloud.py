@@ -106,8 +106,14 @@ _OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}
 
 
 def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
-    """Return longitude and latitude (WGS84) of positions; None if the reference system is unknown, with a
-    warning."""
+    """Return longitude and latitude (WGS84) [deg], shape (N, 2), of positions. None without a reference
+    system, and, with a warning, if it is unknown or a position is outside of its area.
+
+    Args:
+        position: x, y [m] in the reference system, shape (N, 2).
+        crs: The reference system as text for pyproj; "" for none.
+        warnings: Receives the warning.
+    """
     if not crs:
         return None
     import pyproj

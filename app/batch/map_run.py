@@ -217,7 +217,8 @@ def _map_scans(
 
 
 def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) -> None:
-    """Write the pictures of trees. The map is complete already, so errors become warnings."""
+    """Write the pictures of trees to the folder, and their number to the summary of the outcome. The map is
+    complete already, so errors and Ctrl-C become warnings of the outcome."""
     try:
         kept, warning = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
     except (StemmapError, OSError) as error:
@@ -289,7 +290,17 @@ def _run_record(
     losses: dict[str, int],
 ) -> dict[str, Any]:
     """Return the contents of run.json, without times of day and computing times, so that the same run gives
-    the same bytes."""
+    the same bytes.
+
+    Args:
+        plan: The run with its parameters.
+        begun: Sources so far, and the running totals.
+        frame: The last frame.
+        driven_s_m: Duration [s] and length [m] of the path.
+        start_ns: Time of the first scan [ns].
+        evaluation, error: Scores of map and path; None without ground truth.
+        losses: Number of left-out records by reason.
+    """
     description, tally = plan.source.description, begun.tally
     first, *others = begun.sources
     return {

@@ -133,7 +133,15 @@ def _path(merged: MergedMap) -> Path:
 
 
 def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
-    """Change the record of run a to that of the merged run, in place."""
+    """Change the record of run a to that of the merged run, in place; its scores are removed.
+
+    Args:
+        record: Contents of run.json of run a.
+        saved: The merged run.
+        path: Its path.
+        trees: Number of its confirmed trees.
+        match: How b was matched to a.
+    """
     first, *others = saved.sources
     seconds, metres = driven(path, breaks_of(saved.sources))
     record["source"].update(uri=first.uri, sha256=first.digest)

@@ -386,7 +386,13 @@ def _folders(folder: FilePath) -> list[FilePath]:
 
 
 def _described(path: FilePath, name: str, now_s: float) -> PartialOutput | None:
-    """Return the description of a partial output; None if it has just been deleted."""
+    """Return the description of a partial output; None if it has just been deleted or cannot be read.
+
+    Args:
+        path: The folder.
+        name: Name in the description.
+        now_s: Time now [s]; output is "quiet" if nothing changed for QUIET_S and no process holds it.
+    """
     with contextlib.suppress(OSError):
         stats = [path.stat(), *(file.lstat() for file in path.iterdir())]
         changed = max(stat.st_mtime for stat in stats)

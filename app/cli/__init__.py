@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:
-    """Report unknown words of a command, with the nearest flag.
+    """Report unknown words of a command, with the flag nearest to the first of them as remedy.
 
     Raises:
         UsageError: Always.

@@ -59,7 +59,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Score the runs and print the scores."""
+    """Score the runs and print the scores, one set of parameters or, with --param-grid, many.
+
+    Returns:
+        Exit code: 0; 3 if some runs could not be scored; 1 if none could.
+
+    Raises:
+        StemmapError: The arguments contradict each other, or a single run cannot be scored.
+    """
     if len(arguments.truth) not in (0, 1, len(arguments.runs)):
         from app.common.text import count
 
@@ -102,7 +109,12 @@ def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) ->
 
 
 def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]:
-    """Return the scores of a run, and whether it is a whole cloud."""
+    """Return the scores of a run, and whether it is a whole cloud.
+
+    Raises:
+        StemmapError: The run or its ground truth cannot be read, the ground truth has no trees along the
+            path, or all of them are far from those of the map.
+    """
     from app.batch.run_folder import read_run, score_map
     from app.batch.summary import far_map, far_truth
     from pipeline.config import assign
@@ -227,7 +239,11 @@ def distances(arguments: argparse.Namespace) -> list[str]:
 
 
 def run_grid(arguments: argparse.Namespace) -> int:
-    """Compare all sets on all runs; return the exit code."""
+    """Compare all sets on all runs; return the exit code. It is 1 if no run can be used.
+
+    Raises:
+        StemmapError: An argument is wrong, or more than MOST_JOBS results are requested.
+    """
     from app.tuning.grid import combinations, read_axes
 
     sets = combinations(read_axes(arguments.param_grid))
@@ -276,7 +292,8 @@ def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
 
 
 def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Value]) -> Parameters:
-    """Return the parameters that a set changes: the preset of the set or of the run, and the flags."""
+    """Return the parameters that a set changes: the preset that the set names, else that of the run, with the
+    flags applied."""
     from app.tuning.grid import PRESET
     from pipeline.config import preset
 
@@ -321,7 +338,21 @@ def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
 def _print_comparison(
     arguments: argparse.Namespace, comparison: Comparison, outcome: SweepResult, *, refused: int
 ) -> int:
-    """Print the comparison; returns the exit code."""
+    """Print the comparison, as JSON with --json, write its files with --out, and print warnings to standard
+    error.
+
+    Args:
+        arguments: Arguments of the command.
+        comparison: The comparison.
+        outcome: How its results were computed.
+        refused: Number of runs that could not be used.
+
+    Returns:
+        Exit code: 0; 3 if results or runs are missing; 1 if all results are.
+
+    Raises:
+        StemmapError: The files cannot be written.
+    """
     from app.common.text import count
     from app.tuning.report import files, json_text, lines
 

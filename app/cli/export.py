@@ -33,7 +33,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files."""
+    """Write poses and trees of a mapped run as files of Tree Manager.
+
+    Returns:
+        Exit code: 3 if trees far from the path were left out, else 0.
+
+    Raises:
+        StemmapError: The run cannot be read, or is the map of a whole cloud.
+    """
     from app.batch.run_folder import read_run
     from app.common.text import count
     from pipeline.io.readers.tree_manager import write_tree_manager

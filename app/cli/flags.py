@@ -220,7 +220,8 @@ def seed(text: str) -> int:
 
 
 def whole_number(low: int, high: int) -> Callable[[str], int]:
-    """Return a parser of whole numbers from low to high, for argparse."""
+    """Return a parser of whole numbers from low to high, both included, for argparse; it raises
+    ArgumentTypeError for other texts."""
 
     def parse(text: str) -> int:
         if text.isascii() and text.isdigit() and len(text) < 20 and low <= int(text) <= high:
@@ -246,7 +247,7 @@ def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
 
 
 def share(text: str) -> float:
-    """Parse a number from 0 to 1."""
+    """Parse a number from 0 to 1, both included; ArgumentTypeError for other texts."""
     try:
         value = float(text)
     except ValueError:

@@ -79,7 +79,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Map the run; return the exit code."""
+    """Map a run of scans, or a whole cloud with --kind plot or a file that holds one; return the exit code.
+
+    Raises:
+        StemmapError: The arguments contradict each other, or the run cannot be mapped.
+    """
     if arguments.start is not None and arguments.continued is None:
         raise ParameterError("--start needs a continued map", remedy="Add --continue DIR")
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
@@ -95,7 +99,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_plot(arguments: argparse.Namespace) -> int:
-    """Map a whole cloud of a plot; return the exit code."""
+    """Map a whole cloud of a plot; return the exit code.
+
+    Raises:
+        StemmapError: The arguments contradict each other, or the cloud cannot be read or the map not be
+            written.
+    """
     if arguments.continued is not None or arguments.stop_after is not None:
         raise ParameterError("a whole cloud has no scans", remedy="Remove --continue and --stop-after")
     from app.batch.map_cloud import map_plot_run
@@ -181,7 +190,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
 
 
 def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the topics and the mounting that the flags give, for run.json."""
+    """Return the topics and the mounting that the flags give, for run.json; None if there are none."""
     from app.sources.request import request_of_options
 
     kept = request_of_options(arguments.source, flags.source_options(arguments)).kept_choices()

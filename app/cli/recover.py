@@ -18,7 +18,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Repair the recording."""
+    """Write the readable messages of a damaged recording to a new file.
+
+    Returns:
+        Exit code: 3 if parts are lost, else 0.
+
+    Raises:
+        StemmapError: The output is the damaged file, or exists and --force is not given.
+    """
     from pipeline.errors import StemmapError
     from pipeline.io.recording.mcap_writer import mend
 

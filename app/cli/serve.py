@@ -135,7 +135,12 @@ def _report_partial_outputs(settings: Settings) -> None:
 
 
 def _check_source(uri: str) -> None:
-    """Check that a file or scenario exists. The worker checks the contents of a file."""
+    """Check that a file or scenario exists, and the form of an address. The worker checks the contents of a
+    file.
+
+    Raises:
+        StemmapError: It does not exist, or the address is wrong.
+    """
     if _exists(uri):
         return
     scheme, colon, _ = uri.partition(":")

@@ -73,7 +73,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Collect examples, print the scores on scenes that are left out, and write the forest."""
+    """Collect examples, print the scores on scenes that are left out, and write the forest. With
+    --annotations, annotated runs are used instead of scenes.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        StemmapError: --out is missing, or there are no examples.
+    """
     if arguments.annotations:
         return learn_from_annotations(arguments.places, arguments.out, arguments.seed)
     if arguments.out is None:
@@ -98,7 +106,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _look_for(arguments: argparse.Namespace) -> None:
-    """Check the paths before scenes are simulated for an hour."""
+    """Check that the folder of --out and the labelled scans exist, before scenes are simulated for an hour.
+
+    Raises:
+        StemmapError: One does not exist.
+    """
     if not arguments.out.absolute().parent.is_dir():
         raise StemmapError("the folder for --out does not exist", where=str(arguments.out.parent))
     for place in arguments.labelled:

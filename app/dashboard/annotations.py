@@ -57,7 +57,7 @@ def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against
 
 
 def laid_over(own: TruthTrees | None, contents: Sequence[Content]) -> TruthTrees | None:
-    """Return the ground truth of the source with the annotations applied.
+    """Return the ground truth of the source with the annotations applied; None if there are neither.
 
     An annotation replaces the object within SAME_THING that has another class. One of the same class keeps
     the position of the source, and its diameter unless one was typed, because a person who confirms a mapped
@@ -276,7 +276,8 @@ def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[s
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:
-    """Return an annotation as JSON values for the page, with units in the names."""
+    """Return an annotation as JSON values for the page, with units in the names. Unknown diameters are
+    None."""
     content = row.content
     return {
         "id": row.id,

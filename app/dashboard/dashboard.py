@@ -280,7 +280,7 @@ class Dashboard:
     # --- messages of the worker ------------------------------------------------------------------
 
     async def receive(self, message: protocol.FromWorker) -> None:
-        """Process a message of the worker."""
+        """Process a message of the worker. Messages of a run that has been left are ignored."""
         match message:
             case protocol.Report(status=status):
                 self._set_status(status)
@@ -299,7 +299,14 @@ class Dashboard:
                 await self._broadcast_preview(run, revision, trees)
 
     async def _broadcast_preview(self, run: int, revision: int, trees: Trees) -> None:
-        """Broadcast the preview of a map that is being computed, with its score."""
+        """Broadcast the tree positions of a map that is being computed, with its score (None without ground
+        truth). Nothing is sent if another run was opened meanwhile.
+
+        Args:
+            run: Number of the run.
+            revision: Revision of the parameters of this map.
+            trees: Its trees.
+        """
         score = None
         if self.truth is not None:
             evaluation = self.parameters.parameters.evaluation
@@ -317,7 +324,8 @@ class Dashboard:
         self.selector.renamed(dict(changes.followed))
 
     async def _begin(self, opened: protocol.Opened) -> None:
-        """Send the parameters for an opened source; then it plays."""
+        """Load the annotations of an opened source and send the worker its parameters; then it plays, except
+        after a restart of the worker. Nothing is sent if another source was requested meanwhile."""
         self._run, self.digest = opened.run, opened.digest or opened.uri
         number = self._opens
         await self.annotation_editor.begin(opened.digest or opened.uri, opened.uri, opened.truth)
@@ -339,7 +347,8 @@ class Dashboard:
         )
 
     async def _forget(self) -> None:
-        """Show an empty map, and the ground truth of the run that begins."""
+        """Remove map, path, selection, scores and events from the page, and show the ground truth of the run
+        that begins."""
         self.shown = self.path = None
         self.path_xy = np.zeros((0, 2))
         self.live.forget_map()

@@ -136,7 +136,8 @@ class Selection:
 
     @property
     def ring(self) -> tuple[float, float, float] | None:
-        """Position and size of the cluster in the map: x, y, radius [m]."""
+        """Position and size of the selected cluster in the map: x, y, radius [m]; None if no cluster is
+        selected."""
         story = self.cluster
         if story is None:
             return None

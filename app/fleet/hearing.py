@@ -201,7 +201,8 @@ class ResultReceiver:
         self._version = -1
 
     def subscribe_to_new(self) -> None:
-        """Subscribe to results that were not announced before."""
+        """Subscribe to results that were not announced before. Topics of other types, and robots beyond
+        MOST_ROBOTS, are ignored."""
         if self._version == self._link.version:
             return
         self._version = self._link.version
@@ -230,7 +231,14 @@ class ResultReceiver:
         return FleetReport(self._link.problem, self._link.place, robots)
 
     def _report_of(self, name: str, alive: bool, now_s: float) -> RobotReport:
-        """Return the report of one robot. Results that cannot be reported are dropped and counted."""
+        """Return the report of one robot. If its results cannot be reported, they are dropped, which is
+        counted, and the report is empty.
+
+        Args:
+            name: Name of the robot.
+            alive: Whether its connection exists.
+            now_s: Time of the report [s].
+        """
         try:
             return self._robots[name].report(now_s, alive=alive)
         except Exception:  # any error that a stranger's figures can cause

@@ -336,7 +336,8 @@ def fleet_page(request: Request) -> Response:
 
 @router.get("/robots/{name:path}")
 def robot_page(request: Request, name: str) -> Response:
-    """Redirect to the dashboard of a robot, with a ticket for the role of the caller."""
+    """Redirect to the dashboard of a robot, with a ticket for the role of the caller; 404 for an unknown
+    robot, 503 if its dashboard does not answer."""
     fleet: Fleet = request.app.state.fleet
     member = fleet.members.get(name)
     if member is None:

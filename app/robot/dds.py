@@ -281,7 +281,8 @@ class DdsLink(Link):
 
 
 def _offer(found: Any) -> Offer | None:  # noqa: ANN401
-    """Convert an announced writer of cyclonedds."""
+    """Return topic, type and quality of service of a writer that cyclonedds announced; None if it is no topic
+    of ROS."""
     from cyclonedds.core import Policy
 
     reliable = isinstance(found.qos[Policy.Reliability], Policy.Reliability.Reliable)

@@ -124,8 +124,8 @@ def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publish
 
 
 def _camera(there: list[Publisher], topics: dict[str, str], where: str) -> list[Publisher]:
-    """Return the topics of the pictures and of their CameraInfo; [] without a camera. Arguments as in
-    `_pose`."""
+    """Return the topic of the pictures and, where one exists, the CameraInfo with the most similar name; []
+    without a camera. Compressed pictures are preferred; arguments as in `_pose`."""
     if topics.get("camera") == NO_CAMERA:
         return []
     seen = there if "camera" in topics else [p for p in there if not _has_word(p, _NO_SCENE)]

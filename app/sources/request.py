@@ -135,7 +135,8 @@ def mount_of(pose: Pose3) -> Mount:
 
 
 def mount_of_degrees(mount: tuple[float, float, float, float, float, float] | None) -> Mount | None:
-    """Return a mounting whose angles are given in degrees, with angles in radians."""
+    """Convert the angles roll, pitch, yaw of a mounting x, y, z [m], roll, pitch, yaw from degrees to
+    radians; None stays None."""
     if mount is None:
         return None
     x, y, z, roll, pitch, yaw = mount

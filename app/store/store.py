@@ -461,7 +461,8 @@ class Store:
             self._change(connection, self._step(connection, run, author), author, row, content)
 
     def _step(self, connection: Connection, run: int, author: Author) -> int:
-        """Store a new step and return its number; steps that were undone before can no longer be redone."""
+        """Store a new step of a browser and return its number; steps that this browser undid before can no
+        longer be redone."""
         of_browser = (_steps.c.run == run, _steps.c.browser == author.browser)
         connection.execute(update(_steps).where(*of_browser, _steps.c.state == "undone").values(state="left"))
         values = {"browser": author.browser, "who": author.who, "at_ns": self._clock(), "state": "done"}

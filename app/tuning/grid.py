@@ -195,7 +195,12 @@ def _value(spec: FieldSpec, text: str) -> Value:
 
 
 def _check(spec: FieldSpec, value: Value) -> None:
-    """Check a single value. Contradictions between two values depend on the other parameters."""
+    """Check that a single value is in the bounds or choices of its parameter. Contradictions between two
+    values depend on the other parameters.
+
+    Raises:
+        ParameterError: It is not.
+    """
     if spec.kind in ("int", "float") and spec.minimum is not None and spec.maximum is not None:
         if not spec.minimum <= float(value) <= spec.maximum:
             raise ParameterError(

@@ -302,7 +302,8 @@ def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
 
 
 def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str, Any]]:
-    """Return the scores of the search runs and of the held-out runs, at the start and with the best set."""
+    """Return a row of scores for the search runs, and one for the held-out runs if there are any, each at the
+    start and with the best set; [] before the first result."""
     if start is None or best is None:
         return []
     counts = {held_out: sum(run.held_out is held_out for run in plan.runs) for held_out in (False, True)}
@@ -319,7 +320,8 @@ def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str,
 
 
 def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float | None]]:
-    """Return number and held-out score of each trial that was the best when it was made."""
+    """Return number and held-out score of each trial that was the best when it was made; trials without a
+    held-out score or that the goal does not accept are skipped."""
     held, best = [], float("inf")
     for trial in trials:
         if trial.held_out and trial.loss is not None and trial.loss < best and goal.is_kept(trial.loss):

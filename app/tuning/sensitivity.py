@@ -206,7 +206,13 @@ class _ScoringProcess:
 
 
 def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
-    """Return a curve for the page, with the points so far."""
+    """Return a curve for the page.
+
+    Args:
+        question: Parameter, its values, and the other parameters.
+        points: Points so far, at most one per value.
+        error: Why the computation ended early; empty if it did not.
+    """
     return {
         "name": question.name,
         "asked_with": question.parameters.flat(),

@@ -263,7 +263,7 @@ class SharedTrials(Trials):
             raise self._refused(error) from None
 
     def add(self, trial: Trial, most: int) -> Trial | None:
-        """Store a trial, see `Trials.add`."""
+        """Store a trial, see `Trials.add`. It is atomic among the processes that share the database."""
         from sqlalchemy import text
         from sqlalchemy.exc import SQLAlchemyError
 

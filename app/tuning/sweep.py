@@ -116,7 +116,11 @@ def plan_jobs(
 
 def _source_of(source: SourceRequest) -> SourceRequest:
     """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with its
-    choices."""
+    choices.
+
+    Raises:
+        SourceError: The map of the folder was made of several sources.
+    """
     folder = Path(source.uri)
     if not (folder / "run.json").is_file():
         return source
@@ -322,7 +326,14 @@ class _Sweep:
             self._again(number)
 
     def _is_unfit(self, worker: str, number: int, answer: JobResult) -> None:
-        """Give the job to other workers. If no worker is suitable, all jobs of its run fail."""
+        """Give a job to other workers. If no worker is suitable, this job and all waiting jobs of its run
+        fail.
+
+        Args:
+            worker: Name of the worker that refused it.
+            number: Number of the job.
+            answer: Answer with the reason, which becomes a warning.
+        """
         warning = f"{worker}: {answer.error}"
         if warning not in self._outcome.warnings:
             self._outcome.warnings.append(warning)

@@ -131,7 +131,14 @@ def build(
 
 
 def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) -> FastAPI:
-    """Return an application without routes that checks access and answers errors as JSON."""
+    """Return an application without routes that checks access and answers errors as JSON.
+
+    Args:
+        settings: Hosts and size limits.
+        port: Port on which the server listens.
+        token: Token of the owner; that of viewers is derived from it.
+        lifespan: Context in which the application runs.
+    """
     guard = Middleware(
         Guard,
         token=token,
@@ -162,7 +169,7 @@ class SafeHeaders:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Add the headers to the response."""
+        """Call the application; add to its response those security headers that it does not set itself."""
 
         async def careful(message: Message) -> None:
             if message["type"] in ("http.response.start", "websocket.http.response.start"):

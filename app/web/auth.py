@@ -173,7 +173,9 @@ class Guard:
         self.cookie = f"stemmap_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse the request, or pass it on with its role and user."""
+        """Refuse the request, or call the application with the role and user of the caller, a limited body,
+        and a renewed session where it is due. Events other than requests and websockets are passed on
+        unchecked."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
@@ -193,7 +195,8 @@ class Guard:
             await self._app(scope, receive, send)
 
     def _renewing(self, scope: Scope, headers: Headers, send: Send) -> Send:
-        """Return a `send` that renews a session in its second half when the page is loaded."""
+        """Return `send` with a new session cookie in the response, if the page "/" is loaded in the second
+        half of the session; else `send` itself."""
         if scope["path"] != "/" or not self._is_half_over(headers):
             return send
         reply = Response()

@@ -130,12 +130,13 @@ def run_server(
 
 
 def link_of(settings: Settings, port: int, token: str) -> str:
-    """Return the link that opens the page."""
+    """Return the link that opens the page and logs in with the token."""
     return f"http://{_name(settings.host)}:{port}/?token={token}"
 
 
 def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
-    """Return the uvicorn configuration of the application."""
+    """Return the uvicorn configuration of the application: without access log, since the first address
+    contains the token, and without compression of websockets."""
     return uvicorn.Config(
         app,
         ws="websockets-sansio",

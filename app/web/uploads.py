@@ -151,10 +151,17 @@ class Uploads:
 
 
 async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]) -> None:
-    """Write the file in large blocks, each in a thread; `wrote` is called with the length of each block.
+    """Write the file in large blocks, each in a thread.
+
+    Args:
+        part: File to write; it must not exist.
+        size: Announced length [bytes].
+        stream: The contents.
+        wrote: Called with the length of each block but the last.
 
     Raises:
-        UploadError: The browser disconnected, stalled, or sent another length than announced.
+        UploadError: The browser disconnected, stalled, or sent another length than announced. What has been
+            written remains.
     """
     written, waiting = 0, bytearray()
     # Not in a thread: a cancelled request would not notice the file that is created afterwards.
@@ -232,7 +239,9 @@ async def room(request: Request) -> Response:
 
 @router.post(UPLOADS)
 async def upload(request: Request, name: Annotated[str, Query(min_length=1, max_length=1000)]) -> Response:
-    """Store a recording; the body is the file."""
+    """Store a recording, whose bytes are the body of the request, under its name; return how it is stored,
+    with 201. An error, as JSON, for another type than application/octet-stream, without a length, and where
+    the file cannot be stored."""
     uploads: Uploads = request.app.state.uploads
     kind = request.headers.get("content-type", "")
     try:

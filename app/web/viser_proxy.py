@@ -186,7 +186,13 @@ async def _connect(viser: ViserServer, user: str, protocols: list[Subprotocol]) 
 
 
 async def _carry(browser: WebSocket, upstream: ClientConnection, looks_only: bool) -> None:
-    """Forward messages in both directions until either side disconnects."""
+    """Forward messages in both directions until either side disconnects; errors are logged.
+
+    Args:
+        browser: Websocket of the browser.
+        upstream: Connection to the 3D scene.
+        looks_only: Whether commands of the browser that change the scene are dropped.
+    """
     directions = {
         asyncio.create_task(_to_browser(browser, upstream)),
         asyncio.create_task(_to_viser(browser, upstream, looks_only)),

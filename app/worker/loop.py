@@ -102,8 +102,8 @@ class WorkerLoop:
                 self._execute(command)
 
     def _next_command(self) -> protocol.ToWorker | None:
-        """Return the next command, and wait for it until the next scan is due. Of successive parameter
-        changes (a slider drag) the last one is returned.
+        """Return the next command, and wait for it until the next scan is due; None ends the worker. Of
+        successive parameter changes (a slider drag) the last one is returned.
 
         Raises:
             queue.Empty: A scan is due.

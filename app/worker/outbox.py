@@ -54,7 +54,8 @@ class Outbox:
         self._thread.start()
 
     def put(self, message: FromWorker) -> None:
-        """Queue a message. Of several waiting frames only the newest one is sent."""
+        """Queue a message. Of several waiting frames, or messages that replace each other, only the newest
+        one is sent; if MOST_MESSAGES wait, the oldest is dropped and an error is reported."""
         with self._changed:
             if isinstance(message, Shown):
                 self._picture = message
@@ -172,7 +173,8 @@ def rows_from(path: Path, start: int) -> Path:
 
 
 def joined(old: Path | None, start: int, tail: Path) -> Path:
-    """Return the path `old` with its rows from `start` onwards replaced by `tail`."""
+    """Return a path whose rows from `start` onwards are replaced by `tail`; only `tail` without an old path
+    or with start 0."""
     if old is None or start == 0:
         return tail
     columns = ((getattr(old, name)[:start], getattr(tail, name)) for name in _PATH_COLUMNS)

@@ -360,7 +360,8 @@ def changes_between(
 
 
 def _renamed(before: Trees, after: Trees) -> list[tuple[int, int]]:
-    """Return old and new number of each tree that is in both maps."""
+    """Return old and new number of each confirmed tree of the new map that has one of the old map within
+    SAME."""
     old, new = np.flatnonzero(before.confirmed), np.flatnonzero(after.confirmed)
     old_of = match(after.position[new], before.position[old], SAME)
     return [
@@ -389,7 +390,8 @@ def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: i
 
 
 def _why_not(frame: Frame, place: Float) -> str:
-    """Return the reason why a map has no tree at a place."""
+    """Return the reason why a map has no tree at a place, shape (2,) [m]: the class of the nearest column,
+    else the number of observations of the nearest unconfirmed tree, or that nothing was detected."""
     if frame.columns is not None:
         near = _nearest(frame.columns.axis[:, :2], place)
         if near >= 0:

@@ -95,12 +95,12 @@ class Session:
 
     @property
     def frame(self) -> Frame | None:
-        """Frame of the current scan."""
+        """Frame of the current scan; None without a run, or before its first scan."""
         return self._run.frame if self._run else None
 
     @property
     def path(self) -> Path | None:
-        """Path up to the current scan."""
+        """Path up to the current scan; None without a run, or before its first scan."""
         return self._run.path if self._run else None
 
     @property
@@ -374,8 +374,8 @@ class Session:
         self._state, self._detail = "paused", ""
 
     def _arrive(self, run: Run) -> Frame | None:
-        """Stop at the sought scan and return its frame. Parameters that were changed during the seek apply
-        from this scan onwards."""
+        """Stop at the sought scan and return its frame; None before the first scan. Parameters that were
+        changed during the seek apply from this scan onwards."""
         self._target.forget()
         changed = run.use(self._parameters, run.current)
         if self._remaps_on_arrival:
@@ -447,7 +447,8 @@ def _with_run(status: Status, run: Run) -> Status:
 
 
 def opened_of(run: Run) -> Opened:
-    """Return the message for an opened source."""
+    """Return the message for an opened source. Its length is None unless the source has a known begin and
+    end."""
     description = run.source.description
     truth = run.source.truth()
     end_s = None

@@ -52,7 +52,7 @@ def runs_page(request: Request) -> Response:
 
 @router.get("/robots")
 def all_robots(request: Request) -> Response:
-    """Redirect to the page of the fleet that this dashboard belongs to."""
+    """Redirect to the page of the fleet that this dashboard belongs to; 404 without a fleet."""
     port = request.app.state.fleet_port
     if port is None:
         return error_reply(404, "this dashboard belongs to no fleet", remedy="Open / instead")
@@ -90,8 +90,8 @@ def viser_page(request: Request) -> Response:
 
 
 def lead_on(request: Request, port: int) -> Response:
-    """Redirect to another port of this host with a ticket that opens it once for the same role. Redirects are
-    kept in histories and logs, so they must not contain the token."""
+    """Redirect (303) to another port of this host, with a ticket that opens it once for the same role.
+    Redirects are kept in histories and logs, so they must not contain the token."""
     once = ticket(request.app.state.token, port, role_of(request.scope))
     hostname = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
     host = f"[{hostname}]" if ":" in hostname else hostname
@@ -106,7 +106,13 @@ def page_answer(request: Request, path: Path) -> Response:
 
 
 def _file(request: Request, path: Path, policy: str) -> Response:
-    """Return the file, or 304 if the browser has it already."""
+    """Return the file, or 304 without content if the browser has this version (ETag) already.
+
+    Args:
+        request: The request.
+        path: The file, which exists.
+        policy: Content security policy of the response.
+    """
     headers = {**_CHECK_EACH_TIME, "Content-Security-Policy": policy}
     answer = FileResponse(path, headers=headers, stat_result=path.stat())
     known = [tag.strip().removeprefix("W/") for tag in request.headers.get("if-none-match", "").split(",")]

@@ -100,7 +100,14 @@ async def doubts(dashboard: Dash) -> Response:
 
 @router.get("/story/cluster/{number}", dependencies=[ViewerTurn])
 async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> Response:
-    """Return verdict, checks and fit of a cluster of a recently shown scan, by default the newest."""
+    """Return verdict, checks and fit of a cluster as JSON; 404 if the scan is no longer available or has no
+    such cluster.
+
+    Args:
+        number: Row of the cluster.
+        dashboard: The dashboard.
+        scan: Index of a recent scan; by default the newest.
+    """
     try:
         return json_reply(await dashboard.selector.story(scan, number))
     except NoStoryError as error:
@@ -144,7 +151,8 @@ async def stages(dashboard: Dash) -> Response:
 
 @router.post("/compare", dependencies=[ViewerTurn])
 async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
-    """Return the current scan, mapped with each of two parameter sets, as a binary block."""
+    """Map the current scan with each of two parameter sets. Return both frames as a binary block, with the
+    names and the differing parameters in its header."""
     sets = [_parameters_of(dashboard, name) for name in (body.a, body.b)]
     async with bounds.comparisons.turn():
         frames = await dashboard.worker_client.compare(sets)

@@ -114,7 +114,8 @@ async def command(body: _AnyCommand, dashboard: Dash) -> Response:
 
 @router.post("/loop")
 async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
-    """Repeat a part of the run, or end the repetition if a time is missing. The response is empty."""
+    """Repeat a part of the run between two times [s], or end the repetition if a time is missing. The
+    response is empty; an error for a part shorter than SHORTEST_LOOP_S."""
     if body.from_s is None or body.to_s is None:
         dashboard.loop.choose(None)
     elif body.to_s - body.from_s < SHORTEST_LOOP_S:
@@ -147,7 +148,8 @@ async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_
 
 @router.post("/inside")
 async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) -> Response:
-    """Return the topics of a recording or a robot and the mounting of its LiDAR, read by a child process."""
+    """Return the topics of a recording or a robot and the mounting of its LiDAR, read by a child process. The
+    address must be permitted on this server."""
     uri = permitted_uri(body.uri, settings, any_file)
     if uri is None:
         raise not_permitted(body.uri)
@@ -260,7 +262,8 @@ def _permitted_path(name: str, settings: Settings) -> str | None:
 
 
 def _permitted_simulation(uri: str, settings: Settings) -> str | None:
-    """Apply the same rule to the files that a simulated scan of a cloud reads."""
+    """Return the address of a simulated run. For a scan of a cloud, its files are replaced by their permitted
+    paths; None if one is not permitted."""
     name, _, query = uri.removeprefix("sim:").partition("?")
     if name != "cloud":
         return uri

@@ -45,7 +45,8 @@ _decoder: msgspec.json.Decoder[_Select | _SelectCluster] = msgspec.json.Decoder(
 
 @router.websocket("/api/live")
 async def live(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
-    """Send states as they change, the newest of each kind, and receive selections."""
+    """Send states as they change, the newest of each kind, and receive selections; those of viewers are
+    ignored. The websocket is closed at once if too many pages are open."""
     with bounds.pages.place(role) as free:
         if not free:
             await browser.close(_TRY_AGAIN_LATER)
@@ -73,7 +74,8 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool
 @router.websocket("/viser")
 @router.websocket("/viser/")
 async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
-    """Connect the browser with the 3D scene."""
+    """Connect the browser with the 3D scene; viewers cannot change it. The websocket is closed at once if too
+    many scenes are open."""
     with bounds.scenes.place(role) as free:
         if not free:
             await browser.close(_TRY_AGAIN_LATER)

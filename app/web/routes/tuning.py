@@ -31,7 +31,8 @@ class _Sensitivity(Body):
 
 @router.get("/search")
 async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Return the progress of the search, what can be searched for, and the other runs."""
+    """Return the progress of the search, its possible goals and parameters, and the other recorded runs,
+    which are left out if the store cannot be read."""
     try:
         runs = [run.as_plain() for run in await _others(dashboard, settings, any_file)]
     except StemmapError:  # the open run can still be searched over
@@ -64,7 +65,8 @@ async def stop_search(dashboard: Dash) -> Response:
 
 @router.post("/search/go-on")
 async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Continue the search that was stopped, with the same choices; return its state."""
+    """Continue the search that was stopped, with the same choices; return its state. An error if no search
+    was stopped."""
     search = dashboard.search
     if search.request is None:
         raise StemmapError("there is no stopped search", remedy="Start a search")
@@ -127,8 +129,8 @@ async def stop_learning(request: Request) -> Response:
 
 @router.post("/learning/use")
 async def use_learned(request: Request, dashboard: Dash) -> Response:
-    """Classify with the new decision trees from the next scan onwards; return the progress of the
-    training."""
+    """Classify with the new decision trees from the next scan onwards; return the progress of the training.
+    An error if there are none."""
     learned = _learning(request).learned
     if learned is None:
         raise StemmapError("no decision trees were grown", remedy="Grow them first")
@@ -149,7 +151,12 @@ async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted
 
 
 async def _others(dashboard: Dashboard, settings: Settings, any_file: bool) -> list[OtherRun]:
-    """Return the recorded runs besides the open one.
+    """Return the recorded runs besides the open one whose sources may be opened.
+
+    Args:
+        dashboard: Its store and its open run.
+        settings: Permitted folders.
+        any_file: Whether the caller may open every file.
 
     Raises:
         StemmapError: The store cannot be read.
