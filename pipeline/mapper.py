@@ -354,7 +354,12 @@ class Mapper:
         scan: SegmentedScan,
         estimate: PoseEstimate,
     ) -> Correction | None:
-        """Whether the robot is lost, or a lost robot is found in the map."""
+        """Begin a search if the robot is lost, or continue the search.
+
+        Returns:
+            Pose or loop with which the search ended, its failure, or None while nothing changes and if the
+            parameter `relocalisation.method` is "none".
+        """
         p, relocaliser = self._parameters, self._relocaliser
         if p.relocalisation.method == "none":
             return None
@@ -364,7 +369,8 @@ class Mapper:
         return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_lost else None
 
     def _check_loop(self, index: int, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
-        """The loop that the robot has just closed, if any, or that the graph should be solved."""
+        """Return the loop that the robot has just closed, or `Smoothing` if the graph is to be solved; None
+        otherwise and during the search of a lost robot."""
         p = self._parameters.relocalisation
         if self._relocaliser.is_searching:
             return None

@@ -118,7 +118,11 @@ def seen_higher(columns: Columns) -> Int:
 @compiled
 def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
     """Return the increase of the visible height of each column since its features were computed, shape (K,)
-    [m]; arguments are columns of `Columns`."""
+    [m]. It is negative if less is visible now.
+
+    Args:
+        viewed, met, passed, figures: Columns of `Columns`.
+    """
     gain = np.zeros(viewed.shape[0])
     for k in range(gain.shape[0]):
         highest = 0

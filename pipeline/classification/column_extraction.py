@@ -170,7 +170,8 @@ def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Flo
 
 @compiled
 def _is_known(axis: Float, found: Float, kept: int) -> bool:
-    """Return whether one of the first `kept` rows of `found` is the same axis, within TWIN."""
+    """Return whether one of the first `kept` rows of `found` is the same axis as `axis`: x and y, the first
+    two values, both differ by less than TWIN [m]."""
     known = False
     for k in range(kept):
         known |= abs(axis[0] - found[k, 0]) < TWIN and abs(axis[1] - found[k, 1]) < TWIN

@@ -138,7 +138,15 @@ def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None
     """Write into `out` the features of rays: for each band the share of rays that ended at the column; the
     free height above the clean slices up to the next return, and above the highest return; the height up to
     which there are rays; and the gap between the clean slices and the next return, as far as there are rays
-    [m]."""
+    [m].
+
+    Args:
+        rows: Sums over the returns of each slice; the first three are the numbers at the axis, near it and in
+            the ring.
+        met, passed: Rays by slice that ended at the column and that passed it.
+        last: Last clean slice.
+        out: Shares by band, then the four lengths.
+    """
     n = BANDS.shape[0]
     for b in range(n):
         ended, went = 0.0, 0.0
@@ -209,7 +217,13 @@ def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
 def _circle(rows: Float, last: int, out: Float) -> None:
     """Write into `out` the radius of the circle through the returns of all clean slices, at most 1 [m], their
     rms distance from it [m], and the ratio of both; UNSEEN where the fit fails (Kasa 1976: z + B x + C y + D
-    = 0 by least squares)."""
+    = 0 by least squares).
+
+    Args:
+        rows: Returns by slice; those of slices 1 to `last` that are clean are used.
+        last: Last slice.
+        out: Shape (3,).
+    """
     m = np.zeros(9)
     for s in range(1, min(last + 1, SLICES)):
         if rows[s, 0] >= CLEAN * (rows[s, 0] + rows[s, 1] + rows[s, 2]):

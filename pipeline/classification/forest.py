@@ -241,7 +241,15 @@ def _feature_effects(figures: Float, trees: DecisionTrees, kind: int) -> Float:
 
 @compiled
 def _share(figures: Float, unknown: int, root: int | np.int32, trees: DecisionTrees, kind: int) -> float:
-    """Return the share at the leaf, averaged over both branches of each split on the unknown feature."""
+    """Return the share at the leaf, averaged over both branches of each split on the unknown feature.
+
+    Args:
+        figures: Features of a column.
+        unknown: Number of the feature that counts as unknown; negative for none.
+        root: Row of the root of the tree.
+        trees: The trees.
+        kind: Class whose share is returned.
+    """
     _, feature, threshold, left, right, share = trees
     waiting, weight = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)
     waiting[0], weight[0] = root, 1.0

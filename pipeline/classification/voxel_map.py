@@ -231,7 +231,8 @@ def _first_place(key: int | np.int64, mask: int) -> int:
 
 @compiled
 def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
-    """Return the position of a key in the hash table, or the free position for it."""
+    """Return the position of a key in a hash table, or the free position for it. `slot` holds row + 1 in
+    `keys` or 0 for free; its length is a power of two, with at least one free position."""
     mask = slot.shape[0] - 1
     at = _first_place(key, mask)
     while slot[at] > 0 and keys[slot[at] - 1] != key:
@@ -253,7 +254,8 @@ def _tile_of(key: int | np.int64) -> int:
 
 @compiled
 def _link(row: int | np.int64, tables: _Tables, tiles: int) -> int:
-    """Add a voxel to the chain of its tile; return the number of tiles in use."""
+    """Add the voxel `row` to the chain of its tile, and the tile to the tables if it is new. Return the
+    number of tiles; `tiles` is the number before."""
     tile = _tile_of(tables.key[row])
     at = _find(tile, tables.tile_key, tables.tile_slot)
     if tables.tile_slot[at] == 0:
@@ -281,7 +283,8 @@ def _index(used: int, tables: _Tables) -> int:
 
 @compiled
 def _keep_judged(old: _Tables, tiles: int, fresh: _Tables) -> None:
-    """Copy the returns at the last classification to the tiles of another map that exist in both."""
+    """Copy the number of returns at the last classification from each of the first `tiles` tiles of `old` to
+    the same tile of `fresh`, where it exists."""
     for t in range(tiles):
         at = _find(old.tile_key[t], fresh.tile_key, fresh.tile_slot)
         if fresh.tile_slot[at] > 0:
@@ -290,8 +293,9 @@ def _keep_judged(old: _Tables, tiles: int, fresh: _Tables) -> None:
 
 @compiled
 def _select_due(tables: _Tables, tiles: int, grown: float, most: int) -> Int:
-    """Return at most `most` tiles, shape (T, 2), that are due, in the order of the table, and mark them as
-    classified."""
+    """Return the tiles that are due, at most `most` with the largest growth, shape (T, 2), in the order of
+    the table, and mark them as classified. A tile is due if its returns exceed `grown` times those at its
+    last classification."""
     key, returns, judged = tables.tile_key, tables.tile_returns, tables.tile_judged
     growth = np.zeros(tiles)
     due = 0

@@ -59,8 +59,14 @@ def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
 
 @compiled
 def spread_about(points: Float, bounds: Int, centre: Float) -> Float:
-    """Return the standard deviation of the horizontal distances to the centre of each cluster, shape (K,)
-    [m]."""
+    """Return the standard deviation of the horizontal distances of the points of each cluster to a centre,
+    shape (K,) [m].
+
+    Args:
+        points: Points in the order of the clusters, shape (N, 2 or 3) [m].
+        bounds: First row of each cluster, and N, shape (K + 1,); no cluster is empty.
+        centre: x, y first, shape (K, 2 or 3) [m].
+    """
     clusters = bounds.shape[0] - 1
     spread = np.zeros(clusters)
     for k in range(clusters):
@@ -86,7 +92,7 @@ def describe_stems(
 
     Returns:
         Labels in which the vegetation forms clusters of its own, and the shape of each cluster; see
-        `describe`.
+        `describe`. Nothing is separated if `split_slices` is 0 or `centre` is not "circle".
     """
     whole = describe(points, labels, sensor, parameters)
     if parameters.split_slices == 0 or parameters.centre != "circle":
@@ -102,7 +108,7 @@ def describe_stems(
 
 def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
     """Return the clusters with the given ascending rows replaced by others; rows beyond the last are
-    appended."""
+    appended. `others` has one row for each of `rows`."""
     columns = []
     for column in fields(Clusters):
         old, new = getattr(clusters, column.name), getattr(others, column.name)

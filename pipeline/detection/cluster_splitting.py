@@ -91,7 +91,18 @@ def split_trunks(
 def _split_trunks(
     points: Float32, rows: Int, bounds: Int, step: float, sigma: float, slices: int, label: Int32
 ) -> Int:
-    """Relabel the points beside trunks, in place; return the ascending numbers of the reduced clusters."""
+    """Give the points beside trunks new numbers in `label`, in place: each reduced cluster k leaves a further
+    cluster. Return the ascending numbers k.
+
+    Args:
+        points: Points, shape (N, 3) [m], sensor frame.
+        rows: Rows of the points in the order of the clusters.
+        bounds: First position of each cluster in `rows`, and their number, shape (K + 1,).
+        step: Azimuth step of the sensor [rad].
+        sigma: Standard deviation of its ranges [m].
+        slices: Number of slices that must agree.
+        label: Cluster of each point, shape (N,).
+    """
     clusters = bounds.shape[0] - 1
     apart, more = np.empty(clusters, np.int64), 0
     flags = np.empty((2, MOST_RUNS), np.bool_)
@@ -121,6 +132,16 @@ def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs,
     """Find the runs of a cluster that follow the front of a circle.
 
     Fills the table of runs, the run of each return (-1 for none) and its slice; returns the number of runs.
+    It is 0 for a cluster around the sensor.
+
+    Args:
+        points: Points, shape (N, 3) [m], sensor frame.
+        own: Rows of the points of the cluster, shape (n,).
+        step: Azimuth step of the sensor [rad].
+        sigma: Standard deviation of its ranges [m].
+        runs: The table, of which at most MOST_RUNS rows are filled.
+        run: Run of each return, shape (n,); must be -1.
+        level: Slice of each return, shape (n,).
     """
     n = own.shape[0]
     x, y, lowest = 0.0, 0.0, np.inf
@@ -171,8 +192,19 @@ def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs,
 def _follows_circle(
     part: Int, across: Float, reach: Float, step: float, sigma: float, c: float, s: float, runs: Runs, at: int
 ) -> bool:
-    """Return whether a run follows the front of a circle as wide as the run, and write the circle to the
-    table."""
+    """Return whether a run follows the front of a circle as wide as the run, and if so write the circle into
+    the table.
+
+    Args:
+        part: Returns of the run, from right to left.
+        across: Tangent of the azimuth of each return of the cluster, from its middle.
+        reach: Horizontal range of each return [m].
+        step: Azimuth step of the sensor [rad].
+        sigma: Standard deviation of its ranges [m].
+        c, s: Cosine and sine of the azimuth of the middle of the cluster.
+        runs: The table.
+        at: Row that is written.
+    """
     n = part.shape[0]
     right, left = np.arctan(across[part[0]]), np.arctan(across[part[n - 1]])
     mean = 0.0
@@ -205,7 +237,8 @@ def _follows_circle(
 def _find_trunk(runs: Runs, found: int, level: Int, slices: int) -> bool:
     """Mark the runs of the trunk with the most agreeing slices, and among these the most returns.
 
-    Returns whether enough slices agree.
+    Returns whether enough slices agree. `found` is the number of runs, `level` the slice of each return, and
+    `slices` the least number of slices.
     """
     most, returns = 0, 0
     for seed in range(found):

@@ -92,7 +92,20 @@ def _row_offsets(dimensions: int) -> Int:
 def _cluster(
     points: Float, key_of: Int, order: Int, rows: Int, eps2: float, min_points: int, weight: Int32
 ) -> tuple[Int32, Bool]:
-    """Sort the points by cell and label them; see `dbscan_grid`."""
+    """Sort the points by cell and label them; see `dbscan_grid`.
+
+    Args:
+        points: Points, shape (N, 2 or 3) [m].
+        key_of: Key of the cell of each point.
+        order: Rows of the points by ascending key.
+        rows: Offsets of the keys of the neighbouring rows of cells.
+        eps2: Square of the radius [m^2].
+        min_points: Least weight within the radius of a core point.
+        weight: Weight of each point.
+
+    Returns:
+        Cluster of each point, -1 for noise, and whether it is a core point, shape (N,).
+    """
     n = points.shape[0]
     keys, bounds = np.empty(n, np.int64), np.empty(n + 1, np.int64)
     # A third axis of zeros does not change distances in the plane.

@@ -217,7 +217,8 @@ def quantile(ordered: Float, part: float) -> float:
 
 @compiled
 def visible_arc(rays: Float, n: int, p: Float) -> float:
-    """Return the visible arc [rad]: a full turn minus the largest gap between returns around the axis."""
+    """Return the visible arc [rad] around the axis p (x, y, lean x, lean y first) by the first n rays: a full
+    turn minus the largest gap between returns."""
     away = max(np.sqrt(p[0] * p[0] + p[1] * p[1]), 1e-9)
     c, s = -p[0] / away, -p[1] / away  # from the axis to the sensor
     least, most = np.inf, -np.inf
@@ -297,7 +298,8 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
 
 @compiled
 def _to_rays(points: Float, begin: int, end: int, rays: Float) -> int:
-    """Fill the rays from points begin..end-1, at most MOST_POINTS; return the number of rays."""
+    """Fill `rays` from points begin..end-1, at most MOST_POINTS evenly drawn ones: rows are x and y of the
+    horizontal direction, horizontal range [m], and height above the mean [m]. Return the number of rays."""
     n = min(end - begin, MOST_POINTS)
     z0 = 0.0
     for k in range(n):
@@ -316,6 +318,13 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
     """Estimate the centre of a trunk with too few points for a circle from its angular width.
 
     The radius is r = R sin w / (1 - sin w), where w is half the angular width and R the mean range.
+
+    Args:
+        rays: Rays, see `_to_rays`.
+        n: Number of rays.
+        azimuth_step: Azimuth step of the sensor [rad].
+        stem: Receives centre and covariance, see `fit_stems`; radius and its sigma become NaN, the other
+            columns 0.
     """
     distance = 0.0
     for i in range(n):
@@ -337,7 +346,17 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
 
 @compiled
 def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, stem: Float) -> None:
-    """Fit one cluster and write the result to `stem`; `some` is a buffer for a subset of the rays."""
+    """Fit one cluster by a robust circle with lean and write the result to `stem`, a row of the result of
+    `fit_stems`.
+
+    Args:
+        rays: Rays, see `_to_rays`.
+        n: Number of rays.
+        some: Buffer of the shape of `rays` for a subset.
+        sigma: Standard deviation of the ranges [m].
+        azimuth_step: Azimuth step of the sensor [rad].
+        stem: Receives the result.
+    """
     half = middle_half(rays, n, 0.0, 0.0)
     away = np.hypot(half.x, half.y)
     # Between the outermost beam and the next one, a part of the trunk is not hit, less the width of the
@@ -407,7 +426,8 @@ def _some(rays: Float, n: int, some: Float) -> int:
 
 @compiled
 def _write(p: Float, L: Float, inflate: float, stem: Float) -> None:
-    """Write centre, radius and their covariance (L L^T)^-1 times `inflate` to `stem`."""
+    """Write centre, radius and their covariance, (L L^T)^-1 times `inflate` plus that of the model, to
+    `stem`; p holds x, y, lean x, lean y, radius."""
     unit, column = np.zeros(5), np.empty(5)
     stem[0], stem[1], stem[5] = p[0], p[1], p[4]
     unit[0] = 1.0

@@ -46,7 +46,9 @@ def external_clusters(
 
 
 def _levelling(step: Step, stems: Stems, T_base_lidar: Pose3, parameters: Acquisition) -> Float:
-    """Return R_level_base, the rotation without yaw that levels the base frame."""
+    """Return R_level_base, shape (3, 3), the rotation without yaw that levels the base frame: by the tilt of
+    the step, else by the median axis of the stems. It is the identity if levelling is "none" or fewer than
+    AXES_TO_LEVEL stems have an axis."""
     if parameters.level == "none":
         return np.eye(3)
     if step.tilt_known:

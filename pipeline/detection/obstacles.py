@@ -78,13 +78,20 @@ def find_clearance(
 
 
 def _reach(sensor_offset: Float, backward: bool, parameters: Obstacles) -> tuple[float, float]:
-    """Return the extent of the robot along its path and against it, at least to its sensor [m]."""
+    """Return the extent of the robot in the direction in which it drives and in the other one [m]; each is at
+    least that of its sensor, which is at `sensor_offset` x, y, z [m] in the base frame."""
     along = -float(sensor_offset[0]) if backward else float(sensor_offset[0])
     return max(parameters.reach, along), max(parameters.reach, -along)
 
 
 def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles) -> Float32:
-    """Return the points outside of the box of the robot, which contains its base and its sensor."""
+    """Return the points outside of the box of the robot, which contains its base and its sensor.
+
+    Args:
+        near: Points, shape (N, 3) [m], level frame at the sensor.
+        sensor_offset: Position of the sensor in the base frame, x, y first [m].
+        parameters: Reach and width of the robot.
+    """
     half = np.array([parameters.reach, 0.5 * parameters.width])
     place = near[:, :2] + sensor_offset[:2]
     own = (np.minimum(-half, sensor_offset[:2]) <= place) & (place <= np.maximum(half, sensor_offset[:2]))
@@ -154,7 +161,8 @@ def _along(
 
 @compiled
 def _beside_the_way(x: float, y: float, curvature: float) -> float:
-    """Return the lateral distance of a place from the arc through the origin [m]."""
+    """Return the lateral distance [m] of a place x, y [m] from the arc through the origin that begins along
+    +x with a curvature [1/m], positive to the left."""
     if abs(curvature) < STRAIGHT:
         return abs(y)
     radius = 1.0 / abs(curvature)
@@ -164,7 +172,8 @@ def _beside_the_way(x: float, y: float, curvature: float) -> float:
 
 @compiled
 def _on_the_way(x: float, y: float, curvature: float) -> float:
-    """Return the arc length from the origin to a place [m]; up to half a turn is in front of the robot."""
+    """Return the arc length from the origin to the foot of a place x, y [m] on the arc of `_beside_the_way`
+    [m]; up to half a turn is in front of the robot, the rest is negative."""
     if abs(curvature) < STRAIGHT:
         return x
     radius = 1.0 / abs(curvature)

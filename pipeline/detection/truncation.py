@@ -102,7 +102,8 @@ def _within(bins: UInt16, first: int) -> Bool:
 
 
 def _end(beside: Float32, c: float, s: float, side: float) -> tuple[float, Float]:
-    """Return the largest bearing of the returns to a side (1 left, -1 right) [rad], and their ranges [m]."""
+    """Return the largest bearing of the returns to a side (1 left, -1 right) [rad], and their ranges [m]. c
+    and s are cosine and sine of the direction from which bearings are counted; `beside` is not empty."""
     x, y = beside[:, 0].astype(np.float64), beside[:, 1].astype(np.float64)
     turn = side * np.arctan2(c * y - s * x, c * x + s * y)
     return float(turn.max()), np.hypot(x, y)

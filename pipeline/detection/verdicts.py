@@ -22,7 +22,9 @@ def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
 
 
 def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) -> Detections:
-    """Return the clusters with the verdict TREE in the base frame (Eq. 8: p_base = T_base_lidar p_lidar)."""
+    """Return the clusters with the verdict TREE in the base frame (Eq. 8: p_base = T_base_lidar p_lidar). The
+    covariance of the bearing and the range of the parameters is added to that of the fit; `sensor_offset` is
+    the position of the sensor in the base frame, x, y first [m]."""
     rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
     place, covariance = clusters.centre[rows], clusters.covariance[rows]
     reach = np.maximum(np.sqrt(place[:, 0] * place[:, 0] + place[:, 1] * place[:, 1]), 1e-6)

@@ -43,7 +43,7 @@ def pose_of(mu: Float, P: Float) -> Pose:
 
 @compiled_borrowing
 def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
-    """Write a pose into arrays, the inverse of `pose_of`."""
+    """Write a pose into its mean, shape (3,), and covariance, shape (3, 3), the inverse of `pose_of`."""
     mu[0], mu[1], mu[2] = pose.x, pose.y, pose.yaw
     P[0, 0], P[1, 1], P[2, 2] = pose.xx, pose.yy, pose.tt
     P[0, 1] = P[1, 0] = pose.xy
@@ -189,7 +189,8 @@ def corrected(
 
 @compiled_within
 def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
-    """Return cosine and sine of a yaw by those before a small turn."""
+    """Return cosine and sine of `yaw`. c and s are those of the yaw before it was turned by `by` [rad]; for
+    small turns they are updated by a series without cos and sin."""
     if abs(by) > SMALL_TURN:
         return np.cos(yaw), np.sin(yaw)
     b2 = by * by

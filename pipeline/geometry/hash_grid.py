@@ -110,7 +110,15 @@ def clear(cells: Cells, known: int) -> None:
 def holds_unseen(
     cells: Cells, mean: Float, seen: Bool, x: float, y: float, radius2: float, scale: float
 ) -> bool:
-    """Return whether a position that was not seen is within a radius (given as its square) of x, y."""
+    """Return whether a position that was not seen is within a radius of x, y [m], the border included.
+
+    Args:
+        cells, scale: Grid of the positions for searches within this radius.
+        mean: Positions, x, y first [m].
+        seen: Whether each was seen.
+        x, y: Centre [m].
+        radius2: Square of the radius [m^2].
+    """
     u, v = first_of_four(x, y, scale)
     for quarter in range(4):
         at = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]

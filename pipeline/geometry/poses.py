@@ -162,7 +162,7 @@ class Pose3:
 
 def interpolate(a: Pose2, b: Pose2, fraction: float) -> Pose2:
     """Return the pose at a fraction between a (0) and b (1): linear in x and y, and in yaw along the shorter
-    turn."""
+    turn. Other fractions extrapolate."""
     turn = float(wrap_angle(b.yaw - a.yaw))
     return Pose2(
         a.x + fraction * (b.x - a.x),

@@ -407,7 +407,8 @@ def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
 
 @compiled
 def _between(points: Float32, height: Float32, band: Float32) -> Float32:
-    """Return the points with band[0] <= height <= band[1]."""
+    """Return the points with band[0] <= height <= band[1]. `height` and the points have the same rows; NaN is
+    outside."""
     low, high = band[0], band[1]
     inside = np.empty_like(points)
     n = 0

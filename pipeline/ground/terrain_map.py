@@ -282,7 +282,8 @@ def _register(block: Float32, below: Float, weight: Float, before: float | None)
 
     Args:
         block, below, weight: See `fuse`.
-        before: Height at the scan before, which is returned if fewer than LEAST cells are known.
+        before: Height at the scan before, None before the first; returned if fewer than LEAST cells are
+            known.
     """
     known = (block[..., VIEWS] > 0.0) & (weight > NEAR_WEIGHT)
     if np.count_nonzero(known) < LEAST:

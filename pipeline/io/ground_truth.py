@@ -114,7 +114,11 @@ def _text_of(path: Path) -> str:
 
 
 def _rows_of(text: str, where: str) -> tuple[list[int], list[list[str]]]:
-    """Return the line number and the cells of every row that is not empty."""
+    """Return the line number and the cells of every row that is not empty.
+
+    Raises:
+        SourceError: The text is no CSV.
+    """
     first = text.partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
     try:
@@ -143,8 +147,16 @@ def _positions(table: _Table) -> tuple[Float, ...]:
 
 
 def _diameters(table: _Table, dbh_unit: str | None) -> Float:
-    """Return diameters [m]; NaN for 0 and negative numbers, which other programs write for unmeasured
-    ones."""
+    """Return diameters [m], shape (N,); NaN without a column of diameters, and for 0 and negative numbers,
+    which other programs write for unmeasured ones.
+
+    Args:
+        table: The table.
+        dbh_unit: Unit of a column whose name does not state it: "m", "cm" or "mm".
+
+    Raises:
+        SourceError: The unit is unknown.
+    """
     name = table.find((*_DBH, *_DBH_OF_UNKNOWN_UNIT))
     if name is None:
         return np.full(len(table.rows), np.nan)

@@ -106,7 +106,8 @@ class LidarOdometry:
         return self._T_base_lidar @ T_odom_lidar @ self._T_base_lidar.inverse()
 
     def _useful(self, scan: Scan) -> tuple[Float, Float | None]:
-        """Return the points to register, in the sensor frame, and their times after the stamp [s]."""
+        """Return the points to register in the sensor frame, shape (N, 3) [m], without those too near, too
+        far or too low, and their times after the stamp, shape (N,) [s]; None if the scan has no times."""
         points = scan.points.astype(np.float64)
         reach = np.sqrt(np.einsum("ij,ij->i", points, points))
         up = points @ self._T_base_lidar.R[2]

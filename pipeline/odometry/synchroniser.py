@@ -275,7 +275,8 @@ class Synchroniser:
 
     def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:
         """Return pose, velocity in the base frame (x, y [m/s], yaw [rad/s]), and tilt by the odometry at a
-        time [ns]."""
+        time [ns]. After the end of the odometry the last pose is returned without motion and tilt, and None
+        as pose before it begins."""
         newest = self._odometry.newest
         if newest is None:
             if self._use_odometry:

@@ -253,7 +253,8 @@ def _reach(p: Parameters) -> float:
 
 
 def _columns(known: KnownMap, p: Parameters) -> Columns | None:
-    """The voxel columns with the verdicts of other parameters."""
+    """Return the voxel columns with the verdicts of other parameters; None without columns or if the
+    parameter `classification.method` is "none"."""
     if known.columns is None or p.classification.method == "none":
         return None
     from dataclasses import replace

@@ -156,7 +156,13 @@ def _from(points: Float32, start: Float, yaw: float) -> Float32:
 
 
 def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> SimulatedScene:
-    """Return a scene that only has a ground truth: its objects are the surfels."""
+    """Return a scene that only has a ground truth: its objects are the surfels.
+
+    Args:
+        trees: Ground truth in the frame of the cloud; None for an empty one.
+        start: Position of the first pose in this frame, shape (2,) [m]. The scene begins there.
+        yaw: Yaw of the first pose [rad].
+    """
     none = np.zeros(0)
     truth = TruthTrees(none, none, none, ())
     if trees is not None:
@@ -273,7 +279,17 @@ def _stations(clearance: Float, region: Bool) -> Int:
 
 
 def _joined(clearance: Float, region: Bool, stations: Int) -> Int:
-    """Return the cheapest path from station to station and back; narrow cells are expensive."""
+    """Return the cheapest path from station to station and back to the first; narrow cells are expensive, and
+    detours along the same cells are removed.
+
+    Args:
+        clearance: Distance of each cell to the next obstacle, shape (R, C).
+        region: Cells that the robot can reach, shape (R, C).
+        stations: Rows and columns of the stations, shape (S, 2).
+
+    Returns:
+        Rows and columns of the cells of the path, shape (N, 2).
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import dijkstra
 

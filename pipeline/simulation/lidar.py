@@ -71,8 +71,20 @@ def echo(
     """Return range and shape that the receiver reports for beam k of column c.
 
     At the edge of a shape a part of the beam passes and meets the shape behind. Echoes nearer to one another
-    than `Optics.pulse` are reported as one range in between; else the stronger one is reported, or
-    the last one if `last`.
+    than `Optics.pulse` are reported as one range in between; else the stronger one is reported, or the last
+    one if `last`.
+
+    Args:
+        c, k: Column and beam.
+        ranges, hit: Results of `first_returns`, shape (C, K).
+        solids: The shapes.
+        o: Positions of the sensor, shape (C, 3) [m].
+        directions: Directions of the beams in the scene, shape (C, K, 3).
+        optics: Beam and pulse.
+        last: Whether the last of two echoes is preferred.
+
+    Returns:
+        Range [m], infinite without a return, and the row of the shape, GROUND or NOTHING.
     """
     columns = ranges.shape[0]
     before, after = max(c - 1, 0), min(c + 1, columns - 1)

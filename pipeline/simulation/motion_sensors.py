@@ -24,6 +24,11 @@ def wheel_odometry(motion: TrueMotion, quality: WheelQuality, rng: np.random.Gen
 
     The distance is measured along the ground. On a slope it is longer than its projection on the map, so
     planar odometry is wrong there even without noise.
+
+    Args:
+        motion: True motion.
+        quality: Sizes of the errors.
+        rng: Source of the errors.
     """
     step = RATE_HZ // ODOMETRY_HZ
     d = motion.drive

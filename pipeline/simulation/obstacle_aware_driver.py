@@ -55,13 +55,28 @@ def obstacle_aware_drive(
 
 
 def _drive(course: Course, along: list[float], speeds: list[float], first: int) -> Drive:
-    """The drive from a tick onwards."""
+    """Return the drive along a course from tick `first` onwards.
+
+    Args:
+        course: The course.
+        along: Distance driven at each tick [m].
+        speeds: Speed at each tick [m/s].
+        first: First tick.
+    """
     t = np.arange(first, len(along)) / RATE_HZ
     return on_course(course, t, np.array(along[first:]), np.array(speeds[first:]))
 
 
 def _zone(drive: Drive, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, k: int) -> Zone:
-    """Return the zone of obstacle detection after sweep k, which was made during a drive."""
+    """Return the zone of obstacle detection after sweep k; CLEAR if there is no clearance.
+
+    Args:
+        drive: Motion during the sweep.
+        scene: The scene.
+        T_base_lidar: Pose of the sensor on the robot.
+        seed: Random seed of vibration and noise.
+        k: Number of the sweep.
+    """
     # The same phases in each sweep, so that the pieces belong to one vibration.
     motion = lay_on_terrain(drive, scene.terrain, np.random.default_rng(seed))
     offsets = _LIDAR.column_offsets_ns() * 1e-9

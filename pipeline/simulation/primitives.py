@@ -119,7 +119,15 @@ class SolidsBuilder:
         reflectivity: float = 0.35,
         roughness: float = 0.0,
     ) -> None:
-        """Add a tapered cylinder without caps from `start` to `end` (3,) [m] with its two radii [m]."""
+        """Add a tapered cylinder without caps from `start` to `end` (3,) [m] with its two radii [m].
+
+        Args:
+            owner: Number of the object that it belongs to.
+            start, end: Ends of the axis, shape (3,) [m]; they must differ.
+            radii: Radius at `start` and at `end` [m].
+            reflectivity: Share of the light that is reflected.
+            roughness: Largest random deviation of a range from the surface [m].
+        """
         a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
         length = float(np.linalg.norm(b - a))
         shape = [*a, *((b - a) / length), length, radii[0], (radii[1] - radii[0]) / length]
@@ -135,7 +143,12 @@ class SolidsBuilder:
         *,
         reflectivity: float = 0.35,
     ) -> None:
-        """Add a stem: a tapered cylinder as in `cone` with a section that is not round."""
+        """Add a stem: a tapered cylinder as in `cone` with a section that is not round.
+
+        Args:
+            owner, start, end, radii, reflectivity: See `cone`.
+            section: Shape of the section.
+        """
         self.cone(owner, start, end, radii, reflectivity=reflectivity)
         _, shape, capsule, surface, _ = self._rows.pop()
         figures = (

@@ -43,8 +43,15 @@ class Optics(NamedTuple):
 
 @compiled
 def meet_cone(shape: Float, o: Float, d: Float, widest: float = 1.0) -> float:
-    """Return the range at which a ray (origin o, unit direction d) enters the mantle of a tapered cylinder,
-    whose radii are multiplied by `widest`."""
+    """Return the range [m] at which a ray enters the mantle of a tapered cylinder; MISS if it does not, or if
+    the origin is inside.
+
+    Args:
+        shape: Row of the shape, see `Solids.shape`.
+        o: Origin of the ray, shape (3,) [m].
+        d: Unit direction of the ray, shape (3,).
+        widest: Factor of the radii.
+    """
     wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
     along = wx * shape[3] + wy * shape[4] + wz * shape[5]
     rate = d[0] * shape[3] + d[1] * shape[4] + d[2] * shape[5]
@@ -88,8 +95,13 @@ def bark_radius(surface: Float, radius: float, depth: float, angle: float, heigh
 
 @compiled
 def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
-    """Return the range at which a ray enters the bark of a stem. From the mantle that encloses the stem
-    the ray advances by a share of the gap, which is small enough for furrows with a slope of 2."""
+    """Return the range [m] at which a ray enters the bark of a stem, else MISS. From the mantle that encloses
+    the stem the ray advances by a share of the gap, which is small enough for furrows with a slope of 2.
+
+    Args:
+        shape, surface: Rows of the stem, see `Solids`.
+        o, d: Origin [m] and unit direction of the ray, shape (3,).
+    """
     widest = 1.0 + surface[2] + surface[4]
     t = meet_cone(shape, o, d, widest)
     if t == MISS:
@@ -124,7 +136,8 @@ def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
 
 @compiled
 def meet_ellipsoid(shape: Float, o: Float, d: Float) -> tuple[float, float]:
-    """Return the ranges at which a ray enters and leaves an ellipsoid; both are infinite when it misses."""
+    """Return the ranges [m] at which a ray enters and leaves an ellipsoid, negative behind the origin; both
+    are MISS if it passes. Arguments as in `meet_cone`."""
     cos, sin = shape[6], shape[7]
     wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
     px, py, pz = (cos * wx + sin * wy) / shape[3], (cos * wy - sin * wx) / shape[4], wz / shape[5]
@@ -141,7 +154,8 @@ def meet_ellipsoid(shape: Float, o: Float, d: Float) -> tuple[float, float]:
 
 @compiled
 def meet_box(shape: Float, o: Float, d: Float) -> float:
-    """Return the range at which a ray enters an upright box from outside."""
+    """Return the range [m] at which a ray enters an upright box from outside, else MISS; arguments as in
+    `meet_cone`."""
     cos, sin = shape[6], shape[7]
     wx, wy = o[0] - shape[0], o[1] - shape[1]
     enter, leave = -np.inf, np.inf
@@ -165,7 +179,8 @@ def meet_box(shape: Float, o: Float, d: Float) -> float:
 @compiled
 def waves_at(terrain: Float, o: Float, waves: Float) -> None:
     """Fill `waves`, shape (W, 3), with what all rays from one origin share: for each row of the terrain its
-    phase in turns, sine and cosine at the origin; in row 0 the height above the plane."""
+    phase in turns, sine and cosine at the origin; in row 0 the height above the plane. `terrain` is
+    `SimulatedTerrain.packed`, shape (W, 4), and `o` the origin, shape (3,) [m]."""
     waves[0, 0] = o[2] - terrain[0, 0] * o[0] - terrain[0, 1] * o[1] - terrain[0, 2]
     for i in range(1, terrain.shape[0]):
         turns = terrain[i, 1] * o[0] + terrain[i, 2] * o[1] + terrain[i, 3]
@@ -230,7 +245,8 @@ def meet_ground(terrain: Float, waves: Float, d: Float, farthest: float, rate: F
 
 @compiled
 def ground_incidence(terrain: Float, o: Float, d: Float, t: float) -> float:
-    """Return the cosine of the angle between a ray and the normal of the ground at range t."""
+    """Return the absolute cosine of the angle between a ray (origin o, unit direction d) and the normal of
+    the ground at range t [m]; `terrain` is `SimulatedTerrain.packed`."""
     gx, gy = gradient_at(terrain, o[0] + t * d[0], o[1] + t * d[1])
     cosine: float = abs(gx * d[0] + gy * d[1] - d[2]) / np.sqrt(1.0 + gx * gx + gy * gy)
     return cosine
@@ -238,7 +254,8 @@ def ground_incidence(terrain: Float, o: Float, d: Float, t: float) -> float:
 
 @compiled
 def solid_incidence(kind: int, shape: Float, o: Float, d: Float, t: float) -> float:
-    """Return the cosine of the angle between a ray and the normal of the shape that it meets at range t."""
+    """Return the absolute cosine of the angle between a ray (origin o, unit direction d) and the normal of
+    the shape that it meets at range t [m]; `kind` and `shape` are a row of `Solids`. Furrows are ignored."""
     x, y, z = o[0] + t * d[0] - shape[0], o[1] + t * d[1] - shape[1], o[2] + t * d[2] - shape[2]
     if kind == 0 or kind == 3:
         h = x * shape[3] + y * shape[4] + z * shape[5]
@@ -271,6 +288,11 @@ def interval_of_capsule(
     Returns:
         Azimuth of its middle, half its width in azimuth, lowest and highest elevation [rad], and the nearest
         range at which it can be met [m]. The width is negative when it is out of view.
+
+    Args:
+        capsule: Ends of its axis and its radius, shape (7,) [m].
+        R, o: Pose of the sensor.
+        lowest, highest: Elevations of the outer rings [rad].
     """
     a, b = np.empty(3), np.empty(3)
     for i in range(3):
@@ -309,6 +331,12 @@ def window_of_capsule(
     Returns:
         First and last column (modulo C), first and last ring, and the nearest range at which it can be met
         [m]. The columns are empty when it is out of view.
+
+    Args:
+        capsule: Ends of its axis and its radius, shape (7,) [m].
+        R, o: Poses of the sensor.
+        lowest, ring_step: Elevation of the lowest ring, and between two rings [rad].
+        rings: Number of rings.
     """
     columns = R.shape[0]
     step = 2.0 * np.pi / columns
@@ -371,7 +399,13 @@ def ray_directions(R: Float, beams: Float) -> Float:
 
 @compiled
 def meet_solid(kind: int, shape: Float, surface: Float, o: Float, d: Float, chance: float) -> float:
-    """Return the range of the first return from a shape; in foliage it is at a random depth."""
+    """Return the range [m] of the first return from a shape, infinite without one.
+
+    Args:
+        kind, shape, surface: Row of `Solids`.
+        o, d: Origin [m] and unit direction of the ray, shape (3,).
+        chance: Number in (0, 1) that decides the depth of the return in foliage.
+    """
     if kind == 3:
         return meet_stem(shape, surface, o, d)
     if kind == 0:
@@ -402,7 +436,17 @@ def first_returns(
 
     `order` lists the shapes; with near shapes first, rays that they stop are not tested again.
 
-    Column c looks along the azimuth pi - c 2 pi / C from the pose R[c], o[c].
+    Column c looks along the azimuth pi - c 2 pi / C from the pose R[c], o[c]. Ranges are infinite for
+    NOTHING, and beyond `optics.range_max` or outside of its field there is no return.
+
+    Args:
+        solids: The shapes.
+        terrain: `SimulatedTerrain.packed`.
+        R, o: Pose of the sensor at each column, shapes (C, 3, 3) and (C, 3) [m].
+        directions: Unit directions of the rays in the scene, shape (C, K, 3).
+        optics: Range, field and rings.
+        key: Random seed of foliage.
+        order: Rows of the shapes, shape (M,).
     """
     kind, shape, surface = solids.kind, solids.shape, solids.surface
     capsule, farthest = solids.capsule, optics.range_max

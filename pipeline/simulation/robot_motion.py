@@ -41,8 +41,15 @@ def sharp_cells(s: Float, yaw: Float) -> Bool:
 
 
 def neighbouring_curvature(sharp: Bool, s: Float, yaw: Float, closed: bool) -> Float:
-    """Return the curvature at each sample by the yaw of its neighbouring cells that are not sharp, else 0
-    [1/m]."""
+    """Return the curvature [1/m] at each sample, the mean change of yaw in its neighbouring cells that are
+    not sharp; 0 if both are.
+
+    Args:
+        sharp: Whether each cell between two samples has a sharp turn, shape (N - 1,).
+        s: Distance of each sample along the path, shape (N,) [m].
+        yaw: Yaw of each sample, shape (N,) [rad].
+        closed: Whether the last sample is the first one.
+    """
     slope = np.where(sharp, np.nan, np.diff(yaw) / np.diff(s))
     before = np.concatenate([slope[-1:] if closed else slope[:1], slope])
     after = np.concatenate([slope, slope[:1] if closed else slope[-1:]])
@@ -107,7 +114,14 @@ class Spin(NamedTuple):
 
     @classmethod
     def over(cls, first: float, way: float, yaw: float, turn: float) -> Spin:
-        """Return the fastest turn within the limits; it begins at time 0."""
+        """Return the fastest turn within the limits of speed and acceleration; it begins at time 0.
+
+        Args:
+            first: Distance along the course at which it begins [m].
+            way: Length of the course on which it is made, above 0 [m].
+            yaw: Yaw at its begin [rad].
+            turn: Angle [rad].
+        """
         rate = min(YAW_RATE / max(abs(turn), 1e-9), CREEP / way)
         gain = min(YAW_GAIN / max(abs(turn), 1e-9), ACCELERATION / way)
         ramp = min(rate / gain, gain**-0.5)  # a short turn decelerates before it reaches the rate
@@ -208,7 +222,15 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
 
 
 def on_course(course: Course, t: Float, along: Float, speed: Float) -> Drive:
-    """Return the motion along a course: distance [m] and speed [m/s] at times t [s], shape (T,) each."""
+    """Return the motion along a course; a closed course is driven any number of times, and the yaw grows with
+    each.
+
+    Args:
+        course: The course.
+        t: Times, shape (T,) [s].
+        along: Distance driven at these times [m].
+        speed: Speed at these times [m/s].
+    """
     lap, rest = np.divmod(along, course.s[-1]) if course.closed else (np.zeros_like(along), along)
     x, y, yaw, curvature = (
         np.asarray(np.interp(rest, course.s, column))
@@ -321,7 +343,8 @@ class TrueMotion:
 
 
 def lay_on_terrain(drive: Drive, terrain: TerrainModel, rng: np.random.Generator) -> TrueMotion:
-    """Place the base on the ground, perpendicular to it, with vibration while it moves."""
+    """Return the motion of a drive on the ground, with the base perpendicular to it, and with random
+    vibration of roll and pitch while the robot moves."""
     z, gx, gy = terrain.evaluate(drive.x, drive.y).T
     c, s = np.cos(drive.yaw), np.sin(drive.yaw)
     ahead, left = gx * c + gy * s, gy * c - gx * s

@@ -166,10 +166,10 @@ def odometry_of(motion: TrueMotion, request: RunRequest) -> Float:
 
 
 def random_stream(part: int, request: RunRequest, k: int = 0) -> np.random.Generator:
-    """Return the random generator of a part of the run, or of its scan k.
+    """Return the random generator of a part of the run, or of scan k of that part.
 
-    Each part, scan and drive has its own generator, so that none shifts the numbers of another. All drives
-    share the scene.
+    Each part, scan and drive has its own generator, so that none shifts the numbers of another. The part
+    SCENE is equal for all drives.
     """
     drive = [request.drive] if request.drive and part != SCENE else []
     return np.random.default_rng([part, zlib.crc32(request.name.encode()), request.seed, k, *drive])

@@ -82,7 +82,13 @@ class Scenario:
 
 
 def _ring(radius: float, wobble: float, lobes: int, points: int) -> Waypoints:
-    """Return a round course that swings in and out."""
+    """Return a closed course around the origin as x, y [m], with the radius r + w cos(n a) at angle a.
+
+    Args:
+        radius, wobble: r and w [m].
+        lobes: n.
+        points: Number of waypoints; the first is not repeated.
+    """
     angle = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False)
     r = radius + wobble * np.cos(lobes * angle)
     return tuple((float(a), float(b)) for a, b in zip(r * np.cos(angle), r * np.sin(angle), strict=True))

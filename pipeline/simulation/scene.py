@@ -201,7 +201,8 @@ class Plot:
 
 
 def build_scene(scenario: Scenario, course: Course, rng: np.random.Generator) -> SimulatedScene:
-    """Build the scene of a scenario.
+    """Build the scene of a scenario: terrain, placed objects, then random trees and other objects beside the
+    course.
 
     Raises:
         SourceError: There is no position left for an object.

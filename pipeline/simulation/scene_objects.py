@@ -49,7 +49,13 @@ class SceneBuilder:
         return len(self.kinds) - 1
 
     def true_object(self, kind: str, x: float, y: float, dbh: float = np.nan) -> int:
-        """Return the number of a new object that belongs to the ground truth."""
+        """Add an object to the ground truth and return its number, the owner of its shapes.
+
+        Args:
+            kind: Kind of the object.
+            x, y: Position [m].
+            dbh: Diameter [m], NaN for objects without one.
+        """
         self.truth.append((x, y, dbh, kind))
         self.owners.append(self.owner(kind))
         return self.owners[-1]
@@ -135,14 +141,15 @@ def add_tree(
 
 
 def add_pole(scene: SceneBuilder, x: float, y: float, radius: float) -> None:
-    """Add a straight, upright pole of 1.8 to 4 m."""
+    """Add a straight, upright pole of 1.8 to 4 m above the ground at x, y [m] to scene and ground truth."""
     owner, foot = scene.true_object("pole", x, y), scene.foot(x, y)
     top = foot + _up(scene.uniform(1.8, 4.0))
     scene.solids.cone(owner, foot - _up(0.3), top, (radius, radius), reflectivity=0.6)
 
 
 def add_bush(scene: SceneBuilder, x: float, y: float, radius: float) -> None:
-    """Add two or three porous blobs near the ground, with thin stems in them."""
+    """Add two or three porous blobs near the ground, with thin stems in them, within `radius` of x, y [m], to
+    scene and ground truth."""
     rng, owner, foot = scene.rng, scene.true_object("bush", x, y), scene.foot(x, y)
     for _ in range(int(rng.integers(2, 4))):
         half = radius * rng.uniform(0.6, 0.9, 3) * np.array([1.0, 1.0, 0.9])
@@ -154,7 +161,8 @@ def add_bush(scene: SceneBuilder, x: float, y: float, radius: float) -> None:
 
 
 def add_box(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a piece of wall or a crate, 0.8 to 2.4 m long and 1 to 1.8 m high."""
+    """Add a piece of wall or a crate at x, y [m], 0.8 to 2.4 m long and 0.8 to 1.6 m above the ground, to
+    scene and ground truth."""
     half = np.array([scene.uniform(0.4, 1.2), scene.uniform(0.12, 0.4), scene.uniform(0.5, 0.9)])
     owner, centre = scene.true_object("other", x, y), scene.foot(x, y) + _up(half[2]) - _up(0.2)
     scene.solids.box(owner, centre, half, yaw=scene.uniform(0.0, np.pi))
@@ -299,7 +307,16 @@ def _foliage(
     free_path: float,
     reflectivity: float = 0.5,
 ) -> None:
-    """Add a porous ellipsoid that is turned at random."""
+    """Add a porous ellipsoid with a random yaw.
+
+    Args:
+        scene: Receives it.
+        owner: Number of its object.
+        centre: Centre, shape (3,) [m].
+        half: Half sizes, shape (3,) [m].
+        free_path: Mean distance that a ray passes in it [m].
+        reflectivity: Share of the light that is reflected.
+    """
     yaw = scene.uniform(0.0, np.pi)
     scene.solids.ellipsoid(owner, centre, half, yaw=yaw, free_path=free_path, reflectivity=reflectivity)
 
@@ -315,7 +332,15 @@ def _crown(scene: SceneBuilder, base: Float, depth: float, width: float) -> None
 
 
 def _further_stems(scene: SceneBuilder, owner: int, foot: Float, radius: float, height: float) -> None:
-    """Add one to three more stems that part from the trunk at its foot."""
+    """Add one to three more stems that part from a trunk at its foot.
+
+    Args:
+        scene: Receives them.
+        owner: Number of the tree.
+        foot: Foot of the trunk, shape (3,) [m].
+        radius: Radius of the trunk [m].
+        height: Their height [m].
+    """
     for _ in range(int(scene.rng.integers(1, 4))):
         way = _ahead(scene.uniform(0.0, 2.0 * np.pi))
         lean = np.tan(np.radians(scene.uniform(3.0, 15.0)))
@@ -326,7 +351,8 @@ def _further_stems(scene: SceneBuilder, owner: int, foot: Float, radius: float, 
 
 
 def _ivy(scene: SceneBuilder, start: Float, end: Float, radius: float) -> None:
-    """Add leaves that climb a trunk to some height."""
+    """Add leaves around a trunk up to 20 to 60 % of it. The trunk has the ends `start`, `end` (3,) [m] and
+    the radius `radius` [m]."""
     owner = scene.owner("foliage")
     thick, top = radius + scene.uniform(0.05, 0.2), scene.uniform(0.2, 0.6)
     for part in np.arange(0.05, top, 0.08):
@@ -382,7 +408,7 @@ def add_sign(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_car(scene: SceneBuilder, x: float, y: float, yaw: float) -> None:
-    """Add a parked car or van."""
+    """Add a parked car or van at x, y [m] with the yaw `yaw` [rad]."""
     owner, foot = scene.owner("vehicle"), scene.foot(x, y)
     length, is_van = scene.uniform(1.8, 2.6), scene.rng.random() < 0.25
     top = scene.uniform(1.8, 2.4) if is_van else scene.uniform(0.85, 1.05)

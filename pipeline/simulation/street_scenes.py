@@ -96,7 +96,14 @@ def _spinning_lidar(scene: SceneBuilder) -> tuple[SpinningLidar, float]:
 
 
 def _scanned(scene: SceneBuilder, lidar: SpinningLidar, height: float, poses: list[Pose2]) -> StreetScans:
-    """Scan a scene from poses in the plane, with the sensor at a height above the ground [m]."""
+    """Return scans of a scene, one from each pose, without motion during a scan.
+
+    Args:
+        scene: The scene; its generator gives the noise.
+        lidar: The sensor. A solid-state sensor gets a random pattern for each scan.
+        height: Height of the sensor above the ground [m].
+        poses: Poses in the plane.
+    """
     solids, terrain = scene.solids.build(), scene.terrain
     steps, clouds, owners = list[Step](), [], []
     for k, pose in enumerate(poses):
@@ -150,7 +157,14 @@ def _add_street(scene: SceneBuilder) -> None:
 
 
 def _add_border(scene: SceneBuilder, side: float, start: Float, length: float) -> None:
-    """Add what bounds the ground behind a verge, from `start` (2,) along x [m]."""
+    """Add a random kind of border behind a verge: hedge, fence, wall, house, shrubs, or none.
+
+    Args:
+        scene: Receives it.
+        side: 1 on the left of the street, -1 on the right.
+        start: Its first point, shape (2,) [m].
+        length: Its length along x [m].
+    """
     end = start + np.array([length, 0.0])
     kind = scene.rng.choice(BORDERS)
     if kind == "hedge":
@@ -169,7 +183,13 @@ def _add_border(scene: SceneBuilder, side: float, start: Float, length: float) -
 
 
 def _add_verge(scene: SceneBuilder, side: float, kerb: float) -> None:
-    """Add objects in a mixture of this street's own, and parked cars."""
+    """Add objects along one side of a street, with a random mixture of kinds, and parked cars.
+
+    Args:
+        scene: Receives them.
+        side: 1 on the left of the street, -1 on the right.
+        kerb: Distance of the kerb from the middle of the street [m].
+    """
     rng = scene.rng
     mixture = dict(zip(VERGE, rng.dirichlet(list(VERGE.values())).tolist(), strict=True))
     x = -HALF_LENGTH

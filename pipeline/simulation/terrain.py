@@ -33,7 +33,7 @@ def height_at(terrain: Float, x: float, y: float) -> float:
 
 @compiled
 def gradient_at(terrain: Float, x: float, y: float) -> tuple[float, float]:
-    """Return the slope dz/dx and dz/dy of the terrain at one position."""
+    """Return the slopes dz/dx and dz/dy of the terrain (see `SimulatedTerrain.packed`) at x, y [m]."""
     gx, gy = terrain[0, 0], terrain[0, 1]
     for i in range(1, terrain.shape[0]):
         turns = terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3]

@@ -256,7 +256,8 @@ def _add_crown(scene: SceneBuilder, tip: Float, base: float, top: float, dbh: fl
 
 
 def _add_undergrowth(scene: SceneBuilder, plot: Plot, x: float, y: float, radius: float) -> None:
-    """Add plants around the foot of a stem, except where the robot drives."""
+    """Add plants around the foot of a stem, except where the robot drives. x, y [m] is the middle of the
+    stem, and `radius` [m] its radius."""
     rng, owner = scene.rng, scene.owner("undergrowth")
     high, free_path = LOWER_STEM * _draw("undergrowth height", rng), _draw("undergrowth free path", rng)
     for _ in range(int(rng.integers(*PLANTS))):

@@ -132,7 +132,17 @@ def _add_pairs(
     distance_max: float,
 ) -> int:
     """Fill `pairs` with those within the gate, in ascending order of landmark and detection; return their
-    number. Of pairs with equal cost the first one is preferred."""
+    number. Of pairs with equal cost the first one is preferred. A pair whose distance is NaN is within the
+    gate.
+
+    Args:
+        pairs: The table; it must have room for all pairs within `distance_max`.
+        cells, scale: Grid of the detections for searches within `distance_max`.
+        centre, R: Detections in the map, shape (D, 2) [m], and covariances xx, xy, yy, shape (D, 3) [m^2].
+        mean, covariance: Landmarks, likewise.
+        gate: Maximum Mahalanobis distance.
+        distance_max: Maximum distance [m].
+    """
     n = 0
     for j in range(mean.shape[0]):
         first = n

@@ -141,6 +141,11 @@ def find_ambiguous(pairs: int, found: int, room: Room) -> int:
 
     A detection is ambiguous if a second landmark is nearly as likely (LIKELY), or another detection is nearly
     as likely for the same landmark.
+
+    Args:
+        pairs: Number of pairs, which are sorted in `room.order`.
+        found: Number of detections.
+        room: The pairs; `ambiguous` and `claimed` are written.
     """
     count = 0
     for d in range(found):
@@ -210,7 +215,8 @@ def _sort(cost: Float, order: Int, n: int) -> None:
 @compiled_within
 def _sort_sequence(room: Room, pairs: int, found: int) -> None:
     """Write the detections in the order of their best pairs, then those without a pair, into `room.sequence`,
-    since the costs of the next particle have nearly the same order; `landmark_of` becomes -1."""
+    since the costs of the next particle have nearly the same order; `landmark_of` becomes -1. `landmark_of`
+    must be -1 for all detections before."""
     n = 0
     for i in range(pairs):
         d = room.detection[room.order[i]]

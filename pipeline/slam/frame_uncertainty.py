@@ -87,7 +87,7 @@ class FrameUncertainty:
         self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
     ) -> bool:
         """Return whether a landmark with `hits_min` hits or more, within `reach` [m] of the pose, belongs to
-        a reference pose. The arguments are those of `with_pose`."""
+        a reference pose. The arguments are those of `with_pose`. False without reference poses."""
         if not len(self.serial):
             return False
         near = np.hypot(*(mean - pose[:2]).T) <= reach

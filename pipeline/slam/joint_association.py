@@ -77,7 +77,16 @@ def innovation(
     pose: Pose, c: float, s: float, centre: Float, R: Float, d: int, mean: Float, covariance: Float, j: int
 ) -> tuple[float, float, float, float, float, float, float]:
     """Return ax, ay, y0, y1, S0, S1, S2 for detection d and landmark j, in the frame of the map: vector from
-    the robot to the detection [m], innovation [m], and its covariance xx, xy, yy [m^2]."""
+    the robot to the detection [m], innovation [m], and its covariance xx, xy, yy [m^2].
+
+    Args:
+        pose: Pose of the robot with its covariance.
+        c, s: Cosine and sine of its yaw.
+        centre, R: Detections in the base frame, shape (D, 2) [m], and covariances, shape (D, 3).
+        d: Row of the detection.
+        mean, covariance: Landmarks, shape (L, 2) [m], and covariances, shape (L, 3).
+        j: Row of the landmark.
+    """
     ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
     S0, S1, S2 = expected_spread(pose, c, s, ax, ay, R, d)
     return (
@@ -165,7 +174,19 @@ def _accept(
     search: JointSearch,
 ) -> bool:
     """Accept a choice of a level and write cost and pose of the next level; return False if the landmark is
-    taken, the pair is outside the gate, or the cost cannot fall below `least`."""
+    taken, the pair is outside the gate, or the cost cannot fall below `least`.
+
+    Args:
+        level: Level of the search, which decides about one detection.
+        choice: Number of a landmark of this level; the number of landmarks means none.
+        centre, R, mean, covariance: See `innovation`.
+        hits: Hits of the landmarks.
+        gate2: Square of the gate.
+        hits_to_weigh: Least hits of a landmark that corrects the pose.
+        taken: Whether a landmark is taken; the chosen one is marked.
+        least: Cost of the best assignment so far.
+        search: The search; the level after `level` is written.
+    """
     pose = _read_pose(search.pose, level)
     if choice == search.choices[level]:
         cost = search.cost[level] + search.new[level]
@@ -196,7 +217,16 @@ def _accept(
 def _fill_bounds(
     pose: Pose, centre: Float, R: Float, covariance: Float, gate2: float, n: int, search: JointSearch
 ) -> None:
-    """Fill `new` and `least` of the first n levels. The lower bounds hold for a pose without covariance."""
+    """Fill `new` and `least` of the first n levels. The lower bounds hold for a pose without covariance.
+
+    Args:
+        pose: Pose of the robot with its covariance.
+        centre, R: See `innovation`.
+        covariance: Covariances of the landmarks, shape (L, 3).
+        gate2: Square of the gate.
+        n: Number of levels.
+        search: The search.
+    """
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
     search.least[n] = 0.0
     for i in range(n - 1, -1, -1):

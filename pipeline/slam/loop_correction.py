@@ -39,6 +39,7 @@ def corrected_path(path: Float, graph: KeyframeGraph, solution: Solution) -> Flo
     """Return the path with the keyframes of a solution, x, y [m], yaw [rad], shape (N, 3).
 
     Between two keyframes the path keeps its shape, and the difference at the second one is spread evenly.
+    Behind the last keyframe the path moves with it. `path` is the path before, with the same shape.
     """
     scans = graph.scans
     keyframe = np.maximum(np.searchsorted(scans, np.arange(len(path)), side="right") - 1, 0)
@@ -55,6 +56,12 @@ def corrected_landmarks(
     """Return the landmarks of one particle after a correction of the path.
 
     A landmark of the graph is at its solution; another one moves with the keyframe that began it.
+
+    Args:
+        known: Landmarks of the particle.
+        graph: Keyframes with the births of their landmarks.
+        solution: Corrected keyframes and landmarks.
+        path: Path of the particle before the correction, shape (N, 3).
     """
     mean, turn = _moved_rigidly(known.mean, known.birth, graph, solution, path)
     _, ours, theirs = np.intersect1d(known.birth, solution.birth, return_indices=True)
@@ -96,7 +103,8 @@ def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
 
 def joined(known: MapColumns, birth: Int, name: Int) -> MapColumns:
     """Return the landmarks without those of the birth numbers `birth`, whose hits go to those of the birth
-    numbers `name`; see `same_trees`."""
+    numbers `name`; see `same_trees`. Both lists have one entry per pair; all births must exist. The better
+    score of a pair is kept."""
     hits, score = known.hits.copy(), known.score.copy()
     keep = np.ones(len(known.birth), np.bool_)
     row = {int(b): k for k, b in enumerate(known.birth)}

@@ -142,7 +142,8 @@ class Genealogy:
 def _founders_after(
     scans: int, founders: tuple[Int, Int] | None, particles: int, ancestors: Int | None
 ) -> tuple[Int, Int]:
-    """Return the founders after one more scan (see Genealogy); `scans`: number of scans before it."""
+    """Return the founders after one more scan (see Genealogy); `scans`: number of scans before it. `founders`
+    is None before the first scan, and `ancestors`, shape (P,), None without resampling."""
     newer, older = founders or (np.arange(particles),) * 2
     if scans % FOUNDED == 0:
         newer, older = np.arange(particles), newer

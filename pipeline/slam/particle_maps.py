@@ -109,7 +109,7 @@ def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
 @compiled
 def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
     """Return the maps with space for a number of further landmarks per particle and at least a number of free
-    rows in the pool."""
+    rows in the pool. The result shares arrays with `maps` where there was enough space."""
     particles, k = maps.block.shape
     places = landmarks
     for p in range(particles):
@@ -284,7 +284,15 @@ def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[
 
 @compiled_borrowing
 def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: Int32) -> int:
-    """Fill the first two results of `blocks_in_reach`; return the number of shared blocks among them."""
+    """Fill the first two results of `blocks_in_reach`; return the number of shared blocks among them.
+
+    Args:
+        maps: The maps.
+        pose: Poses of the particles, x, y first, shape (P, 3).
+        reach: Distance [m].
+        near: Receives the blocks of each particle, shape (P, K).
+        length: Receives their numbers, shape (P,).
+    """
     shared = 0
     for p in range(pose.shape[0]):
         n = 0
@@ -310,7 +318,7 @@ def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: f
 @compiled_within
 def own_block(maps: Maps, p: int, k: int) -> int:
     """Return the row of the pool of block k of particle p for writing. A shared or unused block gets a free
-    row first."""
+    row first. The pool must have a free row."""
     b = maps.block[p, k]
     if b >= 0 and maps.owners[b] == 1:
         return int(b)

@@ -125,7 +125,16 @@ def _cost_of_new(
     gate2: float,
 ) -> float:
     """Return the decrease of the log likelihood by detections without a well-known landmark. Each counts like
-    a pair at the gate; otherwise particles that recognise nothing would get the largest weights."""
+    a pair at the gate; otherwise particles that recognise nothing would get the largest weights.
+
+    Args:
+        pose: Pose of the particle with its covariance.
+        centre, R: Detections in the base frame, shape (D, 2) [m], and covariances xx, xy, yy, shape (D, 3).
+        hits: Hits of its landmarks.
+        landmark_of: Row of the landmark of each detection, -1 for none.
+        hits_to_weigh: Least hits of a well-known landmark.
+        gate2: Square of the gate.
+    """
     c, s, cost = 0.0, 0.0, 0.0
     for d in range(centre.shape[0]):
         if landmark_of[d] < 0 or hits[landmark_of[d]] < hits_to_weigh:

@@ -110,7 +110,8 @@ def estimate_rigid_shift(
 @compiled
 def _expected(pose: Float, centre: Float, known: Float, votes: Bool) -> int:
     """Return the number of expected pairs: the smaller of the number of detections and the number of
-    landmarks in `votes` that are no farther from the pose than the farthest detection."""
+    landmarks in `votes` that are no farther from the pose than the farthest detection. `pose` is x, y, yaw;
+    `centre` (D, 2) [m] in the base frame, `known` (L, 2) [m] in the map."""
     farthest, expected = 0.0, 0
     for d in range(centre.shape[0]):
         farthest = max(farthest, centre[d, 0] ** 2 + centre[d, 1] ** 2)
@@ -229,6 +230,12 @@ def _agreeing(
 
     Returns:
         Number of these pairs, and their sum of squared normalised deviations per degree of freedom.
+
+    Args:
+        lever, off, variance: Results of `_pairs`.
+        motion: x, y [m], yaw [rad].
+        may: Pairs that are considered.
+        kept: At least one of the pairs by which the motion was estimated must be true; overwritten.
     """
     square, total, n = np.empty(lever.shape[0]), 0.0, 0
     for k in range(lever.shape[0]):

@@ -165,7 +165,8 @@ def updated_familiar(familiar: float, recognised: float, detections: int) -> flo
 
 def _tree_motion_count(before: int, scan: ScanStatistics, doubted: OdometryDoubt) -> int:
     """Return `RunningStatistics.led` after a scan. A doubted scan with too few recognised trees resets it to
-    0."""
+    0. `before` is its value before; without doubt it decreases by 1, at least to 0, and otherwise grows to at
+    most TREE_MOTION_MAX."""
     if not any(doubted):
         return max(before - 1, 0)
     leading = TREES_WITHOUT_ODOMETRY if doubted.reported else MANY

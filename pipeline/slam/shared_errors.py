@@ -247,7 +247,8 @@ def update_shared_errors(x: Float, measured: MeasuredPose, p: int) -> None:
 
 @compiled
 def _add_shared(measured: MeasuredPose, p: int, z: Float, R: Float) -> None:
-    """Replace z by z - H e and R by R + H E H^T, with the errors e, E of particle p, in place."""
+    """Replace z by z - H e and R by R + H E H^T, with the mean e and covariance E of the shared errors of
+    particle p and the Jacobian H of `measured`, in place; shapes (3,) and (3, 3)."""
     E, H = measured.covariance[p], measured.H
     for i in range(3):
         for a in range(SHARED):

@@ -81,7 +81,8 @@ def _update_rows(
 
 @compiled_borrowing
 def _predict(x: Float, P: Float, dt: float, acceleration_sigma: float) -> None:
-    """Replace x by F x and P by F P F^T + Q, in place; see `transition` and `process_noise`."""
+    """Replace the state x, shape (4,), by F x and P, shape (4, 4), by F P F^T + Q, in place, for `dt` [s] and
+    the standard deviation `acceleration_sigma` [m/s^2]; see `transition` and `process_noise`."""
     for a in range(2):
         x[a] += dt * x[a + 2]
         for b in range(4):

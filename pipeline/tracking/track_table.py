@@ -187,8 +187,9 @@ class Rows(NamedTuple):
 def join(rows: Rows, old: int, young: int) -> None:
     """Fuse the track of row `young` into that of row `old`, in place.
 
-    Positions are fused by split covariance intersection, counts and sums are added, and the class tree
-    prevails. The row `young` stays unchanged; the caller removes it.
+    Positions are fused by split covariance intersection, counts and sums are added (a last scan that observed
+    both counts once), and the larger score is kept. The class is tree if one is a tree; a track without class
+    gets that of the other one. The row `young` stays unchanged; the caller removes it.
     """
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, sides, verdict = rows.hits, rows.sides, rows.verdict

@@ -165,8 +165,14 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
 
 
 def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameUncertainty:
-    """Return the uncertainty of the frame of the merged map: the records of both runs, those of b with the
-    uncertainty of T added."""
+    """Return the uncertainty of the frame of the merged map: the records of both runs. Those of b are moved
+    by T and the uncertainty of T is added; without records of b, those of a are returned.
+
+    Args:
+        a, b: States of the runs.
+        T: Pose of the frame of b in the frame of a.
+        covariance: Covariance of T, x, y [m], yaw [rad], shape (3, 3).
+    """
     own, other = a.frame.without_hidden(), b.frame
     if not len(other.serial):
         return own
@@ -207,7 +213,8 @@ def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int
 
 
 def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
-    """Return the columns of a, and those of b at positions where a has none."""
+    """Return the columns of a, and those of b at positions where a has none; T is the pose of the frame of b
+    in the frame of a."""
     axis = b.axis.copy()
     axis[:, :2] = T.apply(b.axis[:, :2])
     axis[:, 2:4] = b.axis[:, 2:4] @ T.rotation().T

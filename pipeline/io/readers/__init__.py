@@ -179,7 +179,7 @@ def file_format(path: Path, head: bytes) -> Format | None:
 
 
 def expected_format(path: Path) -> Format | None:
-    """Return the format by the suffix of a file."""
+    """Return the format by the suffix of a file, in upper or lower case; None for another suffix."""
     return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
 
 

@@ -248,7 +248,8 @@ class MessageSource(FileSource):
         return picture_of(message, self._picture_channels, self._decoder, stamp_ns)
 
     def _nearest(self, stamp_ns: int, within_ns: int) -> tuple[int, Message] | None:
-        """Return the time [ns] and message of the nearest picture within an interval."""
+        """Return the time [ns] and message of the picture nearest to a time; None if none is within
+        `within_ns` of it."""
         log_ns, best = stamp_ns - self._offset_ns, None
         wider_ns = within_ns - SAME_TIME_NS
         for taken_ns, message in self._taken(log_ns - _EARLY_NS - wider_ns):

@@ -136,6 +136,9 @@ class CloudFile:
 
         Args:
             kind, points, known: Fields of the description.
+
+        Raises:
+            SourceError: No point has valid coordinates.
         """
         for _, xyz in self._read():
             first = xyz[is_place(xyz)][:1000]
@@ -273,6 +276,16 @@ def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, 
     """Check that the compressed items of a point are together as long as a point (LASzip, `laszip.check`).
 
     The decoder allocates memory by their sizes: up to 65,535 bytes per point.
+
+    Args:
+        file: The opened file.
+        at, end: First byte of the variable-length records, and first byte after them.
+        records: Number of these records.
+        length: Length of a point by the header [bytes].
+        uri: Name of the file in errors.
+
+    Raises:
+        SourceError: The lengths differ.
     """
     for _ in range(records):
         file.seek(at)
@@ -292,7 +305,17 @@ def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, 
 
 
 def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
-    """Check that the chunk table has no more entries than the file has bytes."""
+    """Check that the chunk table is inside the file and has no more entries than the file has bytes.
+
+    Args:
+        file: The opened file.
+        first: First byte of the points.
+        size: Size of the file [bytes].
+        uri: Name of the file in errors.
+
+    Raises:
+        SourceError: The file is cut off, or its table is too large.
+    """
     file.seek(first)
     raw = file.read(8)
     at = struct.unpack("<q", raw)[0] if len(raw) == 8 else 0
@@ -359,7 +382,11 @@ class E57Cloud(CloudFile):
                     yield len(xyz), xyz
 
     def _station(self, file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types
-        """Yield the points of a station in the frame of the file, (N, 3) [m]; NaN for invalid ones."""
+        """Yield the points of a station in the frame of the file, (N, 3) [m]; NaN for invalid ones.
+
+        Raises:
+            SourceError: The points have no coordinates.
+        """
         header = file.get_header(station)
         there = set(header.point_fields)
         axes = _CARTESIAN if there.issuperset(_CARTESIAN) else _SPHERICAL

@@ -157,7 +157,11 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
 
 def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
     """Return the first `limit` + 1 unpacked bytes of a block, or all if there are fewer; arguments as in
-    `unpack`."""
+    `unpack`.
+
+    Raises:
+        BrokenChunkError: The block is damaged, or the compression is unknown.
+    """
     try:
         match compression:
             case "" | "none":
@@ -259,7 +263,7 @@ class ChunkedFile(Container):
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
         """Yield messages, see `Container.messages`. Chunks may overlap in time; each is unpacked when its
-        first message is due."""
+        first message is due. Damaged chunks are left out and counted."""
         wanted = frozenset(numbers)
         heap: list[tuple[int, int, Message]] = []
         serial = held = 0

@@ -483,6 +483,9 @@ def _channels(container: Container, run: LiveRunHeader, where: str) -> list[Chan
         container: The recording.
         run: Settings of the live run.
         where: Name of the recording in errors.
+
+    Raises:
+        SourceError: A topic is missing, or the first topic has no scans.
     """
     by_topic = {channel.topic: channel for channel in container.channels}
     missing = [topic for topic in run.topics if topic not in by_topic]

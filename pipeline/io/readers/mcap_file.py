@@ -48,7 +48,7 @@ class McapFile(ChunkedFile):
     kind = "ROS 2 MCAP"
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """Return the bytes of an attachment, see `Container.attachment`."""
+        """Return the bytes of an attachment, see `Container.attachment`. None if there is none."""
         for opcode, offset, length in self._further:
             if opcode != Opcode.ATTACHMENT or _attachment_name(self._read(offset, 4096)) != name:
                 continue
@@ -133,7 +133,14 @@ class McapFile(ChunkedFile):
         return behind[0][0] if behind else 0
 
     def _take_or_count(self, opcode: int, body: int, length: int) -> bool:
-        """Store the contents of a record, see `_take`; return False and count it if it is damaged."""
+        """Store the contents of a record, see `_take`. Return whether it could be read; a damaged record is
+        counted.
+
+        Args:
+            opcode: Type of the record.
+            body: First byte of its contents in the file.
+            length: Length of its contents [bytes].
+        """
         try:
             self._take(opcode, body, length)
         except DAMAGE:

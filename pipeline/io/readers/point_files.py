@@ -164,8 +164,13 @@ class _Stream:
     member: str | None = None
 
     def records(self, path: Path, points: int, stack: ExitStack) -> Iterator[NDArray[Any]]:
-        """Yield the records of the points part by part; an incomplete last one is left out. The stack closes
-        the file."""
+        """Yield the records of the points part by part, as structured arrays of shape (n,).
+
+        Args:
+            path: The file.
+            points: Number of points by the header. If the file has fewer, only whole records are yielded.
+            stack: Closes the file.
+        """
         file: IO[bytes]
         if self.member is None:
             file = stack.enter_context(path.open("rb"))
@@ -532,7 +537,12 @@ class _NumpyArray:
 
 
 def _open_npz(path: Path) -> PointTable:
-    """Open the array with a usual name, else the first table, else arrays x, y and z."""
+    """Open the array with a usual name, else the first that is a table of points, else arrays x, y and z of
+    equal length.
+
+    Raises:
+        ScanFileError: The file is damaged or has no such array.
+    """
     arrays: dict[str, _NumpyArray] = {}
     reason = "it holds no arrays"
     try:

@@ -155,7 +155,12 @@ def _table(lines: list[list[str]], columns: int) -> Float:
 
 
 def _date(line: str) -> int:
-    """Parse a time like 2011-09-26 13:02:25.964389445 as nanoseconds since 1970 (UTC)."""
+    """Parse a time like 2011-09-26 13:02:25.964389445 as nanoseconds since 1970 (UTC); further digits are
+    ignored.
+
+    Raises:
+        TextError: It is no time.
+    """
     whole, _, fraction = line.strip().partition(".")
     try:
         moment = datetime.fromisoformat(whole + "+00:00")

@@ -204,7 +204,11 @@ class RosSource(MessageSource):
         return None
 
     def _first_scan(self) -> tuple[Scan, str, int]:
-        """Return the first scan that can be read, its frame and the product number of the sensor."""
+        """Return the first scan that can be read, its frame and the product number of the sensor.
+
+        Raises:
+            SourceError: None of the first messages has points that can be read.
+        """
         reason = "the topic has no messages that can be read"
         for arrival in islice(self._scan_arrivals(None), _TRIES):
             try:

@@ -213,7 +213,8 @@ class BagFolder(Container):
         return heapq.merge(*streams, key=attrgetter("log_ns"))
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """Return the bytes of an attachment of any file, see `Container.attachment`."""
+        """Return the bytes of an attachment of any file, see `Container.attachment`. None if no file has
+        it."""
         found = (part.attachment(name, limit) for part in self._parts)
         return next((content for content in found if content is not None), None)
 

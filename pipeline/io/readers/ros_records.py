@@ -61,7 +61,12 @@ def decode_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2, stamp_ns: int) -> Sc
 
 
 def _table(cloud: ros2.sensor_msgs__msg__PointCloud2) -> NDArray[np.void]:
-    """Return the points as a structured array of shape (N,), after a check of its size."""
+    """Return the points as a structured array of shape (N,), after a check of its size. Padding of rows is
+    removed.
+
+    Raises:
+        LayoutError: The header contradicts itself or the size of the data, or claims too many points.
+    """
     width, height = int(cloud.width), int(cloud.height)
     step, row_step, length = int(cloud.point_step), int(cloud.row_step), len(cloud.data)
     count = width * height
@@ -281,7 +286,12 @@ class RecordDecoder:
         return Odometry(stamp_ns, pose_of(pose.position, pose.orientation))
 
     def _imu(self, message: Message, stamp_ns: int) -> Imu:
-        """Decode an IMU reading, rotated into the base frame when the pose of the IMU is known."""
+        """Decode an IMU reading, rotated into the base frame if the pose of the IMU is known. Its orientation
+        is None if the message has none.
+
+        Raises:
+            ValueError: A rate is not finite.
+        """
         decoded: ros2.sensor_msgs__msg__Imu = self.message(message)
         linked = self._tree.find(self.base, frame_name(decoded.header.frame_id))
         R_base_imu = np.eye(3) if linked is None else linked.R

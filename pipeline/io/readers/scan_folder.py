@@ -141,7 +141,14 @@ class ScanFolder(FileSource):
     def _read_texts(
         self, places: list[Path], names: Iterable[str], read: Callable[[Path], T]
     ) -> Iterator[tuple[Path, T]]:
-        """Yield the files of some names that exist and can be read, each with its contents."""
+        """Yield the files of some names that exist and can be read, each with its contents. A file that
+        cannot be read becomes a warning.
+
+        Args:
+            places: Folders, searched in this order.
+            names: Names of the files.
+            read: Returns the contents of a file.
+        """
         for path in [place / name for place in places for name in names]:
             try:
                 yield path, read(path)

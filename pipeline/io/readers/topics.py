@@ -130,7 +130,14 @@ def _role_of(topic: Topic) -> str:
 
 
 def _free(topics: list[Topic], role: str, wanted: Mapping[str, str]) -> list[Topic]:
-    """Return the topics for a role: the topic chosen as pose of another SLAM is not used as odometry."""
+    """Return the topics that may have a role: all, but for the role "odometry" not the topic that the user
+    chose as pose of another SLAM.
+
+    Args:
+        topics: Topics of the recording.
+        role: The role.
+        wanted: Topic by role where the user named it.
+    """
     taken = wanted.get("pose") if role == "odometry" else None
     return [topic for topic in topics if topic.name != taken]
 

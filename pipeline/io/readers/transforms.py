@@ -25,7 +25,8 @@ class TransformTree:
         self._links: dict[str, dict[str, Pose3]] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Pose3) -> None:
-        """Keep a transform; a later one of the same pair replaces it."""
+        """Store the transform T_parent_child between two frames, in both directions; a later one of the same
+        pair replaces it."""
         self._links.setdefault(parent, {})[child] = T_parent_child
         self._links.setdefault(child, {})[parent] = T_parent_child.inverse()
 

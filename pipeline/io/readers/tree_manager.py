@@ -192,7 +192,14 @@ class TreeManagerSource(FileSource):
                     yield scan
 
     def _scan(self, file: Path, stamp_ns: int, losses: dict[str, int]) -> Scan | None:
-        """Return the scan of a frame, which may have no stems; None when the file cannot be read."""
+        """Return the scan of a frame, with the positions of its stems as points; it may have no stems. None,
+        which is counted, if the file cannot be read.
+
+        Args:
+            file: The file of the frame.
+            stamp_ns: Time of the scan [ns].
+            losses: Counts files and rows that cannot be read.
+        """
         try:
             table, at, damaged = _read_frame(file, self._uri)
         except (SourceError, OSError):

@@ -228,7 +228,14 @@ class PcapSource(FileSource):
         self._file.close()
 
     def _read(self, rows: range) -> list[bytes]:
-        """Read the packets of one sweep."""
+        """Return the packets of one sweep, PACKET_BYTES each.
+
+        Args:
+            rows: Rows of the packets; not empty.
+
+        Raises:
+            SourceError: The file cannot be read.
+        """
         offsets = self._packets.offset[rows.start : rows.stop]
         start = int(offsets[0])
         try:
@@ -239,7 +246,12 @@ class PcapSource(FileSource):
         return [block[at : at + PACKET_BYTES] for at in (offsets - start).tolist()]
 
     def _one_sensor(self, packets: Packets, uri: str) -> Packets:
-        """Return the packets of the sensor that sent most, without those with impossible times."""
+        """Return the packets of the sensor that sent most, without those with impossible or decreasing times;
+        what is left out is counted.
+
+        Raises:
+            SourceError: There are no packets.
+        """
         if not len(packets.offset):
             raise SourceError(
                 f"the capture has no data packets of a known Velodyne sensor to port {DATA_PORT}",
@@ -335,7 +347,11 @@ def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]
 
 
 def _file_header(header: bytes, path: Path) -> tuple[str, int, int]:
-    """Return the byte order, the nanoseconds per unit of fractions, and the bytes before the IP header."""
+    """Return the byte order, the nanoseconds per unit of fractions, and the bytes before the IP header.
+
+    Raises:
+        SourceError: This is no capture of Ethernet packets in the pcap format.
+    """
     if header.startswith(b"\x0a\x0d\x0d\x0a"):
         raise SourceError(
             "a capture of the newer kind pcapng",

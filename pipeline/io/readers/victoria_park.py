@@ -167,7 +167,12 @@ class VictoriaParkSource(FileSource):
             return _nanoseconds(table[:, 0]), table[:, 1:].astype(np.float32)
 
     def _read_encoders(self, text: bytes, uri: str) -> tuple[Int, Float]:
-        """Return times and poses; scans before the first encoder reading get its pose."""
+        """Return times [ns], shape (N,), and poses by dead reckoning, x, y [m], yaw [rad], shape (N, 3).
+        Scans before the first encoder reading get its pose; readings out of bounds are counted.
+
+        Raises:
+            SourceError: There is no valid reading.
+        """
         table = self._rows(text, "DRS.txt")
         table = self._ascending(table, "encoder readings with impossible times")
         sound = (np.abs(table[:, 1]) < _FASTEST) & (np.abs(table[:, 2]) < _STEEPEST)

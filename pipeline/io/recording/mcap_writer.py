@@ -247,6 +247,11 @@ class LiveWriter(_RosWriter):
     def add_parameters(self, revision: int, from_scan: int, values: Mapping[str, Any]) -> None:
         """Write the parameters that apply from a mapped scan onwards.
 
+        Args:
+            revision: Number of the change.
+            from_scan: Index of the first scan with these parameters.
+            values: Value by name.
+
         Raises:
             OSError: The disk refuses.
         """

@@ -213,7 +213,7 @@ def text(content: str) -> bytes:
 
 
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Pose3) -> Message:
-    """Return a tf2_msgs/TFMessage with one transform."""
+    """Return a tf2_msgs/TFMessage with one transform, that of the frame `child` in the frame `parent`."""
     moved = make(
         "geometry_msgs/Transform",
         translation=vector(*T_parent_child.t),

@@ -117,7 +117,8 @@ class _Search:
         self._most, self._looked = most, 0
 
     def best_two(self) -> tuple[_Candidate | None, _Candidate | None]:
-        """Return the pose in which most stems agree, and the best pose with other pairs."""
+        """Return the pose in which most stems agree, and the best pose with other pairs; None for each that
+        does not exist, with the reason in `reason`."""
         local, reference, p = self._local, self._reference, self._p
         if min(len(local), len(reference)) < p.stems_min:
             return None, None
