@@ -36,10 +36,14 @@ class StemPicture:
 
 
 def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[StemPicture]:
-    """Return the best view of each confirmed tree that the camera saw, ordered by time, at most MOST.
+    """Return the best view of each of the first MOST confirmed trees that the camera saw, ordered by time; []
+    without pictures.
 
     Args:
-        stamps: Times of the pictures, ascending [ns].
+        camera: The camera.
+        trees: Trees of the map.
+        path: Path of the robot, in the frame of the map.
+        stamps: Times of the pictures, ascending, shape (S,) [ns].
     """
     views: list[StemPicture] = []
     if not len(stamps):

@@ -146,8 +146,8 @@ class Events:
         self._note(key, Event(time_s, "annotation", f"{who or 'Somebody'} edited {edits}"[:_LONGEST]))
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the events for the page, ordered by time; `before` flags events from before a change of
-        parameters."""
+        """Return the events for the page, ordered by time [s]; `before` flags events from before a change of
+        parameters. Of these only so many are returned that the total is at most _MOST."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]

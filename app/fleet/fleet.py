@@ -202,7 +202,7 @@ class Member:
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
-        """Start the server."""
+        """Start the server as a task of the running event loop."""
         self._task = asyncio.create_task(self._server.serve([self._listening]), name=f"serve {self.name}")
 
     @property

@@ -298,7 +298,8 @@ def build_fleet(
     fleet: Fleet,
     watching: RobotWatch | RemoteRobots | None = None,
 ) -> FastAPI:
-    """Return the application of the page of the fleet.
+    """Return the application of the page of the fleet. It starts the fleet and `watching` when it starts, and
+    closes both when it ends.
 
     Args:
         settings: Settings of the deployment.

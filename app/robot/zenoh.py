@@ -24,7 +24,9 @@ _LONGEST_TOKEN = 1000
 
 
 def publisher_of(token: str) -> Publisher | None:
-    """Return the publisher of a liveliness token; None for other tokens.
+    """Return robot (the namespace), topic and message type of the liveliness token of a publisher. None for
+    tokens of other entities, without a type `<package>::msg::dds_::<name>_`, and for tokens that are too
+    long.
 
     A token is `@ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>`, followed for
     an endpoint by `/<topic>/<type>/<hash>/<qos>`. A slash inside of a part is written `%`.

@@ -177,8 +177,8 @@ class VoxelNode:
         self.count = 0
 
     def show(self, filtered: NDArray[np.float32], size: float, visible: bool) -> None:
-        """Show the voxels that contain filtered points. `count` is the number of all voxels; at most
-        MOST_VOXELS are drawn.
+        """Show the voxels that contain filtered points. `count` becomes their number, 0 while nothing is
+        shown; at most MOST_VOXELS are drawn.
 
         Args:
             filtered: Points, shape (N, 3) [m].

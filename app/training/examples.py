@@ -44,8 +44,8 @@ class Examples:
 
 
 def object_numbers(examples: Sequence[Examples]) -> Int:
-    """Return a number for each example, equal for all examples of one object, that is of one position in a
-    scene."""
+    """Return a number for each example of all sets in their order, equal for all examples of one object, that
+    is of one position in one set."""
     key = [
         (scene, float(x), float(y))
         for scene, each in enumerate(examples)

@@ -124,7 +124,13 @@ def stand_name(uri: str, furnished: bool) -> str:
 
 
 def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
-    """Return the class of each column by the ground truth, as indices in CLASSES."""
+    """Return the class of each column by the objects of the ground truth near it, as indices in CLASSES,
+    shape (K,): OTHER without a near object, and UNKNOWN if a tree is near but not at the column.
+
+    Args:
+        axis: Columns, x, y first [m].
+        truth: Ground truth in the same frame.
+    """
     label = np.full(len(axis), CLASSES.index(Verdict.OTHER), np.int64)
     place = np.stack([truth.x, truth.y], axis=1)
     kind = np.array(truth.kind)
@@ -262,7 +268,13 @@ def label_by_points(axis: Float, points: Float, label: Int, sure: Float, any_tru
 
 
 def _distance(axis: Float, place: Float) -> Float:
-    """Return the distance of each column from the nearest position [m]."""
+    """Return the distance of each column, shape (K,) [m], from the nearest position; infinite without
+    positions.
+
+    Args:
+        axis: Columns, x, y first [m].
+        place: Positions, shape (N, 2) [m].
+    """
     if len(place) == 0:
         return np.full(len(axis), np.inf)
     from scipy.spatial import cKDTree

@@ -143,7 +143,7 @@ APART = 0.5  # m; columns within this distance belong to one tree
 
 def leave_one_out(examples: list[Examples], augmented: list[Examples], share: float) -> Iterator[str]:
     """Yield a line per real scene: trees that are found, number of trees, and false ones, by trees fitted to
-    all other scenes.
+    all other scenes. A scene is skipped if the other ones have too few examples to fit trees.
 
     Args:
         examples: Examples of all scenes; the last set of a scene, which holds all its scans, is scored.

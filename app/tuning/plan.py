@@ -128,7 +128,8 @@ class Goal:
         return 100.0 * figure if self.name == "position" and figure is not None else figure
 
     def shown(self, loss: float) -> str:
-        """Return a loss as text, for example "RMSE 3.20 cm"."""
+        """Return a loss as text, for example "RMSE 3.20 cm"; "outside the bound" if the goal does not accept
+        it."""
         if not self.is_kept(loss):
             return "outside the bound"
         digits = 2 if self.name == "position" else 3

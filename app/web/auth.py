@@ -246,7 +246,8 @@ class Guard:
         )
 
     def _limit_of(self, scope: Scope) -> int:
-        """Return the maximum size of the body of a request [bytes]."""
+        """Return the maximum size of the body of a request [bytes]; uploads of recordings have a larger
+        one."""
         is_upload = scope.get("path") == UPLOADS and scope.get("method") == "POST"
         return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
 

@@ -168,7 +168,8 @@ class WorkerLoop:
             self._report_when_due(now)
 
     def _is_due(self) -> bool:
-        """Return whether a scan is due now."""
+        """Return whether a scan is due now: never while idle, on arrival in a live run, and in a replay at
+        its time, or at once as long as nothing is prepared or no time is known."""
         pace = self._session.pace
         if pace == "idle":
             return False

@@ -44,7 +44,11 @@ class ColumnVotes:
         return self.place.nbytes + self.votes.nbytes + self.otherwise.nbytes + self.forced.nbytes
 
     def verdict(self, tree_share: float) -> Int32:
-        """Return the verdict of each column."""
+        """Return the verdict of each column, shape (K,).
+
+        Args:
+            tree_share: Least share of the votes of a tree.
+        """
         voted = np.where(self.votes[:, 0] >= tree_share, np.int32(Verdict.TREE), self.otherwise)
         verdict: Int32 = np.where(self.forced == UNFORCED, voted, self.forced).astype(np.int32)
         return verdict

@@ -83,7 +83,8 @@ class Extent:
 
 
 def find_extent(parts: Iterable[Float32], where: str) -> Extent:
-    """Return the extent of a cloud.
+    """Return the extent of a cloud. Points in sparse squares that have no dense neighbour are outside of it
+    and counted; if no square is dense, all points are inside.
 
     Args:
         parts: Points in parts, shape (N, 3) [m] each.

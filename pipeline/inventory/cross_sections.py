@@ -79,13 +79,16 @@ def _through_three(a: Float, b: Float, c: Float) -> tuple[float, float, float]:
 
 @compiled
 def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) -> bool:
-    """Fit a circle geometrically. Return whether there is a circle with at least five points on it.
+    """Fit a circle geometrically. Return whether there is one within the bounds with at least five points on
+    it; if not, `out` is undefined.
 
     Args:
         xy: Points, shape (N, 2) [m].
         reach: Points farther from the circle are ignored [m].
         r_min, r_max: Minimum and maximum radius [m].
-        out: Initial x, y and radius in `out[:3]`; filled with the result, shape (FIGURES,).
+        out: Initial x, y and radius in `out[:3]`; filled with the result, shape (FIGURES,): x, y, radius [m],
+            variances and covariance xx, xy, yy, rr [m^2], scatter [m], coverage, number of points on the
+            circle, and contrast.
     """
     n = xy.shape[0]
     x, y, r = out[0], out[1], out[2]
@@ -138,7 +141,8 @@ def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) 
 
 
 def without_scatter(radius: Float, scatter: Float) -> Float:
-    """Return radii without the bias that the scatter of the points causes [m], shape (N,).
+    """Return radii without the bias that the scatter of the points causes [m], shape (N,), at least half of
+    the fitted ones; NaN stays NaN.
 
     Points with an error of s in both directions are on average s^2 / 2 r farther from the centre (Rice).
 

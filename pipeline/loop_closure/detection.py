@@ -69,7 +69,8 @@ class RunHistory:
     contradicted: bool = False
 
     def scan_of(self, stamp_ns: Int) -> Int:
-        """Return the scan of each time, the newest scan for later times."""
+        """Return the index of the first scan at or after each time [ns], int64, of the shape of `stamp_ns`;
+        the newest scan for later times."""
         scan: Int = np.minimum(np.searchsorted(self.stamp_ns, stamp_ns), len(self.stamp_ns) - 1)
         return scan
 
@@ -126,7 +127,8 @@ def loop_to(
     run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
     """Return the loop from the scan at which known trees were left to the newest scan, at which they are
-    found again; None if the error is too small, or larger than the drift of the path can be.
+    found again. None if they were seen until the map last changed, if the error is too small and no earlier
+    loop contradicts the map, or if it is larger than the drift of the path can be.
 
     Args:
         run: Path and map.

@@ -83,7 +83,8 @@ def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, fl
 
 @compiled
 def _rows_in_range(points: Float32, least: float, below: float) -> Int32:
-    """Return the rows, int32, of the points with `least` <= range < `below` [m]."""
+    """Return the rows, int32, shape (M,), of the points with `least` <= range < `below` [m]; without rows of
+    NaN."""
     rows = np.empty(points.shape[0], np.int32)
     n = 0
     for i in range(points.shape[0]):

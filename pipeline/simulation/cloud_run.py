@@ -213,7 +213,9 @@ def loop_through(points: Float32, ground: TerrainRaster, where: str) -> Float:
 
 
 def _obstacles(points: Float32, ground: TerrainRaster) -> Int:
-    """Return the number of points that are obstacles in each cell of CELL."""
+    """Return the number of points that are obstacles in each cell of side CELL, shape (R, C), over the extent
+    of `ground`. `points` holds x, y, z and height above the ground [m]; those above LOW and below HIGH are
+    obstacles."""
     times = round(ground.cell / CELL)
     shape = (ground.seen.shape[0] * times, ground.seen.shape[1] * times)
     way = points[(points[:, 3] > LOW) & (points[:, 3] < HIGH)]
@@ -241,7 +243,13 @@ def _clearance(free: Bool, ground: TerrainRaster) -> Float:
 
 
 def _loop(clearance: Float, least: float) -> Float | None:
-    """Return a closed path over cells with at least this clearance, None when there is none."""
+    """Return a closed path over the largest region of cells with at least a clearance [m]: rows and columns
+    of cells, shape (N, 2). None if it does not lead around a large enough part of the cloud.
+
+    Args:
+        clearance: Distance of each cell to obstacles, shape (R, C) [m].
+        least: Least clearance [m].
+    """
     from scipy.ndimage import label
 
     region, regions = label(clearance >= least)
@@ -258,7 +266,16 @@ def _loop(clearance: Float, least: float) -> Float | None:
 
 
 def _stations(clearance: Float, region: Bool) -> Int:
-    """Return cells around the middle with the most clearance, one in each direction that has any."""
+    """Return cells around the middle of a region, one in each of STATIONS directions that has any: at a
+    certain part of the way to the border, if possible with much clearance.
+
+    Args:
+        clearance: Distance of each cell to obstacles, shape (R, C) [m].
+        region: Cells of the region, shape (R, C).
+
+    Returns:
+        Rows and columns, shape (S, 2).
+    """
     cells = np.argwhere(region)
     middle = cells.mean(axis=0)
     off = cells - middle

@@ -337,7 +337,8 @@ class TrueMotion:
         return rotations(roll, pitch, yaw), np.stack([x, y, z], axis=1)
 
     def sensor_at(self, t: Float, T_base_lidar: Pose3) -> tuple[Float, Float]:
-        """Return the same for a sensor on the base."""
+        """Return rotations, shape (T, 3, 3), and positions, shape (T, 3) [m], of a sensor on the base at
+        ascending times t, shape (T,) [s]."""
         R, p = self.at(t)
         return np.ascontiguousarray(R @ T_base_lidar.R), p + R @ T_base_lidar.t
 

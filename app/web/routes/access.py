@@ -62,7 +62,8 @@ class RequestQueue:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
-        """Wait for a turn, which lasts as long as the context.
+        """Wait for a turn, which lasts as long as the context. Turns follow each other with the pause of the
+        queue in between.
 
         Raises:
             TooManyRequestsError: The queue is full.

@@ -194,7 +194,7 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameUnce
 
 def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int) -> PackedVoxelMap:
     """Return the voxels of a with the means of those of b, each added as often as it was seen in b, up to
-    MOST_RETURNS.
+    MOST_RETURNS. No tile of the result is due for classification.
 
     Args:
         a, b: Voxel maps.

@@ -415,7 +415,8 @@ class E57Cloud(CloudFile):
 
 
 def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401
-    """Return rotation and translation of a station in the frame of the file; identity by default."""
+    """Return rotation (3, 3) and translation (3,) [m] of a station in the frame of the file; identity by
+    default."""
     if not header.has_pose():
         return np.eye(3), np.zeros(3)
     return np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)

@@ -145,7 +145,8 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
         size: Size by the header.
 
     Raises:
-        BrokenChunkError: The size is larger than BLOCK_LIMIT or wrong, or the compression is unknown.
+        BrokenChunkError: The block is damaged, the size is larger than BLOCK_LIMIT or wrong, or the
+            compression is unknown.
     """
     if size > BLOCK_LIMIT:
         raise BrokenChunkError("a block is too large")

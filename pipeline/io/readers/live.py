@@ -116,7 +116,9 @@ class ArrivalReader:
         return "" if self._source is None else self._source.base
 
     def add(self, message: Message) -> list[Record]:
-        """Process the next message; return the records that it completes.
+        """Process the next message; return the records that it completes. Until the source is described by
+        its first OPENING_SCANS scans, or for OPENING_NS after the first one, messages are stored and [] is
+        returned; then the stored ones follow at once.
 
         Raises:
             SourceError: There are scans, and none can be read.

@@ -59,7 +59,8 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
     """Read poses of the LiDAR: TUM rows t x y z qx qy qz qw with times [ns], or KITTI rows (times None).
 
     Raises:
-        TextError: It has neither format, or positions beyond 1e8 m.
+        TextError: It has neither format, times that do not ascend, quaternions of no length, or positions
+            beyond 1e8 m.
         OSError: It cannot be read.
     """
     lines = _lines(path)

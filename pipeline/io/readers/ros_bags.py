@@ -104,7 +104,8 @@ class Db3File(Container):
             raise damaged("the database holds no tables of messages and topics", self._path)
 
     def _read_index(self) -> tuple[Int, Int, Int]:
-        """Return row, topic and time of all messages in the order of time, without damaged ones."""
+        """Return row, topic and time [ns] of all messages in the order of time, shape (N,) each. Damaged ones
+        are left out; damaged pages end the list and are counted."""
         rows: list[tuple[int, int, int]] = []
         cursor = self._database.execute("SELECT rowid, topic_id, timestamp FROM messages")
         try:
@@ -164,7 +165,8 @@ def bag_files(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[int, str]:
-    """Return the sort key of a part of a recording: recorders write ..._0, ..._1, ..., ..._10."""
+    """Return the sort key of a part of a recording by its number: recorders write ..._0, ..._1, ..., ..._10.
+    A name without a number comes first."""
     tail = path.stem.rpartition("_")[2]
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
 
