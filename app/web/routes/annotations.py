@@ -75,7 +75,8 @@ class _TruthChoice(Body):
 
 @router.get("/annotations")
 async def read(dashboard: Dash, browser: str = "") -> Response:
-    """Return the annotations of the run, and how many edits this browser can undo and redo."""
+    """Return the annotations of the run, and how many edits this browser can undo and redo; both 0 without a
+    run or with an invalid name of the browser."""
     steps = None
     if re.fullmatch(_BROWSER, browser):
         steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, browser))
@@ -114,7 +115,8 @@ async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
 
 @router.post("/annotations/undo")
 async def undo(body: _Edit, dashboard: Dash) -> Response:
-    """Undo the last edit of the browser; return the numbers of edits that can be undone and repeated."""
+    """Undo the last edit of the browser; return the numbers of edits that can be undone and repeated. 409 if
+    there is none, or if another person has changed the annotation since."""
     await dashboard.annotation_editor.edit(body.run, lambda store: store.undo(body.run, body.author))
     return await _done(dashboard, body, {})
 
@@ -122,7 +124,7 @@ async def undo(body: _Edit, dashboard: Dash) -> Response:
 @router.post("/annotations/redo")
 async def redo(body: _Edit, dashboard: Dash) -> Response:
     """Repeat the edit that the browser undid last; return the numbers of edits that can be undone and
-    repeated."""
+    repeated. 409 if there is none, or if another person has changed the annotation since."""
     await dashboard.annotation_editor.edit(body.run, lambda store: store.redo(body.run, body.author))
     return await _done(dashboard, body, {})
 

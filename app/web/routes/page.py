@@ -76,7 +76,7 @@ def plotly(request: Request) -> Response:
 
 @router.get("/static/{path:path}")
 def page_file(request: Request, path: str) -> Response:
-    """Return a file of the page."""
+    """Return a file of the page, or 304 if the browser has it already; 404 for an unknown one."""
     found = _page_path(path)
     if found is None:
         return error_reply(404, "there is no such file", where=f"/static/{path[:200]}")

@@ -71,7 +71,8 @@ async def read(dashboard: Dash) -> Response:
 
 @router.patch("/parameters")
 async def change(body: _Changes, dashboard: Dash) -> Response:
-    """Change values by their dotted names; return all values as `GET /api/parameters` does."""
+    """Change values by their dotted names; return all values as `GET /api/parameters` does. 422 for an
+    unknown name or a wrong value."""
     await dashboard.change_parameters(dict(body.changes), body.gesture)
     return await read(dashboard)
 
@@ -93,14 +94,16 @@ async def reach(body: _Reach, dashboard: Dash) -> Response:
 
 @router.post("/parameters/undo")
 async def undo(dashboard: Dash) -> Response:
-    """Undo the last change of parameters; return them as `GET /api/parameters` does."""
+    """Undo the last change of parameters, whoever made it; return them as `GET /api/parameters` does. 409 if
+    there is none."""
     await dashboard.tune(lambda state: state.undo())
     return await read(dashboard)
 
 
 @router.post("/parameters/redo")
 async def redo(dashboard: Dash) -> Response:
-    """Repeat the change that was undone last; return the parameters as `GET /api/parameters` does."""
+    """Repeat the change that was undone last; return the parameters as `GET /api/parameters` does. 409 if
+    there is none, or a parameter was changed since."""
     await dashboard.tune(lambda state: state.redo())
     return await read(dashboard)
 
@@ -136,7 +139,8 @@ async def saved_sets(dashboard: Dash) -> Response:
 
 @router.post("/sets")
 async def save_set(body: SaveSet, dashboard: Dash) -> Response:
-    """Save the values in force under a name; a set of that name is replaced. Return all saved sets."""
+    """Save the values in force under a name; a set of that name is replaced. Return all saved sets; 422 for
+    the name of a preset."""
     state = dashboard.parameters
     await dashboard.sets.save(body.name, state.preset, state.parameters, body.who)
     return json_reply(dashboard.sets.as_plain(), 201)
@@ -144,7 +148,7 @@ async def save_set(body: SaveSet, dashboard: Dash) -> Response:
 
 @router.post("/sets/use")
 async def use_set(body: _SetName, dashboard: Dash) -> Response:
-    """Use all values of a saved set or a preset. The response is empty."""
+    """Use all values of a saved set or a preset. The response is empty; 404 if there is none of this name."""
     preset_name, values = dashboard.sets.named(body.name)
     await dashboard.tune(lambda state: state.use(preset_name, values))
     return json_reply({})
@@ -152,7 +156,7 @@ async def use_set(body: _SetName, dashboard: Dash) -> Response:
 
 @router.post("/sets/delete")
 async def delete_set(body: _SetName, dashboard: Dash) -> Response:
-    """Delete a saved set; return the others."""
+    """Delete a saved set; return the others. 404 if there is none of this name."""
     await dashboard.sets.delete(body.name)
     return json_reply(dashboard.sets.as_plain())
 

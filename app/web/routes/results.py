@@ -41,7 +41,7 @@ class _Compare(Body):
 
 @router.get("/trees")
 async def trees(dashboard: Dash) -> Response:
-    """Return the confirmed trees."""
+    """Return the confirmed trees as JSON; an empty list before the first map."""
     shown = dashboard.shown
     if shown is None:
         return json_reply({"trees": []})
@@ -52,7 +52,7 @@ async def trees(dashboard: Dash) -> Response:
 
 @router.get("/trees.csv")
 def trees_table(dashboard: Dash) -> Response:
-    """Return the confirmed trees as a table."""
+    """Return the confirmed trees as a CSV table, with only its header before the first map."""
     from pipeline.io.result_files import TREE_COLUMNS, csv_text, tree_rows
 
     shown = dashboard.shown
@@ -62,7 +62,7 @@ def trees_table(dashboard: Dash) -> Response:
 
 @router.get("/path.csv")
 def path_table(dashboard: Dash) -> Response:
-    """Return the path, one row per scan."""
+    """Return the path as a CSV table, one row per scan, with only its header before the first map."""
     from pipeline.io.result_files import PATH_COLUMNS, csv_text, path_rows
 
     path = dashboard.path
@@ -72,14 +72,14 @@ def path_table(dashboard: Dash) -> Response:
 
 @router.get("/evaluation")
 async def evaluation(dashboard: Dash) -> Response:
-    """Return the score against the ground truth; null without ground truth."""
+    """Return the score against the ground truth; null without ground truth or before the first score."""
     return json_reply(dashboard.scores.latest)
 
 
 @router.get("/pairs", dependencies=[ViewerTurn])
 async def pairs(dashboard: Dash) -> Response:
     """Return the distances between the first confirmed trees as a matrix [m], with their errors [%] if there
-    is ground truth, see `pairs_payload`."""
+    is ground truth, see `pairs_payload`; an empty matrix before the first map."""
     shown = dashboard.shown
     if shown is None:
         return json_reply({"numbers": [], "distance_m": [], "error_percent": None, "left_out": 0})
@@ -91,7 +91,8 @@ async def pairs(dashboard: Dash) -> Response:
 
 @router.get("/doubts")
 async def doubts(dashboard: Dash) -> Response:
-    """Return the votes on each tree, the most uncertain first, and the share that a tree needs."""
+    """Return the votes on each tree, the most uncertain first, and the share that a tree needs; no trees
+    before the first map."""
     share = dashboard.parameters.parameters.classification.tree_share
     shown = dashboard.shown
     rows = [] if shown is None else await asyncio.to_thread(doubts_of, shown.frame, share)
@@ -116,7 +117,7 @@ async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> 
 
 @router.get("/story/tree/{number}", dependencies=[ViewerTurn])
 async def tree_story(number: Number, dashboard: Dash) -> Response:
-    """Return votes, DBH, coverage and history of a tree."""
+    """Return votes, DBH, coverage and history of a tree by its number; 404 if the map has no such tree."""
     try:
         return json_reply(await dashboard.worker_client.tree(number))
     except NoStoryError as error:
@@ -125,8 +126,8 @@ async def tree_story(number: Number, dashboard: Dash) -> Response:
 
 @router.get("/camera", dependencies=[ViewerTurn])
 async def camera(dashboard: Dash) -> Response:
-    """Return the stamp of the camera picture of the current scan, and the boxes of trees and clusters in
-    it."""
+    """Return the stamp of the camera picture of the current scan, and the boxes of trees and clusters in it;
+    409 before the first map."""
     if dashboard.shown is None:
         return _nothing_mapped()
     return json_reply(await dashboard.camera.look(dashboard.shown.frame, dashboard.path))
@@ -134,7 +135,8 @@ async def camera(dashboard: Dash) -> Response:
 
 @router.get("/camera/{stamp_ns}.jpg")
 async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
-    """Return a camera picture by the stamp that `GET /api/camera` returned, as JPEG."""
+    """Return a camera picture, as JPEG, by the stamp [ns] that `GET /api/camera` returned; 404 if it is no
+    longer stored."""
     content = dashboard.camera.jpeg(stamp_ns)
     if content is None:
         return error_reply(404, "this picture is not kept any more", remedy="Ask for the newest one")
@@ -143,7 +145,8 @@ async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
 
 @router.get("/stages", dependencies=[ViewerTurn])
 async def stages(dashboard: Dash) -> Response:
-    """Return the points of the current scan, stage by stage (Fig. 3)."""
+    """Return the points of the current scan, stage by stage (Fig. 3), as a binary block; 409 before the first
+    map."""
     if dashboard.shown is None:
         return _nothing_mapped()
     return block_reply(await asyncio.to_thread(stages_payload, dashboard.shown.frame))

@@ -115,7 +115,7 @@ async def command(body: _AnyCommand, dashboard: Dash) -> Response:
 @router.post("/loop")
 async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
     """Repeat a part of the run between two times [s], or end the repetition if a time is missing. The
-    response is empty; an error for a part shorter than SHORTEST_LOOP_S."""
+    response is empty; 422 for a part shorter than SHORTEST_LOOP_S."""
     if body.from_s is None or body.to_s is None:
         dashboard.loop.choose(None)
     elif body.to_s - body.from_s < SHORTEST_LOOP_S:
@@ -148,8 +148,8 @@ async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_
 
 @router.post("/inside")
 async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) -> Response:
-    """Return the topics of a recording or a robot and the mounting of its LiDAR, read by a child process. The
-    address must be permitted on this server."""
+    """Return the topics of a recording or a robot and the mounting of its LiDAR, read by a child process; 403
+    if the address is not permitted on this server."""
     uri = permitted_uri(body.uri, settings, any_file)
     if uri is None:
         raise not_permitted(body.uri)

@@ -53,8 +53,8 @@ async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
 
 @router.get("/compare", dependencies=[ViewerTurn])
 async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b: _KeyInQuery) -> Response:
-    """Return two runs as JSON, "a" and "b", with the map of b in the frame of a; an error if one does not
-    exist. The keys name runs of the store or output folders."""
+    """Return two runs as JSON, "a" and "b", with the map of b in the frame of a; 404 if one does not exist.
+    The keys name runs of the store or output folders."""
     first, second = await _whole(a, settings, dashboard), await _whole(b, settings, dashboard)
     same = first["source"] == second["source"] and bool(first["source"])
     return json_reply({"a": first, "b": second, **await compare(first, second, same_source=same)})
@@ -63,13 +63,13 @@ async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b:
 @router.get("/{key}", dependencies=[ViewerTurn])
 async def read_run(key: _Key, dashboard: Dash, settings: Deployment) -> Response:
     """Return a run of the store or an output folder with its map, its parameters and their history (empty for
-    a folder); an error if it does not exist."""
+    a folder); 404 if it does not exist."""
     return json_reply(await _whole(key, settings, dashboard))
 
 
 @router.patch("/{number}")
 async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
-    """Rename a run; return its number. An error for a name that is empty or not printable."""
+    """Rename a run; return its number. 422 for a name that is empty or not printable."""
     name = " ".join(body.name.split())
     if not name or not name.isprintable():
         raise BadRequestError("the name is empty or has characters that cannot be shown", where="name")

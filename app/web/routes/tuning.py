@@ -51,7 +51,7 @@ async def start_search(
     body: SearchRequest, dashboard: Dash, settings: Deployment, any_file: AnyFile
 ) -> Response:
     """Start a search over the open run, from its first scan to its last, and over other recorded runs. Return
-    the state of the search."""
+    the state of the search; 409 while another search runs, or if the run cannot be searched over."""
     await dashboard.search.start(await _plan(dashboard, settings, any_file, body), body)
     return json_reply(dashboard.search.as_plain(), 202)
 
@@ -65,8 +65,8 @@ async def stop_search(dashboard: Dash) -> Response:
 
 @router.post("/search/go-on")
 async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Continue the search that was stopped, with the same choices; return its state. An error if no search
-    was stopped."""
+    """Continue the search that was stopped, with the same choices; return its state. 409 if no search was
+    stopped."""
     search = dashboard.search
     if search.request is None:
         raise StemmapError("there is no stopped search", remedy="Start a search")
@@ -76,7 +76,8 @@ async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFi
 
 @router.post("/search/use")
 async def use_found(dashboard: Dash) -> Response:
-    """Use the values of the best set, as one change that can be undone. The response is empty."""
+    """Use the values of the best set, as one change that can be undone. The response is empty; 409 if no
+    better set was found."""
     preset_name, values, _ = dashboard.search.found()
     await dashboard.tune(lambda state: state.use(preset_name, values))
     return json_reply({})
@@ -84,7 +85,8 @@ async def use_found(dashboard: Dash) -> Response:
 
 @router.post("/search/save")
 async def save_found(body: SaveSet, dashboard: Dash) -> Response:
-    """Save the best set under a name, with its provenance; return all saved sets."""
+    """Save the best set under a name, with its provenance; return all saved sets. 409 if no better set was
+    found, 422 for the name of a preset."""
     preset_name, values, text = dashboard.search.found()
     await dashboard.sets.save(body.name, preset_name, values, body.who, text)
     return json_reply(dashboard.sets.as_plain(), 201)
@@ -92,8 +94,8 @@ async def save_found(body: SaveSet, dashboard: Dash) -> Response:
 
 @router.post("/sensitivity")
 async def start_sensitivity(body: _Sensitivity, dashboard: Dash) -> Response:
-    """Start to score the whole run over values of a parameter, in their order. The response is empty; each
-    score is broadcast."""
+    """Start to score the whole run over values of a parameter, in their order. The response is empty and each
+    score is broadcast; 409 if the run cannot be scored."""
     dashboard.how_much_matters(body.name, list(body.values))
     return json_reply({}, 202)
 
@@ -130,7 +132,7 @@ async def stop_learning(request: Request) -> Response:
 @router.post("/learning/use")
 async def use_learned(request: Request, dashboard: Dash) -> Response:
     """Classify with the new decision trees from the next scan onwards; return the progress of the training.
-    An error if there are none."""
+    409 if there are none."""
     learned = _learning(request).learned
     if learned is None:
         raise StemmapError("no decision trees were grown", remedy="Grow them first")
