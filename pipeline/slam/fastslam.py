@@ -34,7 +34,7 @@ from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrap
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.particle_maps import known_near, shared_map, take_ancestors
 from pipeline.slam.particle_update import Rules
-from pipeline.slam.places import ODDS, agreement
+from pipeline.slam.places import ODDS, PlaceStates, agreement
 from pipeline.slam.pose_quality import is_lost, pose_health
 from pipeline.slam.random_draws import draws
 from pipeline.slam.resampling import low_variance_ancestors, normalised
@@ -318,7 +318,7 @@ class FastSlam:
         )
         maps, weights, mean, odometry, births = use_scan(
             state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
-            state.detections, state.places.for_kernels(), rules, shared.for_particles(measured),
+            state.detections, self._places_in_reach(state, centre), rules, shared.for_particles(measured),
         )  # fmt: skip
         if trees.slipped:
             odometry = disagreement(motion, state.motion, state.motion_covariance)
@@ -338,6 +338,16 @@ class FastSlam:
             shared=shared,
         )
         return state, scan, weights, births
+
+    def _places_in_reach(self, state: SlamState, centre: Float) -> PlaceStates:
+        """Return the states of the places whose landmarks the particles may associate with detections,
+        shape (D, 2) [m], after the motion of the state."""
+        x, y, _ = state.pose[state.best].tolist()
+        apart = np.hypot(state.pose[:, 0] - x, state.pose[:, 1] - y).max()
+        reach = self.parameters.view_range + self.parameters.distance_max + float(apart)
+        reach += math.hypot(*state.motion[:2].tolist()) + float(np.hypot(*centre.T).max(initial=0.0))
+        _, _, _, birth = known_near(state.maps, state.best, x, y, reach)
+        return state.places.in_reach(birth, state.distance)
 
     def _with_places(
         self, state: SlamState, births: Int, centre: Float, R: Float, estimate: PoseEstimate, reach: float
@@ -410,7 +420,7 @@ class FastSlam:
         return against_slip(
             state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
             state.recent.odometry_trust(noise_of(self.parameters)), centre, R,
-            state.places.for_kernels(), rules,
+            self._places_in_reach(state, centre), rules,
         )  # fmt: skip
 
     def _shared(

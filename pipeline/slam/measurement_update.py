@@ -10,7 +10,7 @@ from pipeline.slam.candidate_pairs import room_for
 from pipeline.slam.motion import OdometryTrust, moved_pose, moved_poses, weighted_pose
 from pipeline.slam.particle_maps import ROOM, Maps, blocks_in_reach, known_near, with_room
 from pipeline.slam.particle_update import Rules, near_for, observe, predict
-from pipeline.slam.places import Inactive, is_inactive
+from pipeline.slam.places import INACTIVE, PlaceStates, state_of
 from pipeline.slam.resampling import normalised
 from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
 from pipeline.slam.scan_statistics import STATISTICS, mean_statistics
@@ -30,7 +30,7 @@ def against_slip(
     wheels: OdometryTrust,
     centre: Float,
     R: Float,
-    places: Inactive,
+    places: PlaceStates,
     rules: Rules,
 ) -> TreeMotion:
     """Return the motion by odometry, corrected with the map of the best particle, see `motion_by_trees`. With
@@ -48,8 +48,8 @@ def against_slip(
         return TreeMotion(False, motion.copy(), motion_covariance.copy(), False)
     at = moved_pose(pose[best], motion)
     known, spread, hits, birth = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
-    if places.inactive.shape[0]:
-        active = np.array([not is_inactive(b, places) for b in birth], np.bool_)
+    if places.state.shape[0]:
+        active = np.array([state_of(b, places) != INACTIVE for b in birth], np.bool_)
         known, spread, hits = known[active], spread[active], hits[active]
     return motion_by_trees(
         pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,
@@ -69,7 +69,7 @@ def use_scan(
     R: Float,
     clear_range: Float,
     first_birth: int,
-    places: Inactive,
+    places: PlaceStates,
     rules: Rules,
     measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, float, Int]:

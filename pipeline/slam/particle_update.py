@@ -15,7 +15,7 @@ from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.slam.candidate_pairs import Room
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.particle_maps import ROOM, Maps, own_block, widen
-from pipeline.slam.places import Inactive, is_inactive
+from pipeline.slam.places import ACTIVE, INACTIVE, PlaceStates, state_of
 from pipeline.slam.proposal import recognise
 from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.shared_errors import MeasuredPose, correct_by_measured, update_shared_errors
@@ -134,7 +134,7 @@ def observe(
     clear_range: Float,
     reach: float,
     first_birth: int,
-    places: Inactive,
+    places: PlaceStates,
     rules: Rules,
     near: Near,
     room: Room,
@@ -160,7 +160,8 @@ def observe(
         clear_range: Free range per direction [m], see `FastSlam.process`.
         reach: Distance beyond which landmarks are not used [m].
         first_birth: Birth number of the first detection.
-        places: Places whose landmarks are not used.
+        places: States of the places; landmarks of inactive places are not used, and those of uncertain ones
+            are not updated.
         rules: Parameters.
         near, room: Work arrays for the landmarks in reach and for pairs.
         statistics: Statistics of the scan by particle, shape (P, STATISTICS); filled.
@@ -216,11 +217,12 @@ def _gather(
     blocks: int,
     mu: Float,
     reach: float,
-    places: Inactive,
+    places: PlaceStates,
     near: Near,
 ) -> tuple[int, int]:
     """Fill `near` with the active landmarks of particle p within `reach` [m] of the pose mu; return their
-    number and the number of unused rows of its blocks."""
+    number and the number of unused rows of its blocks. Landmarks of uncertain places are marked as seen, so
+    that they are neither updated nor missed nor merged."""
     n, free = 0, 0
     count = maps.places[p]
     for i in range(blocks):
@@ -233,7 +235,10 @@ def _gather(
                 continue
             x, y = maps.mean[b, o, 0], maps.mean[b, o, 1]
             dx, dy = x - mu[0], y - mu[1]
-            if dx * dx + dy * dy > reach * reach or is_inactive(maps.birth[b, o], places):
+            if dx * dx + dy * dy > reach * reach:
+                continue
+            state = state_of(maps.birth[b, o], places)
+            if state == INACTIVE:
                 continue
             near.block[n], near.place[n] = k, o
             near.mean[n, 0], near.mean[n, 1] = x, y
@@ -244,7 +249,7 @@ def _gather(
                 maps.score[b, o],
                 maps.birth[b, o],
             )
-            near.seen[n] = near.changed[n] = False
+            near.seen[n], near.changed[n] = state != ACTIVE, False
             n += 1
     return n, free
 
@@ -281,6 +286,8 @@ def _learn(
         R0, R1, R2 = rotated(R, d, c, s)
         j = landmark_of[d]
         if j >= 0:
+            if near.seen[j]:  # of an uncertain place
+                continue
             kalman_update(near.mean, near.covariance, j, z0, z1, R0, R1, R2, rules.looks)
             near.hits[j] += 1
             near.score[j] = min(near.score[j] + 1.0, SCORE_MAX)

@@ -4,8 +4,9 @@ Data association by distance needs a pose whose error is smaller than the distan
 long way this holds for the landmarks that the robot has just seen, but not always for those of a place that
 it left long ago: each detection is then associated with the old landmark next to it, and many such
 associations confirm a wrong pose. At a place that the robot has not seen for REVISIT_DISTANCE, the detections
-are therefore compared with the landmarks (`agreement`). If they agree about as often as by chance, the
-landmarks of the place are inactive until the pose is corrected, by a loop or by other places.
+are therefore compared with the landmarks (`agreement`). Until this decides, the landmarks correct the pose
+but are not updated, because a landmark that follows a wrong pose agrees with it. If they agree about as often
+as by chance, they are inactive until the pose is corrected, by a loop or by other places.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from pipeline.types.records import Bool, Int
 
 #: m of path without a view of a place, after which a view of it is a revisit.
 REVISIT_DISTANCE = 30.0
+#: States of a place: its landmarks are associated and updated, associated only, or left alone.
+ACTIVE, UNCERTAIN, INACTIVE = 0, 1, 2
 PLACE = 5.0  # m of path; the landmarks that are begun within it belong to one place
 GATE = 3.0  # sigma; a detection agrees with a landmark within it
 WINDOW = 8.0  # m; radius in which the density of landmarks is measured
@@ -108,9 +111,19 @@ class Places:
         row = self._row(birth)
         return (row < 0) | ~self.inactive[row] if len(self.birth) else row < 0
 
-    def for_kernels(self) -> Inactive:
-        """Return the inactive places."""
-        return Inactive(self.birth, self.inactive if self.inactive.any() else self.inactive[:0])
+    def in_reach(self, birth: Int, distance: float) -> PlaceStates:
+        """Return the states of the places at a distance driven [m] for the landmarks of one scan; an empty
+        table if the places of all of them are active.
+
+        Args:
+            birth: Birth numbers of the landmarks in reach, int64, shape (L,).
+            distance: Distance driven [m].
+        """
+        state = np.where(self.inactive, INACTIVE, np.where(self.is_old(distance), UNCERTAIN, ACTIVE))
+        row = self._row(birth)
+        if not np.any(state[row[row >= 0]] != ACTIVE):
+            return PlaceStates(self.birth[:0], state[:0])
+        return PlaceStates(self.birth, state)
 
     def _row(self, birth: Int) -> Int:
         """Return the place of each landmark, -1 for those that precede all places."""
@@ -127,29 +140,29 @@ class Places:
         return near
 
 
-class Inactive(NamedTuple):
-    """The inactive places as kernels take them.
+class PlaceStates(NamedTuple):
+    """The states of places as kernels take them.
 
     Attributes:
         birth: See Places.
-        inactive: See Places; empty if no place is inactive.
+        state: ACTIVE, UNCERTAIN or INACTIVE, int64, shape (M,).
     """
 
     birth: Int
-    inactive: Bool
+    state: Int
 
 
 @compiled_within
-def is_inactive(birth: int, places: Inactive) -> bool:
-    """Return whether the landmark of a birth number belongs to an inactive place."""
-    low, high = 0, places.inactive.shape[0]
+def state_of(birth: int, places: PlaceStates) -> int:
+    """Return the state of the place of a landmark; ACTIVE for landmarks that precede all places."""
+    low, high = 0, places.state.shape[0]
     while low < high:
         middle = (low + high) // 2
         if places.birth[middle] <= birth:
             low = middle + 1
         else:
             high = middle
-    return low > 0 and places.inactive[low - 1]
+    return places.state[low - 1] if low > 0 else ACTIVE
 
 
 @compiled

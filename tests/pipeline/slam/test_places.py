@@ -14,15 +14,18 @@ from pipeline.geometry.gaussian import Pose
 from pipeline.geometry.poses import Pose2
 from pipeline.slam import FastSlam
 from pipeline.slam.places import (
+    ACTIVE,
     AGREEING,
     GATE,
+    INACTIVE,
     ODDS,
     PLACE,
     REVISIT_DISTANCE,
+    UNCERTAIN,
     WINDOW,
     Places,
     agreement,
-    is_inactive,
+    state_of,
 )
 from tests.pipeline.strategies import detections, seeds
 
@@ -94,11 +97,12 @@ def test_a_contradicted_place_is_inactive_until_it_is_seen():
     places = line().with_contradiction(np.array([4]))
     assert places.contradicted
     assert places.is_active(np.array([3, 4, 5])).tolist() == [True, False, True]
-    kernels = places.for_kernels()
-    assert [is_inactive(b, kernels) for b in (-1, 3, 4, 5, 40)] == [False, False, True, False, False]
+    kernels = places.in_reach(np.array([4, 30]), 30 * PLACE)
+    states = [ACTIVE, UNCERTAIN, INACTIVE, UNCERTAIN, ACTIVE, ACTIVE]
+    assert [state_of(b, kernels) for b in (-1, 3, 4, 5, 30, 40)] == states
     assert places.with_seen(200.0, np.array([5])).is_active(np.array([4])).all()
     assert not places.with_scan(200.0, 31, np.zeros(0, np.int64)).contradicted
-    assert not len(line().for_kernels().inactive), "kernels skip the test where no place is inactive"
+    assert not len(places.in_reach(np.array([-1, 29, 30]), 30 * PLACE).state), "all in reach are active"
 
 
 def test_landmarks_of_inactive_places_are_left_alone():
@@ -118,3 +122,17 @@ def test_landmarks_of_inactive_places_are_left_alone():
     slam.state = replace(slam.state, places=slam.state.places.with_seen(0.0, known.birth))
     estimate = slam.process(5, Pose2(), detections(seen), np.zeros(128))
     assert not slam.state.places.inactive.any()
+
+
+def test_landmarks_of_uncertain_places_correct_the_pose_and_stay():
+    trees = np.array([[3.0, 4.0], [6.0, -3.0], [9.0, 2.0]])
+    slam = FastSlam(preset("stems").slam, 1)
+    for k in range(4):
+        slam.process(k, Pose2(0.5, 0.0, 0.0), detections(trees - [0.5 * k, 0.0]), np.zeros(128))
+    known = slam.landmarks()
+    old = replace(slam.state.places, seen=slam.state.places.seen - 2.0 * REVISIT_DISTANCE)
+    slam.state = replace(slam.state, places=old)
+    estimate = slam.process(4, Pose2(0.55, 0.0, 0.0), detections(trees - [2.0, 0.0]), np.zeros(128))
+    assert estimate.landmark_of.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(slam.landmarks().position, known.position)
+    assert not slam.state.places.is_old(slam.state.distance).any(), "three trees that agree decide"
