@@ -87,7 +87,7 @@ def test_parameters_are_found_by_words(dashboard: Dashboard):
     page.locator("#tune-find").fill("eccentricity")
     titles = page.locator(".tune-row:visible label")
     expect(titles.first).to_have_text(re.compile("Minimum eccentricity"))
-    assert titles.count() > 2
+    assert titles.count() > 1
     page.locator("#tune-find").fill("no such thing at all")
     expect(page.locator("#tune-none")).to_contain_text("No parameter matches")
     page.locator("#tune-find").fill("")

@@ -107,7 +107,7 @@ def test_a_contradicted_place_is_inactive_until_it_is_seen():
 
 def test_landmarks_of_inactive_places_are_left_alone():
     trees = np.array([[3.0, 4.0], [6.0, -3.0], [9.0, 2.0]])
-    slam = FastSlam(preset("stems").slam, 1)
+    slam = FastSlam(preset("stems").slam.model_copy(update={"particles": 1}), 1)
     for k in range(4):
         slam.process(k, Pose2(0.5, 0.0, 0.0), detections(trees - [0.5 * k, 0.0]), np.zeros(128))
     known = slam.landmarks()
@@ -126,7 +126,7 @@ def test_landmarks_of_inactive_places_are_left_alone():
 
 def test_landmarks_of_uncertain_places_correct_the_pose_and_stay():
     trees = np.array([[3.0, 4.0], [6.0, -3.0], [9.0, 2.0]])
-    slam = FastSlam(preset("stems").slam, 1)
+    slam = FastSlam(preset("stems").slam.model_copy(update={"particles": 1}), 1)
     for k in range(4):
         slam.process(k, Pose2(0.5, 0.0, 0.0), detections(trees - [0.5 * k, 0.0]), np.zeros(128))
     known = slam.landmarks()
