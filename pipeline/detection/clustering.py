@@ -262,6 +262,8 @@ def _join(cores: Cores, rows: Int, reach: Int32, eps2: float) -> Int:
 
 @compiled
 def root_of(parent: Int, c: int) -> int:
+    """Return the root of cell c in a forest of disjoint sets, and halve the paths to it in `parent`, shape
+    (C,)."""
     while parent[c] != c:
         parent[c] = parent[parent[c]]
         c = parent[c]
