@@ -260,7 +260,7 @@ class FastSlam:
         )
 
     def reset_health(self) -> None:
-        """Discard the statistics of recent scans, by which the health is judged."""
+        """Discard the running statistics that determine the health, except whether trees were mapped."""
         self.state = replace(self.state, recent=RunningStatistics(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
