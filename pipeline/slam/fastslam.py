@@ -77,14 +77,24 @@ class FastSlam:
         state = self._moved(self.state.with_particles(p.particles), motion)
         ancestors, doubt = None, motion.doubt
         R, rules = rows_of(detections.covariance), rules_of(p)
-        trees = self._by_trees(state, detections.centre, R, rules)
+        places = self._places_in_reach(state, detections.centre)
+        trees = self._by_trees(state, detections.centre, R, places, rules)
         used = index == 0 or state.since_update >= p.update_distance or trees.slipped
         slipped = trees.slipped or state.recent.slipped
         doubted = OdometryDoubt(bool(doubt), slipped)
         doubt = doubt or slip_detection.slip_message(state.motion, slipped, trees.unsure)
         if used:
             state, scan, weights, births = self._observed(
-                state, trees, detections.centre, R, clear_range, noise, motion.measured, doubted, rules
+                state,
+                trees,
+                detections.centre,
+                R,
+                clear_range,
+                noise,
+                motion.measured,
+                doubted,
+                places,
+                rules,
             )
         else:
             scan, weights, births = ScanStatistics(), normalised(state.log_weight), None
@@ -191,7 +201,7 @@ class FastSlam:
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        graph = graph.certain(state.places).with_loop(loop.anchor, loop.T_map_base, loop.covariance)
+        graph = graph.without_uncertain(state.places).with_loop(loop.anchor, loop.T_map_base, loop.covariance)
         solution = graph.solve(new_loop=True)
         if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
             return None
@@ -304,6 +314,7 @@ class FastSlam:
         noise: Float,
         measured: PoseMeasurement | None,
         doubted: OdometryDoubt,
+        places: PlaceStates,
         rules: Rules,
     ) -> tuple[SlamState, ScanStatistics, Float, Int]:
         """Return the state after a scan, the statistics of the scan, the weights, and the births of the
@@ -318,7 +329,7 @@ class FastSlam:
         )
         maps, weights, mean, odometry, births = use_scan(
             state.pose, state.log_weight, state.maps, motion, covariance, noise, centre, R, clear_range,
-            state.detections, self._places_in_reach(state, centre), rules, shared.for_particles(measured),
+            state.detections, places, rules, shared.for_particles(measured),
         )  # fmt: skip
         if trees.slipped:
             odometry = disagreement(motion, state.motion, state.motion_covariance)
@@ -352,7 +363,8 @@ class FastSlam:
     def _with_places(
         self, state: SlamState, births: Int, centre: Float, R: Float, estimate: PoseEstimate, reach: float
     ) -> SlamState:
-        """Return the state with the places that a scan shows, among them known ones that agree with it.
+        """Return the state with the place of a scan, and with the known places that the scan confirms or
+        contradicts.
 
         Args:
             state: State after the scan.
@@ -416,11 +428,12 @@ class FastSlam:
             state.keyframe_covariance, birth, centre, R,
         )  # fmt: skip
 
-    def _by_trees(self, state: SlamState, centre: Float, R: Float, rules: Rules) -> TreeMotion:
+    def _by_trees(
+        self, state: SlamState, centre: Float, R: Float, places: PlaceStates, rules: Rules
+    ) -> TreeMotion:
         return against_slip(
             state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
-            state.recent.odometry_trust(noise_of(self.parameters)), centre, R,
-            self._places_in_reach(state, centre), rules,
+            state.recent.odometry_trust(noise_of(self.parameters)), centre, R, places, rules,
         )  # fmt: skip
 
     def _shared(
@@ -480,7 +493,7 @@ def _estimate(
     landmarks = state.map_of(state.best)
     known = landmarks
     if state.places.inactive.any():
-        known = landmarks.take(state.places.is_active(landmarks.birth))
+        known = landmarks.take(state.places.is_usable(landmarks.birth))
     covariance, frame = state.frame.with_pose(
         mean, spread, n_eff, known.mean, known.birth, known.hits, p.hits_to_weigh, reach
     )

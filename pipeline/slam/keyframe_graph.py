@@ -244,7 +244,7 @@ class KeyframeGraph:
 
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
-    def certain(self, places: Places) -> KeyframeGraph:
+    def without_uncertain(self, places: Places) -> KeyframeGraph:
         """Return the graph without associations with landmarks of places that were not seen for certain in
         the last REVISIT_DISTANCE; the path may have drifted by more than the distance between trees."""
 

@@ -28,9 +28,9 @@ REVISIT_DISTANCE = 30.0
 ACTIVE, UNCERTAIN, INACTIVE = 0, 1, 2
 PLACE = 5.0  # m of path; the landmarks that are begun within it belong to one place
 GATE = 3.0  # sigma; a detection agrees with a landmark within it
-WINDOW = 8.0  # m; radius in which the density of landmarks is measured
-AGREEING = 0.4  # share of the landmarks of a known place that a scan shows at least; others are hidden
-ODDS = math.log(100.0)  # log odds of a known place, at which it is accepted, and below minus which it is not
+WINDOW = 8.0  # m; radius in which the density of stems is measured; it holds several stems of a forest
+AGREEING = 0.4  # least share of the stems of a known place that are seen again; others are hidden
+ODDS = math.log(100.0)  # a place is accepted above these log odds and contradicted below their negative
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class Places:
         distance: Distance driven at each place, shape (M,) [m].
         seen: Distance driven when the place was last seen for certain, shape (M,) [m].
         inactive: Which places the detections contradict, shape (M,).
-        contradicted: Whether the last scan contradicts a place.
+        contradicted: Whether the last scan contradicts a place; then a loop is searched for.
     """
 
     birth: Int = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -106,8 +106,8 @@ class Places:
         row = self._row(birth)
         return np.where(row < 0, np.inf, self.seen[row]) if len(self.birth) else np.full(len(birth), np.inf)
 
-    def is_active(self, birth: Int) -> Bool:
-        """Return which landmarks belong to active places, shape (L,), by birth numbers of shape (L,)."""
+    def is_usable(self, birth: Int) -> Bool:
+        """Return which landmarks are not in inactive places, shape (L,), by birth numbers of shape (L,)."""
         row = self._row(birth)
         return (row < 0) | ~self.inactive[row] if len(self.birth) else row < 0
 

@@ -18,6 +18,7 @@ from pipeline.geometry.poses import Float, Pose2
 from pipeline.loop_closure.stem_matching.alignment import aligned, alignment_covariance
 from pipeline.loop_closure.stem_matching.hypotheses import cells_of, crowding, pairs_within, partners, search
 from pipeline.loop_closure.stem_matching.stem_constellation import MapStems
+from pipeline.slam.places import AGREEING, WINDOW
 from pipeline.types.records import Int, Int32
 
 Refusal = Literal[
@@ -32,11 +33,9 @@ LEAST = 4  # stems in agreement; hypotheses with fewer are dropped
 REACH = 1.0  # m; largest distance of two stems that agree
 ROUNDS = 8  # iterations of pairing and alignment
 WIDE, WIDE_ROUNDS = 3.0, 2  # factor of the slack in the first iterations, which start from a single pair
-WINDOW = 8.0  # m; radius in which the density of the map is measured
 FALSE_ALARMS = 1e-4  # expected number of equally good agreements by chance
 SECOND_BEST = 0.7  # largest ratio of the agreements of the second best pose and the best one
 LEAD = 3  # least difference of their numbers
-AGREEING = 0.4  # least share of agreeing stems among those inside the map
 SIGMA_XY, SIGMA_YAW = 0.5, 0.05  # m, rad; largest standard deviations of the pose
 
 

@@ -28,8 +28,8 @@ def score(job: dict[str, Any], folder: Path) -> dict[str, Any]:
         died.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     for file in sys.argv[2:]:
-        with Path(file).open("a", encoding="utf-8") as told:
-            told.write(f"{eps}\n")
+        with Path(file).open("a", encoding="utf-8") as log:
+            log.write(f"{eps}\n")
     while (folder / "wait").exists():
         time.sleep(0.01)
     return {"scores": scores(eps), "scans": 10, "trees": 3, "seconds": 1.0, "looked": True}

@@ -1,4 +1,4 @@
-"""Jobs that cost nothing, and what they are answered with."""
+"""Jobs that need no computation, and their scores."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.app.tuning.scores import scores as plain_scores
 
 
 def scores(f1: float | None, *, found: int = 3, wrong: int = 0) -> MapScores:
-    """Scores that are told apart by their F1."""
+    """Return scores that differ only in their F1."""
     return msgspec.convert(plain_scores(f1, found=found, wrong=wrong), MapScores)
 
 

@@ -1,4 +1,4 @@
-"""Scores that cost nothing, and nothing to import: processes of tests load no more than this."""
+"""Scores without a dependency, so that processes of tests start fast."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 def scores(f1: float | None, *, found: int = 3, wrong: int = 0) -> dict[str, Any]:
-    """As a worker tells them; the F1 is what they are told apart by."""
+    """Return scores as a worker sends them; they differ only in their F1."""
     rate = {"of": 4}
     return {
         "TA": {"count": found, **rate}, "FR": {"count": 4 - found, **rate},

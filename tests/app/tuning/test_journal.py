@@ -26,7 +26,7 @@ def journal_of(path: Path) -> Journal:
     return Journal(path, SEARCH)
 
 
-def test_a_disk_that_gets_full_is_told_and_leaves_no_part_of_a_line(tmp_path):
+def test_a_disk_that_gets_full_is_reported_and_leaves_no_part_of_a_line(tmp_path):
     resource = pytest.importorskip("resource")
     path = tmp_path / "a.journal"
     with closing(journal_of(path)) as journal:
@@ -69,7 +69,7 @@ def test_a_process_that_was_killed_while_it_began_leaves_an_empty_journal(tmp_pa
 
 
 @pytest.mark.parametrize("line", ['{"number": 3}', '{"number": 5, "values": {}, "loss": 1.0}', "[", "\xff"])
-def test_a_damaged_line_is_told_and_nothing_is_changed(tmp_path, line):
+def test_a_damaged_line_is_reported_and_nothing_is_changed(tmp_path, line):
     path = tmp_path / "a.journal"
     with closing(journal_of(path)) as journal:
         journal.add(TRIAL, 9)
@@ -89,7 +89,7 @@ def test_of_two_searches_only_one_writes_to_a_journal(tmp_path):
         journal_of(path)
 
 
-def test_a_journal_in_a_folder_that_is_not_there_is_told_in_a_line(tmp_path):
+def test_a_journal_in_a_folder_that_is_not_there_is_reported_in_a_line(tmp_path):
     with pytest.raises(StemmapError, match="the trials cannot be kept: no such file"):
         journal_of(tmp_path / "none" / "a.journal")
 
@@ -99,7 +99,7 @@ def test_a_search_begins_with_decision_trees_that_were_learned(tmp_path, monkeyp
     name = Forests(tmp_path).keep({**data, ALL_AROUND: data[ALL_AROUND][:20]})
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path))
     start = preset("forest").replace({"classification.forest": name})
-    told = plan(tmp_path, start=start.model_dump())
-    with closing(InlineWorker()) as worker, closing(Search(told, worker)) as search:
+    search_plan = plan(tmp_path, start=start.model_dump())
+    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker)) as search:
         search.advance()
         assert search.start is not None

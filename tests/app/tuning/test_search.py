@@ -33,14 +33,14 @@ OVER = ["detection.e_max=5..200", "classification.tree_share=0.1..1"]
 
 def plan(folder: Path, name: str = "a", **changes: object) -> Plan:
     """A search over two parameters of a short run."""
-    told = Plan(
+    search_plan = Plan(
         runs=(PlannedRun(SourceRequest(RUN)),),
         axes=axes_of(OVER),
         start=preset("forest").model_dump(),
         storage=str(folder / f"{name}.journal"),
         trials=9,
     )
-    return msgspec.structs.replace(told, **changes)
+    return msgspec.structs.replace(search_plan, **changes)
 
 
 def exhaust(search: Search, most: int = 1000) -> None:
@@ -50,9 +50,9 @@ def exhaust(search: Search, most: int = 1000) -> None:
         made += len(search.advance())
 
 
-def searched(told: Plan, most: int = 1000) -> list[Trial]:
+def searched(search_plan: Plan, most: int = 1000) -> list[Trial]:
     """The trials of a search, after so many more."""
-    with closing(InlineWorker()) as worker, closing(Search(told, worker)) as search:
+    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker)) as search:
         exhaust(search, most)
         return search.trials()
 
@@ -70,23 +70,23 @@ def test_the_start_is_tried_first_and_is_never_better_than_the_best(whole):
 
 
 def test_a_stopped_search_goes_on_to_the_same_trials(whole, tmp_path):
-    told = plan(tmp_path)
-    assert searched(told, 5) == whole[:5]
+    search_plan = plan(tmp_path)
+    assert searched(search_plan, 5) == whole[:5]
 
     # Stopped in the middle of a trial, and killed while it wrote.
     def stopped(_job: Job) -> JobResult:
         raise KeyboardInterrupt
 
-    with closing(Search(told, InlineWorker(stopped))) as search, pytest.raises(KeyboardInterrupt):
+    with closing(Search(search_plan, InlineWorker(stopped))) as search, pytest.raises(KeyboardInterrupt):
         exhaust(search)
-    with Path(told.storage).open("ab") as journal:
+    with Path(search_plan.storage).open("ab") as journal:
         journal.write(b'{"number": 5, "val')
-    assert searched(told) == whole
+    assert searched(search_plan) == whole
 
 
 def test_a_search_goes_on_from_trials_in_memory(whole, tmp_path):
-    told = plan(tmp_path, storage="")
-    with closing(InlineWorker()) as worker, closing(Search(told, worker, whole[:5])) as search:
+    search_plan = plan(tmp_path, storage="")
+    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker, whole[:5])) as search:
         exhaust(search)
         assert search.trials() == whole
 
@@ -95,20 +95,23 @@ def test_what_a_trial_scores_is_what_map_scores(whole, tmp_path):
     trial = whole[3]
     sets = [word for name, value in trial.values.items() for word in ("--set", f"{name}={value}")]
     assert main(["map", RUN, "--out", str(tmp_path / "out"), *sets]) == 0
-    told = read_run_record(tmp_path / "out")["evaluation"]
+    written = read_run_record(tmp_path / "out")["evaluation"]
     score = trial.training[0]
     assert (score.TA, score.FA, score.spurious) == (
-        told["TA"]["count"],
-        told["FA"]["count"],
-        told["spurious"],
+        written["TA"]["count"],
+        written["FA"]["count"],
+        written["spurious"],
     )
-    assert (score.position_rmse, score.pair_error) == (told["position_rmse"], told["mean_pair_error_percent"])
+    assert (score.position_rmse, score.pair_error) == (
+        written["position_rmse"],
+        written["mean_pair_error_percent"],
+    )
 
 
 def test_a_journal_of_another_search_is_left_alone(tmp_path):
-    told = plan(tmp_path, trials=1)
-    searched(told)
-    before = Path(told.storage).read_bytes()
+    search_plan = plan(tmp_path, trials=1)
+    searched(search_plan)
+    before = Path(search_plan.storage).read_bytes()
     for changes, words in (
         ({"goal": "position"}, "another goal"),
         ({"axes": axes_of(OVER[:1])}, "other parameters or bounds"),
@@ -116,32 +119,34 @@ def test_a_journal_of_another_search_is_left_alone(tmp_path):
         ({"start": preset("paper").model_dump()}, "to begin with"),
     ):
         with pytest.raises(StemmapError, match=words):
-            Search(msgspec.structs.replace(told, **changes), InlineWorker())
-    assert Path(told.storage).read_bytes() == before
+            Search(msgspec.structs.replace(search_plan, **changes), InlineWorker())
+    assert Path(search_plan.storage).read_bytes() == before
 
 
-def test_a_journal_of_another_version_is_told(tmp_path, monkeypatch):
-    told = plan(tmp_path, trials=1)
-    searched(told)
+def test_a_journal_of_another_version_is_reported(tmp_path, monkeypatch):
+    search_plan = plan(tmp_path, trials=1)
+    searched(search_plan)
     monkeypatch.setattr("app.tuning.plan.version", lambda: "9.9.9")
     with pytest.raises(StemmapError, match="another version of stemmap"):
-        Search(told, InlineWorker())
+        Search(search_plan, InlineWorker())
 
 
 @pytest.mark.parametrize(
     "text", [b"x_m,y_m\n1,2\n", b'{"op_code": 0}\n{"op_code": "?"}\n', b"\xff\xfe\n", b"\xff\xfe", b"\n"]
 )
 def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
-    told = plan(tmp_path)
-    Path(told.storage).write_bytes(text)
+    search_plan = plan(tmp_path)
+    Path(search_plan.storage).write_bytes(text)
     with pytest.raises(StemmapError, match="journal"):
-        Search(told, InlineWorker())
-    assert Path(told.storage).read_bytes() == text
+        Search(search_plan, InlineWorker())
+    assert Path(search_plan.storage).read_bytes() == text
 
 
 def test_sets_that_contradict_themselves_are_counted_and_left_out(tmp_path):
-    told = plan(tmp_path, axes=axes_of(["detection.e_min=1..100", "detection.e_max=10..100"]), trials=6)
-    with closing(InlineWorker()) as worker, closing(Search(told, worker)) as search:
+    search_plan = plan(
+        tmp_path, axes=axes_of(["detection.e_min=1..100", "detection.e_max=10..100"]), trials=6
+    )
+    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker)) as search:
         exhaust(search)
         result = result_of(search)
     assert result.made == 6
@@ -167,8 +172,11 @@ def test_a_set_whose_worker_was_lost_is_scored_again_until_too_many_are_lost(who
 
 @pytest.mark.slow  # the processes start
 def test_two_processes_make_as_many_trials_and_one_that_is_killed_is_replaced(whole, tmp_path):
-    told = plan(tmp_path, trials=4)
-    with closing(search_processes(told, 2)) as workers, closing(Search(told, workers)) as search:
+    search_plan = plan(tmp_path, trials=4)
+    with (
+        closing(search_processes(search_plan, 2)) as workers,
+        closing(Search(search_plan, workers)) as search,
+    ):
         while search.start is None:
             search.advance()
         search.advance(0.0)
@@ -195,8 +203,8 @@ def test_the_command_writes_a_set_with_its_provenance(tmp_path, capsys):
     text = (tmp_path / "best.toml").read_text()
     name, values = read_file(text, "best.toml")
     assert name == "forest"
-    told = provenance_in(text)
-    assert [run["uri"] for run in told["run"]] == [RUN, OTHER]
+    provenance = provenance_in(text)
+    assert [run["uri"] for run in provenance["run"]] == [RUN, OTHER]
     changed = values.changes_from(preset("forest"))
     assert set(changed) <= {"detection.e_max", "classification.tree_share"}
     # The same command goes on with its journal, and another one with more trials makes them.
@@ -221,15 +229,15 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
         if line.startswith("trial 0"):
             break
     process.send_signal(signal.SIGINT)
-    said, told = process.communicate(timeout=120)
-    assert process.returncode == 3, told
-    assert "the same command continues" in told
+    said, errors = process.communicate(timeout=120)
+    assert process.returncode == 3, errors
+    assert "the same command continues" in errors
     assert provenance_in(out.read_text())["tuned"]["trials"] >= 1
     assert "written to" in said
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "told"),
+    ("words", "code", "message"),
     [
         (["sim:stand?duration=1", "--truth", "{far}"], 1, "no ground truth is within"),
         (["sim:stand?duration=1", "--truth", "{aside}"], 1, "has a mapped tree within"),
@@ -242,7 +250,7 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
         ([RUN, OTHER, "--truth", "{far}"], 2, "Name the run of each file"),
     ],
 )
-def test_bad_input_is_told_in_a_line(words, code, told, tmp_path, capsys):
+def test_bad_input_is_reported_in_a_line(words, code, message, tmp_path, capsys):
     (tmp_path / "far.csv").write_text("x_m,y_m\n900,900\n")
     (tmp_path / "aside.csv").write_text("x_m,y_m\n0.5,0.1\n")
     room = tmp_path / "room"
@@ -255,7 +263,7 @@ def test_bad_input_is_told_in_a_line(words, code, told, tmp_path, capsys):
     out = tmp_path / "best.toml"
     assert main(["tune", *given, "--trials", "2", "--out", str(out)]) == code
     said = capsys.readouterr().err.strip().splitlines()
-    assert told in said[-1]
+    assert message in said[-1]
     assert not out.exists()
 
 

@@ -32,7 +32,7 @@ def server() -> Iterator[str]:
 
 
 @pytest.fixture
-def told(server: str, tmp_path: Path) -> Plan:
+def search_plan(server: str, tmp_path: Path) -> Plan:
     """A search that nobody has begun."""
     empty(server, "stemmap_search")
     return plan(tmp_path, storage=server, trials=TRIALS)
@@ -44,23 +44,23 @@ def scored(job: Job) -> JobResult:
     return msgspec.convert({"scores": scores(0.5, wrong=wrong)}, JobResult)
 
 
-def searched(told: Plan) -> list[Trial]:
-    with closing(Search(told, InlineWorker(scored))) as search:
+def searched(search_plan: Plan) -> list[Trial]:
+    with closing(Search(search_plan, InlineWorker(scored))) as search:
         exhaust(search)
         return search.trials()
 
 
-def test_a_search_on_a_server_makes_the_trials_that_a_journal_gets(told: Plan, tmp_path: Path):
-    made = searched(told)
+def test_a_search_on_a_server_makes_the_trials_that_a_journal_gets(search_plan: Plan, tmp_path: Path):
+    made = searched(search_plan)
     assert made == searched(plan(tmp_path, "journal", trials=TRIALS))
-    assert made == searched(told)  # nothing is left to be done
+    assert made == searched(search_plan)  # nothing is left to be done
 
 
-def test_two_machines_share_the_trials(told: Plan):
+def test_two_machines_share_the_trials(search_plan: Plan):
     together = Barrier(2, timeout=60)
 
     def machine(_name: str) -> int:
-        with closing(Search(told, InlineWorker(scored))) as search:
+        with closing(Search(search_plan, InlineWorker(scored))) as search:
             together.wait()
             made = 0
             while not search.is_complete:
@@ -74,16 +74,16 @@ def test_two_machines_share_the_trials(told: Plan):
         made = list(pool.map(machine, ["red", "blue"]))
     assert sum(made) == TRIALS
     assert min(made) >= 1
-    trials = searched(told)
+    trials = searched(search_plan)
     assert [trial.number for trial in trials] == list(range(TRIALS))
     assert len({tuple(trial.values.items()) for trial in trials}) == TRIALS
     assert {"detection.e_max": 60.0, "classification.tree_share": 0.4} in [trial.values for trial in trials]
 
 
-def test_a_set_beyond_the_number_of_trials_is_not_stored(told: Plan):
+def test_a_set_beyond_the_number_of_trials_is_not_stored(search_plan: Plan):
     with (
-        closing(Search(told, InlineWorker(scored))) as one,
-        closing(Search(told, InlineWorker(scored))) as other,
+        closing(Search(search_plan, InlineWorker(scored))) as one,
+        closing(Search(search_plan, InlineWorker(scored))) as other,
     ):
         while len(one.trials()) < TRIALS - 1:
             one.advance()
@@ -122,23 +122,26 @@ while True:
 """
 
 
-def test_a_machine_that_is_killed_in_a_trial_blocks_nobody(told: Plan, tmp_path: Path):
+def test_a_machine_that_is_killed_in_a_trial_blocks_nobody(search_plan: Plan, tmp_path: Path):
     machine = subprocess.Popen([sys.executable, "-c", HANG], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert machine.stdin is not None
     assert machine.stdout is not None
     with machine.stdin, machine.stdout:
-        machine.stdin.write(msgspec.json.encode(told))
+        machine.stdin.write(msgspec.json.encode(search_plan))
         machine.stdin.close()
         try:
             assert machine.stdout.readline() == b"begun\n"
         finally:
             machine.kill()
             machine.wait(30)
-    made = searched(told)
+    made = searched(search_plan)
     assert [trial.number for trial in made] == list(range(TRIALS))
     assert made == searched(plan(tmp_path, "journal", trials=TRIALS))
 
 
-def test_a_database_that_is_gone_is_reported_in_a_line(told: Plan):
+def test_a_database_that_is_gone_is_reported_in_a_line(search_plan: Plan):
     with pytest.raises(StemmapError, match="the database cannot be used"):
-        Search(msgspec.structs.replace(told, storage="postgresql://nobody@127.0.0.1:9/none"), InlineWorker())
+        Search(
+            msgspec.structs.replace(search_plan, storage="postgresql://nobody@127.0.0.1:9/none"),
+            InlineWorker(),
+        )

@@ -60,13 +60,13 @@ def run() -> list[Table]:
             columns,
             tuple(rows),
             (
-                "Rings are driven twice; odometry and detections err as the filter is told. The mean of 50 "
-                "runs lies in the band in 95 % of the scans if the sigmas are honest; above it they are too "
-                "small, below it too large.",
-                "Trees: those of the tracker at the end, all in one mean; the band is for 50 runs of one "
-                "tree each, those of a run sharing the error of its path. Innovations: mean of a run, a "
-                "degree of freedom; the band is for 50 runs of one scan each, views of other scans "
-                "not being independent.",
+                "Rings are driven twice; odometry and detections have the errors that the filter "
+                "assumes. The mean of the 50 runs is inside the band in 95 % of the scans if the "
+                "sigmas are correct; above the band they are too small, below it too large.",
+                "Trees: the trees of the tracker at the end of all runs, in one mean. The band is "
+                "that of 50 runs with one tree each, because the trees of a run share the error of "
+                "its path. NIS: mean of a run, one degree of freedom. Its band is that of 50 runs "
+                "with one scan each, because views of successive scans are not independent.",
             ),
         )
     ]

@@ -175,13 +175,13 @@ def test_a_loop_overrules_associations_by_the_drifted_path():
         birth = np.arange(len(sees))
         places = places.with_scan(6.0 * k, 4 * k, birth)
         graph = graph.with_keyframe(Keyframe(k, 4 * k, 6.0 * k, motion, 4.0 * Q, birth, centre, R), T)
-    graph = graph.certain(places)
+    graph = graph.without_uncertain(places)
     assert [len(k.birth) for k in graph.keyframes] == [4] * 4 + [0] * 38
     solution = graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3)).solve(new_loop=True)
     assert solution is not None
     assert solution.loop_weight[0] > 0.9
     assert off(solution.pose, true)[-1] < 0.1
-    seen = graph.certain(places.with_seen(246.0, np.arange(4)))
+    seen = graph.without_uncertain(places.with_seen(246.0, np.arange(4)))
     assert seen.keyframes == graph.keyframes, "what is left is certain"
 
 

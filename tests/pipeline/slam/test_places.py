@@ -30,6 +30,7 @@ from pipeline.slam.places import (
 from tests.pipeline.strategies import detections, seeds
 
 R = [0.03**2, 0.0, 0.03**2]
+TREES = np.array([[3.0, 4.0], [6.0, -3.0], [9.0, 2.0]])
 EXACT = Pose(0.0, 0.0, 0.0, 1e-6, 0.0, 0.0, 1e-6, 0.0, 1e-8)
 
 
@@ -45,6 +46,14 @@ def of_stand(trees: np.ndarray, shown: np.ndarray, pose: Pose = EXACT) -> tuple[
     """Log odds of the trees and which of them agree, for exact detections."""
     odds, agrees, _ = agreement(pose, shown, np.tile(R, (len(shown), 1)), trees, np.tile(R, (len(trees), 1)))
     return odds, agrees
+
+
+def mapped() -> FastSlam:
+    """A filter with one particle after four scans of TREES, the last one at x = 1.5 m."""
+    slam = FastSlam(preset("stems").slam.model_copy(update={"particles": 1}), 1)
+    for k in range(4):
+        slam.process(k, Pose2(0.5, 0.0, 0.0), detections(TREES - [0.5 * k, 0.0]), np.zeros(128))
+    return slam
 
 
 @given(seed=seeds)
@@ -96,43 +105,37 @@ def test_an_old_place_is_seen_only_for_certain():
 def test_a_contradicted_place_is_inactive_until_it_is_seen():
     places = line().with_contradiction(np.array([4]))
     assert places.contradicted
-    assert places.is_active(np.array([3, 4, 5])).tolist() == [True, False, True]
+    assert places.is_usable(np.array([3, 4, 5])).tolist() == [True, False, True]
     kernels = places.in_reach(np.array([4, 30]), 30 * PLACE)
     states = [ACTIVE, UNCERTAIN, INACTIVE, UNCERTAIN, ACTIVE, ACTIVE]
     assert [state_of(b, kernels) for b in (-1, 3, 4, 5, 30, 40)] == states
-    assert places.with_seen(200.0, np.array([5])).is_active(np.array([4])).all()
+    assert places.with_seen(200.0, np.array([5])).is_usable(np.array([4])).all()
     assert not places.with_scan(200.0, 31, np.zeros(0, np.int64)).contradicted
     assert not len(places.in_reach(np.array([-1, 29, 30]), 30 * PLACE).state), "all in reach are active"
 
 
 def test_landmarks_of_inactive_places_are_left_alone():
-    trees = np.array([[3.0, 4.0], [6.0, -3.0], [9.0, 2.0]])
-    slam = FastSlam(preset("stems").slam.model_copy(update={"particles": 1}), 1)
-    for k in range(4):
-        slam.process(k, Pose2(0.5, 0.0, 0.0), detections(trees - [0.5 * k, 0.0]), np.zeros(128))
+    slam = mapped()
     known = slam.landmarks()
     assert known.birth.tolist() == [0, 1, 2]
     slam.state = replace(slam.state, places=slam.state.places.with_contradiction(known.birth))
-    seen = trees - [2.5, 0.2]
+    seen = TREES - [2.5, 0.2]
     estimate = slam.process(4, Pose2(0.5, 0.0, 0.0), detections(seen), np.zeros(128))
     assert estimate.landmark_of.min() > 2
     now = slam.landmarks()
     assert len(now.birth) == 6
     np.testing.assert_array_equal(now.position[:3], known.position)
     slam.state = replace(slam.state, places=slam.state.places.with_seen(0.0, known.birth))
-    estimate = slam.process(5, Pose2(), detections(seen), np.zeros(128))
+    slam.process(5, Pose2(), detections(seen), np.zeros(128))
     assert not slam.state.places.inactive.any()
 
 
 def test_landmarks_of_uncertain_places_correct_the_pose_and_stay():
-    trees = np.array([[3.0, 4.0], [6.0, -3.0], [9.0, 2.0]])
-    slam = FastSlam(preset("stems").slam.model_copy(update={"particles": 1}), 1)
-    for k in range(4):
-        slam.process(k, Pose2(0.5, 0.0, 0.0), detections(trees - [0.5 * k, 0.0]), np.zeros(128))
+    slam = mapped()
     known = slam.landmarks()
     old = replace(slam.state.places, seen=slam.state.places.seen - 2.0 * REVISIT_DISTANCE)
     slam.state = replace(slam.state, places=old)
-    estimate = slam.process(4, Pose2(0.55, 0.0, 0.0), detections(trees - [2.0, 0.0]), np.zeros(128))
+    estimate = slam.process(4, Pose2(0.55, 0.0, 0.0), detections(TREES - [2.0, 0.0]), np.zeros(128))
     assert estimate.landmark_of.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(slam.landmarks().position, known.position)
     assert not slam.state.places.is_old(slam.state.distance).any(), "three trees that agree decide"
