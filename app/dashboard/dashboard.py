@@ -25,6 +25,7 @@ from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_pay
 from app.dashboard.run_recorder import RunRecorder, RunState
 from app.dashboard.scores import Scores, score_map
 from app.dashboard.selection import Selector, WorkerClient
+from app.sources.inspection import check_source
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
@@ -90,7 +91,8 @@ class Dashboard:
         self._run: int | None = None
         self._notice = ""
         self._restarts = 0
-        self._opens = 0
+        self._opens = self._requests = 0
+        self.check_source = check_source
         self._opening = asyncio.Lock()
         self._go = False
         self._show_scene = Throttle(lambda f, xy: self.scene.show(f, xy), pause_s=_SCENE_PAUSE_S)
@@ -152,9 +154,18 @@ class Dashboard:
     async def open(self, request: SourceRequest) -> None:
         """Close the run and open another source, with the parameters of the request if it has any.
 
+        The source is checked before an open run is closed. Of several requests, only the newest is opened.
+
         Raises:
-            ParameterError: The parameters are not valid in this version; nothing changes.
+            StemmapError: The source cannot be opened, or the parameters are not valid in this version; the
+                open run is kept.
         """
+        self._requests += 1
+        asked = self._requests
+        if self._run is not None:
+            await self.check_source(request)
+            if asked != self._requests:
+                return
         if request.preset or request.parameters:
             self.parameters.take(request.preset, request.parameters)
             self._show_parameters()  # the worker receives them when the source is open

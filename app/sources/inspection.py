@@ -23,15 +23,19 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
-from app.sources.request import LONGEST_URI
+from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.clouds import is_cloud
 from pipeline.io.readers.topics import TYPES_BY_ROLE
+from pipeline.odometry.synchroniser import steps
+from pipeline.simulation.scenarios import SCHEME, parse_uri
 
 COMMAND = python_module("app.sources.inspection")
 PATIENCE_S = 120.0
+#: A large recording on a slow disk takes minutes to be opened.
+OPENING_LIMIT_S = 300.0
 LARGEST_ANSWER = 64 << 20
 MEMORY_LIMIT = 8 << 30
 _MOST_AT_ONCE = 2
@@ -86,6 +90,22 @@ async def ask(
     return answer.content
 
 
+async def check_source(request: SourceRequest) -> None:
+    """Check that a source can be opened. A child process reads the first scan of a file; of simulated runs
+    and live robots only the address is checked.
+
+    Raises:
+        StemmapError: It cannot be opened; the error gives the reason.
+    """
+    if is_live(request.uri):
+        parse_address(request.uri)
+    elif request.uri.startswith(SCHEME) and not Path(request.uri).exists():
+        parse_uri(request.uri)
+    else:
+        question = {"ask": "first_scan", "path": request.uri, "request": msgspec.to_builtins(request)}
+        await ask(question, patience_s=OPENING_LIMIT_S)
+
+
 # --- in the child process ----------------------------------------------------------------------------
 
 HYPOTHESES = 1_000_000
@@ -95,6 +115,24 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
     """Return the format of a recording, detected from its contents."""
     with closing(open_source(question["path"])) as source:
         return {"kind": source.description.kind}
+
+
+def first_scan(question: dict[str, Any]) -> dict[str, Any]:
+    """Return the time of the first scan of a source [ns], read as a `SourceRequest` chooses.
+
+    Args:
+        question: `request` has the fields of the `SourceRequest`.
+
+    Raises:
+        SourceError: There is no scan, or it cannot be read.
+    """
+    request = msgspec.convert(question["request"], SourceRequest)
+    with closing(open_source(request.uri, request.options())) as source:
+        moving, chosen = with_odometry(source, request.odometry)
+        step = next(steps(moving.records(None), odometry=chosen.steps), None)
+        if step is None:
+            raise SourceError("there is no scan in it", where=request.uri, remedy="Choose another source")
+        return {"stamp_ns": step.scan.stamp_ns}
 
 
 def inside(question: dict[str, Any]) -> dict[str, Any]:
@@ -173,6 +211,7 @@ def alignment(question: dict[str, Any]) -> dict[str, Any]:
 
 QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "recording": recording,
+    "first_scan": first_scan,
     "inside": inside,
     "finished": finished,
     "alignment": alignment,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from playwright.sync_api import expect
 
@@ -128,16 +130,20 @@ def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
     expect(drawn.first).to_be_attached()
 
 
-def test_a_missing_run_is_reported_with_a_remedy(dashboard: Dashboard):
+def test_a_source_that_cannot_be_opened_leaves_the_run_and_says_why(dashboard: Dashboard, tmp_path: Path):
     page = dashboard.page
     dashboard.tab("Trees")
     expect(page.locator("#trees tbody tr").first).to_be_visible()
+    before = page.locator("#trees tbody tr").count(), dashboard.ask("/api/status")
+    (tmp_path / "notes.txt").write_text("birch, birch, oak")
     page.locator("#source-button").click()
-    page.locator("#source-uri").fill("/nowhere/run.mcap")
-    page.get_by_role("button", name="Open", exact=True).click()
-    expect(page.locator("#source-error")).to_contain_text("/nowhere/run.mcap")
-    expect(page.locator("#trees tbody tr")).to_have_count(0)  # of the run that was left nothing stays
-    expect(page.locator("#trees-empty")).to_contain_text("Nothing mapped yet")
+    for uri, reason in (("/nowhere/run.mcap", "no such file"), (str(tmp_path / "notes.txt"), "Not a LiDAR")):
+        page.locator("#source-uri").fill(uri)
+        page.get_by_role("button", name="Open", exact=True).click()
+        expect(page.locator("#source-error")).to_contain_text(uri)
+        expect(page.locator("#source-error")).to_contain_text(reason, ignore_case=True)
+    assert (page.locator("#trees tbody tr").count(), dashboard.ask("/api/status")) == before
+    expect(page.locator("#state b")).to_have_text("Paused")
     dashboard.errors.clear()  # the browser logs an answer that refuses
     page.get_by_role("button", name="sim:paper").click()
     expect(page.locator("#source-dialog")).not_to_be_visible()

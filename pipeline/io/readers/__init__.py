@@ -85,7 +85,9 @@ def _find_opener(path: Path, uri: str) -> Opener:
     kind = file_format(path, head)
     if kind is None:
         promised = expected_format(path)
-        what = f"the contents are not those of a {promised.words} file" if promised else "unknown format"
+        what = (
+            f"the contents are not those of a {promised.words} file" if promised else "not a LiDAR recording"
+        )
         raise SourceError(what, where=uri, remedy=READABLE)
     return kind.open
 
@@ -151,7 +153,7 @@ FILES = (
 )
 
 _MOST_NAMED = 5
-READABLE = "Readable are: " + ", ".join(
+READABLE = "Supported formats: " + ", ".join(
     [kind.words for kind in FILES]
     + [
         "a folder of .bin, .pcd, .ply, .npy, .npz, .las or .laz scans",

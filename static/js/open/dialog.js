@@ -8,6 +8,7 @@ import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
 const dialog = byId("source-dialog");
+let requested = null; // address that the server checks; the open run is kept meanwhile
 let asked = null; // address that is being opened
 let left = null; // status before that
 
@@ -44,19 +45,22 @@ export async function ask(uri) {
     say("Enter a path or an address, for example sim:stand.");
     return;
   }
-  asked = uri;
+  requested = uri;
   left = state.status;
   say("");
   setText(byId("source-open"), "Opening…");
   try {
     await open({ uri, odometry: byId("source-odometry").value, ...chosenFor(uri) });
+    if (requested !== uri) return;
+    asked = uri;
+    follow(state);
   } catch (error) {
-    finish(error.message);
+    if (requested === uri) finish(error.message);
   }
 }
 
 function finish(message) {
-  asked = null;
+  requested = asked = null;
   setText(byId("source-open"), "Open");
   if (message) say(message);
   else dialog.close();
@@ -76,7 +80,7 @@ function say(text) {
 
 export function startSources() {
   for (const id of ["source-button", "notice-open"]) byId(id).addEventListener("click", () => openSources());
-  byId("source-close").addEventListener("click", () => { asked = null; dialog.close(); setText(byId("source-open"), "Open"); });
+  byId("source-close").addEventListener("click", () => finish(""));
   byId("source-form").addEventListener("submit", (event) => {
     event.preventDefault();
     ask(byId("source-uri").value.trim());

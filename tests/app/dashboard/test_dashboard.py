@@ -7,6 +7,7 @@ import json
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from typing import Any
+from unittest.mock import AsyncMock
 
 import msgspec
 import numpy as np
@@ -16,6 +17,7 @@ import pytest_asyncio
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
+from app.sources.request import SourceRequest
 from app.worker.protocol import (
     Answer,
     AskCluster,
@@ -29,7 +31,7 @@ from app.worker.protocol import (
     Status,
 )
 from pipeline.config import preset
-from pipeline.errors import ParameterError
+from pipeline.errors import ParameterError, SourceError
 from pipeline.ground.terrain_map import no_height_map
 from tests.app.explain.stories import cluster_story
 from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_trees
@@ -39,6 +41,7 @@ from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_tr
 async def dashboard() -> AsyncIterator[Dashboard]:
     made = Dashboard(ParameterState(), Broadcast())
     made.worker, made.scene = FakeWorker(), FakeScene()
+    made.check_source = AsyncMock()
     await made.start(Open("fake:"))
     yield made
     await made.close()
@@ -120,6 +123,36 @@ async def test_opening_empties_the_page_at_once_and_nothing_of_the_old_run_comes
     assert scene_calls(dashboard)[-3][0] == "clear"
     assert (dashboard.shown, dashboard.truth, dashboard.path) == (None, None, None)
     assert "trees" not in browser_knows(dashboard)["truth"]
+
+
+async def test_a_source_that_cannot_be_opened_leaves_the_open_run_as_it_is(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened(truth=truth_trees()))
+    await dashboard.receive(Shown(1, 0.0, frame(0, 1, n_trees=3), 0, path([0.0])))
+    told, known = len(worker(dashboard).commands), browser_knows(dashboard)
+    dashboard.check_source = AsyncMock(side_effect=SourceError("not a LiDAR recording", where="notes.txt"))
+    with pytest.raises(SourceError, match="not a LiDAR"):
+        await dashboard.open(SourceRequest("notes.txt", preset="paper"))
+    assert dashboard.shown is not None
+    assert (dashboard.source.uri, dashboard.parameters.preset) == ("fake:", "forest")
+    assert browser_knows(dashboard) == known
+    assert len(worker(dashboard).commands) == told
+
+
+async def test_of_two_sources_that_are_checked_at_once_the_newer_is_opened(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened())
+    slow = asyncio.Event()
+
+    async def check(request: SourceRequest) -> None:
+        if request.uri == "slow:":
+            await slow.wait()
+
+    dashboard.check_source = check
+    first = asyncio.create_task(dashboard.open(SourceRequest("slow:")))
+    await asyncio.sleep(0)
+    await dashboard.open(SourceRequest("quick:"))
+    slow.set()
+    await first
+    assert dashboard.source.uri == "quick:"
 
 
 async def test_a_ground_stands_with_every_picture_after_the_one_that_brought_it(dashboard: Dashboard) -> None:

@@ -107,6 +107,28 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
     assert "no topic was announced" in inspection.heard("velodyne:127.0.0.1:2368")["warnings"][0]
 
 
+async def test_a_source_is_checked_up_to_its_first_scan(tmp_path: Path, run: Path) -> None:
+    await inspection.check_source(SourceRequest(str(run), mount=(0.0, 0.0, 2.0, 0.0, 0.0, 0.0)))
+    notes, cut = tmp_path / "notes.txt", tmp_path / "cut.mcap"
+    notes.write_text("birch, birch, oak")
+    cut.write_bytes(run.read_bytes()[:60])
+    for uri, reason in ((notes, "not a LiDAR recording.*Supported formats"), (cut, "cut.mcap")):
+        with pytest.raises(SourceError, match=reason):
+            await inspection.check_source(SourceRequest(str(uri)))
+    with pytest.raises(SourceError, match="no topic /other"):
+        await inspection.check_source(SourceRequest(str(run), topics={"scan": "/other"}))
+
+
+@pytest.mark.parametrize("uri", ["sim:stand?seed=2", "velodyne:0.0.0.0:2368?from=192.168.1.201"])
+async def test_of_simulated_and_live_sources_the_address_is_checked(
+    uri: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(inspection, "ask")  # no child process
+    await inspection.check_source(SourceRequest(uri))
+    with pytest.raises(SourceError):
+        await inspection.check_source(SourceRequest(uri + "&nothing=5"))
+
+
 async def test_the_choice_goes_to_the_worker(both: Running) -> None:
     client, dashboard = both
     body = {"uri": "run.mcap", "topics": {"scan": "/other", "imu": "/imu"}, "mount": MOUNT}

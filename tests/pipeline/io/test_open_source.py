@@ -39,7 +39,7 @@ def test_a_folder_without_scans_is_told(tmp_path: Path):
 def test_an_unknown_file_is_told(tmp_path: Path):
     path = tmp_path / "notes.txt"
     path.write_text("hello")
-    with pytest.raises(SourceError, match=r"unknown format.*Readable are"):
+    with pytest.raises(SourceError, match=r"not a LiDAR recording.*Supported formats"):
         open_source(str(path))
 
 
