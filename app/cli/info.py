@@ -33,8 +33,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the description."""
-    from pipeline.io.readers import open_source
-    from pipeline.io.readers.clouds import is_cloud, open_cloud
+    from app.sources.opening import open_cloud, open_source
+    from pipeline.io.readers.clouds import is_cloud
 
     if is_cloud(arguments.source):
         cloud = open_cloud(arguments.source).description

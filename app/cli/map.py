@@ -109,8 +109,8 @@ def _run_plot(arguments: argparse.Namespace) -> int:
         raise ParameterError("a whole cloud has no scans", remedy="Remove --continue and --stop-after")
     from app.batch.map_cloud import map_plot_run
     from app.batch.run_folder import check_folder
+    from app.sources.opening import open_cloud
     from pipeline.io.ground_truth import read_truth_trees
-    from pipeline.io.readers.clouds import open_cloud
 
     truth = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     name, parameters = flags.chosen_parameters(arguments, "forest")

@@ -27,9 +27,9 @@ from app.robot.recorder import Recorder
 from app.robot.topics import SCAN_TYPES, Choice, Publisher, choose
 from app.robot.velodyne import VelodyneLink
 from app.robot.zenoh import RosPublisher, ZenohLink
+from app.sources.opening import open_source
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.io.readers import open_source
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions, count_loss
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics

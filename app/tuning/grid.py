@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 import re
-import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from typing import Any
 from app.common.text import value_text
 from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value
-from pipeline.config.text import parsed
+from pipeline.config.text import parsed, toml_table
 from pipeline.errors import ParameterError
 
 PRESET = "preset"  # the axis whose values are names of presets, which the other axes change
@@ -92,12 +91,10 @@ def _axes_of(file: Path) -> list[GridAxis]:
     try:
         if file.stat().st_size > _LARGEST_FILE:
             raise ParameterError("the file is larger than 1 MB", where=str(file))
-        given = tomllib.loads(file.read_text(encoding="utf-8"))
+        given = toml_table(file.read_text(encoding="utf-8"), str(file))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not text"
         raise ParameterError(f"cannot read the grid: {reason}", where=str(file), remedy=_EXAMPLE) from None
-    except (ValueError, RecursionError) as error:
-        raise ParameterError(f"not a TOML file: {error}", where=str(file)) from None
     axes = []
     for stage, entry in given.items():
         if stage == PRESET:

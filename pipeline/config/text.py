@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from typing import Any
 
 from pipeline.config.model import FieldSpec, Parameters, Value, current_names, field_specs, validated
 from pipeline.errors import ParameterError
+
+LONGEST_TOML = 1_000_000  # characters
+#: A name of more parts: tomllib takes gigabytes for names of thousands of parts.
+_DEEP_NAME = re.compile(r"(?:\.[^.,=\n]{0,100}){20}")
 
 
 def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
@@ -67,10 +72,7 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
     Raises:
         ParameterError: The text is not TOML, or a value is not valid.
     """
-    try:
-        given = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError
-        raise ParameterError(f"not a TOML file: {error}", where=where) from None
+    given = toml_table(text, where)
     for stage, values in given.items():
         if not isinstance(values, dict):
             raise ParameterError(
@@ -86,6 +88,26 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
         return validated(tree)
     except ParameterError as error:
         raise ParameterError(error.what, where=where) from None
+
+
+def toml_table(text: str, where: str) -> dict[str, Any]:
+    """Return the contents of a TOML text from outside.
+
+    Args:
+        text: Content of the file.
+        where: Name of the file, for error messages.
+
+    Raises:
+        ParameterError: The text is not TOML, is too long, or has names of too many parts.
+    """
+    if len(text) > LONGEST_TOML:
+        raise ParameterError(f"the file is longer than {LONGEST_TOML:,} characters", where=where)
+    if _DEEP_NAME.search(text):
+        raise ParameterError("a name in the file has too many parts", where=where)
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:  # a TOMLDecodeError is a ValueError
+        raise ParameterError(f"not a TOML file: {error}", where=where) from None
 
 
 def markdown_table(presets: dict[str, Parameters]) -> str:

@@ -20,7 +20,7 @@ from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.types.records import HIDDEN, Sensor, Truth, TruthPath, TruthTrees
 
 KINDS = ("tree", "pole", "person", "bush", "other", HIDDEN)
-LARGEST_FILE = 64 << 20
+LARGEST_FILE = 8 << 20
 _X = ("x_m", "x", "treelocationx", "easting", "easting_m", "east", "utm_x")
 _Y = ("y_m", "y", "treelocationy", "northing", "northing_m", "north", "utm_y")
 _AZIMUTH = ("azimuth_deg", "azimuth")
@@ -105,7 +105,7 @@ class _Table:
 def _text_of(path: Path) -> str:
     try:
         if path.stat().st_size > LARGEST_FILE:
-            raise SourceError("the table of trees is larger than 64 MB", where=str(path))
+            raise SourceError("the table of trees is larger than 8 MB", where=str(path))
         return path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise SourceError(f"cannot read the table of trees: {error.strerror}", where=str(path)) from None

@@ -191,6 +191,8 @@ _RECORD = struct.Struct("<18xHH32x")
 #: The record of LASzip lists the items of a point from this byte on: kind, length and version of each.
 _LASZIP_USER = b"laszip encoded"
 _LASZIP, _ITEMS, _ITEM = 22204, 34, struct.Struct("<HHH")
+#: Layers of a chunk by the kind of the item (LAS 1.4); extra bytes have one layer each.
+_LAYERS, _BYTES_14 = {10: 9, 11: 1, 12: 2, 13: 1}, 14
 
 
 class LasCloud(CloudFile):
@@ -263,8 +265,12 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
         if points and there == 0:
             raise SourceError("the LAS file ends before its first point", where=uri, remedy=_REMEDY)
         if compressed:
-            _check_items(file, header_size, first, records, length, uri)
+            record, layers = _check_items(file, header_size, first, records, length, uri)
             _check_chunks(file, first, size, uri)
+            if layers:
+                there = min(points, _points_before_damage(file, first, length, record, layers))
+            if points and there == 0:
+                raise SourceError("the first chunk of the LAS file is damaged", where=uri, remedy=_REMEDY)
     if points == 0:
         raise SourceError("the cloud has no points", where=uri)
     if points > MOST_POINTS or (compressed and points > 4000 * room):
@@ -272,7 +278,9 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
     return points, there, compressed, version
 
 
-def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, uri: str) -> None:
+def _check_items(
+    file: IO[bytes], at: int, end: int, records: int, length: int, uri: str
+) -> tuple[bytes, int]:
     """Check that the compressed items of a point are together as long as a point (LASzip, `laszip.check`).
 
     The decoder allocates memory by their sizes: up to 65,535 bytes per point.
@@ -283,6 +291,9 @@ def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, 
         records: Number of these records.
         length: Length of a point by the header [bytes].
         uri: Name of the file in errors.
+
+    Returns:
+        The record of LASzip, b"" if there is none, and the number of layers of a chunk; 0 without layers.
 
     Raises:
         SourceError: The lengths differ.
@@ -302,6 +313,34 @@ def _check_items(file: IO[bytes], at: int, end: int, records: int, length: int, 
         table = table[: len(table) // _ITEM.size * _ITEM.size]
         if sum(size for _, size, _ in _ITEM.iter_unpack(table)) != length:
             raise SourceError("the header of the LAS file contradicts itself", where=uri, remedy=_REMEDY)
+        kinds = [(kind, size) for kind, size, _ in _ITEM.iter_unpack(table)]
+        return record, sum(size if kind == _BYTES_14 else _LAYERS.get(kind, 0) for kind, size in kinds)
+    return b"", 0
+
+
+def _points_before_damage(file: IO[bytes], first: int, length: int, record: bytes, layers: int) -> int:
+    """Return the number of points in the chunks before the first one whose layers are longer than the chunk.
+
+    The decoder allocates memory by the lengths of the layers.
+
+    Args:
+        file: The opened file.
+        first: First byte of the points.
+        length: Length of a point [bytes]; a chunk begins with one point, a number, and a length per layer.
+        record: The record of LASzip.
+        layers: Number of layers of a chunk.
+    """
+    import lazrs
+
+    file.seek(first)
+    points, at = 0, first + 8
+    for count, size in lazrs.read_chunk_table(file, lazrs.LazVlr(record)):
+        file.seek(at + length + 4)
+        lengths = np.frombuffer(file.read(4 * layers), "<u4")
+        if len(lengths) < layers or lengths.sum(dtype=np.int64) > size:
+            break
+        points, at = points + count, at + size
+    return points
 
 
 def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:

@@ -55,7 +55,7 @@ class Db3File(Container):
         try:
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MESSAGE_LIMIT)
             self._database.execute("PRAGMA trusted_schema = OFF")
-            self._refuse_views()
+            self._tables = self._plain_tables()
             self._row, self._topic, self._stamp = self._read_index()
             self.channels = self._read_channels()
         except (sqlite3.Error, OverflowError, UnicodeDecodeError, ValueError, TypeError) as error:
@@ -94,14 +94,22 @@ class Db3File(Container):
             return None
         return found[0] if found is not None and isinstance(found[0], bytes) else None
 
-    def _refuse_views(self) -> None:
-        """Refuse views and virtual tables, which can compute without end; recorders write plain tables."""
-        plain = self._database.execute(
-            "SELECT name FROM sqlite_master WHERE type = 'table' AND name IN ('messages', 'topics')"
-            " AND sql NOT LIKE '%VIRTUAL%' AND sql NOT LIKE '%GENERATED%'"
-        ).fetchall()
-        if len(plain) != 2:
+    def _plain_tables(self) -> set[str]:
+        """Return the names of the plain tables.
+
+        Views, virtual tables and computed columns can compute without end; recorders write none.
+
+        Raises:
+            SourceError: `messages` or `topics` is not such a table.
+        """
+        found = self._database.execute(
+            "SELECT name FROM pragma_table_list AS t WHERE schema = 'main' AND type = 'table'"
+            " AND NOT EXISTS (SELECT 1 FROM pragma_table_xinfo(t.name) WHERE hidden)"
+        )
+        plain = {name for (name,) in found}
+        if not {"messages", "topics"} <= plain:
             raise damaged("the database holds no tables of messages and topics", self._path)
+        return plain
 
     def _read_index(self) -> tuple[Int, Int, Int]:
         """Return row, topic and time [ns] of all messages in the order of time, shape (N,) each. Damaged ones
@@ -131,6 +139,8 @@ class Db3File(Container):
     def _definitions(self) -> dict[str, tuple[str, str]]:
         """Return the format and text of message definitions by type, stored since ROS 2 Iron."""
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+        if "message_definitions" not in self._tables:
+            return {}
         try:
             return {str(name): (str(kind), str(text)) for name, kind, text in self._database.execute(query)}
         except sqlite3.Error:

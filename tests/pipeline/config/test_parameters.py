@@ -20,6 +20,7 @@ from pipeline.config import (
     preset,
     to_toml,
 )
+from pipeline.config.text import toml_table
 from pipeline.errors import ParameterError
 
 SPECS = field_specs()
@@ -237,6 +238,10 @@ def test_toml_may_omit_values_and_write_lengths_as_integers():
         "[clustering]\neps = 1" + 400 * "0",
         "[clustering]\neps = 1" + 5000 * "0",
         "[clustering]\neps = " + 3000 * "[" + 3000 * "]",
+        "a" + 25_000 * ".a" + " = 1",
+        "[clustering]\neps = {a" + 25_000 * ". a" + " = 1}",
+        "[" + "a." * 25_000 + "a]",
+        "# " + 1_000_000 * "x",
     ],
     ids=lambda text: repr(text[:28]),
 )
@@ -247,6 +252,12 @@ def test_an_invalid_toml_gives_one_line_with_the_file_name(text):
     assert "mine.toml" in message
     assert "\n" not in message
     assert len(message) < 500
+
+
+def test_long_lists_and_paths_are_not_names_of_many_parts():
+    numbers = ", ".join(f"{k}.5" for k in range(500))
+    text = f"[clustering]\neps = [{numbers}]\npath = '{'/a.b' * 15}'\n"
+    assert len(toml_table(text, "grid.toml")["clustering"]["eps"]) == 500
 
 
 @pytest.mark.parametrize(

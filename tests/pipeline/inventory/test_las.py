@@ -14,6 +14,7 @@ import pytest
 from app.cli import main
 from pipeline.errors import SourceError
 from pipeline.io.readers.clouds import is_cloud, open_cloud
+from pipeline.io.readers.point_files import MISSING
 from tests.pipeline.inventory.plots import PLACES, plot, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)
@@ -121,6 +122,27 @@ def test_items_longer_than_a_point_are_refused_before_the_decoder_takes_memory_f
     assert struct.unpack_from("<HHH", content, items)[:2] in ((6, 20), (10, 30))
     file.write_bytes(damage(content, items + 2, struct.pack("<H", 65535)))
     with pytest.raises(SourceError, match="contradicts itself"):
+        open_cloud(str(file))
+
+
+def test_a_chunk_with_layers_longer_than_itself_ends_the_points_before_the_decoder_takes_memory(
+    tmp_path, points
+):
+    many = np.tile(points[:10_000], (12, 1))
+    file = write_las(tmp_path / "plot.laz", many, version="1.4")  # chunks of 50,000 points
+    content = file.read_bytes()
+    (first,) = struct.unpack_from("<I", content, 96)
+    (length,) = struct.unpack_from("<H", content, 105)
+    layers = first + 8 + length + 4
+    sizes = np.frombuffer(content, "<u4", 9, layers)
+    second = layers + 36 + int(sizes.sum()) + length + 4
+    huge = struct.pack("<I", 4_000_000_000)
+    file.write_bytes(damage(content, second, huge))
+    cloud = open_cloud(str(file))
+    assert sum(map(len, cloud.parts())) == 50_000
+    assert cloud.losses == {MISSING: 70_000}
+    file.write_bytes(damage(content, layers, huge))
+    with pytest.raises(SourceError, match="the first chunk of the LAS file is damaged"):
         open_cloud(str(file))
 
 

@@ -117,6 +117,11 @@ def test_what_does_not_fit_is_said_with_line_and_column(tmp_path, text, says):
     assert "\n" not in str(caught.value)
 
 
+def test_a_table_that_would_take_gigabytes_is_refused(tmp_path):
+    with pytest.raises(SourceError, match="larger than 8 MB"):
+        read(tmp_path, "x_m,y_m\n" + "1,1\n" * (3 << 20))
+
+
 def test_a_missing_file_and_a_folder(tmp_path):
     for path in (tmp_path / "none.csv", tmp_path):
         with pytest.raises(SourceError, match="cannot read"):

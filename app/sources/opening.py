@@ -1,0 +1,56 @@
+"""Opening of files from outside: first in a child process with limits, then in this one.
+
+A damaged or hostile file can take gigabytes, hang, or end the process that opens it. The limits grow with the
+size of the file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable
+from pathlib import Path
+
+from app.common.limited_process import Limits, run_limited
+from pipeline.inventory.cloud import WholeCloud
+from pipeline.io.readers import Source, SourceOptions, clouds
+from pipeline.io.readers import open_source as _open_source
+
+
+def open_source(uri: str, options: SourceOptions | None = None) -> Source:
+    """Open a run, see `pipeline.io.readers.open_source`.
+
+    Raises:
+        SourceError: It cannot be read, or takes more time or memory than a file of its size should.
+    """
+    if clouds.is_cloud(uri):
+        open_cloud(uri)
+    else:
+        _check(lambda: _open_source(uri, options).truth(), uri)
+    return _open_source(uri, options)
+
+
+def open_cloud(uri: str) -> WholeCloud:
+    """Open a whole cloud, see `pipeline.io.readers.clouds.open_cloud`.
+
+    Raises:
+        SourceError: As for `open_source`.
+    """
+    _check(lambda: clouds.open_cloud(uri), uri)
+    return clouds.open_cloud(uri)
+
+
+def _check(opening: Callable[[], object], uri: str) -> None:
+    """Run an opening in a child process if the source is a file or a folder."""
+    size = _size(uri)
+    if size is not None:
+        run_limited(opening, Limits.for_size(size), uri)
+
+
+def _size(uri: str) -> int | None:
+    """Return the size of a file, or of all files in a folder [bytes]; None if there is none."""
+    with contextlib.suppress(OSError, ValueError, RuntimeError):
+        path = Path(uri.removeprefix("file:").removeprefix("//")).expanduser()
+        if path.is_dir():
+            return sum(inside.stat().st_size for inside in path.rglob("*") if inside.is_file())
+        return path.stat().st_size
+    return None
