@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import faulthandler
 import os
 import select
@@ -17,6 +18,7 @@ import msgspec
 
 from pipeline.errors import SourceError, StemmapError
 
+_PR_SET_PDEATHSIG = 1
 _DAMAGED = "The file is damaged, or this is a fault in stemmap"
 
 
@@ -98,6 +100,7 @@ def _be_child(work: Callable[[], object], limits: Limits, where: str, sending: i
     error: tuple[str, str, str] | None = None
     try:
         faulthandler.disable()
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_DFL)
         nowhere = os.open(os.devnull, os.O_WRONLY)
