@@ -9,7 +9,7 @@ from pipeline.classification.voxel_map import SIDE, SLICE, SLICES
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import Bool, Float32, Int, Int32
+from pipeline.types.records import RING_FAR, Bool, Float32, Int, Int32
 
 BUCKET = 0.9  # m; radius of the neighbourhood of a column
 MARGIN = 1.2  # m around a tile in which neighbours are considered
@@ -17,7 +17,7 @@ LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m, and to 3 m, in which a c
 LEAST = 3  # slices with returns
 TWIN = 0.02  # m; axes within this distance are the same
 APART = 0.3  # m; of two columns within this distance the weaker one is dropped
-INSIDE, RING_NEAR, RING_FAR = 0.3, 0.45, 0.9  # m around the axis
+INSIDE, RING_NEAR = 0.3, 0.45  # m around the axis
 OCTANTS = 8
 ARC = 11  # first column of the moments of an arc, see `profile`
 PROFILE = 20  # columns of a profile, see `profile`

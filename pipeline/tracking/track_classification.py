@@ -18,7 +18,7 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.tracking.observation import SECTORS, sides_of
 from pipeline.tracking.track_table import Rows, ScanPose
-from pipeline.types.records import AT_ROUND, CLASSES, Bool, Columns, Int, Int32, Verdict
+from pipeline.types.records import AT_ROUND, CLASSES, RING_FAR, Bool, Columns, Int, Int32, Verdict
 
 TREE, OTHER = int(Verdict.TREE), int(Verdict.OTHER)
 ONE_TREE = 0.5  # m; tree columns nearer to each other are one tree
@@ -47,6 +47,7 @@ def classify(
     verdict: Int32,
     tree_share: float,
     range_max: float,
+    hits_to_confirm: int,
 ) -> Int:
     """Give the tracks the classes of the columns at their positions.
 
@@ -57,6 +58,7 @@ def classify(
         votes: Shares of the votes, shape (C, 6).
         verdict: Classes by votes and rules, shape (C,), changed in place by `confirm_round`.
         tree_share, range_max: See `Classification`.
+        hits_to_confirm: See `Tracking`.
 
     Returns:
         Rows of the tree columns without a track, where new tracks begin.
@@ -67,7 +69,7 @@ def classify(
     confirm_round(tracks, cells, scale, axis, votes, verdict, tree_share)
     trees = _best_first(axis, votes, verdict)
     _take_classes(tracks, scan, cells, scale, axis, verdict, min(DUE_REACH, DUE_SHARE * range_max))
-    return _assign_trees(tracks, axis, trees)
+    return _assign_trees(tracks, axis, trees, hits_to_confirm)
 
 
 @compiled_borrowing
@@ -238,24 +240,27 @@ def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
 
 
 @compiled
-def _assign_trees(tracks: Rows, axis: Float, trees: Int) -> Int:
+def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
     to the axis.
 
-    Columns are assigned in their order. Each takes the track within REACH that is most likely (see
-    `_likeliest`) and not assigned yet.
+    Columns are assigned in their order, first those with a detected track. Each takes the track within REACH
+    that is most likely (see `_likeliest`) and not assigned yet. The class of a column depends on its
+    surroundings, up to RING_FAR: at a column without a detected track, but with a detected track in its
+    surroundings, that track is the stem, and the column is its undergrowth or a branch.
 
     Args:
         tracks: The tracks, changed in place.
         axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
         trees: Rows of the tree columns, those with most votes first.
+        fewest: Minimum number of detections of a detected track.
 
     Returns:
         Rows of the columns without a track.
     """
     count = tracks.verdict.shape[0]
     taken, new, n = np.zeros(count, np.bool_), np.empty(trees.shape[0], np.int64), 0
-    cells, scale = cells_for(count), per_metre(REACH)
+    cells, scale = cells_for(count), per_metre(RING_FAR)
     fill(cells, tracks.x, count, scale)
     at = np.empty(trees.shape[0], np.int64)
     for k in range(trees.shape[0]):
@@ -263,18 +268,57 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int) -> Int:
         at[k] = _likeliest(tracks, taken, cells, scale, axis[c, 0], axis[c, 1])
         if at[k] >= 0:
             taken[at[k]] = True
-        else:
-            new[n] = c
-            n += 1
     for k in range(trees.shape[0]):
         t, c = at[k], trees[k]
+        if t < 0 or tracks.hits[t] == 0:
+            stem = _stem_beside(tracks, cells, scale, axis[c, 0], axis[c, 1], fewest)
+            t = stem if stem >= 0 else t
         if t < 0:
+            new[n] = c
+            n += 1
             continue
         tracks.verdict[t] = TREE
         if tracks.hits[t] == 0:  # a tree without detections is at its column
             tracks.x[t, 0], tracks.x[t, 1] = axis[c, 0], axis[c, 1]
     found: Int = new[:n].copy()
     return found
+
+
+@compiled_within
+def _stem_beside(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
+    """Return the row of the track with most detections within RING_FAR of an axis x, y [m]; -1 for none. It
+    has at least `fewest` detections, and is a tree or a candidate: without class, or of a class by votes for
+    which roundness is evidence against (see `AT_ROUND`)."""
+    u, v = first_of_four(x, y, scale)
+    best = np.int64(-1)
+    for quarter in range(4):
+        t = np.int64(cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))])
+        while t >= 0:
+            dx, dy = x - tracks.x[t, 0], y - tracks.x[t, 1]
+            if (
+                dx * dx + dy * dy < RING_FAR * RING_FAR
+                and tracks.hits[t] >= fewest
+                and _may_be_stem(tracks.verdict[t])
+                and (
+                    best < 0
+                    or tracks.hits[t] > tracks.hits[best]
+                    or (tracks.hits[t] == tracks.hits[best] and t < best)
+                )
+            ):
+                best = t
+            t = np.int64(cells.following[t])
+    return int(best)
+
+
+@compiled_within
+def _may_be_stem(verdict: int) -> bool:
+    """Return whether a track of a class can be the stem of a tree column beside it; see `_stem_beside`."""
+    if verdict < 0 or verdict == TREE:
+        return True
+    for k in range(_KINDS.shape[0]):
+        if verdict == _KINDS[k]:
+            return bool(_AT_ROUND[k] < 1.0)
+    return False
 
 
 @compiled_within

@@ -136,7 +136,7 @@ class Tracker:
         scan = self._scan._replace(stamp_ns=stamp_ns)
         new = classify(
             self.tracks.as_rows(), scan, columns.axis, columns.share, verdict, parameters.tree_share,
-            parameters.range_max,
+            parameters.range_max, self.parameters.hits_to_confirm,
         )  # fmt: skip
         if len(new):
             position = columns.axis[new, :2]

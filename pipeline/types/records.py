@@ -120,6 +120,8 @@ class Verdict(IntEnum):
 CLASSES = (Verdict.TREE, Verdict.POLE, Verdict.PERSON, Verdict.BUSH, Verdict.WALL, Verdict.OTHER)
 #: Weights of the votes for an object that is round by its circle fits (docs/trunks.md).
 AT_ROUND = tuple(1.0 if k in (Verdict.TREE, Verdict.POLE, Verdict.PERSON) else 0.1 for k in CLASSES)
+#: Radius around the axis of a column of the surroundings that its features describe [m].
+RING_FAR = 0.9
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,10 +13,11 @@ from pipeline.config import preset
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import REACH
 from pipeline.tracking.track_table import TrackTable
-from pipeline.types.records import Verdict
+from pipeline.types.records import RING_FAR, Verdict
 from tests.pipeline.tracking.test_round_fit_override import PLACE, column
 
 FOREST = preset("forest")
+ENOUGH = FOREST.tracking.hits_to_confirm
 
 
 def told(*tracks: tuple[float, int]):
@@ -29,7 +32,7 @@ def told(*tracks: tuple[float, int]):
     return [Verdict(int(v)) if v >= 0 else None for v in tracker.tracks.verdict]
 
 
-@pytest.mark.parametrize("own", [(0.0, 0), (0.0, 1), (0.05, 3), (0.07, 240), (0.15, 240)])
+@pytest.mark.parametrize("own", [(0.0, 1), (0.05, 3), (0.07, 240), (0.15, 240)])
 @pytest.mark.parametrize("beside", [(0.43, 290), (0.4, 3000)])
 def test_branches_near_a_stem_with_more_hits_do_not_get_its_column(own, beside):
     assert told(beside, own) == [Verdict.OTHER, Verdict.TREE]
@@ -42,8 +45,51 @@ def test_of_two_parts_of_a_trunk_the_one_with_more_hits_gets_the_column():
 
 
 def test_a_single_track_within_reach_gets_the_column():
-    assert told((REACH - 0.01, 3)) == [Verdict.TREE]
-    assert told((REACH + 0.01, 3))[1:] == [Verdict.TREE], "the column begins a track of its own"
+    assert told((REACH - 0.01, 1)) == [Verdict.TREE]
+    assert told((REACH + 0.01, 1))[1:] == [Verdict.TREE], "the column begins a track of its own"
+
+
+@pytest.mark.parametrize("away", [REACH + 0.01, RING_FAR - 0.01])
+@pytest.mark.parametrize("own", [[], [(0.0, 0)]], ids=["no track", "a track without detections"])
+def test_a_column_without_detections_belongs_to_the_detected_stem_in_its_surroundings(away, own):
+    assert told((away, ENOUGH), *own) == [Verdict.TREE, *[Verdict.OTHER] * len(own)]
+
+
+def test_the_stem_in_the_surroundings_is_the_one_with_most_detections():
+    assert told((0.5, ENOUGH), (0.8, 50)) == [None, Verdict.TREE]
+
+
+@pytest.mark.parametrize("stem", [(RING_FAR + 0.01, 50), (0.6, ENOUGH - 1)], ids=["too far", "too few"])
+def test_a_column_without_a_detected_stem_in_its_surroundings_begins_a_track(stem):
+    assert told(stem)[1:] == [Verdict.TREE]
+
+
+@pytest.mark.parametrize("kind", [Verdict.POLE, Verdict.PERSON, Verdict.MOVING, Verdict.TOO_LOW])
+def test_a_pole_a_person_or_a_low_object_is_not_the_stem_of_a_column_beside_it(kind):
+    assert beside(kind) == [kind, Verdict.TREE]
+
+
+@pytest.mark.parametrize("kind", [Verdict.BUSH, Verdict.WALL, Verdict.OTHER])
+def test_votes_against_a_round_object_do_not_exclude_the_stem_of_a_column_beside_it(kind):
+    assert beside(kind) == [Verdict.TREE]
+
+
+def beside(kind: Verdict):
+    """Verdicts of the tracks after classification: a detected track with its own column of a class, and a
+    tree column without detections 0.6 m beside it."""
+    tracker = Tracker(FOREST.tracking)
+    table = TrackTable.empty(1)
+    table.x[0, :2] = PLACE + np.array([0.6, 0.0])
+    table.number[0], table.hits[0] = 1, 20
+    tracker.tracks, tracker.next_number = table, 2
+    tree, other = column(Verdict.TREE, tree=0.8), column(kind)
+    other.axis[0, :2] = table.x[0, :2]
+    columns = {
+        name: np.concatenate([getattr(tree, name), getattr(other, name)])
+        for name in tree.__dataclass_fields__
+    }
+    tracker.classify(1, replace(tree, **columns), FOREST.classification)
+    return [Verdict(int(v)) for v in tracker.tracks.verdict]
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 0.44), st.integers(0, 600)), min_size=1, max_size=6))
