@@ -19,7 +19,7 @@ from app.batch.continue_map import (
     at_origin,
     continue_map,
 )
-from app.batch.run_folder import as_written, score_map
+from app.batch.run_folder import as_written, read_seen_area, score_map
 from app.batch.summary import breaks_of, driven, far_truth, start_lines, summary_lines
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
@@ -28,13 +28,15 @@ from app.common.timers import Stopwatch
 from app.sources.request import ChosenOdometry, with_odometry
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
+from pipeline.detection.free_space import clear_range
 from pipeline.errors import SourceError, StemmapError
 from pipeline.evaluation import MapScores, PathError, path_error
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.io.readers.base import Source
-from pipeline.io.result_files import RunFiles, terrain_text
+from pipeline.io.result_files import RunFiles, seen_text, terrain_text
 from pipeline.jit import on_compiling
 from pipeline.mapper import Mapper
+from pipeline.stand.seen_area import SeenArea, SeenRecorder
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
 MEASURED_SCANS = 100_000  # whose times enter the medians
@@ -112,7 +114,7 @@ def map_run(
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
     try:
         with on_compiling(stopwatch.disturb):
-            outcome, mapped = _map(plan, files, progress, stopwatch)
+            outcome, mapped = _map(plan, files, progress, stopwatch, earlier)
     except BaseException:
         files.abandon()
         raise
@@ -132,7 +134,11 @@ class _Mapped(NamedTuple):
 
 
 def _map(
-    plan: OfflineRun, files: RunFiles, progress: Progress, stopwatch: Stopwatch
+    plan: OfflineRun,
+    files: RunFiles,
+    progress: Progress,
+    stopwatch: Stopwatch,
+    earlier: FilePath | None,
 ) -> tuple[MappingResult, _Mapped]:
     moving, chosen = with_odometry(plan.source, plan.odometry)
     plan = replace(plan, source=moving)
@@ -141,8 +147,9 @@ def _map(
     begun = _beginning(plan, mapper, chosen)
     left_out = Counter[str]()
     to_map = begun.steps(plan.source, chosen.steps, left_out)
+    seen = SeenRecorder()
     frame, start_ns = _map_scans(
-        plan, mapper, begun, islice(to_map, plan.stop_after), files, progress, stopwatch
+        plan, mapper, begun, islice(to_map, plan.stop_after), files, progress, stopwatch, seen
     )
     tally = begun.tally
     path, truth = mapper.path, _truth(plan, begun)
@@ -173,7 +180,10 @@ def _map(
         scan_ms=stopwatch.scan_ms,
         stage_ms=stopwatch.stage_ms,
     )
-    further = {"terrain.csv": terrain_text(mapper.height_map)}
+    further = {
+        "terrain.csv": terrain_text(mapper.height_map),
+        "seen.csv": seen_text(_observed(seen.area(path), earlier)),
+    }
     files.finish(frame.trees, path, start_ns, record, state, further)
     return outcome, _Mapped(plan.source, frame.trees, path)
 
@@ -186,6 +196,7 @@ def _map_scans(
     files: RunFiles,
     progress: Progress,
     stopwatch: Stopwatch,
+    seen: SeenRecorder,
 ) -> tuple[Frame, int]:
     """Map all scans and write their detections; return the last frame and the time of the first scan [ns].
 
@@ -197,6 +208,7 @@ def _map_scans(
         files: Output files.
         progress: Updated after each scan.
         stopwatch: Measures the stages.
+        seen: Receives what the scans observed.
     """
     start_ns, frame = begun.start_ns, None
     for step in to_map:
@@ -206,6 +218,9 @@ def _map_scans(
             frame = mapper.process(step)
         if plan.on_frame is not None:
             plan.on_frame(frame, mapper)
+        pose = frame.estimate.T_map_base
+        if seen.is_due(pose):
+            seen.add(frame.stamp_ns, pose, clear_range(frame.raw, frame.filtered, frame.sensor_offset))
         start_ns = frame.stamp_ns if start_ns is None else start_ns
         files.add(frame, start_ns)
         begun.tally.add(frame)
@@ -214,6 +229,12 @@ def _map_scans(
         mapped = " that was not mapped yet" if begun.scans else ""
         raise SourceError(f"there is no scan in it{mapped}", where=plan.source.description.uri)
     return frame, start_ns
+
+
+def _observed(area: SeenArea, earlier: FilePath | None) -> SeenArea:
+    """Return the observed area with that of the run in `earlier`, if its files contain it."""
+    before = None if earlier is None else read_seen_area(earlier)
+    return area if before is None else before.joined(area)
 
 
 def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from app.batch.continue_map import PAUSE_NS, SavedRun, read_saved_run
-from app.batch.run_folder import check_folder, read_run_record
+from app.batch.run_folder import check_folder, read_run_record, read_seen_area
 from app.batch.summary import RunHealth, RunTotals, breaks_of, driven
 from app.common.text import changed_values, version
 from pipeline.config import Parameters
@@ -21,7 +21,7 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.merged_map import MergedMap, merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
-from pipeline.io.result_files import DETECTION_COLUMNS, RunFiles, csv_text
+from pipeline.io.result_files import DETECTION_COLUMNS, RunFiles, csv_text, seen_text
 from pipeline.loop_closure.stem_matching import MapStems, Match, find_constellation
 from pipeline.types.records import Path, Trees
 
@@ -85,6 +85,9 @@ def merge_runs(
         _update(record, saved, path, int(np.count_nonzero(trees.confirmed)), match)
         table = _correspondence(merged, b.map, _shown(trees), _shown(trees_a), _shown(trees_b))
         more = {"correspondence.csv": csv_text(CORRESPONDENCE_COLUMNS, table)}
+        seen_a, seen_b = read_seen_area(folder_a), read_seen_area(folder_b)
+        if seen_a is not None and seen_b is not None:
+            more["seen.csv"] = seen_text(seen_a.joined(seen_b, match.pose))
         files.finish(trees, path, a.start_ns, record, saved.as_bytes(), more)
     except BaseException:
         files.abandon()

@@ -28,7 +28,16 @@ from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.evaluation import MapScores, evaluate
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED, is_held
-from pipeline.io.result_files import PATH_COLUMNS, ROWS, TREE_COLUMNS, path_rows, tree_rows
+from pipeline.io.result_files import (
+    PATH_COLUMNS,
+    ROWS,
+    SEEN_COLUMNS,
+    TERRAIN_COLUMNS,
+    TREE_COLUMNS,
+    path_rows,
+    tree_rows,
+)
+from pipeline.stand.seen_area import CELL, SeenArea
 from pipeline.types.records import Int, Path, Trees, TruthTrees
 
 LARGEST_FILE = 256 << 20
@@ -38,6 +47,7 @@ _FILES = (
     "trees.geojson",
     "detections.csv",
     "terrain.csv",
+    "seen.csv",
     "slices.csv",
     "state.zip",
 )
@@ -82,6 +92,46 @@ def read_run(folder: FilePath) -> FinishedRun:
         _trees(_columns(folder / "trees.csv", TREE_COLUMNS)),
         is_of_cloud(record),
     )
+
+
+def read_seen_area(folder: FilePath) -> SeenArea | None:
+    """Return the area that a run observed, from seen.csv; None without this file.
+
+    Raises:
+        SourceError: The file is damaged.
+    """
+    file = folder / "seen.csv"
+    if not file.is_file():
+        return None
+    return _seen_area(_columns(file, SEEN_COLUMNS), CELL)
+
+
+def read_ground_area(folder: FilePath) -> SeenArea | None:
+    """Return the area in which a run observed the ground, from terrain.csv, with unknown distances; None
+    without cells. Gaps up to 1 m, such as the feet of stems, are closed.
+
+    Raises:
+        SourceError: The file is missing or damaged.
+    """
+    from scipy.ndimage import binary_closing
+
+    c = _columns(folder / "terrain.csv", TERRAIN_COLUMNS)
+    if not len(c["x_m"]):
+        return None
+    places = np.unique(np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / CELL).astype(np.int64), axis=0)
+    low, high = places.min(axis=0) - 3, places.max(axis=0) + 4
+    if math.prod((high - low).tolist()) > LARGEST_FILE:
+        raise SourceError("the terrain covers too large an area", where=str(folder))
+    raster = np.zeros(high - low, np.bool_)
+    raster[tuple((places - low).T)] = True
+    closed = np.argwhere(binary_closing(raster, iterations=2)) + low
+    unknown = np.full(len(closed), np.nan)
+    return SeenArea(CELL, closed, unknown, np.zeros(len(closed), np.int64))
+
+
+def _seen_area(c: dict[str, Float], cell: float) -> SeenArea:
+    place = np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / cell).astype(np.int64)
+    return SeenArea(cell, place, c["nearest_m"], np.nan_to_num(c["views"]).astype(np.int64))
 
 
 def is_of_cloud(record: dict[str, Any]) -> bool:

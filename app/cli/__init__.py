@@ -29,6 +29,7 @@ COMMANDS = (
     "info",
     "simulate",
     "evaluate",
+    "stand",
     "export",
     "params",
     "train",

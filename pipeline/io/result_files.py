@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED, hold
+from pipeline.stand.seen_area import SeenArea
 from pipeline.types.records import Frame, HeightMap, Path, Trees, Verdict
 
 ROWS = "detections.csv"  # written during the run
@@ -36,6 +37,7 @@ TREE_COLUMNS = (
 )
 PATH_COLUMNS = ("t_s", "x_m", "y_m", "yaw_rad", "sigma_xy_m")
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
+SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
 DETECTION_COLUMNS = (
     "scan",
     "t_s",
@@ -103,6 +105,18 @@ def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
     columns = (middle, ground.height[order], ground.sigma[order], ground.views[order])
     for (x, y), z, sigma, views in zip(*columns, strict=True):
         yield [_number(x, 3), _number(y, 3), _number(z, 3), _number(sigma, 3), str(views)]
+
+
+def seen_text(area: SeenArea) -> str:
+    """Return the text of seen.csv: the observed cells from west to east; x and y are their centres. The
+    distance of the nearest free view and the number of views are empty where unknown."""
+    return csv_text(
+        SEEN_COLUMNS,
+        (
+            [_number(x, 3), _number(y, 3), _number(nearest, 2), str(views) if views else ""]
+            for (x, y), nearest, views in zip(area.centres, area.nearest, area.views, strict=True)
+        ),
+    )
 
 
 def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
@@ -253,8 +267,10 @@ class RunFiles:
         for name, text in texts.items():
             (self._staging / name).write_text(text, encoding="utf-8", newline="")
         states = [] if state is None else ["state.zip"]
+        for name in ("seen.csv", "georeference.json"):  # of an earlier run, which may have another frame
+            (self._folder / name).unlink(missing_ok=True)
         if state is None:
-            (self._folder / "state.zip").unlink(missing_ok=True)  # of an earlier run
+            (self._folder / "state.zip").unlink(missing_ok=True)
         else:
             (self._staging / "state.zip").write_bytes(state)
         # run.json last: if it exists, so do the others

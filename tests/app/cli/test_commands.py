@@ -258,7 +258,8 @@ def test_a_source_without_a_file_is_not_served(capsys, tmp_path, monkeypatch):
 # --- map and evaluate -----------------------------------------------------------------------------
 
 FILES = {
-    "trees.csv", "path.csv", "trees.geojson", "detections.csv", "terrain.csv", "run.json", "state.zip",
+    "trees.csv", "path.csv", "trees.geojson", "detections.csv", "terrain.csv", "seen.csv", "run.json",
+    "state.zip",
 }  # fmt: skip
 
 

@@ -12,7 +12,8 @@ import pytest
 from app.cli import main
 
 FILES = {
-    "trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip", "correspondence.csv"
+    "trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip", "correspondence.csv",
+    "seen.csv"
 }  # fmt: skip
 
 

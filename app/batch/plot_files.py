@@ -1,0 +1,106 @@
+"""Plots from GIS files: GeoPackage, Shapefile and GeoJSON."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path as FilePath
+from typing import Any
+
+import shapely
+
+from app.batch.georeference import LOCAL, MapFrame, read_map_frame
+from app.common.extras import needed
+from pipeline.errors import SourceError, StemmapError
+from pipeline.stand.plots import PLOTS_MAX, Plot, checked
+
+LARGEST_FILE = 64 << 20
+SUFFIXES = (".gpkg", ".shp", ".geojson", ".json")
+_NAMES = ("name", "plot", "plot_id", "plotid", "id", "nr", "number")
+_RADII = ("radius_m", "radius", "r_m")
+
+
+def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list[Plot]:
+    """Return the plots of a file in the frame of the map of a run.
+
+    Polygons are plots; points are circles if a column `radius_m` gives their radius. Names are those of a
+    column `name`, `plot` or `id`, else the numbers of the rows.
+
+    Args:
+        file: A GeoPackage, Shapefile or GeoJSON.
+        run: Folder of the run.
+        crs: Reference system of a file without one: an EPSG code, or "local" for the frame of the map. It
+            also says that a GeoJSON, which is WGS84 by its standard, is in that system.
+
+    Raises:
+        StemmapError: The file cannot be read, has no plots, or its reference system does not fit the run.
+    """
+    geopandas = needed("geopandas", "gis", "plots from files")
+    if file.suffix.lower() not in SUFFIXES:
+        raise SourceError("plots are .gpkg, .shp or .geojson files", where=str(file))
+    try:
+        if file.stat().st_size > LARGEST_FILE:
+            raise SourceError("the file of plots is larger than 64 MB", where=str(file))
+        table = geopandas.read_file(file, engine="pyogrio", rows=PLOTS_MAX + 1)
+    except OSError as error:
+        raise SourceError(f"cannot read the plots: {error.strerror}", where=str(file)) from None
+    except (RuntimeError, ValueError) as error:
+        text = str(error).splitlines()[0]
+        raise SourceError(f"cannot read the plots: {text}", where=str(file)) from None
+    if not 0 < len(table) <= PLOTS_MAX:
+        raise SourceError(f"the file has {'no' if not len(table) else 'too many'} plots", where=str(file))
+    shapes = _in_map(table, _crs_of(file, table, crs), read_map_frame(run), file)
+    columns = {str(name).lower(): name for name in table.columns}
+    named = next((columns[name] for name in _NAMES if name in columns), None)
+    radius = next((columns[name] for name in _RADII if name in columns), None)
+    plots = []
+    for k, shape in enumerate(shapes):
+        name = str(k + 1) if named is None else str(table[named].iloc[k])
+        if shape is not None and shape.geom_type == "Point" and radius is not None:
+            from pipeline.stand.plots import circle
+
+            plots.append(circle(name, shape.x, shape.y, float(table[radius].iloc[k])))
+        else:
+            plots.append(checked(Plot(name, shape)))
+    return plots
+
+
+def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN401 - a pyproj.CRS
+    """Return the reference system of a file; None for the frame of the map."""
+    import pyproj
+
+    declared = table.crs
+    if file.suffix.lower() in (".geojson", ".json"):
+        record = json.loads(file.read_text(encoding="utf-8-sig"))
+        if "coordinateFrame" in record:  # a file of this program without georeference
+            declared = None
+            given = given or LOCAL
+        elif given is not None and "crs" not in record:
+            declared = None
+    if declared is None and given is None:
+        raise StemmapError(
+            "the file of plots has no coordinate reference system",
+            where=str(file),
+            remedy="Give it with --plots-crs EPSG:CODE, or --plots-crs local for the coordinates of the map",
+        )
+    if declared is not None:
+        return declared
+    if given == LOCAL:
+        return None
+    try:
+        return pyproj.CRS.from_user_input(given)
+    except pyproj.exceptions.CRSError:
+        raise StemmapError(f"--plots-crs {given!r} is not a coordinate reference system") from None
+
+
+def _in_map(table: Any, crs: Any, frame: MapFrame, file: FilePath) -> list[Any]:  # noqa: ANN401
+    """Return the shapes of a table in the frame of the map."""
+    if crs is None:
+        return list(table.geometry)
+    if not frame.crs:
+        raise StemmapError(
+            f"the plots are in {crs.name}, but the map is local",
+            where=str(file),
+            remedy="Run stemmap georeference for the map, or give --plots-crs local if they are in its frame",
+        )
+    moved = table.set_crs(crs, allow_override=True).to_crs(frame.crs)
+    return [None if shape is None else shapely.transform(shape, frame.to_map) for shape in moved.geometry]

@@ -1,0 +1,237 @@
+"""Stand figures of a finished run: reads its folder and plots, and writes tables."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from app.batch.georeference import MapFrame, read_map_frame
+from app.batch.run_folder import FinishedRun, read_ground_area, read_run, read_seen_area
+from app.common.text import count, version
+from pipeline.config.stages import Stand
+from pipeline.errors import StemmapError
+from pipeline.io.atomic_files import write_beside
+from pipeline.io.result_files import csv_text
+from pipeline.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
+from pipeline.stand.plots import Plot, detection_function, figures_of, seen_plot, within_reach
+from pipeline.stand.seen_area import SeenArea
+
+ALL = "all"
+NO_RECORD = "the run has no record of what was observed; cells with ground returns are used. Map it again"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StandResult:
+    """Stand figures of a run.
+
+    Attributes:
+        run, frame: The run and the frame of its map.
+        trees: Its trees.
+        parameters: Parameters of the figures.
+        plots: The plots; the whole observed area without plots.
+        seen: Observed area within reach.
+        figures: Figures of each plot by name.
+        total: Mean over the plots, or the figures of the one plot.
+        detection_sigma: Scale of the half-normal function [m]; inf for certain detection.
+        warnings: Messages, those of plots with the name of the plot.
+    """
+
+    run: FinishedRun
+    frame: MapFrame
+    trees: PlotTrees
+    parameters: Stand
+    plots: Sequence[Plot]
+    seen: SeenArea
+    figures: dict[str, StandFigures]
+    total: dict[str, Estimate]
+    detection_sigma: float
+    warnings: tuple[str, ...]
+
+
+def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[Plot] = ()) -> StandResult:
+    """Return the stand figures of a finished run.
+
+    Args:
+        folder: Its folder.
+        parameters: Parameters of the figures.
+        plots: Plots in the frame of the map; without any, the whole observed area is one plot.
+
+    Raises:
+        StemmapError: The folder is not that of a run, nothing was observed, two plots have the same name, or
+            no plot touches the observed area.
+    """
+    run, frame = read_run(folder), read_map_frame(folder)
+    warnings = []
+    recorded = read_seen_area(folder)
+    if recorded is None:
+        recorded = read_ground_area(folder)
+        if not run.of_cloud:
+            warnings.append(NO_RECORD)
+    seen = None if recorded is None else within_reach(recorded, parameters)
+    if seen is None or not len(seen.place):
+        raise StemmapError(
+            "the run has no record of what was observed",
+            where=str(folder),
+            remedy="Map it again, or allow a greater --reach or fewer --views-min",
+        )
+    names = [plot.name for plot in plots]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise StemmapError(f"two plots are called {twice!r}", remedy="Give each plot its own name")
+    trees = PlotTrees(run.trees.position, run.trees.dbh, run.trees.dbh_sigma)
+    chosen = list(plots) or [seen_plot(ALL, seen)]
+    figures = figures_of(chosen, trees, seen, parameters)
+    if not any(f.seen > 0.0 for f in figures.values()):
+        raise StemmapError(
+            f"{'the plot is' if len(chosen) == 1 else 'all plots are'} outside of what the run observed",
+            where=str(folder),
+            remedy=f"Check the coordinates; the map is in {frame.name} coordinates, {_extent(seen.centres)}",
+        )
+    for name, f in figures.items():
+        warnings += [text if name == ALL else f"plot {name}: {text}" for text in f.warnings]
+    if len(chosen) > 1 and 0 < sum(f.trees for f in figures.values()) < FEW_TREES:
+        warnings.append("fewer than ten trees in all plots: the figures are uncertain")
+    if np.nanmax(trees.dbh, initial=0.0) > 3.0:
+        warnings.append("a diameter is larger than 3 m: is the column dbh_cm of trees.csv in centimetres?")
+    elif np.isfinite(trees.dbh).sum() >= 3 and np.nanmax(trees.dbh) < 0.02:
+        warnings.append("all diameters are below 2 cm: is the column dbh_cm of trees.csv in metres?")
+    total = combined(figures) if len(chosen) > 1 else dict(figures[chosen[0].name].values)
+    sigma = detection_function(trees, seen, parameters).sigma
+    return StandResult(run, frame, trees, parameters, chosen, seen, figures, total, sigma, tuple(warnings))
+
+
+def _extent(points: np.ndarray) -> str:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return f"x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} to {high[1]:.0f} m"
+
+
+PLOT_COLUMNS = ("plot", "area_m2", "seen_m2", "trees", "trees_without_dbh", "detection", "detection_se")
+CLASS_COLUMNS = ("plot", "from_cm", "to_cm", "trees", "n_ha", "n_ha_se", "g_ha", "g_ha_se")
+
+
+def stand_files(result: StandResult) -> dict[str, str]:
+    """Return the texts of stand.csv (one row per plot, and `mean` for several), classes.csv and stand.json by
+    name."""
+    header = (*PLOT_COLUMNS, *(f"{name}{end}" for name in FIGURES for end in ("", "_se")))
+    rows = []
+    for name, f in result.figures.items():
+        about = [name, f"{f.area:.2f}", f"{f.seen:.2f}", str(f.trees), str(f.without_dbh)]
+        rows.append([*about, *map(_number, f.detection), *_cells(dict(f.values))])
+    if len(result.figures) > 1:
+        rows.append(["mean", *[""] * (len(PLOT_COLUMNS) - 1), *_cells(result.total)])
+    classes = [
+        [name, f"{c.low:g}", f"{c.high:g}", str(c.trees), *map(_number, (*c.n_ha, *c.g_ha))]
+        for name, f in result.figures.items()
+        for c in f.classes
+    ]
+    return {
+        "stand.csv": csv_text(header, rows),
+        "classes.csv": csv_text(CLASS_COLUMNS, classes),
+        "stand.json": json.dumps(stand_record(result), indent=1, allow_nan=False) + "\n",
+    }
+
+
+def stand_record(result: StandResult) -> dict[str, Any]:
+    """Return the figures as JSON values; unknown values are null."""
+    return {
+        "stemmap": version(),
+        "source": result.run.uri,
+        "crs": result.frame.name,
+        "parameters": result.parameters.model_dump(),
+        "detection_sigma_m": _finite(result.detection_sigma),
+        "units": {name: unit for name, (_, unit) in FIGURES.items()},
+        "plots": {
+            name: {
+                "area_m2": round(f.area, 3),
+                "seen_m2": round(f.seen, 3),
+                "trees": f.trees,
+                "trees_without_dbh": f.without_dbh,
+                "detection": _pair(f.detection),
+                **{key: _pair(value) for key, value in f.values.items()},
+                "classes": [
+                    {
+                        "from_cm": c.low,
+                        "to_cm": c.high,
+                        "trees": c.trees,
+                        "n_ha": _pair(c.n_ha),
+                        "g_ha": _pair(c.g_ha),
+                    }
+                    for c in f.classes
+                ],
+            }
+            for name, f in result.figures.items()
+        },
+        "mean": {key: _pair(value) for key, value in result.total.items()},
+        "warnings": list(result.warnings),
+    }
+
+
+def _pair(estimate: Estimate) -> list[float | None]:
+    return [_finite(value) for value in estimate]
+
+
+def _finite(value: float) -> float | None:
+    return round(float(value), 6) if math.isfinite(value) else None
+
+
+def _number(value: float) -> str:
+    return f"{value:.4f}" if math.isfinite(value) else ""
+
+
+def _cells(values: dict[str, Estimate]) -> list[str]:
+    return [_number(value) for name in FIGURES for value in values[name]]
+
+
+def write_stand(result: StandResult, folder: FilePath) -> list[FilePath]:
+    """Write the files of `stand_files` to a folder, which is created if necessary; return their paths.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    for name, text in stand_files(result).items():
+        with write_beside(folder / name) as partial:
+            partial.write_text(text, encoding="utf-8", newline="")
+        written.append(folder / name)
+    return written
+
+
+def stand_summary(result: StandResult) -> list[str]:
+    """Return the figures as lines for people."""
+    seen = sum(f.seen for f in result.figures.values())
+    area = sum(f.area for f in result.figures.values())
+    trees = sum(f.trees for f in result.figures.values())
+    of = count(len(result.figures), "plot") if result.figures.keys() != {ALL} else "whole observed area"
+    least = f"{100.0 * result.parameters.dbh_min:g} cm"
+    part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
+    least = f"{100.0 * result.parameters.dbh_min:g} cm"
+    part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
+    lines = [
+        f"{of}: {count(trees, 'tree')} from {least} on {seen:,.0f} m2 observed{part}, "
+        f"coordinates {result.frame.name}"
+    ]
+    for name, (title, unit) in FIGURES.items():
+        value, se = result.total[name]
+        if math.isfinite(value):
+            error = f" +- {_digits(se)}" if math.isfinite(se) else ""
+            lines.append(f"{title}: {_digits(value)}{error} {unit}".rstrip())
+    sigma = result.detection_sigma
+    lines.append(
+        f"detection: half-normal over distance, sigma {sigma:.1f} m"
+        if math.isfinite(sigma)
+        else "detection: does not decrease with distance within reach"
+    )
+    errors = "between plots" if len(result.figures) > 1 else "of this area: diameters, occlusion, detection"
+    lines.append(f"+- standard error {errors}")
+    return lines
+
+
+def _digits(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"

@@ -1,0 +1,181 @@
+"""`stemmap stand`: stand figures of a finished run, for plots or the whole observed area."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from app.cli.flags import cannot_write, positive_number
+from pipeline.errors import ParameterError, StemmapError
+
+if TYPE_CHECKING:
+    from pipeline.config.stages import Stand
+    from pipeline.stand.plots import Plot
+
+HELP = "stems and basal area per hectare, diameters and density of a mapped run"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("run", metavar="DIR", type=Path, help="folder that `stemmap map` wrote")
+    add_plot_flags(parser)
+    add_stand_flags(parser)
+    parser.add_argument("--out", metavar="DIR", type=Path, help="write stand.csv, classes.csv and stand.json")
+    parser.epilog = (
+        "Without plots, the whole observed area is one plot. A tree belongs to a plot if its centre does.\n"
+        "Figures refer to the part of a plot that was observed; `plain` figures to the whole plot, and\n"
+        "`corrected` figures take the probability of detection over distance into account.\n"
+        "Exit code 3: there are warnings, such as fewer than ten trees."
+    )
+
+
+def add_plot_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags that define plots."""
+    group = parser.add_argument_group("plots", "in metres, in the coordinates of the map")
+    group.add_argument(
+        "--plots",
+        metavar="FILE",
+        type=Path,
+        help="polygons: .gpkg, .shp or .geojson",
+    )
+    group.add_argument(
+        "--plots-crs",
+        metavar="CRS",
+        help="reference system of --plots if the file has none: EPSG:CODE, or local for that of the map",
+    )
+    group.add_argument("--circle", metavar="X,Y,R", action="append", default=[], help="a circle; repeatable")
+    group.add_argument(
+        "--rectangle",
+        metavar="X,Y,LENGTH,WIDTH[,TURN]",
+        action="append",
+        default=[],
+        help="a rectangle by its centre; TURN of its length from x to y in degrees; repeatable",
+    )
+    group.add_argument(
+        "--along",
+        metavar="M",
+        type=positive_number(1e4, "distance in metres"),
+        help="circles along the path, one every M metres",
+    )
+    group.add_argument(
+        "--radius",
+        metavar="M",
+        type=positive_number(500.0, "radius in metres"),
+        default=5.64,
+        help="radius of the circles of --along (default: 5.64, 100 m2)",
+    )
+
+
+def add_stand_flags(parser: argparse.ArgumentParser) -> None:
+    """Add a flag for each parameter of the stand figures."""
+    from pipeline.config.stages import Stand
+
+    group = parser.add_argument_group("figures")
+    for name, declared in Stand.model_fields.items():
+        extra = declared.json_schema_extra
+        unit = str(extra["unit"]) if isinstance(extra, dict) else ""
+        group.add_argument(
+            f"--{name.replace('_', '-')}",
+            dest=f"stand_{name}",
+            metavar=unit or name.upper(),
+            help=f"{declared.description} (default: {declared.default})".replace("%", "%%"),
+        )
+
+
+def stand_parameters(arguments: argparse.Namespace) -> Stand:
+    """Return the parameters that the flags give.
+
+    Raises:
+        ParameterError: A value is not valid.
+    """
+    from pydantic import ValidationError
+
+    from pipeline.config.stages import Stand
+
+    given: dict[str, Any] = {}
+    for name, declared in Stand.model_fields.items():
+        text = getattr(arguments, f"stand_{name}")
+        if text is not None:
+            try:
+                given[name] = declared.annotation(text) if declared.annotation in (int, float) else text
+            except ValueError:
+                raise ParameterError(f"--{name.replace('_', '-')} {text!r} is not a number") from None
+    try:
+        return Stand(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        flag = f"--{first['loc'][0]}".replace("_", "-")
+        raise ParameterError(
+            f"{flag} {first['input']}: {first['msg'][0].lower()}{first['msg'][1:]}"
+        ) from None
+
+
+def chosen_plots(arguments: argparse.Namespace) -> list[Plot]:
+    """Return the plots that the flags define, in the frame of the map.
+
+    Raises:
+        StemmapError: A plot or a file is not valid.
+    """
+    import numpy as np
+
+    from app.batch.run_folder import read_run
+    from pipeline.stand.plots import along, circle, rectangle
+
+    plots: list[Plot] = []
+    if arguments.plots is not None:
+        from app.batch.plot_files import read_plots
+
+        plots += read_plots(arguments.plots, arguments.run, crs=arguments.plots_crs)
+    shapes = [("--circle", text) for text in arguments.circle]
+    shapes += [("--rectangle", text) for text in arguments.rectangle]
+    for flag, text in shapes:
+        numbers, name = _numbers(flag, text), str(len(plots) + 1)
+        if flag == "--circle":
+            plots.append(circle(name, *numbers))
+        else:
+            x, y, length, width, turn = (*numbers, 0.0)[:5]
+            plots.append(rectangle(name, x, y, length, width, math.radians(turn)))
+    if arguments.along is not None:
+        path = read_run(arguments.run).path
+        plots += along(np.stack([path.x, path.y], axis=1), arguments.along, arguments.radius)
+    return plots
+
+
+def _numbers(flag: str, text: str) -> list[float]:
+    sizes = (3,) if flag == "--circle" else (4, 5)
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in sizes or not all(abs(number) < 1e8 for number in numbers):
+        raise StemmapError(
+            f"{flag} {text!r} is not {' or '.join(map(str, sizes))} numbers with commas between them"
+        )
+    if min(numbers[2:4]) <= 0.0:
+        raise StemmapError(f"{flag} {text!r} has an area of 0", remedy="Give sizes above 0, in metres")
+    return numbers
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the figures and write the files.
+
+    Returns:
+        Exit code: 3 with warnings, else 0.
+    """
+    import sys
+
+    from app.batch.stand import stand_of, stand_summary, write_stand
+
+    result = stand_of(arguments.run, stand_parameters(arguments), chosen_plots(arguments))
+    print("\n".join(stand_summary(result)))
+    for warning in result.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if arguments.out is not None:
+        try:
+            write_stand(result, arguments.out)
+        except OSError as error:
+            raise cannot_write(error, arguments.out) from None
+        print(f"files in {arguments.out}")
+    return 3 if result.warnings else 0

@@ -1,0 +1,27 @@
+"""Optional packages."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from pipeline.errors import StemmapError
+
+
+def needed(module: str, extra: str, purpose: str) -> Any:  # noqa: ANN401 - a module
+    """Return an optional module.
+
+    Args:
+        module: Its name.
+        extra: The extra of this package that installs it.
+        purpose: What needs it, for the message.
+
+    Raises:
+        StemmapError: It is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise StemmapError(
+            f"{purpose} need the package {module}", remedy=f"Install it with: pip install 'stemmap[{extra}]'"
+        ) from None

@@ -1,0 +1,5 @@
+"""Stand figures of a mapped stand: stems per hectare, basal area, diameters, density, spatial pattern.
+
+Pure computations: trees, plots and the observed area come in as arrays, results are records. Files are read
+and written in `app.batch`.
+"""

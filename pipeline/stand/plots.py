@@ -1,0 +1,188 @@
+"""Plots of a stand: circles, rectangles and polygons in the frame of the map, and circles along a path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+
+from pipeline.config.stages import Stand
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Float
+from pipeline.stand.distance_sampling import CERTAIN, DetectionFunction, fit_half_normal
+from pipeline.stand.figures import PlotTrees, StandFigures, stand_figures
+from pipeline.stand.seen_area import SeenArea
+from pipeline.types.records import Bool
+
+PLOTS_MAX = 2000
+AREA_MAX = 1e6  # m^2
+_ARC = 64  # segments of a quarter circle
+_SAMPLES = 4  # along each side of a cell
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plot:
+    """A plot.
+
+    Attributes:
+        name: Name for people, unique in a list of plots.
+        shape: Its area, a shapely Polygon or MultiPolygon in the frame of the map [m].
+    """
+
+    name: str
+    shape: Any
+
+    def contains(self, points: Float) -> Bool:
+        """Return whether the plot contains each point, shape (N, 2); points on its border count."""
+        points = np.reshape(points, (-1, 2))
+        inside: Bool = shapely.intersects_xy(self.shape, points[:, 0], points[:, 1])
+        return inside
+
+
+def circle(name: str, x: float, y: float, radius: float) -> Plot:
+    """Return a circle with the exact area of its radius [m].
+
+    Raises:
+        StemmapError: See `checked`.
+    """
+    # A regular polygon inside of the circle is smaller than it; its corners are moved outwards.
+    k = 4 * _ARC
+    larger = radius * math.sqrt(2.0 * math.pi / (k * math.sin(2.0 * math.pi / k)))
+    return checked(Plot(name, shapely.Point(x, y).buffer(max(larger, 0.0), quad_segs=_ARC)))
+
+
+def rectangle(name: str, x: float, y: float, length: float, width: float, turn: float = 0.0) -> Plot:
+    """Return a rectangle.
+
+    Args:
+        name: Its name.
+        x, y: Its centre [m].
+        length, width: Along and across its axis [m].
+        turn: Angle of its axis from x towards y [rad].
+
+    Raises:
+        StemmapError: See `checked`.
+    """
+    corners = 0.5 * np.array([[-length, -width], [length, -width], [length, width], [-length, width]])
+    c, s = math.cos(turn), math.sin(turn)
+    return checked(Plot(name, shapely.Polygon(corners @ np.array([[c, s], [-s, c]]) + [x, y])))
+
+
+def checked(plot: Plot) -> Plot:
+    """Return a plot that can be used.
+
+    Raises:
+        StemmapError: It is not an area, crosses itself, is empty, is larger than AREA_MAX or has coordinates
+            that are not finite.
+    """
+    shape, problem = plot.shape, ""
+    if shape is None or shape.is_empty or shape.geom_type not in ("Polygon", "MultiPolygon"):
+        problem = "is not an area"
+    elif not np.isfinite(shapely.get_coordinates(shape)).all():
+        problem = "has coordinates that are not finite"
+    elif not shape.is_valid:
+        problem = f"is not valid: {shapely.is_valid_reason(shape)}"
+    elif shape.area <= 0.0:
+        problem = "has an area of 0"
+    elif shape.area > AREA_MAX:
+        problem = f"has {shape.area:,.0f} m2, more than {AREA_MAX / 1e4:g} ha"
+    if problem:
+        raise StemmapError(f"plot {plot.name} {problem}", remedy="Correct its border; units are metres")
+    return plot
+
+
+def along(path: Float, every: float, radius: float) -> list[Plot]:
+    """Return circles "path 1", "path 2", ... along a path, the first at half the distance between two.
+
+    Args:
+        path: Positions, shape (N, 2) [m].
+        every: Distance along the path between two centres [m].
+        radius: Radius of the circles [m].
+
+    Raises:
+        StemmapError: The path is shorter than half of `every`, or there are more than PLOTS_MAX circles.
+    """
+    steps = np.hypot(*np.diff(path, axis=0).T) if len(path) > 1 else np.zeros(0)
+    driven = np.concatenate([[0.0], np.cumsum(steps)])
+    count = int((driven[-1] + 0.5 * every) // every)
+    if not 0 < count <= PLOTS_MAX:
+        raise StemmapError(
+            f"the path of {driven[-1]:.1f} m has {count or 'no'} plots every {every:g} m",
+            remedy="Choose another distance" if count else "Choose a shorter distance",
+        )
+    at = every * (np.arange(count) + 0.5)
+    places = np.stack([np.interp(at, driven, path[:, axis]) for axis in (0, 1)], axis=1)
+    return [circle(f"path {k + 1}", x, y, radius) for k, (x, y) in enumerate(places.tolist())]
+
+
+def seen_plot(name: str, seen: SeenArea) -> Plot:
+    """Return the whole observed area as a plot.
+
+    Raises:
+        StemmapError: Nothing was observed.
+    """
+    low = seen.place * seen.cell
+    return checked(Plot(name, shapely.union_all(shapely.box(*low.T, *(low + seen.cell).T))))
+
+
+def within_reach(seen: SeenArea, parameters: Stand) -> SeenArea:
+    """Return the cells that count as observed. Cells with unknown distance, as for a whole cloud,
+    all count."""
+    near = ~(seen.nearest > parameters.reach)
+    return seen.where(near & ((seen.views >= parameters.views_min) | (seen.views == 0)))
+
+
+def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> DetectionFunction:
+    """Return the probability of detection over distance, fitted to all trees in the observed area; certain
+    detection if the parameters or too few trees say so, or if the distances are unknown."""
+    if parameters.correction == "none" or not np.isfinite(seen.nearest).any():
+        return CERTAIN
+    rows = seen.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
+    return fit_half_normal(seen.nearest[rows[rows >= 0]], seen.nearest) or CERTAIN
+
+
+def figures_of(
+    plots: Sequence[Plot], trees: PlotTrees, seen: SeenArea, parameters: Stand
+) -> dict[str, StandFigures]:
+    """Return the figures of each plot by its name.
+
+    Args:
+        plots: Plots with unique names.
+        trees: All trees of the map.
+        seen: Observed area, see `within_reach`.
+        parameters: Limits, and whether detection is corrected.
+    """
+    observed = seen.rows(trees.position) >= 0
+    detection = detection_function(trees, seen, parameters)
+    steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES
+    offsets = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    result = {}
+    for plot in plots:
+        shape = plot.shape
+        shapely.prepare(shape)
+        low, high = np.array(shape.bounds[:2]), np.array(shape.bounds[2:])
+        corner = seen.place * seen.cell
+        cells = np.flatnonzero(np.all((corner + seen.cell >= low) & (corner <= high), axis=1))
+        samples = (corner[cells, None, :] + seen.cell * offsets).reshape(-1, 2)
+        inside = plot.contains(samples).reshape(len(cells), len(offsets)).mean(axis=1)
+        area = float(shape.area)
+        part = min(float(inside.sum()) * seen.cell**2, area)
+        if part > 0.995 * area:  # less than the accuracy of the raster
+            part = area
+        available = np.repeat(seen.nearest[cells], np.round(inside * len(offsets)).astype(int))
+        probability = detection.mean(available) if np.isfinite(available).all() else (1.0, 0.0)
+        of_plot = plot.contains(trees.position)
+        result[plot.name] = stand_figures(
+            trees.where(of_plot & observed),
+            trees.where(of_plot & ~observed),
+            area=area,
+            seen=part,
+            perimeter=float(min(shape.length, shape.convex_hull.length)) * math.sqrt(part / area),
+            detection=probability,
+            parameters=parameters,
+        )
+    return result

@@ -1,0 +1,184 @@
+"""Stand figures on the command line."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import warnings
+
+import geopandas
+import numpy as np
+import pytest
+import shapely
+
+from tests.app.batch.finished_runs import grid_run, write_run
+from tests.app.cli.test_commands import stemmap
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A finished run with 2,500 stems per hectare."""
+    return grid_run(tmp_path / "run")
+
+
+def table(file):
+    """The rows of a CSV file by the first column."""
+    with file.open(newline="") as text:
+        return {row["plot"]: row for row in csv.DictReader(text)}
+
+
+def test_the_whole_observed_area_is_a_plot_by_default(run, tmp_path, capsys):
+    told = stemmap(capsys, "stand", run, "--out", tmp_path / "out")
+    assert (told.code, told.err) == (0, "")
+    assert "100 trees from 7 cm on 400 m2 observed, coordinates local" in told.out
+    row = table(tmp_path / "out" / "stand.csv")["all"]
+    assert float(row["n_ha"]) == pytest.approx(2500.0)
+    assert float(row["g_ha"]) == pytest.approx(2500 * math.pi / 4 * 0.04)
+    assert float(row["seen_m2"]) == float(row["area_m2"]) == 400.0
+    assert float(row["nearest_neighbour_m"]) == pytest.approx(2.0)
+    record = json.loads((tmp_path / "out" / "stand.json").read_text())
+    assert record["plots"]["all"]["n_ha"][0] == pytest.approx(2500.0)
+    assert record["detection_sigma_m"] is None
+    with (tmp_path / "out" / "classes.csv").open(newline="") as text:
+        assert sum(int(c["trees"]) for c in csv.DictReader(text)) == 100
+
+
+def test_plots_have_rows_of_their_own_and_a_mean(run, tmp_path, capsys):
+    words = ["--circle", "10,10,5.641896", "--rectangle", "10,10,9,9", "--along", "9", "--radius", "4"]
+    told = stemmap(capsys, "stand", run, *words, "--out", tmp_path / "out")
+    assert told.code == 0, told.err
+    rows = table(tmp_path / "out" / "stand.csv")
+    assert list(rows) == ["1", "2", "path 1", "path 2", "path 3", "mean"]
+    assert float(rows["1"]["area_m2"]) == pytest.approx(100.0, abs=0.01)
+    assert int(rows["2"]["trees"]) == 16
+    assert rows["2"]["trees_without_dbh"] == "0"
+    assert float(rows["mean"]["n_ha_se"]) > 0.0
+
+
+def written(folder, name, shapes, names=("a", "b"), crs=None, columns=None):
+    """A file of plots."""
+    file = folder / name
+    frame = geopandas.GeoDataFrame(
+        {"name": list(names)[: len(shapes)], **(columns or {})}, geometry=shapes, crs=crs
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of files without a reference system
+        frame.to_file(file)
+    return file
+
+
+@pytest.mark.parametrize("name", ["plots.gpkg", "plots.shp", "plots.geojson"])
+def test_plots_of_a_file_in_the_frame_of_the_map(run, tmp_path, capsys, name):
+    file = written(tmp_path, name, [shapely.box(0, 0, 10, 10), shapely.box(10, 0, 20, 20)])
+    told = stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local", "--out", tmp_path / "out")
+    assert told.code == 0, told.err
+    rows = table(tmp_path / "out" / "stand.csv")
+    assert [rows[n]["trees"] for n in ("a", "b")] == ["25", "50"]
+
+
+def test_points_with_a_radius_are_circles(run, tmp_path, capsys):
+    file = written(tmp_path, "p.gpkg", [shapely.Point(10, 10)], columns={"radius_m": [5.0]})
+    assert (
+        stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local", "--out", tmp_path / "out").code
+        == 0
+    )
+    assert float(table(tmp_path / "out" / "stand.csv")["a"]["area_m2"]) == pytest.approx(
+        25 * math.pi, abs=0.01
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--circle", "500,500,5"], "outside of what the run observed"),
+        (["--circle", "10,10,0"], "area of 0"),
+        (["--circle", "10,10"], "not 3 numbers"),
+        (["--circle", "nan,10,2"], "not 3 numbers"),
+        (["--rectangle", "10,10,5,inf"], "not 4 or 5 numbers"),
+        (["--along", "200"], "no plots every 200 m"),
+        (["--plots", "missing.gpkg"], "cannot read the plots"),
+        (["--plots", "plots.txt"], ".gpkg, .shp or .geojson"),
+    ],
+)
+def test_plots_that_cannot_be_used_are_refused(run, capsys, words, says):
+    stemmap(capsys, "stand", run, *words).refused(1, says)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--dbh-min", "7"], "--dbh-min 7"),
+        (["--reach", "far"], "--reach"),
+        (["--correction", "x"], "--correction"),
+    ],
+)
+def test_parameters_out_of_bounds_are_refused(run, capsys, words, says):
+    stemmap(capsys, "stand", run, *words).refused(2, says)
+
+
+def test_plots_in_a_country_s_coordinates_need_a_georeference(run, tmp_path, capsys):
+    shapes = [shapely.box(500000, 5.3e6, 500010, 5300010)]
+    file = written(tmp_path, "p.gpkg", shapes, crs="EPSG:25832")
+    stemmap(capsys, "stand", run, "--plots", file).refused(1, "but the map is local", "stemmap georeference")
+    nowhere = written(tmp_path, "n.gpkg", shapes)
+    stemmap(capsys, "stand", run, "--plots", nowhere).refused(1, "no coordinate reference", "--plots-crs")
+
+
+@pytest.mark.parametrize("text", ["", "{", '{"type": "FeatureCollection", "features": []}', "\0" * 500])
+@pytest.mark.parametrize("suffix", ["gpkg", "shp", "geojson"])
+def test_damaged_files_of_plots_end_with_one_line(run, tmp_path, capsys, text, suffix):
+    file = tmp_path / f"plots.{suffix}"
+    file.write_text(text)
+    told = stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local")
+    assert told.code == 1
+    assert told.err.startswith("stemmap: ")
+    assert "Traceback" not in told.err
+
+
+def test_few_trees_and_empty_plots_are_warnings(run, capsys):
+    few = stemmap(capsys, "stand", run, "--circle", "10,10,2")
+    assert few.code == 3
+    assert "plot 1: only 4 trees" in few.err
+    empty = stemmap(capsys, "stand", run, "--circle", "10,10,0.5", "--circle", "5,5,4")
+    assert empty.code == 3
+    assert "plot 1: the plot has no trees" in empty.err
+
+
+def test_two_plots_of_one_name_are_refused(run, tmp_path, capsys):
+    file = written(tmp_path, "p.gpkg", [shapely.box(0, 0, 9, 9)] * 2, names=["x", "x"])
+    stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local").refused(
+        1, "two plots are called 'x'"
+    )
+
+
+def test_diameters_in_another_unit_are_noticed(tmp_path, capsys):
+    position = np.random.default_rng(1).uniform(1, 19, (12, 2))
+    thick = write_run(tmp_path / "thick", position, np.full(12, 20.0))
+    assert "in centimetres?" in stemmap(capsys, "stand", thick).err
+    thin = write_run(tmp_path / "thin", position, np.full(12, 0.002))
+    assert "in metres?" in stemmap(capsys, "stand", thin).err
+
+
+def test_a_run_without_a_record_of_what_was_seen_uses_the_ground(tmp_path, capsys):
+    run = grid_run(tmp_path / "old", seen=False)
+    told = stemmap(capsys, "stand", run)
+    assert told.code == 3
+    assert "no record of what was observed; cells with ground returns are used" in told.err
+    assert "100 trees" in told.out
+
+
+def test_trees_far_from_every_view_are_corrected_for_detection(tmp_path, capsys):
+    random = np.random.default_rng(5)
+    position = random.uniform(0, 20, (600, 2))
+    distance = np.abs(position[:, 0] - position[:, 1]) / np.sqrt(2)
+    found = random.random(600) < np.exp(-0.5 * (distance / 6.0) ** 2)
+    run = write_run(tmp_path / "run", position[found], np.full(found.sum(), 0.2))
+    assert stemmap(capsys, "stand", run, "--out", tmp_path / "out").code == 0
+    row = table(tmp_path / "out" / "stand.csv")["all"]
+    assert abs(float(row["n_ha_corrected"]) - 15000) < 2.5 * float(row["n_ha_corrected_se"])
+    assert float(row["n_ha"]) < 12000
+    none = stemmap(capsys, "stand", run, "--out", tmp_path / "none", "--correction", "none")
+    assert none.code == 0
+    row = table(tmp_path / "none" / "stand.csv")["all"]
+    assert row["n_ha"] == row["n_ha_corrected"]
