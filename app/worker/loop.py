@@ -32,6 +32,8 @@ T = TypeVar("T")
 # Interval of status reports while a run plays, and of frames during a seek. A short seek shows no frames
 # before its target, so that the page does not flicker.
 _REPORT_S = 0.25
+# The supervisor replaces a worker that plays and is silent for long.
+_HEARTBEAT_S = 1.0
 _GLIMPSE_S = 0.5
 _COMPILING = COMPILING.capitalize()
 _COMPILES_ON_S = 60.0  # kernels compiled within this time of one another count as one wait
@@ -109,7 +111,7 @@ class WorkerLoop:
             queue.Empty: A scan is due.
         """
         if not self._taken:
-            self._taken.append(self._commands.get(timeout=self._patience()))
+            self._taken.append(self._await_command())
         with contextlib.suppress(queue.Empty):
             while True:
                 self._taken.append(self._commands.get_nowait())
@@ -121,6 +123,18 @@ class WorkerLoop:
         ):
             command = self._taken.popleft()
         return command
+
+    def _await_command(self) -> protocol.ToWorker | None:
+        """Wait for the next command until the next scan is due; report at intervals that the worker is alive.
+
+        Raises:
+            queue.Empty: A scan is due.
+        """
+        while (patience_s := self._patience()) is not None and patience_s > _HEARTBEAT_S:
+            with contextlib.suppress(queue.Empty):
+                return self._commands.get(timeout=_HEARTBEAT_S)
+            self._report()
+        return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
         """Return the time until the next scan is due [s]; None if only a command can start work."""

@@ -8,6 +8,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import replace
 from typing import Literal
 
 from app.common.child_process import exit_reason, python_module
@@ -30,6 +31,9 @@ OPENING_LIMIT_S = 300.0
 # Another source may be opened before the first is open. A live recording that is left may need 10 s to close.
 _REPLACE_AFTER_S = 12.0
 _WRITE_LIMIT_S = 5.0
+# Longest time without a message while a run plays or a command is executed. A part of it is reported before.
+SILENCE_LIMIT_S = 30.0
+_NOTICE_SHARE = 6
 # Consecutive ends without a result after which the playback speed is reset, which may be the cause.
 _SUSPICIOUS_ENDS = 2
 # Commands that are stored and sent again after a restart, or that a new process does not need.
@@ -54,7 +58,9 @@ class WorkerProcess:
         on_message: Awaited on the event loop for each message in turn; must not block it.
         command: Program and arguments of the process.
         clock: Returns the time [s] from any origin.
-        opening_limit_s: Maximum time without a message while a source is being opened [s].
+        opening_limit_s: Maximum time without a message while a source is being opened or kernels are compiled
+            [s].
+        silence_limit_s: Maximum time without a message while a run plays or a command is executed [s].
 
     Attributes:
         restarts: Number of restarts after an unexpected end.
@@ -66,6 +72,7 @@ class WorkerProcess:
         command: Sequence[str] = WORKER,
         clock: Callable[[], float] = time.monotonic,
         opening_limit_s: float = OPENING_LIMIT_S,
+        silence_limit_s: float = SILENCE_LIMIT_S,
     ) -> None:
         self._on_message = on_message
         self._command = command
@@ -86,6 +93,10 @@ class WorkerProcess:
         self._opening_timer: asyncio.TimerHandle | None = None
         self._replaced = False
         self._gave_up = False
+        self._silence_limit_s = silence_limit_s
+        self._silence: asyncio.Timeout | None = None
+        self._status = protocol.Status(state="starting")
+        self._has_command = False
         self.restarts = 0
 
     @property
@@ -155,6 +166,10 @@ class WorkerProcess:
                 await process.stdin.drain()
         except (ConnectionError, TimeoutError):
             return False
+        self._has_command = True
+        limit_s = self._limit_s()
+        if self._silence is not None and self._silence.when() is None and limit_s is not None:
+            self._silence.reschedule(asyncio.get_running_loop().time() + limit_s / _NOTICE_SHARE)
         return True
 
     async def _watch(self) -> None:
@@ -232,15 +247,60 @@ class WorkerProcess:
         process = self._process
         if process is None or process.stdout is None:
             return "it could not be started"
+        self._status, self._has_command = protocol.Status(state="starting"), False
         try:
-            while True:
-                size = int.from_bytes(await process.stdout.readexactly(protocol.LENGTH_BYTES), "little")
+            while (head := await self._head(process.stdout)) is not None:
+                size = int.from_bytes(head, "little")
                 protocol.check_size(size)
-                await self._deliver(self._codec_in.decode(await process.stdout.readexactly(size)))
+                message = self._codec_in.decode(await process.stdout.readexactly(size))
+                if isinstance(message, protocol.Report):
+                    self._status = message.status
+                await self._deliver(message)
         except asyncio.IncompleteReadError:
             return exit_reason(await process.wait())
         except protocol.WireError as error:
             return f"protocol error: {error}"
+        self._kill()
+        return "it did not answer"
+
+    async def _head(self, stdout: asyncio.StreamReader) -> bytes | None:
+        """Wait for the length of the next message; None if the worker hangs, which is reported before."""
+        silent_s = 0.0
+        while True:
+            limit_s = self._limit_s()
+            pause_s = None if limit_s is None else limit_s / _NOTICE_SHARE
+            try:
+                async with asyncio.timeout(pause_s) as self._silence:
+                    head = await stdout.readexactly(protocol.LENGTH_BYTES)
+            except TimeoutError:
+                limit_s = self._limit_s()
+                if limit_s is None:
+                    silent_s = 0.0
+                    continue
+                silent_s += limit_s / _NOTICE_SHARE
+                if silent_s >= limit_s:
+                    return None
+                if limit_s == self._silence_limit_s:
+                    detail = f"The mapping process has not answered for {silent_s:.0f} s"
+                    await self._deliver(
+                        protocol.Report(replace(self._status, state="waiting", detail=detail))
+                    )
+            else:
+                self._has_command = False
+                return head
+            finally:
+                self._silence = None
+
+    def _limit_s(self) -> float | None:
+        """Return the longest time [s] until the next message; None where no message is due."""
+        if self._opening or self._open is None:
+            return None  # the opening has a limit of its own
+        status = self._status
+        if status.state == "starting" or status.compiling_since_s is not None:
+            return self._opening_limit_s
+        if status.state == "failed":  # Play opens the source again
+            return self._opening_limit_s if self._has_command else None
+        return self._silence_limit_s if self._has_command or status.state in ("playing", "waiting") else None
 
     async def _deliver(self, message: protocol.FromWorker) -> None:
         self._note_opening(message)

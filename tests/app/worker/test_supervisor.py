@@ -289,3 +289,60 @@ async def test_it_does_not_outlive_the_web_process() -> None:
     process.stdin.close()
     async with asyncio.timeout(20):
         assert await process.wait() == 0
+
+
+async def test_a_run_that_stops_answering_is_reported_and_replaced() -> None:
+    said = Said()
+    worker = WorkerProcess(said, FAKE, silence_limit_s=3.0)
+    await worker.start()
+    try:
+        await worker.send(Open("fake:100000"))
+        await said.opened()
+        await worker.send(Play())
+        await said.state("playing")
+        first = worker.pid
+        assert first is not None
+        os.kill(first, signal.SIGSTOP)
+        assert "has not answered" in (await said.state("waiting")).detail
+        assert "did not answer" in (await said.state("failed")).detail
+        await said.opened()
+        assert not is_running(first)
+        assert worker.restarts == 1
+    finally:
+        await worker.close()
+
+
+async def test_a_command_that_is_not_answered_while_paused_replaces_the_worker() -> None:
+    said = Said()
+    worker = WorkerProcess(said, FAKE, silence_limit_s=3.0)
+    await worker.start()
+    try:
+        await worker.send(Open("fake:30"))
+        await said.opened()
+        await said.state("paused")
+        first = worker.pid
+        assert first is not None
+        os.kill(first, signal.SIGSTOP)
+        await asyncio.sleep(4.0)
+        assert worker.restarts == 0  # no message is due
+        await worker.send(Advance(1))
+        assert "did not answer" in (await said.state("failed")).detail
+        await said.opened()
+    finally:
+        await worker.close()
+
+
+async def test_a_run_that_is_paused_or_plays_slowly_is_not_replaced() -> None:
+    said = Said()
+    worker = WorkerProcess(said, FAKE, silence_limit_s=3.0)
+    await worker.start()
+    try:
+        await worker.send(SetSpeed(0.01))
+        await worker.send(Open("fake:30"))
+        await said.opened()
+        await worker.send(Play())
+        await said.state("playing")
+        await asyncio.sleep(5.0)
+        assert worker.restarts == 0
+    finally:
+        await worker.close()
