@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 from dataclasses import dataclass, field
@@ -10,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from app.batch.run_folder import is_of_cloud, read_run_record
+from app.batch.run_folder import is_of_cloud, read_run, read_run_record, read_terrain
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_beside
+from pipeline.stand.control_points import fit_control_points
 
 FILE = "georeference.json"
 LOCAL = "local"
@@ -165,3 +167,212 @@ def write_map_frame(folder: FilePath, frame: MapFrame) -> None:
     }
     with write_beside(folder / FILE) as partial:
         partial.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+
+_EAST = ("easting", "easting_m", "east", "east_m", "utm_x")
+_NORTH = ("northing", "northing_m", "north", "north_m", "utm_y")
+_LON, _LAT = ("lon", "longitude", "lon_deg"), ("lat", "latitude", "lat_deg")
+_HEIGHT = ("elevation_m", "elevation", "z_m", "z", "height_m")
+_POINTS_MAX = 1000
+
+
+def by_control_points(folder: FilePath, file: FilePath, crs: str, point_sigma: float | None) -> MapFrame:
+    """Return the frame of a map by control points: trees by their numbers, or positions in the map.
+
+    Heights, if the file has them, give the height of the map's zero with the terrain of the run.
+
+    Args:
+        folder: Folder of the run.
+        file: CSV with a header.
+        crs: Reference system, see `projected`.
+        point_sigma: See `fit_control_points`; None for 0.125 m.
+
+    Raises:
+        StemmapError: The table is damaged or names unknown trees, or the points contradict one another.
+    """
+    import pyproj
+
+    rows = _control_rows(file)
+    run = read_run(folder)
+    place = {int(n): p for n, p in zip(run.trees.number, run.trees.position, strict=True)}
+    local: list[Float] = []
+    names: list[str] = []
+    for line, row in rows:
+        name = row.get("name") or row.get("tree") or str(len(names) + 1)
+        if row.get("tree"):
+            number = _cell(row, ("tree",), line, file)
+            if number not in place:
+                raise StemmapError(f"line {line}: the map has no tree {row['tree']}", where=str(file))
+            local.append(place[int(number)])
+        else:
+            local.append(np.array([_cell(row, (axis,), line, file) for axis in ("x_m", "y_m")]))
+        names.append(name)
+    columns = rows[0][1]
+    geographic = any(name in columns for name in _LON)
+    axes = (_LON, _LAT) if geographic else (_EAST, _NORTH)
+    known = np.array([[_cell(row, axis, line, file) for axis in axes] for line, row in rows])
+    if geographic:
+        transformer = pyproj.Transformer.from_crs(4326, crs, always_xy=True)
+        known = np.stack(transformer.transform(known[:, 0], known[:, 1]), axis=1)
+    check_area(crs, known)
+    fit = fit_control_points(np.array(local), known, names=names, point_sigma=point_sigma or 0.125)
+    z = 0.0
+    if any(name in columns for name in _HEIGHT):
+        heights = np.array([_cell(row, _HEIGHT, line, file) for line, row in rows])
+        z = float(np.mean(heights - ground_heights(folder, np.array(local))))
+        if not math.isfinite(z):
+            raise StemmapError(
+                "the run has no terrain at a control point with a height",
+                where=str(file),
+                remedy="Leave the heights out",
+            )
+    residuals = [(n, float(e), float(m)) for n, (e, m) in zip(names, fit.residuals, strict=True)]
+    how = (
+        f"{len(names)} control points, {fit.rms:.3f} m (RMS), one coordinate of a point "
+        f"+- {fit.sigma_point:.3f} m, turn +- {math.degrees(fit.sigma_turn):.3f} degrees"
+    )
+    return MapFrame(crs, fit.pose, z, how, fit.sigma, tuple(residuals))
+
+
+def _control_rows(file: FilePath) -> list[tuple[int, dict[str, str]]]:
+    """Return line number and cells by lower-case header of each row that is not empty."""
+    try:
+        if file.stat().st_size > _LARGEST_FILE:
+            raise SourceError("the table of control points is larger than 1 MB", where=str(file))
+        text = file.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise SourceError(f"cannot read the control points: {error.strerror}", where=str(file)) from None
+    except UnicodeDecodeError:
+        raise SourceError("the table of control points is not text", where=str(file)) from None
+    head = text.partition("\n")[0]
+    reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=head.count))
+    try:
+        table = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
+    except csv.Error as error:
+        raise SourceError(f"the control points are damaged: {error}", where=str(file)) from None
+    table = [(line, row) for line, row in table if any(row)]
+    header = [name.lower() for name in table[0][1]] if table else []
+    if len(table) > _POINTS_MAX:
+        raise SourceError(f"there are more than {_POINTS_MAX} control points", where=str(file))
+    known = any(n in header for n in (*_EAST, *_LON)) and any(n in header for n in (*_NORTH, *_LAT))
+    if not known or not ("tree" in header or {"x_m", "y_m"} <= set(header)):
+        raise SourceError(
+            "the header of the control points is not complete",
+            where=str(file),
+            remedy="It needs easting and northing (or lon and lat), and tree or x_m and y_m",
+        )
+    rows = [(line, dict(zip(header, row, strict=False))) for line, row in table[1:]]
+    if not rows:
+        raise SourceError("the file has no control points", where=str(file))
+    return rows
+
+
+def _cell(row: dict[str, str], names: tuple[str, ...], line: int, file: FilePath) -> float:
+    name = next((name for name in names if name in row), names[0])
+    try:
+        value = float(row[name])
+    except (KeyError, ValueError):
+        value = math.nan
+    if not abs(value) < _FARTHEST:
+        raise SourceError(f"line {line}: {name} = {row.get(name, '')!r} is not a number", where=str(file))
+    return value
+
+
+def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, z: float) -> MapFrame:
+    """Return the frame of a map by the position of its origin [m], the angle of its x axis from east to north
+    [rad], and the height of its zero [m].
+
+    Raises:
+        StemmapError: The position is not in the area of the reference system.
+    """
+    read_run_record(folder)
+    check_area(crs, np.array([[east, north]]))
+    return MapFrame(crs, Pose2(east, north, turn), z, "by hand")
+
+
+def by_gnss(folder: FilePath, crs: str) -> MapFrame:
+    """Return the frame of a map by the GNSS fixes of its recording, fitted to the whole path. Fixes that are
+    far from the path, compared with the others, do not count.
+
+    Raises:
+        StemmapError: The recording cannot be read, has no fixes, or they do not fit the path.
+    """
+    import pyproj
+
+    from app.batch.continue_map import read_saved_run
+    from pipeline.io.readers import open_source
+    from pipeline.io.readers.measured_poses import fit_rigid
+    from pipeline.io.readers.ros import RosSource
+
+    run = read_run(folder)
+    source = open_source(run.uri)
+    fixes = source.fixes() if isinstance(source, RosSource) else []
+    if not fixes:
+        raise StemmapError(
+            "the recording has no GNSS fixes", where=run.uri, remedy="Use --control or --by-hand"
+        )
+    transformer = pyproj.Transformer.from_crs(4326, crs, always_xy=True)
+    positions = np.stack(
+        transformer.transform([f.longitude for f in fixes], [f.latitude for f in fixes]), axis=1
+    )
+    check_area(crs, positions)
+    origin = positions[0].copy()
+    stamps = read_saved_run(folder).map.stamp_ns
+    path = np.stack([run.path.x, run.path.y], axis=1)
+    at_ns = np.array([fix.stamp_ns for fix in fixes], np.int64)
+    sigma = np.array([fix.sigma for fix in fixes])
+    keep = np.argsort(at_ns, kind="stable")
+    keep = keep[(at_ns[keep] >= stamps[0]) & (at_ns[keep] <= stamps[-1])]
+    fit, why, used = None, "they are not from the time of the run", len(keep)
+    for _ in range(5):  # rounds of fitting and leaving out
+        fit, why = fit_rigid(
+            at_ns[keep], positions[keep] - origin, sigma[keep], stamps.tolist(), path,
+            shortest=5.0, what="fixes", unknown="the direction of north",
+        )  # fmt: skip
+        if fit is None:
+            break
+        used = len(keep)
+        on_path = np.stack([np.interp(at_ns[keep], stamps, path[:, axis]) for axis in (0, 1)], axis=1)
+        off = np.hypot(*(fit.T_map_other.apply(positions[keep] - origin) - on_path).T)
+        near = off <= max(3.0 * float(np.median(off)), 0.05)
+        if near.all():
+            break
+        keep = keep[near]
+    if fit is None:
+        raise StemmapError(f"the GNSS fixes cannot be used: {why}", where=run.uri, remedy="Use --control")
+    pose = fit.T_map_other.inverse()
+    how = (
+        f"{used} of {len(fixes)} GNSS fixes, {fit.residual:.2f} m (RMS) from the path, "
+        f"turn +- {math.degrees(fit.yaw_sigma):.2f} degrees"
+    )
+    return MapFrame(crs, Pose2(pose.x + origin[0], pose.y + origin[1], pose.yaw), 0.0, how, fit.sigma)
+
+
+def ground_heights(folder: FilePath, points: Float) -> Float:
+    """Return the height of the terrain of a run at positions in the map, shape (N, 2): that of the nearest
+    cell within 2 m; NaN without one.
+
+    Raises:
+        SourceError: terrain.csv is missing or damaged.
+    """
+    from scipy.spatial import cKDTree
+
+    terrain = read_terrain(folder)
+    if not len(terrain):
+        return np.full(len(points), np.nan)
+    distance, row = cKDTree(terrain[:, :2]).query(np.reshape(points, (-1, 2)))
+    return np.where(distance <= 2.0, terrain[row, 2], np.nan)
+
+
+def frame_lines(frame: MapFrame) -> list[str]:
+    """Return a frame as lines for people."""
+    if not frame.crs:
+        return ["local coordinates: the map has no reference system"]
+    lines = [
+        f"{frame.name}: origin at {frame.pose.x:.3f}, {frame.pose.y:.3f} m, x axis "
+        f"{math.degrees(frame.pose.yaw):.3f} degrees from east to north, by {frame.how or 'the source'}"
+    ]
+    if math.isfinite(frame.sigma):
+        lines.append(f"a coordinate in the middle of the points +- {frame.sigma:.3f} m")
+    lines += [f"point {name}: residual {e:+.3f} m east, {n:+.3f} m north" for name, e, n in frame.residuals]
+    return lines

@@ -129,6 +129,16 @@ def read_ground_area(folder: FilePath) -> SeenArea | None:
     return SeenArea(CELL, closed, unknown, np.zeros(len(closed), np.int64))
 
 
+def read_terrain(folder: FilePath) -> Float:
+    """Return the terrain of a run, terrain.csv, as x, y, z of its cells, shape (K, 3) [m].
+
+    Raises:
+        SourceError: The file is missing or damaged.
+    """
+    c = _columns(folder / "terrain.csv", TERRAIN_COLUMNS)
+    return np.stack([c["x_m"], c["y_m"], c["z_m"]], axis=1)
+
+
 def _seen_area(c: dict[str, Float], cell: float) -> SeenArea:
     place = np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / cell).astype(np.int64)
     return SeenArea(cell, place, c["nearest_m"], np.nan_to_num(c["views"]).astype(np.int64))

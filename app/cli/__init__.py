@@ -30,6 +30,7 @@ COMMANDS = (
     "simulate",
     "evaluate",
     "stand",
+    "georeference",
     "export",
     "params",
     "train",

@@ -15,7 +15,7 @@ from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
 from pipeline.io.readers.camera import Camera, MessageSource, find_camera
 from pipeline.io.readers.container import Container, Message
-from pipeline.io.readers.measured_poses import FrameAlignments
+from pipeline.io.readers.measured_poses import Fix, FrameAlignments
 from pipeline.io.readers.message_time import (
     WINDOW_NS,
     Clock,
@@ -115,6 +115,19 @@ class RosSource(MessageSource):
     def truth(self) -> Truth | None:
         """Return the ground truth attached to a simulated recording, None when there is none."""
         return self._truth
+
+    def fixes(self) -> list[Fix]:
+        """Return the GNSS fixes of the recording, in its order; damaged messages are left out."""
+        found = []
+        for message in self._container.messages(self._topics.numbers("gnss"), None, {}):
+            for stamped in self._stamped(message, {}):
+                try:
+                    fix, _ = self._records.fix(stamped.content, stamped.stamp_ns)
+                except Exception:  # noqa: S112 - as in RecordDecoder.record
+                    continue
+                if fix is not None:
+                    found.append(fix)
+        return found
 
     def camera(self) -> tuple[Camera | None, str]:
         """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""

@@ -50,7 +50,7 @@ def write_run(folder, position, dbh, *, dbh_sigma=0.01, side=20.0, seen=True, nu
     nearest = np.abs((cells[:, 0] - cells[:, 1]) * CELL) / np.sqrt(2.0)
     area = SeenArea(CELL, cells, nearest, np.full(len(cells), 5))
     rows = [[f"{x:.3f}", f"{y:.3f}", f"{0.1 * x:.3f}", "", ""] for x, y in area.centres]
-    source: dict[str, object] = {"uri": "sim:written", "kind": "simulated", "sha256": "00"}
+    source: dict[str, object] = {"uri": "sim:stand", "kind": "simulated", "sha256": "00"}
     if cloud_crs is not None:
         source.update(offset_m=[0.0, 0.0, 0.0], crs=cloud_crs or None)
         path = Path(np.zeros(0, np.int64), *(np.zeros(0) for _ in range(4)))

@@ -16,6 +16,7 @@ from app.cli import main
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.measured_poses import BEST_SIGMA, UNKNOWN_SIGMA, Fix, align_fixes
+from pipeline.io.readers.ros import RosSource
 from pipeline.types.records import PoseMeasurement, Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, Write, points_of, write_recording
@@ -89,6 +90,11 @@ def test_fixes_are_poses_in_the_frame_of_the_map(kind: str, tmp_path: Path, open
     source = opened(write_recording(kind, tmp_path, straight))
     measured = [record for record in source.records() if isinstance(record, PoseMeasurement)]
     assert len(measured) == 11
+    assert isinstance(source, RosSource)
+    fixes = source.fixes()
+    assert len(fixes) == 11
+    assert {fix.sigma for fix in fixes} == {SIGMA}
+    assert fixes[0].latitude == pytest.approx(LATITUDE, abs=1e-5)
     for pose in measured:
         step = (pose.stamp_ns - START_NS) / STEP_NS
         assert pose.is_sound()

@@ -1,0 +1,87 @@
+"""`stemmap georeference`: gives a mapped run coordinates of the country."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from app.cli.flags import cannot_write, positive_number
+from pipeline.errors import StemmapError, UsageError
+
+HELP = "give a mapped run coordinates of the country, by control points, GNSS or by hand"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("run", metavar="DIR", type=Path, help="folder that `stemmap map` wrote")
+    parser.add_argument("--crs", metavar="CRS", help="projected reference system, such as EPSG:25832")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument(
+        "--control",
+        metavar="FILE",
+        type=Path,
+        help="CSV with easting, northing (or lon, lat), and tree or x_m, y_m; optional name, elevation_m",
+    )
+    how.add_argument(
+        "--gnss", action="store_true", help="fixes of the recording of the run, fitted to its whole path"
+    )
+    how.add_argument(
+        "--by-hand",
+        metavar="EAST,NORTH,TURN[,Z]",
+        help="position of the map's origin, angle of its x axis from east to north in degrees, and height",
+    )
+    how.add_argument("--remove", action="store_true", help="make the map local again")
+    parser.add_argument(
+        "--point-sigma",
+        metavar="M",
+        type=positive_number(100.0, "standard deviation in metres"),
+        help="expected error of a control point; contradicting points are refused (default: 0.125)",
+    )
+    parser.epilog = (
+        "Writes georeference.json to DIR, which `stemmap stand`, `export` and `report` use. Without\n"
+        "a method, the present one is printed. Mapping again into DIR removes it."
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Find the frame of the map, write it and print its residuals."""
+    from app.batch import georeference
+    from app.batch.run_folder import read_run_record
+
+    folder = arguments.run
+    try:
+        if arguments.remove:
+            read_run_record(folder)
+            (folder / georeference.FILE).unlink(missing_ok=True)
+            print("the map is local")
+            return 0
+        if arguments.control is None and not arguments.gnss and arguments.by_hand is None:
+            frame = georeference.read_map_frame(folder)
+        else:
+            if not arguments.crs:
+                raise UsageError("--crs is missing", remedy="Name the reference system, such as EPSG:25832")
+            crs = georeference.projected(arguments.crs)
+            if arguments.control is not None:
+                frame = georeference.by_control_points(folder, arguments.control, crs, arguments.point_sigma)
+            elif arguments.gnss:
+                frame = georeference.by_gnss(folder, crs)
+            else:
+                frame = georeference.by_hand(folder, crs, *_by_hand(arguments.by_hand))
+            georeference.write_map_frame(folder, frame)
+    except OSError as error:
+        raise cannot_write(error, folder) from None
+    for line in georeference.frame_lines(frame):
+        print(line)
+    return 0
+
+
+def _by_hand(text: str) -> tuple[float, float, float, float]:
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (3, 4) or not all(abs(number) < 1e8 for number in numbers):
+        raise StemmapError(f"--by-hand {text!r} is not three or four numbers with commas between them")
+    east, north, turn, z = (*numbers, 0.0)[:4]
+    return east, north, math.radians(turn), z

@@ -1,0 +1,119 @@
+"""The position of a map in a coordinate reference system from points that are known in both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Float, Pose2
+
+# A set of control points contradicts itself if its residuals exceed this number of standard deviations.
+CONTRADICTION = 4.0
+# A scale beyond this difference from 1 is another unit or another set of points.
+SCALE = 0.02
+SPREAD_MIN = 0.5  # m
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ControlFit:
+    """Rigid motion from the map to a reference system, fitted by least squares.
+
+    Attributes:
+        pose: T_crs_map.
+        residuals: Known minus transformed position of each point, shape (N, 2) [m].
+        rms: Root mean square length of the residuals [m].
+        sigma_point: Standard deviation of one coordinate of a point, from the residuals with 2 N - 3 degrees
+            of freedom [m].
+        sigma: Standard deviation of a coordinate of a position at the centre of the points [m].
+        sigma_turn: Standard deviation of the rotation [rad].
+    """
+
+    pose: Pose2
+    residuals: Float
+    rms: float
+    sigma_point: float
+    sigma: float
+    sigma_turn: float
+
+
+def fit_control_points(
+    local: Float, known: Float, *, names: Sequence[str] = (), point_sigma: float | None = None
+) -> ControlFit:
+    """Fit the pose of the map to control points.
+
+    Args:
+        local: Positions in the map, shape (N, 2) [m].
+        known: The same points in the reference system: east, north, shape (N, 2) [m].
+        names: Names of the points, for messages; by default their numbers.
+        point_sigma: Expected standard deviation of a coordinate [m]. Larger residuals are refused.
+
+    Raises:
+        StemmapError: There are fewer than two points, they lie at one place, or they contradict one another:
+            in their scale, the order of their axes, or their residuals. The message names the cause.
+    """
+    n = len(local)
+    if n < 2:
+        raise StemmapError(f"{n or 'no'} control {'point is' if n == 1 else 'points are'} too few",
+                           remedy="Give two or more points")  # fmt: skip
+    names = list(names) or [str(k + 1) for k in range(n)]
+    centre, to = local.mean(axis=0), known.mean(axis=0)
+    a, b = local - centre, known - to
+    spread_a, spread_b = (float(np.sqrt(np.square(v).sum(axis=1).mean())) for v in (a, b))
+    if min(spread_a, spread_b) < SPREAD_MIN:
+        raise StemmapError(
+            "the control points lie at one place", remedy="Give points that are far from one another"
+        )
+    fit = _rigid(a, b, centre, to)
+    allowed = 0.5 if point_sigma is None else CONTRADICTION * point_sigma
+    if fit.sigma_point <= allowed:
+        return fit
+    if _rigid(a, b[:, ::-1], centre, to).sigma_point <= min(allowed, 0.2 * fit.sigma_point) and n > 2:
+        raise StemmapError(
+            "east and north of the control points seem to be exchanged", remedy="Check the header of the file"
+        )
+    if abs(spread_b / spread_a - 1.0) > SCALE and _rigid(
+        a, b * spread_a / spread_b, centre, to
+    ).sigma_point <= min(allowed, 0.2 * fit.sigma_point):
+        raise StemmapError(
+            f"distances between the control points are {spread_b / spread_a:.3f} times those in the map",
+            remedy="Check their unit, which is metres, and which tree each point is",
+        )
+    text = f"the control points contradict one another: {fit.rms:.2f} m (RMS)"
+    if n > 3:
+        others = [_without(local, known, k).sigma_point for k in range(n)]
+        k = int(np.argmin(others))
+        raise StemmapError(
+            f"{text}; without point {names[k]} {_without(local, known, k).rms:.2f} m",
+            remedy=f"Check point {names[k]}, or allow it with a greater --point-sigma",
+        )
+    raise StemmapError(text, remedy="Check which tree each point is, or give a greater --point-sigma")
+
+
+def _without(local: Float, known: Float, k: int) -> ControlFit:
+    a, b = np.delete(local, k, axis=0), np.delete(known, k, axis=0)
+    return _rigid(a - a.mean(axis=0), b - b.mean(axis=0), a.mean(axis=0), b.mean(axis=0))
+
+
+def _rigid(a: Float, b: Float, centre: Float, to: Float) -> ControlFit:
+    """Fit points about their centres (Horn 1987, in the plane)."""
+    n = len(a)
+    yaw = math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
+    c, s = math.cos(yaw), math.sin(yaw)
+    R = np.array([[c, -s], [s, c]])
+    residuals = b - a @ R.T
+    shift = to - R @ centre
+    squares = float(np.square(residuals).sum())
+    sigma = math.sqrt(squares / max(2 * n - 3, 1))
+    spread = math.sqrt(float(np.square(a).sum()))
+    return ControlFit(
+        Pose2(float(shift[0]), float(shift[1]), yaw),
+        residuals,
+        math.sqrt(squares / n),
+        sigma,
+        sigma / math.sqrt(n),
+        sigma / spread,
+    )
