@@ -15,7 +15,7 @@ from app.batch.run_folder import is_of_cloud, read_run, read_run_record, read_te
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_beside
-from pipeline.stand.control_points import fit_control_points
+from pipeline.stand.control_points import fit_control_points, fit_rigid_pairs
 
 FILE = "georeference.json"
 LOCAL = "local"
@@ -323,26 +323,25 @@ def by_gnss(folder: FilePath, crs: str) -> MapFrame:
     sigma = np.array([fix.sigma for fix in fixes])
     keep = np.argsort(at_ns, kind="stable")
     keep = keep[(at_ns[keep] >= stamps[0]) & (at_ns[keep] <= stamps[-1])]
-    fit, why, used = None, "they are not from the time of the run", len(keep)
-    for _ in range(5):  # rounds of fitting and leaving out
-        fit, why = fit_rigid(
-            at_ns[keep], positions[keep] - origin, sigma[keep], stamps.tolist(), path,
-            shortest=5.0, what="fixes", unknown="the direction of north",
-        )  # fmt: skip
-        if fit is None:
+    on_path = np.stack([np.interp(at_ns, stamps, path[:, axis]) for axis in (0, 1)], axis=1)
+    for _ in range(10):  # rounds of fitting and leaving out
+        if len(keep) < 2:
             break
-        used = len(keep)
-        on_path = np.stack([np.interp(at_ns[keep], stamps, path[:, axis]) for axis in (0, 1)], axis=1)
-        off = np.hypot(*(fit.T_map_other.apply(positions[keep] - origin) - on_path).T)
+        rigid = fit_rigid_pairs(on_path[keep], positions[keep] - origin)
+        off = np.hypot(*rigid.residuals.T)
         near = off <= max(3.0 * float(np.median(off)), 0.05)
         if near.all():
             break
         keep = keep[near]
+    fit, why = fit_rigid(
+        at_ns[keep], positions[keep] - origin, sigma[keep], stamps.tolist(), path,
+        shortest=5.0, what="fixes", unknown="the direction of north",
+    )  # fmt: skip
     if fit is None:
         raise StemmapError(f"the GNSS fixes cannot be used: {why}", where=run.uri, remedy="Use --control")
     pose = fit.T_map_other.inverse()
     how = (
-        f"{used} of {len(fixes)} GNSS fixes, {fit.residual:.2f} m (RMS) from the path, "
+        f"{len(keep)} of {len(fixes)} GNSS fixes, {fit.residual:.2f} m (RMS) from the path, "
         f"turn +- {math.degrees(fit.yaw_sigma):.2f} degrees"
     )
     return MapFrame(crs, Pose2(pose.x + origin[0], pose.y + origin[1], pose.yaw), 0.0, how, fit.sigma)

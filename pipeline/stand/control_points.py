@@ -60,24 +60,22 @@ def fit_control_points(
         raise StemmapError(f"{n or 'no'} control {'point is' if n == 1 else 'points are'} too few",
                            remedy="Give two or more points")  # fmt: skip
     names = list(names) or [str(k + 1) for k in range(n)]
-    centre, to = local.mean(axis=0), known.mean(axis=0)
-    a, b = local - centre, known - to
+    a, b = local - local.mean(axis=0), known - known.mean(axis=0)
     spread_a, spread_b = (float(np.sqrt(np.square(v).sum(axis=1).mean())) for v in (a, b))
     if min(spread_a, spread_b) < SPREAD_MIN:
         raise StemmapError(
             "the control points lie at one place", remedy="Give points that are far from one another"
         )
-    fit = _rigid(a, b, centre, to)
+    fit = fit_rigid_pairs(local, known)
     allowed = 0.5 if point_sigma is None else CONTRADICTION * point_sigma
     if fit.sigma_point <= allowed:
         return fit
-    if _rigid(a, b[:, ::-1], centre, to).sigma_point <= min(allowed, 0.2 * fit.sigma_point) and n > 2:
+    if fit_rigid_pairs(a, b[:, ::-1]).sigma_point <= min(allowed, 0.2 * fit.sigma_point) and n > 2:
         raise StemmapError(
             "east and north of the control points seem to be exchanged", remedy="Check the header of the file"
         )
-    if abs(spread_b / spread_a - 1.0) > SCALE and _rigid(
-        a, b * spread_a / spread_b, centre, to
-    ).sigma_point <= min(allowed, 0.2 * fit.sigma_point):
+    scaled = fit_rigid_pairs(a, b * spread_a / spread_b)
+    if abs(spread_b / spread_a - 1.0) > SCALE and scaled.sigma_point <= min(allowed, 0.2 * fit.sigma_point):
         raise StemmapError(
             f"distances between the control points are {spread_b / spread_a:.3f} times those in the map",
             remedy="Check their unit, which is metres, and which tree each point is",
@@ -94,13 +92,14 @@ def fit_control_points(
 
 
 def _without(local: Float, known: Float, k: int) -> ControlFit:
-    a, b = np.delete(local, k, axis=0), np.delete(known, k, axis=0)
-    return _rigid(a - a.mean(axis=0), b - b.mean(axis=0), a.mean(axis=0), b.mean(axis=0))
+    return fit_rigid_pairs(np.delete(local, k, axis=0), np.delete(known, k, axis=0))
 
 
-def _rigid(a: Float, b: Float, centre: Float, to: Float) -> ControlFit:
-    """Fit points about their centres (Horn 1987, in the plane)."""
-    n = len(a)
+def fit_rigid_pairs(local: Float, known: Float) -> ControlFit:
+    """Return the fit of two or more pairs of points, shape (N, 2), without any check (Horn 1987, in the
+    plane)."""
+    n, centre, to = len(local), local.mean(axis=0), known.mean(axis=0)
+    a, b = local - centre, known - to
     yaw = math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
     c, s = math.cos(yaw), math.sin(yaw)
     R = np.array([[c, -s], [s, c]])

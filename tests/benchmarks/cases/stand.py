@@ -20,6 +20,7 @@ RADIUS = 15.0
 #: Stand, duration of the drive [s] and minimum diameter [m] of each question.
 STAND = "sim:stand?seed={seed}&duration=40"
 DENSE = "sim:dense?seed={seed}&duration=30"
+SHORT = "sim:dense?seed={seed}&duration=10"
 KEYS = ("n_ha", "g_ha")
 VARIANTS = ("_plain", "", "_corrected")
 NAMES = {"_plain": "whole plot", "": "observed area", "_corrected": "observed area, detection corrected"}
@@ -30,6 +31,7 @@ def run() -> list[Table]:
     return [
         _table("sim:stand, 40 s of drive", STAND, errors_asked=True),
         _table("sim:dense, one pass of 30 s", DENSE, errors_asked=False),
+        _table("sim:dense, one pass of 10 s", SHORT, errors_asked=False),
     ]
 
 
