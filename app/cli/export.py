@@ -1,4 +1,4 @@
-"""`stemmap export`: writes a finished run in the format of other tools."""
+"""`stemmap export`: writes a finished run as files for GIS, CAD, spreadsheets and other tools."""
 
 from __future__ import annotations
 
@@ -6,45 +6,78 @@ import argparse
 import sys
 from pathlib import Path
 
-from app.cli.flags import positive_number
-from pipeline.errors import StemmapError
+from app.cli.flags import cannot_write, positive_number
+from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, stand_parameters
+from pipeline.errors import StemmapError, UsageError
 
-HELP = "write a finished run in the format of other tools"
+HELP = "write a finished run as GIS, CAD or spreadsheet files, or for other tools"
 REACH = 30.0
+TREE_MANAGER = "tree-manager"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("run", metavar="DIR", type=Path, help="folder that `stemmap map` wrote")
-    parser.add_argument("--to", choices=("tree-manager",), default="tree-manager", help="the format")
-    parser.add_argument("--out", metavar="FOLDER", type=Path, required=True, help="new or empty folder")
+    parser.add_argument(
+        "--to",
+        metavar="FILE",
+        default=TREE_MANAGER,
+        help="file .gpkg, .shp, .geojson, .dxf, .xlsx or .tif (terrain), or tree-manager (default)",
+    )
+    parser.add_argument(
+        "--out", metavar="FOLDER", type=Path, help="new or empty folder, only for tree-manager"
+    )
     parser.add_argument(
         "--reach",
         metavar="M",
         type=positive_number(1e4, "distance in metres"),
         default=REACH,
-        help=f"largest distance of a tree from the pose of its frame (default: {REACH:g} m)",
+        help=f"tree-manager: largest distance of a tree from the pose of its frame (default: {REACH:g} m)",
     )
     parser.epilog = (
+        "GeoPackage: layers trees, path, plots and contours, with styles for QGIS. Coordinates are those of\n"
+        "`stemmap georeference`, else local. The same run gives the same bytes.\n"
         "tree-manager: TreeManagerState_<i>.csv with the trees around each pose, and trajectory.txt, the\n"
         "exchange format of place recognition by stems. `stemmap map FOLDER` reads it.\n"
         "Exit code 3: some trees are too far from the path to be in any frame."
     )
+    add_plot_flags(parser)
+    add_stand_flags(parser, without=("reach",))
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write poses and trees of a mapped run as files of Tree Manager.
+    """Write the files.
 
     Returns:
-        Exit code: 3 if trees far from the path were left out, else 0.
+        Exit code: 3 if trees far from the path were left out of tree-manager files, else 0.
 
     Raises:
-        StemmapError: The run cannot be read, or is the map of a whole cloud.
+        StemmapError: The run cannot be read, or lacks what the format shows.
     """
+    if arguments.to == TREE_MANAGER:
+        return _tree_manager(arguments)
+    from app.batch.export import export_run, read_for_export
+
+    if arguments.out is not None:
+        raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
+    file = Path(arguments.to)
+    exported = read_for_export(arguments.run, chosen_plots(arguments), stand_parameters(arguments))
+    try:
+        written = export_run(exported, file)
+    except OSError as error:
+        raise cannot_write(error, file) from None
+    print(f"{len(exported.place)} trees in {exported.frame.name} coordinates: {', '.join(map(str, written))}")
+    return 0
+
+
+def _tree_manager(arguments: argparse.Namespace) -> int:
+    """Write poses and trees of a mapped run as files of Tree Manager."""
     from app.batch.run_folder import read_run
     from app.common.text import count
     from pipeline.io.readers.tree_manager import write_tree_manager
 
+    if arguments.out is None:
+        raise UsageError("--out is missing", remedy="Name a folder, or a file with --to trees.gpkg")
     finished = read_run(arguments.run)
     if finished.of_cloud:
         raise StemmapError(

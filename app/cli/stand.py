@@ -68,12 +68,14 @@ def add_plot_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_stand_flags(parser: argparse.ArgumentParser) -> None:
-    """Add a flag for each parameter of the stand figures."""
+def add_stand_flags(parser: argparse.ArgumentParser, without: tuple[str, ...] = ()) -> None:
+    """Add a flag for each parameter of the stand figures but those in `without`."""
     from pipeline.config.stages import Stand
 
     group = parser.add_argument_group("figures")
     for name, declared in Stand.model_fields.items():
+        if name in without:
+            continue
         extra = declared.json_schema_extra
         unit = str(extra["unit"]) if isinstance(extra, dict) else ""
         group.add_argument(
@@ -96,7 +98,7 @@ def stand_parameters(arguments: argparse.Namespace) -> Stand:
 
     given: dict[str, Any] = {}
     for name, declared in Stand.model_fields.items():
-        text = getattr(arguments, f"stand_{name}")
+        text = getattr(arguments, f"stand_{name}", None)
         if text is not None:
             try:
                 given[name] = declared.annotation(text) if declared.annotation in (int, float) else text

@@ -1,0 +1,510 @@
+"""Files of a finished run for GIS, CAD and spreadsheets: GeoPackage, Shapefile, GeoJSON, DXF, XLSX, GeoTIFF.
+
+The same run gives the same bytes: time stamps in the files are fixed.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+import os
+import sqlite3
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.batch.georeference import MapFrame, ground_heights, read_map_frame
+from app.batch.run_folder import FinishedRun, read_run, read_terrain
+from app.batch.stand import stand_of
+from app.common.extras import needed
+from app.common.text import version
+from pipeline.config.stages import Stand
+from pipeline.errors import SourceError, StemmapError
+from pipeline.geometry.poses import Float
+from pipeline.io.result_files import geojson
+from pipeline.stand.figures import FIGURES
+from pipeline.stand.plots import Plot
+
+_DATE = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
+_CELLS_MAX = 25_000_000
+TERRAIN_CELL = 0.5  # m
+CONTOUR_STEP = 0.5  # m
+LOCAL_WKT = (
+    'ENGCRS["local frame of the map",EDATUM["origin of the map"],CS[Cartesian,2],'
+    'AXIS["x",unspecified,ORDER[1]],AXIS["y",unspecified,ORDER[2]],LENGTHUNIT["metre",1]]'
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A column of the exported trees: name, name in a Shapefile (at most 10 characters), unit, meaning."""
+
+    name: str
+    short: str
+    unit: str
+    meaning: str
+
+
+TREE_FIELDS = (
+    Field("tree", "tree", "", "number of the tree in the map"),
+    Field("dbh_cm", "dbh_cm", "cm", "diameter at breast height"),
+    Field("sigma_dbh_cm", "sdbh_cm", "cm", "standard deviation of the diameter"),
+    Field("g_m2", "g_m2", "m2", "basal area"),
+    Field("sigma_x_m", "sx_m", "m", "standard deviation of the position along x of the map"),
+    Field("sigma_y_m", "sy_m", "m", "standard deviation of the position along y of the map"),
+    Field("z_m", "z_m", "m", "height of the ground at the tree"),
+    Field("map_x_m", "mapx_m", "m", "x in the frame of the map"),
+    Field("map_y_m", "mapy_m", "m", "y in the frame of the map"),
+    Field("observations", "obs", "", "number of scans with a detection of the tree"),
+    Field("coverage_deg", "cover_deg", "deg", "part of the circumference that was observed"),
+    Field("eccentricity", "eccentr", "", "ratio of the eigenvalues of the points of a scan"),
+)
+#: Names of the figures of a plot in a Shapefile.
+PLOT_SHORT = {
+    "n_ha": "n_ha",
+    "n_ha_plain": "n_ha_plain",
+    "n_ha_corrected": "n_ha_corr",
+    "g_ha": "g_ha",
+    "g_ha_plain": "g_ha_plain",
+    "g_ha_corrected": "g_ha_corr",
+    "dg_cm": "dg_cm",
+    "mean_dbh_cm": "dm_cm",
+    "dominant_dbh_cm": "ddom_cm",
+    "sdi": "sdi",
+    "nearest_neighbour_m": "nn_m",
+    "clark_evans": "ce",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportedRun:
+    """A run in the coordinates of its files.
+
+    Attributes:
+        folder, run, frame: The run.
+        place: East, north of the trees, or x, y of a local map, shape (T, 2) [m].
+        columns: Values of TREE_FIELDS by name; NaN for unknown values.
+        path: The path, shape (N, 2) [m].
+        plots: Plots in these coordinates, with their figures by name.
+        terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
+    """
+
+    folder: FilePath
+    run: FinishedRun
+    frame: MapFrame
+    place: Float
+    columns: dict[str, Any]
+    path: Float
+    plots: tuple[tuple[str, Any, dict[str, float]], ...]
+    terrain: Float
+
+    @property
+    def crs(self) -> str:
+        """Reference system as text for libraries; LOCAL_WKT without one."""
+        return self.frame.crs or LOCAL_WKT
+
+
+def read_for_export(
+    folder: FilePath, plots: Sequence[Plot] = (), parameters: Stand | None = None
+) -> ExportedRun:
+    """Return a run with its values for export.
+
+    Args:
+        folder: Folder of the run.
+        plots: Plots in the frame of the map.
+        parameters: Parameters of their figures; None for the defaults.
+
+    Raises:
+        StemmapError: The run is damaged, or a plot cannot be used.
+    """
+    run, frame = read_run(folder), read_map_frame(folder)
+    trees = run.trees
+    ground = ground_heights(folder, trees.position) + frame.z
+    values = (
+        trees.number,
+        100.0 * trees.dbh,
+        100.0 * trees.dbh_sigma,
+        0.25 * math.pi * np.square(trees.dbh),
+        np.sqrt(trees.covariance[:, 0, 0]),
+        np.sqrt(trees.covariance[:, 1, 1]),
+        ground,
+        trees.position[:, 0],
+        trees.position[:, 1],
+        trees.observations,
+        np.where(trees.coverage > 0.0, np.degrees(trees.coverage), np.nan),
+        trees.eccentricity,
+    )
+    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3)
+    columns = {
+        field.name: v if v.dtype.kind == "i" else np.round(v, d)
+        for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)
+    }
+    shapes: list[tuple[str, Any, dict[str, float]]] = []
+    if plots:
+        result = stand_of(folder, parameters or Stand(), plots)
+        for plot in result.plots:
+            f = result.figures[plot.name]
+            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": float(f.trees)}
+            figures.update({name: f.values[name].value for name in FIGURES})
+            shapes.append((plot.name, shapely.transform(plot.shape, frame.to_crs), figures))
+    path = frame.to_crs(np.stack([run.path.x, run.path.y], axis=1))
+    return ExportedRun(
+        folder, run, frame, frame.to_crs(trees.position), columns, path, tuple(shapes), read_terrain(folder)
+    )
+
+
+def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
+    """Write a run to a file whose suffix gives the format; return all files that were written.
+
+    Files are complete or absent: they are written elsewhere first.
+
+    Raises:
+        StemmapError: The suffix is unknown, a package is missing, or the run lacks what the format shows.
+        OSError: The file cannot be written.
+    """
+    writer = WRITERS.get(file.suffix.lower())
+    if writer is None:
+        raise StemmapError(
+            f"{file.name!r} has an unknown format", remedy=f"Formats: {', '.join(WRITERS)}, or tree-manager"
+        )
+    with TemporaryDirectory(prefix=".export-", dir=file.parent) as folder:
+        writer(run, FilePath(folder) / file.name)
+        written = []
+        for part in sorted(FilePath(folder).iterdir()):
+            os.replace(part, file.parent / part.name)  # noqa: PTH105 - over an existing file, everywhere
+            written.append(file.parent / part.name)
+    return written
+
+
+def _layers(run: ExportedRun) -> dict[str, Any]:
+    """Return the layers as GeoDataFrames by name: trees, and path, plots and contours where there are any."""
+    geopandas = needed("geopandas", "gis", "GIS files")
+    layers = {
+        "trees": geopandas.GeoDataFrame(
+            run.columns, geometry=shapely.points(run.place.reshape(-1, 2)), crs=run.crs
+        )
+    }
+    if len(run.path) > 1:
+        length = float(np.hypot(*np.diff(run.path, axis=0).T).sum())
+        layers["path"] = geopandas.GeoDataFrame(
+            {"scans": [len(run.path)], "length_m": [round(length, 2)]},
+            geometry=[shapely.LineString(run.path)],
+            crs=run.crs,
+        )
+    if run.plots:
+        names = list(run.plots[0][2])
+        layers["plots"] = geopandas.GeoDataFrame(
+            {
+                "plot": [name for name, _, _ in run.plots],
+                **{key: [round(figures[key], 4) for _, _, figures in run.plots] for key in names},
+            },
+            geometry=[shape for _, shape, _ in run.plots],
+            crs=run.crs,
+        )
+    lines = contours(run)
+    if lines:
+        layers["contours"] = geopandas.GeoDataFrame(
+            {"z_m": [z for z, _ in lines]},
+            geometry=[shapely.LineString(line) for _, line in lines],
+            crs=run.crs,
+        )
+    return layers
+
+
+def _write_layers(run: ExportedRun, file: FilePath) -> None:
+    import pyogrio
+
+    pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")})
+    try:
+        for name, layer in _layers(run).items():
+            pyogrio.write_dataframe(layer, file, layer=name, driver="GPKG", append=file.exists())
+    finally:
+        pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": None})
+    _write_styles(file)
+
+
+def _write_styles(file: FilePath) -> None:
+    """Add the styles that QGIS reads from a GeoPackage by default (table layer_styles)."""
+    database = sqlite3.connect(file)
+    try:
+        tables = [row[0] for row in database.execute("SELECT table_name FROM gpkg_contents")]
+        database.execute(
+            "CREATE TABLE layer_styles (id INTEGER PRIMARY KEY AUTOINCREMENT, f_table_catalog TEXT(256), "
+            "f_table_schema TEXT(256), f_table_name TEXT(256), f_geometry_column TEXT(256), "
+            "styleName TEXT(30), styleQML TEXT, styleSLD TEXT, useAsDefault BOOLEAN, description TEXT, "
+            "owner TEXT(30), ui TEXT(30), update_time DATETIME)"
+        )
+        date = _DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")
+        database.execute(
+            "INSERT INTO gpkg_contents (table_name, data_type, identifier, description, last_change, srs_id) "
+            "VALUES ('layer_styles', 'attributes', 'layer_styles', '', ?, 0)",
+            (date,),
+        )
+        for table in tables:
+            database.execute(
+                "INSERT INTO layer_styles (f_table_catalog, f_table_schema, f_table_name, f_geometry_column, "
+                "styleName, styleQML, styleSLD, useAsDefault, description, owner, update_time) "
+                "VALUES ('', '', ?, 'geom', ?, ?, '', 1, 'stemmap', 'stemmap', ?)",
+                (table, table, _STYLES[table], date),
+            )
+        database.commit()
+    finally:
+        database.close()
+
+
+def _qml(kind: str, symbol: str, layer: str, properties: dict[str, str], extra: str = "") -> str:
+    options = "".join(f'<Option name="{k}" type="QString" value="{v}"/>' for k, v in properties.items())
+    return (
+        f'<!DOCTYPE qgis PUBLIC "http://mrcc.com/qgis.dtd" "SYSTEM"><qgis version="3.28" '
+        f'styleCategories="Symbology"><renderer-v2 type="singleSymbol"><symbols>'
+        f'<symbol type="{kind}" name="0">'
+        f'<layer class="{symbol}"><Option type="Map">{options}</Option>{layer}</layer></symbol></symbols>'
+        f"</renderer-v2>{extra}</qgis>"
+    )
+
+
+_BY_DBH = (
+    '<data_defined_properties><Option type="Map"><Option name="properties" type="Map">'
+    '<Option name="size" type="Map"><Option name="active" type="bool" value="true"/>'
+    '<Option name="expression" type="QString" value="coalesce(&quot;dbh_cm&quot; / 100, 0.1)"/>'
+    '<Option name="type" type="int" value="3"/></Option></Option>'
+    '<Option name="type" type="QString" value="collection"/></Option></data_defined_properties>'
+)
+#: Styles of the layers: trees are circles with their diameter in metres on the map.
+_STYLES = {
+    "trees": _qml(
+        "marker",
+        "SimpleMarker",
+        _BY_DBH,
+        {"color": "47,125,50,255", "outline_color": "20,60,25,255", "size": "0.3", "size_unit": "MapUnit"},
+    ),
+    "path": _qml("line", "SimpleLine", "", {"line_color": "31,90,180,255", "line_width": "0.4"}),
+    "plots": _qml(
+        "fill",
+        "SimpleFill",
+        "",
+        {"color": "230,140,20,40", "outline_color": "200,110,0,255", "style": "solid"},
+    ),
+    "contours": _qml("line", "SimpleLine", "", {"line_color": "150,110,70,255", "line_width": "0.15"}),
+}
+
+
+def _write_shapefiles(run: ExportedRun, file: FilePath) -> None:
+    import pyogrio
+
+    short = {field.name: field.short for field in TREE_FIELDS} | PLOT_SHORT
+    for name, layer in _layers(run).items():
+        part = file if name == "trees" else file.with_name(f"{file.stem}_{name}{file.suffix}")
+        table = layer.rename(columns=short).set_crs(run.frame.crs or None, allow_override=True)
+        options = {"DBF_DATE_LAST_UPDATE": _DATE.strftime("%Y-%m-%d"), "ENCODING": "UTF-8"}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a file without a reference system
+            pyogrio.write_dataframe(table, part, driver="ESRI Shapefile", layer_options=options)
+        if not run.frame.crs:
+            part.with_suffix(".prj").unlink(missing_ok=True)
+
+
+def _write_geojson(run: ExportedRun, file: FilePath) -> None:
+    lon_lat = None
+    if run.frame.crs:
+        import pyproj
+
+        transformer = pyproj.Transformer.from_crs(run.frame.crs, 4326, always_xy=True)
+        lon_lat = np.stack(transformer.transform(*run.place.T), axis=1).reshape(-1, 2)
+    file.write_text(geojson(run.run.trees, 0, lon_lat=lon_lat), encoding="utf-8", newline="")
+
+
+def _write_dxf(run: ExportedRun, file: FilePath) -> None:
+    ezdxf = needed("ezdxf", "gis", "DXF files")
+    before = ezdxf.options.write_fixed_meta_data_for_testing
+    ezdxf.options.write_fixed_meta_data_for_testing = True
+    try:
+        drawing = ezdxf.new("R2010", units=ezdxf.units.M)
+        drawing.header.custom_vars.append("CRS", run.frame.name)
+        drawing.header.custom_vars.append("Program", f"stemmap {version()}")
+        for layer, colour in (("TREES", 3), ("LABELS", 7), ("PATH", 5), ("PLOTS", 30), ("CONTOURS", 33)):
+            drawing.layers.add(layer, color=colour)
+        space = drawing.modelspace()
+        columns = run.columns
+        for k, (x, y) in enumerate(run.place.tolist()):
+            z = float(np.nan_to_num(columns["z_m"][k]))
+            dbh = float(columns["dbh_cm"][k])
+            space.add_point((x, y, z), dxfattribs={"layer": "TREES"})
+            if math.isfinite(dbh):
+                space.add_circle((x, y, z), 0.005 * dbh, dxfattribs={"layer": "TREES"})
+            text = f"{columns['tree'][k]}" + (f" {dbh:.0f}" if math.isfinite(dbh) else "")
+            label = space.add_text(text, height=0.25, dxfattribs={"layer": "LABELS"})
+            label.set_placement((x + 0.2, y + 0.2, z))
+        if len(run.path) > 1:
+            space.add_lwpolyline(run.path.tolist(), dxfattribs={"layer": "PATH"})
+        for name, shape, _ in run.plots:
+            for part in getattr(shape, "geoms", [shape]):
+                for ring in (part.exterior, *part.interiors):
+                    space.add_lwpolyline(list(ring.coords), close=True, dxfattribs={"layer": "PLOTS"})
+            label = space.add_text(name, height=0.5, dxfattribs={"layer": "PLOTS"})
+            label.set_placement(tuple(shape.centroid.coords[0]))
+        for z, line in contours(run):
+            space.add_lwpolyline(line.tolist(), dxfattribs={"layer": "CONTOURS", "elevation": z})
+        drawing.saveas(file)
+    finally:
+        ezdxf.options.write_fixed_meta_data_for_testing = before
+
+
+def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
+    xlsxwriter = needed("xlsxwriter", "gis", "XLSX files")
+    book = xlsxwriter.Workbook(str(file), {"nan_inf_to_errors": False, "strings_to_formulas": False})
+    book.set_properties({"created": _DATE.replace(tzinfo=None), "comments": f"stemmap {version()}"})
+    bold = book.add_format({"bold": True})
+    first, second = ("east_m", "north_m") if run.frame.crs else ("x_m", "y_m")
+    place = {first: np.round(run.place[:, 0], 3), second: np.round(run.place[:, 1], 3)}
+    number = run.columns["tree"]
+    _sheet(book, "trees", {"tree": number, **place, **run.columns}, bold)
+    if run.plots:
+        table: dict[str, Any] = {"plot": [name for name, _, _ in run.plots]}
+        for key in run.plots[0][2]:
+            table[key] = np.array([figures[key] for _, _, figures in run.plots])
+        _sheet(book, "plots", table, bold)
+    fields = [*TREE_FIELDS, Field(first, "", "m", f"coordinate in {run.frame.name}")]
+    fields.append(Field(second, "", "m", f"coordinate in {run.frame.name}"))
+    units = {"field": [f.name for f in fields], "unit": [f.unit for f in fields]}
+    figures = {"field": list(FIGURES), "unit": [u for _, u in FIGURES.values()]}
+    _sheet(
+        book,
+        "fields",
+        {
+            "field": units["field"] + (figures["field"] if run.plots else []),
+            "unit": units["unit"] + (figures["unit"] if run.plots else []),
+            "meaning": [f.meaning for f in fields] + ([t for t, _ in FIGURES.values()] if run.plots else []),
+        },
+        bold,
+    )
+    about = {
+        "program": f"stemmap {version()}",
+        "source": run.run.uri,
+        "coordinates": run.frame.name,
+        "georeference": run.frame.how or "none",
+    }
+    _sheet(book, "about", {"what": list(about), "value": list(about.values())}, bold)
+    book.close()
+
+
+def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # noqa: ANN401
+    sheet = book.add_worksheet(name)
+    sheet.freeze_panes(1, 0)
+    for column, (title, values) in enumerate(table.items()):
+        sheet.write_string(0, column, title, bold)
+        longest = len(title)
+        for row, value in enumerate(values, start=1):
+            if isinstance(value, str):
+                sheet.write_string(row, column, value)
+                longest = max(longest, len(value))
+            elif math.isfinite(value):  # a field without a value is empty
+                sheet.write_number(row, column, float(value))
+        sheet.set_column(column, column, min(longest + 2, 60))
+
+
+def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
+    """Return the terrain as a north-up raster in the coordinates of the files, rows from north to south, NaN
+    where unknown, with west and north of its corner [m]; None without terrain. A turned map is resampled
+    linearly from the centres of its cells.
+
+    Raises:
+        SourceError: The raster would be too large.
+    """
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.spatial import cKDTree
+
+    if not len(run.terrain):
+        return None
+    place, z = run.frame.to_crs(run.terrain[:, :2]), run.terrain[:, 2] + run.frame.z
+    cell = TERRAIN_CELL
+    low = np.floor(place.min(axis=0) / cell) * cell
+    high = np.floor(place.max(axis=0) / cell) * cell + cell
+    width, height = np.round((high - low) / cell).astype(int)
+    if width * height > _CELLS_MAX:
+        raise SourceError("the terrain covers too large an area", where=str(run.folder))
+    raster = np.full((height, width), np.nan)
+    aligned = abs(math.remainder(run.frame.pose.yaw, math.tau)) < 1e-12 and len(
+        np.unique(place, axis=0)
+    ) == len(z)
+    on_grid = np.abs((place - low) / cell - np.floor((place - low) / cell) - 0.5) < 1e-3
+    if aligned and on_grid.all():
+        column, row = np.floor((place - low) / cell).astype(int).T
+        raster[height - 1 - row, column] = z
+    else:
+        x, y = low[0] + (np.arange(width) + 0.5) * cell, high[1] - (np.arange(height) + 0.5) * cell
+        nodes = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        distance, nearest = cKDTree(place).query(nodes)
+        values = z[nearest]
+        if len(z) > 3 and np.linalg.matrix_rank(place - place.mean(axis=0)) == 2:
+            linear = LinearNDInterpolator(place - low, z)(nodes - low)
+            values = np.where(np.isfinite(linear), linear, values)
+        raster = np.where(distance <= 0.75 * cell, values, np.nan).reshape(height, width)
+    return raster, float(low[0]), float(high[1])
+
+
+def contours(run: ExportedRun) -> list[tuple[float, Float]]:
+    """Return height and line, shape (N, 2), of contours every CONTOUR_STEP metres; none without terrain."""
+    found = terrain_raster(run)
+    if found is None or min(found[0].shape) < 2:
+        return []
+    contourpy = needed("contourpy", "gis", "contours")
+    raster, west, north = found
+    x = west + (np.arange(raster.shape[1]) + 0.5) * TERRAIN_CELL
+    y = north - (np.arange(raster.shape[0]) + 0.5) * TERRAIN_CELL
+    generator = contourpy.contour_generator(x - west, y - north, np.ma.masked_invalid(raster))
+    low, high = np.nanmin(raster), np.nanmax(raster)
+    levels = np.arange(math.ceil(low / CONTOUR_STEP), math.floor(high / CONTOUR_STEP) + 1) * CONTOUR_STEP
+    return [
+        (float(level), line + np.array([west, north]))
+        for level in levels
+        for line in generator.lines(level)
+        if len(line) > 2
+    ]
+
+
+def _write_geotiff(run: ExportedRun, file: FilePath) -> None:
+    tifffile = needed("tifffile", "gis", "GeoTIFF files")
+    found = terrain_raster(run)
+    if found is None:
+        raise StemmapError("the run has no terrain", where=str(run.folder))
+    raster, west, north = found
+    tags: list[tuple[Any, ...]] = [
+        (33550, "d", 3, (TERRAIN_CELL, TERRAIN_CELL, 0.0), True),  # ModelPixelScale
+        (33922, "d", 6, (0.0, 0.0, 0.0, west, north, 0.0), True),  # ModelTiepoint
+        (42113, "s", 0, "nan", True),  # GDAL_NODATA
+    ]
+    authority, _, code = run.frame.crs.partition(":")
+    if run.frame.crs and (authority != "EPSG" or not code.isdigit() or int(code) > 32766):
+        raise StemmapError(
+            f"a GeoTIFF needs a reference system with an EPSG code, not {run.frame.crs[:60]}",
+            remedy="Run stemmap georeference with --crs EPSG:CODE",
+        )
+    keys: tuple[int, ...]
+    if run.frame.crs:  # version 1.1.0; projected, pixels are areas, code of the system, metres
+        keys = (1, 1, 0, 4, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, int(code), 3076, 0, 1, 9001)
+    else:  # user-defined
+        text = "local|"
+        keys = (1, 1, 0, 3, 1024, 0, 1, 32767, 1025, 0, 1, 1, 1026, 34737, len(text), 0)
+        tags.append((34737, "s", 0, text, True))
+    tags.append((34735, "H", len(keys), keys, True))
+    tifffile.imwrite(
+        file, raster.astype(np.float32), compression="zlib", metadata=None, extratags=tags, datetime=False,
+        software="stemmap",
+    )  # fmt: skip
+
+
+WRITERS: dict[str, Callable[[ExportedRun, FilePath], None]] = {
+    ".gpkg": _write_layers,
+    ".shp": _write_shapefiles,
+    ".geojson": _write_geojson,
+    ".dxf": _write_dxf,
+    ".xlsx": _write_xlsx,
+    ".tif": _write_geotiff,
+}
