@@ -1,11 +1,13 @@
-"""The panel of viser: a widget for every declared parameter, and the commands of the scene to the server.
+"""The panel of viser: a slider for each of the main parameters, and the commands of the scene to the server.
 
-The tab Tune of the page shows the same declarations, see `static/js/tune/`.
+The tab Tune of the page has all parameters, see `static/js/tune/`. The page moves the sliders of the panel
+(`static/js/scene/panel.js`); what is typed into their number boxes arrives here.
 """
 
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -19,6 +21,7 @@ from pipeline.errors import StemmapError
 
 Value = float | int | bool | str
 CHANGED = "● "
+MAIN = tuple(spec for spec in field_specs() if spec.main)
 
 OnChange = Callable[[str, Value, viser.ClientHandle], None]
 OnPreset = Callable[[str, viser.ClientHandle], None]
@@ -26,7 +29,7 @@ OnReset = Callable[[list[str], viser.ClientHandle], None]
 
 
 class TunePanel:
-    """Sliders, a list of presets and reset buttons. All callbacks run in the thread of viser.
+    """Sliders, a list of presets and a reset button. All callbacks run in the thread of viser.
 
     Args:
         gui: Panel of viser, at the place of the new widgets.
@@ -43,14 +46,18 @@ class TunePanel:
         on_preset: OnPreset,
         on_reset: OnReset,
     ) -> None:
-        self._on_change, self._on_reset = on_change, on_reset
-        self._widgets: dict[str, viser.GuiInputHandle[Any]] = {}
-        self._folders: dict[str, viser.GuiFolderHandle] = {}
+        self._on_change = on_change
+        self._widgets: dict[str, viser.GuiSliderHandle[Any]] = {}
         self._preset = gui.add_dropdown(
             "Preset", tuple(PRESETS), initial_value=preset_name, hint=_preset_hint()
         )
         self._summary = gui.add_markdown("")
-        self._add_reset(gui, "Reset all", [])
+        button = gui.add_button("Reset all", color="gray", hint="Reset to the values of the preset.")
+
+        @button.on_click
+        async def _(event: viser.GuiEvent[Any]) -> None:
+            if event.client is not None:
+                on_reset([], event.client)
 
         @self._preset.on_update
         async def _(event: viser.GuiEvent[Any]) -> None:
@@ -58,11 +65,11 @@ class TunePanel:
                 on_preset(event.target.value, event.client)
 
         values = parameters.flat()
-        stages: dict[str, list[FieldSpec]] = {}
-        for spec in field_specs():
-            stages.setdefault(spec.stage, []).append(spec)
-        for stage, specs in stages.items():
-            self._add_stage(gui, stage, specs, values)
+        for stage, specs in itertools.groupby(MAIN, lambda spec: spec.stage):
+            with gui.add_folder(stage):
+                for spec in specs:
+                    self._widgets[spec.name] = self._add_widget(gui, spec, values[spec.name])
+        gui.add_markdown("All parameters are in the tab *Tune*.")
         self.show(parameters, preset_name, frozenset())
 
     def show(self, parameters: Parameters, preset_name: str, moving: frozenset[str]) -> None:
@@ -74,32 +81,25 @@ class TunePanel:
         """
         changed = parameters.changes_from(preset(preset_name))
         values = parameters.flat()
-        for spec in field_specs():
-            widget = self._widgets[spec.name]
+        for spec in MAIN:
+            widget, value = self._widgets[spec.name], values[spec.name]
+            widget.min, widget.max = _range(spec, value)
             if spec.name not in moving:
-                set_value(widget, _shown(spec, values[spec.name]))
+                set_value(widget, _kind(spec)(value))
             widget.label = _label(spec, spec.name in changed)
-        for stage, folder in self._folders.items():
-            count = sum(spec.stage == stage and spec.name in changed for spec in field_specs())
-            folder.label = f"{CHANGED}{stage} ({count} changed)" if count else stage
         set_value(self._preset, preset_name)
         self._summary.content = _summary(len(changed), preset_name)
 
-    def widget(self, name: str) -> viser.GuiInputHandle[Any]:
-        """Return the widget of a parameter, by its dotted name."""
+    def widget(self, name: str) -> viser.GuiSliderHandle[Any]:
+        """Return the slider of a parameter, by its dotted name."""
         return self._widgets[name]
 
-    def _add_stage(
-        self, gui: viser.GuiApi, stage: str, specs: list[FieldSpec], values: dict[str, Value]
-    ) -> None:
-        self._folders[stage] = gui.add_folder(stage, expand_by_default=stage in ("Clustering", "Detection"))
-        with self._folders[stage]:
-            for spec in specs:
-                self._widgets[spec.name] = self._add_widget(gui, spec, values[spec.name])
-            self._add_reset(gui, f"Reset {stage.lower()}", [spec.name for spec in specs])
-
-    def _add_widget(self, gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiInputHandle[Any]:
-        widget = make_widget(gui, spec, value)
+    def _add_widget(self, gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiSliderHandle[Any]:
+        kind = _kind(spec)
+        low, high = _range(spec, value)
+        step = kind(spec.step or 1) if kind is int else (spec.step or 1.0) / 10  # digits of the number box
+        hint = f"{spec.doc} ({spec.name})"
+        widget = gui.add_slider(_label(spec, changed=False), low, high, step, kind(value), hint=hint)
 
         @widget.on_update
         async def _(event: viser.GuiEvent[Any]) -> None:
@@ -108,43 +108,21 @@ class TunePanel:
 
         return widget
 
-    def _add_reset(self, gui: viser.GuiApi, title: str, names: list[str]) -> None:
-        button = gui.add_button(title, color="gray", hint="Reset to the values of the preset.")
 
-        @button.on_click
-        async def _(event: viser.GuiEvent[Any]) -> None:
-            if event.client is not None:
-                self._on_reset(names, event.client)
+def _kind(spec: FieldSpec) -> type[int] | type[float]:
+    return int if spec.kind == "int" else float
 
 
-def make_widget(gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiInputHandle[Any]:
-    """Return a new widget for a parameter: a slider with a number box, a list or a switch.
-
-    Args:
-        gui: Panel of viser.
-        spec: Declaration of the parameter.
-        value: Initial value.
-    """
-    label = _label(spec, changed=False)
-    if spec.kind == "bool":
-        return gui.add_checkbox(label, bool(value), hint=spec.doc)
-    if spec.kind == "choice":
-        return gui.add_dropdown(label, spec.choices, initial_value=str(value), hint=spec.doc)
-    if spec.kind == "name":
-        # Changed on the page: here every typed letter would be a change.
-        return gui.add_text(label, str(value), disabled=True, hint=spec.doc)
-    kind = int if spec.kind == "int" else float
-    low, high, step = (kind(bound or 0) for bound in (spec.minimum, spec.maximum, spec.step))
-    return gui.add_slider(label, low, high, step, kind(value), hint=f"{spec.doc} ({spec.name})")
+def _range(spec: FieldSpec, value: Value) -> tuple[float, float]:
+    """Return the ends of a slider: those declared, or the value if it is beyond them."""
+    low, high = spec.shown or (0.0, 1.0)
+    kind = _kind(spec)
+    return kind(min(low, float(value))), kind(max(high, float(value)))
 
 
 def _label(spec: FieldSpec, changed: bool) -> str:
     unit = f" [{spec.unit}]" if spec.unit else ""
     return f"{CHANGED if changed else ''}{spec.title}{unit}"
-
-
-def _shown(spec: FieldSpec, value: Value) -> Value:
-    return float(value) if spec.kind == "float" else value
 
 
 def _meant(spec: FieldSpec, value: Value) -> Value:

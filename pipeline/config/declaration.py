@@ -23,7 +23,17 @@ class Stage(BaseModel):
         return (cls.__doc__ or cls.__name__).partition(":")[0].strip()
 
 
-def number(default: float, title: str, unit: str, low: float, high: float, step: float) -> Any:  # noqa: ANN401 - pydantic's Field is the default of a field of any type
+def number(
+    default: float,
+    title: str,
+    unit: str,
+    low: float,
+    high: float,
+    step: float,
+    shown: tuple[float, float] | None = None,
+    *,
+    main: bool = False,
+) -> Any:  # noqa: ANN401 - pydantic's Field is the default of a field of any type
     """Return the declaration of a floating-point parameter.
 
     Args:
@@ -31,14 +41,18 @@ def number(default: float, title: str, unit: str, low: float, high: float, step:
         title: Label of the slider.
         unit: Unit symbol; empty if dimensionless.
         low, high: Bounds, inclusive.
-        step: Increment of the slider.
+        step: Increment of the slider by a key.
+        shown: Range of the slider. By default, from a tenth to ten times of a positive default within the
+            bounds, else the bounds.
+        main: Whether the parameter has a slider next to the 3D scene.
     """
-    return Field(
-        default=default, title=title, ge=low, le=high, json_schema_extra={"unit": unit, "step": step}
-    )
+    if shown is None:
+        shown = (max(low, default / 10), min(high, default * 10)) if default > 0.0 <= low else (low, high)
+    extra: dict[str, Any] = {"unit": unit, "step": step, "shown": list(shown), "main": main}
+    return Field(default=default, title=title, ge=low, le=high, json_schema_extra=extra)
 
 
-def count(default: int, title: str, unit: str, low: int, high: int) -> Any:  # noqa: ANN401
+def count(default: int, title: str, unit: str, low: int, high: int, *, main: bool = False) -> Any:  # noqa: ANN401
     """Return the declaration of an integer parameter.
 
     Args:
@@ -46,8 +60,9 @@ def count(default: int, title: str, unit: str, low: int, high: int) -> Any:  # n
         title: Label of the slider.
         unit: Unit symbol; empty if dimensionless.
         low, high: Bounds, inclusive.
+        main: Whether the parameter has a slider next to the 3D scene.
     """
-    return number(default, title, unit, low, high, 1)
+    return number(default, title, unit, low, high, 1, main=main)
 
 
 def name(default: str, title: str, pattern: str) -> Any:  # noqa: ANN401

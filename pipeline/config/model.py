@@ -173,6 +173,9 @@ class FieldSpec:
         doc: One sentence of explanation.
         kind: Type of the value.
         minimum, maximum, step: Bounds and slider increment of a number, else None.
+        shown: Range of the slider of a number, else None.
+        log: Whether the slider is logarithmic: its range is positive and spans a factor of 8 or more.
+        main: Whether the parameter has a slider next to the 3D scene.
         choices: Valid words of a choice, else empty.
         default: Value in the preset `forest`.
     """
@@ -186,6 +189,9 @@ class FieldSpec:
     minimum: float | None
     maximum: float | None
     step: float | None
+    shown: tuple[float, float] | None
+    log: bool
+    main: bool
     choices: tuple[str, ...]
     default: Value
 
@@ -219,7 +225,8 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
         kind = "name"
     else:
         kind = "float"
-    step = extra.get("step")
+    step, shown = extra.get("step"), extra.get("shown")
+    low, high = (float(str(end)) for end in shown) if isinstance(shown, list) else (0.0, 0.0)  # of a number
     return FieldSpec(
         name=f"{stage_name}.{name}",
         stage=stage_model.title(),
@@ -230,6 +237,9 @@ def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
         minimum=None if minimum is None else float(minimum.ge),
         maximum=None if maximum is None else float(maximum.le),
         step=None if not isinstance(step, int | float) else float(step),
+        shown=(low, high) if shown else None,
+        log=0.0 < 8.0 * low <= high,
+        main=bool(extra.get("main")),
         choices=choices,
         default=field.default,
     )

@@ -56,25 +56,25 @@ class Acquisition(Stage):
 class Filters(Stage):
     """Filters: the pass-through box in the sensor frame and the voxel grid (Eq. 2)."""
 
-    x_min: float = number(-40.0, "x min", "m", -100.0, 100.0, 0.1)
+    x_min: float = number(-40.0, "x min", "m", -100.0, 100.0, 0.1, (-50.0, 50.0), main=True)
     """Rear face of the pass-through box."""
 
-    x_max: float = number(40.0, "x max", "m", -100.0, 100.0, 0.1)
+    x_max: float = number(40.0, "x max", "m", -100.0, 100.0, 0.1, (-50.0, 50.0), main=True)
     """Front face of the pass-through box."""
 
-    y_min: float = number(-40.0, "y min", "m", -100.0, 100.0, 0.1)
+    y_min: float = number(-40.0, "y min", "m", -100.0, 100.0, 0.1, (-50.0, 50.0), main=True)
     """Right face of the pass-through box."""
 
-    y_max: float = number(40.0, "y max", "m", -100.0, 100.0, 0.1)
+    y_max: float = number(40.0, "y max", "m", -100.0, 100.0, 0.1, (-50.0, 50.0), main=True)
     """Left face of the pass-through box."""
 
-    z_min: float = number(-20.0, "z min", "m", -50.0, 50.0, 0.05)
+    z_min: float = number(-20.0, "z min", "m", -50.0, 50.0, 0.05, (-20.0, 20.0), main=True)
     """Lower face of the pass-through box."""
 
-    z_max: float = number(20.0, "z max", "m", -50.0, 50.0, 0.05)
+    z_max: float = number(20.0, "z max", "m", -50.0, 50.0, 0.05, (-20.0, 20.0), main=True)
     """Upper face of the pass-through box."""
 
-    voxel_size: float = number(0.01, "Voxel size", "m", 0.0, 1.0, 0.005)
+    voxel_size: float = number(0.01, "Voxel size", "m", 0.0, 1.0, 0.001, (0.005, 0.2), main=True)
     """Points in a cube of this edge length are replaced by their mean; 0 turns the filter off."""
 
     @model_validator(mode="after")
@@ -116,10 +116,10 @@ class Clustering(Stage):
     dimensions: int = count(2, "Dimensions", "", 2, 3)
     """2 clusters the horizontal projection, 3 the 3D points."""
 
-    eps: float = number(0.15, "Radius eps", "m", 0.01, 5.0, 0.01)
+    eps: float = number(0.15, "Radius eps", "m", 0.01, 5.0, 0.01, (0.05, 1.0), main=True)
     """Maximum distance between neighbouring points (DBSCAN eps)."""
 
-    min_points: int = count(8, "Minimum points", "", 1, 500)
+    min_points: int = count(8, "Minimum points", "", 1, 500, main=True)
     """Neighbours, including the point itself, that make a point a core point (DBSCAN min_samples)."""
 
     stem_area: float = number(0.1, "Stem area", "m²", 0.0, 10.0, 0.01)
@@ -147,13 +147,15 @@ class Detection(Stage):
     whole: bool = choice(True, "Whole trunks only")
     """Reject clusters that are cut off by the box, the range limit or the edge of the field of view."""
 
-    e_min: float = number(1.0, "Minimum eccentricity", "", 1.0, 1000.0, 0.5)
+    e_min: float = number(1.0, "Minimum eccentricity", "", 1.0, 1000.0, 0.1, (1.0, 30.0), main=True)
     """Clusters with a smaller lambda1 / lambda2 are rejected as too round."""
 
-    e_max: float = number(60.0, "Maximum eccentricity", "", 1.0, 1000.0, 0.5)
+    e_max: float = number(60.0, "Maximum eccentricity", "", 1.0, 1000.0, 0.5, (3.0, 300.0), main=True)
     """Clusters with a larger lambda1 / lambda2 are rejected as too long."""
 
-    cylindrical_stddev_thresh: float = number(0.06, "Maximum radial deviation", "m", 0.001, 2.0, 0.005)
+    cylindrical_stddev_thresh: float = number(
+        0.06, "Maximum radial deviation", "m", 0.001, 2.0, 0.005, main=True
+    )
     """Maximum standard deviation of the distances to the stem axis."""
 
     radius_min: float = number(0.04, "Minimum radius", "m", 0.0, 2.0, 0.01)
@@ -231,7 +233,7 @@ class Slam(Stage):
     merge_gate: float = number(1.0, "Merge gate", "sigma", 0.0, 10.0, 0.1)
     """Landmarks within this Mahalanobis distance of which a scan shows only one are merged; 0 is off."""
 
-    resample_below: float = number(0.5, "Resampling threshold", "", 0.0, 1.0, 0.05)
+    resample_below: float = number(0.5, "Resampling threshold", "", 0.0, 1.0, 0.05, (0.0, 1.0))
     """The filter resamples when N_eff falls below this fraction of the particles."""
 
     update_distance: float = number(0.0, "Update distance", "m", 0.0, 10.0, 0.05)
@@ -272,7 +274,7 @@ class Classification(Stage):
     voxels_log2: int = count(19, "Memory (log2 voxels)", "", 12, 24)
     """Binary logarithm of the maximum number of voxels; the oldest half is removed when the map is full."""
 
-    tree_share: float = number(0.4, "Tree threshold", "", 0.0, 1.0, 0.05)
+    tree_share: float = number(0.4, "Tree threshold", "", 0.0, 1.0, 0.05, (0.0, 1.0))
     """Minimum share of votes for tree that makes a column a tree."""
 
     forest: str = name("package", "Classifier", r"^(package|[0-9a-f]{16})$")

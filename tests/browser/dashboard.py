@@ -212,6 +212,13 @@ class Dashboard:
         self._has_scene = True
         self.scene.wait_for_function(HAS_NODE, arg="/world/robot/scan/raw")
 
+    def until_scene_is_named(self) -> None:
+        """Wait until the page has named the sliders of the scene."""
+        self.scene.wait_for_function(
+            "() => { const all = [...document.querySelectorAll('.mantine-Slider-root [role=slider]')];"
+            " return all.length > 0 && all.every(node => node.getAttribute('aria-label')); }"
+        )
+
     def row(self, label: str) -> Locator:
         """The row of a parameter in the Tune panel, by the text of its label."""
         text = self.scene.get_by_text(label, exact=False).first

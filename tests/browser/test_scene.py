@@ -36,13 +36,15 @@ def test_the_eps_slider_changes_the_clusters_of_the_current_scan(dashboard: Dash
     before = dashboard.clusters()
     assert before > 3
     box = dashboard.row("Radius eps").locator("input[type=text]")
-    box.fill("5")  # all stems in one
+    box.fill("0.05")  # the stems fall apart
     box.press("Tab")
-    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 5")
-    dashboard.until("was => Number(document.querySelector('[data-clusters]').dataset.clusters) < was", before)
+    dashboard.until_server("/api/parameters", "it.values['clustering.eps'] === 0.05")
+    dashboard.until(
+        "was => Number(document.querySelector('[data-clusters]').dataset.clusters) !== was", before
+    )
     expect(dashboard.scene.get_by_text("● Radius eps")).to_be_visible()
     expect(dashboard.page.locator("#preset")).to_have_text("● forest, 1 changed")
-    dashboard.scene.get_by_role("button", name="Reset clustering").click()
+    dashboard.scene.get_by_role("button", name="Reset all").click()
     dashboard.until_server("/api/parameters", "it.changed.length === 0")
     dashboard.until(
         "was => Number(document.querySelector('[data-clusters]').dataset.clusters) === was", before
@@ -52,10 +54,13 @@ def test_the_eps_slider_changes_the_clusters_of_the_current_scan(dashboard: Dash
     dashboard.tab("Tune")
     eps.fill("0.3")
     eps.press("Enter")
+    dashboard.tab("Trees")  # the panel of the scene is closed beside the tab Tune
     expect(box).to_have_value("0.3")  # both are in step
     box.fill("0.4")
     box.press("Tab")
+    dashboard.tab("Tune")
     expect(eps).to_have_value("0.4")
+    dashboard.tab("Trees")
 
 
 def test_the_eps_slider_moves_by_the_keyboard(dashboard: Dashboard):
@@ -68,12 +73,74 @@ def test_the_eps_slider_moves_by_the_keyboard(dashboard: Dashboard):
 
 
 def test_a_contradictory_value_is_reverted_with_the_reason(dashboard: Dashboard):
+    set_maximum = dashboard.row("Maximum eccentricity").locator("input[type=text]")
+    set_maximum.fill("20")
+    set_maximum.press("Tab")
+    dashboard.until_server("/api/parameters", "it.values['detection.e_max'] === 20")
     box = dashboard.row("Minimum eccentricity").locator("input[type=text]")
-    box.fill("900")
+    box.fill("25")
     box.press("Tab")
     expect(dashboard.scene.get_by_text("must be less than")).to_be_visible()
     expect(box).to_have_value("1")
-    assert dashboard.ask("/api/parameters")["changed"] == []
+    assert dashboard.ask("/api/parameters")["changed"] == ["detection.e_max"]
+
+
+# Of each slider of the scene: its label, and its thumb and the ends of its track in pixels of the page.
+SLIDERS = """() => [...document.querySelectorAll('.mantine-Slider-root')].map(root => {
+  const middle = (node) => {
+    const box = node.getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+  };
+  return [root.querySelector('[role=slider]').getAttribute('aria-label'),
+    ...middle(root.querySelector('[role=slider]'))];
+})"""
+
+
+def test_a_press_on_a_slider_changes_nothing_and_a_drag_is_one_step(dashboard: Dashboard):
+    page, scene = dashboard.page, dashboard.scene
+    dashboard.until_scene_is_named()
+    before = dashboard.ask("/api/parameters")
+    main = [spec for spec in before["specs"] if spec["main"]]
+    frame = page.locator("#scene").bounding_box()
+    assert frame is not None
+    steps = before["undo"]
+    for k, spec in enumerate(main):
+        scene.locator(".mantine-Slider-root").nth(k).scroll_into_view_if_needed()
+        label, x, y = scene.evaluate(SLIDERS)[k]
+        assert label.startswith(spec["title"])
+        # Off the centre of the thumb, where the pointer of a person lands.
+        page.mouse.move(frame["x"] + x + 3, frame["y"] + y)
+        page.mouse.down()
+        page.mouse.up()
+        pressed = dashboard.ask("/api/parameters")
+        assert (pressed["values"], pressed["undo"]) == (before["values"], steps), spec["name"]
+        value = before["values"][spec["name"]]
+        towards = 1 if value < sum(spec["shown"]) / 2 else -1
+        page.mouse.down()
+        for travelled in range(1, 13):
+            page.mouse.move(frame["x"] + x + 3 + towards * travelled, frame["y"] + y)
+            if travelled == 6 and k == 0:
+                page.wait_for_timeout(2000)  # a person looks at the scene
+        page.mouse.up()
+        dashboard.until_server("/api/parameters", f"it.values['{spec['name']}'] !== {value}")
+        page.wait_for_timeout(100)
+        dragged = dashboard.ask("/api/parameters")
+        steps += 1
+        assert dragged["undo"] == steps, spec["name"]
+        moved = abs(dragged["values"][spec["name"]] - value)
+        whole = spec["shown"][1] - spec["shown"][0]
+        largest = abs(value) * (1.01**13 - 1) if spec["log"] else 13 / 400 * whole  # 1 % per pixel
+        assert moved <= largest + (1 if spec["kind"] == "int" else 0), spec["name"]
+        before = dragged
+
+
+def test_the_panel_of_the_scene_is_closed_while_tune_is_open(dashboard: Dashboard):
+    slider = dashboard.row("Radius eps").get_by_role("slider")
+    expect(slider).to_be_visible()
+    dashboard.tab("Tune")
+    expect(slider).not_to_be_visible()
+    dashboard.tab("Trees")
+    expect(slider).to_be_visible()
 
 
 def test_a_preset_is_chosen_in_the_scene(dashboard: Dashboard):

@@ -23,6 +23,7 @@ def test_a_search_finds_a_better_set_and_a_stopped_search_is_resumed(dashboard: 
     share.press("Enter")
     dashboard.until_server("/api/parameters", f"{SHARE} === 0.9")
 
+    page.get_by_text("Search for better values").click()
     page.locator("#search-open").click()
     rows = page.locator("#search-axes li")
     expect(rows).to_have_count(8)

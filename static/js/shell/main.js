@@ -18,6 +18,7 @@ import { startPlots } from "../plots/plots.js";
 import { startCamera } from "../scene/camera.js";
 import { startLayers } from "../scene/layers.js";
 import { startOverlay } from "../scene/overlay.js";
+import { startScenePanel } from "../scene/panel.js";
 import { startScene } from "../scene/scene.js";
 import { startStages } from "../scene/stages.js";
 import { startScores } from "../scores/scores.js";
@@ -32,6 +33,6 @@ import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startLayers, startKeys, startPalette, startDrawer, startWelcome, startShare]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLayers, startKeys, startPalette, startDrawer, startWelcome, startShare]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

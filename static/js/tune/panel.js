@@ -13,9 +13,10 @@ import { searchPart, startSearch } from "./search.js";
 import { sensitivityButton, startSensitivity } from "./sensitivity.js";
 
 const LARGEST_FILE = 100_000;
-const OPEN_FIRST = ["Clustering", "Detection"];
+const MAIN = "Main parameters";
+const FIRST_STAGES = ["Detection", "Clustering"]; // of the main parameters; those of the last one come first
 const rows = new Map(); // by the parameter's name
-const groups = new Map(); // by the stage
+const groups = new Map(); // by the stage; the main parameters have their own group
 let presetValues = {};
 
 const counts = el("section", { id: "tune-counts", "aria-label": "Effect of the last change on the clusters of this scan" });
@@ -30,34 +31,37 @@ function build() {
   } });
   const find = el("input", { id: "tune-find", type: "search", placeholder: "Find a parameter", "aria-label": "Find a parameter by name, stage or meaning", autocomplete: "off", oninput: sift });
   const only = el("input", { id: "tune-only", type: "checkbox", onchange: sift });
-  const stages = [...new Set(tuning.specs.map((spec) => spec.stage))].map(stageOf);
+  const main = tuning.specs.filter((spec) => spec.main).sort((a, b) => FIRST_STAGES.indexOf(b.stage) - FIRST_STAGES.indexOf(a.stage));
+  const others = tuning.specs.filter((spec) => !spec.main);
+  const parts = [groupOf(MAIN, main), ...[...new Set(others.map((spec) => spec.stage))].map((stage) => groupOf(stage, others.filter((spec) => spec.stage === stage)))];
   byId("panel-tune").replaceChildren(
     el("div", { class: "tune-head" },
       el("select", { id: "tune-set", "aria-label": "Preset or saved set", onchange: (event) => use(event.target.value) }),
       button("tune-undo", "Undo", "Undo the last parameter change (Ctrl+Z in this tab)", undo), button("tune-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo),
-      button("tune-compare", "A | B", "Compare two sets on this scan (C)", () => byId("compare-button").click())),
-    el("div", { class: "tune-files" },
-      button("tune-save", "Save as …", "Save these values on the server under a name", askName), button("tune-delete", "Delete", "Delete the saved set", dropSet),
-      el("a", { class: "small", id: "tune-download", href: "/api/parameters.toml", download: "parameters.toml", text: "Download", title: "These values as a TOML file, for --config of the command line" }),
-      button("tune-upload", "Upload", "Use the values of a TOML file", () => file.click()), file, el("span", { class: "grow" }), button("tune-reset", "Reset all", "Reset all values to the preset", () => reset([]))),
-    el("form", { id: "tune-name-form", class: "tune-files", hidden: true, onsubmit: saveSet },
-      el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
-      el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName })),
+      button("tune-reset", "Reset all", "Reset all values to the preset", () => reset([]))),
     el("p", { id: "tune-error", class: "error", role: "alert", hidden: true }),
-    counts, wholeRun, searchPart,
-    el("p", { id: "tune-summary", class: "note dim" }),
+    el("div", { class: "tune-effect" }, counts, wholeRun),
     el("div", { class: "tune-files" }, find, el("label", { class: "tune-only" }, only, " changed only")),
-    el("div", { id: "tune-rows" }, ...stages),
-    el("p", { id: "tune-none", class: "empty", hidden: true }));
+    el("div", { id: "tune-rows" }, ...parts),
+    el("p", { id: "tune-none", class: "empty", hidden: true }),
+    el("details", { class: "tune-part" }, el("summary", { text: "Sets and files" }),
+      el("p", { id: "tune-summary", class: "note dim" }),
+      el("div", { class: "tune-files" },
+        button("tune-save", "Save as …", "Save these values on the server under a name", askName), button("tune-delete", "Delete", "Delete the saved set", dropSet),
+        el("a", { class: "small", id: "tune-download", href: "/api/parameters.toml", download: "parameters.toml", text: "Download", title: "These values as a TOML file, for --config of the command line" }),
+        button("tune-upload", "Upload", "Use the values of a TOML file", () => file.click()), file),
+      el("form", { id: "tune-name-form", class: "tune-files", hidden: true, onsubmit: saveSet },
+        el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
+        el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName }))),
+    el("details", { class: "tune-part" }, el("summary", { text: "Search for better values" }), searchPart));
   show();
 }
 
-function stageOf(stage) {
-  const specs = tuning.specs.filter((spec) => spec.stage === stage);
+function groupOf(stage, specs) {
   for (const spec of specs) rows.set(spec.name, rowOf(spec, ...(spec.kind === "name" ? [] : [sensitivityButton(spec)])));
   const changedCount = el("small");
   const group = el("details", { "data-stage": stage }, el("summary", {}, stage, changedCount), ...specs.map(({ name }) => rows.get(name).node));
-  group.open = OPEN_FIRST.includes(stage);
+  group.open = stage === MAIN;
   groups.set(stage, { group, changedCount, specs, open: group.open });
   group.addEventListener("toggle", () => { if (!sifting()) groups.get(stage).open = group.open; });
   return group;
@@ -137,6 +141,7 @@ function showError() {
 }
 
 function askName() {
+  byId("tune-save").closest("details").open = true;
   byId("tune-name-form").hidden = false;
   byId("tune-name").value = state.parameters.set;
   byId("tune-name").focus();
@@ -197,12 +202,10 @@ function countsBeforeAfter() {
   names.sort((a, b) => (b === "tree") - (a === "tree") || (now[b] ?? 0) - (now[a] ?? 0));
   const total = (of) => Object.values(of).reduce((sum, number) => sum + number, 0);
   const pending = state.status?.revision < state.parameters?.revision;
-  const lead = pending ? `Mapping scan ${index} with the new values …`
-    : then ? `Scan ${index}: ${total(then)} → ${count(total(now), "cluster")} by the last change`
-    : `Scan ${index}: ${count(total(now), "cluster")}. ${state.status?.state === "playing" ? "Pause to compare before and after." : "Change a parameter to compare before and after."}`;
+  const lead = pending ? "Mapping this scan …" : then ? `${total(then)} → ${count(total(now), "cluster")}` : count(total(now), "cluster");
+  const title = `Scan ${index}${then ? ", before and after the last change" : state.status?.state === "playing" ? ". Pause to compare before and after a change." : ". Change a parameter to compare before and after."}`;
   const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
-  return [el("p", { class: "note dim", text: lead }),
-    el("ul", { class: "chips" }, ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
+  return [el("ul", { class: "chips", title }, el("li", { class: "lead", text: lead }), ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
       same.length ? el("li", { class: "same", text: `unchanged: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];
 }
 
@@ -213,7 +216,7 @@ function chip(name, then, now) {
 function truthChips(right, wrong, before) {
   if (right === null || right === undefined) return [];
   const ring = () => el("span", { class: "letter ring", "aria-hidden": "true" });
-  return [change("at a true tree", before?.right ?? null, right, ring()), change("not at a tree", before?.wrong ?? null, wrong, ring())];
+  return [change("true", before?.right ?? null, right, ring()), change("false", before?.wrong ?? null, wrong, ring())];
 }
 
 function change(name, then, now, sign) {

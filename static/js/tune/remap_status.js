@@ -8,10 +8,8 @@ import { changed, on, state } from "../core/store.js";
 import { attempt, isTuning } from "./parameters.js";
 
 const MOST = 30; // lines of the list
-const FOLDED_FROM = 9; // lines; a longer list would push the sliders out of view
 const SIGNS = { appeared: "+", vanished: "−", moved: "→" };
 let begun = null; // {share, at, left, estimatedAt}: start of the re-mapping, and the estimate of the time left [s]
-let known = 0; // lines of the list
 const progress = el("progress", { id: "tune-progress", max: "1", hidden: true, "aria-label": "Progress of the re-mapping" });
 const note = el("p", { id: "tune-whole-status", class: "note dim", role: "status" });
 const list = el("ul", { id: "tune-changes" });
@@ -19,8 +17,8 @@ const folded = el("summary");
 const all = el("details", { id: "tune-changes-all" }, folded, list);
 const box = el("input", { id: "tune-whole", type: "checkbox", onchange: () => attempt(() => put("/api/parameters/reach", { whole: box.checked })) });
 export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The whole run" },
-  el("label", { title: "On: each change re-maps the run from its first scan, so that the map and its scores follow. Off: changes apply from the current scan onwards" }, box, " re-map the whole run"),
-  progress, note, all);
+  el("label", { title: "On: each change re-maps the run from its first scan, so that the map and its scores follow. Off: changes apply from the current scan onwards" }, box, " whole run"),
+  note, progress, all);
 
 // Trees that remain under another number, as [before, now].
 const renumbered = ({ renamed }) => renamed.filter(([before, now]) => before !== now);
@@ -52,13 +50,13 @@ function left(share) {
   const guess = (spent * (1 - share)) / (share - begun.share);
   const before = begun.left === null ? guess : Math.max(begun.left - (now - begun.estimatedAt), 0);
   Object.assign(begun, { left: before + SMOOTH * (guess - before), estimatedAt: now });
-  return `, exact result in about ${roughly(begun.left)}`;
+  return `, about ${roughly(begun.left)} left`;
 }
 
 // The preview has no score: it is only roughly right.
 function progressText(share, preview) {
   const percent = `${Math.round(100 * share)} %${left(share)}`;
-  return `${preview ? `Preview (dashed in the map): about ${count(preview.places.length, "tree")}. ` : ""}Re-mapping the run: ${percent}`;
+  return `Re-mapping: ${percent}${preview ? `. Preview (dashed in the map): about ${count(preview.places.length, "tree")}` : ""}`;
 }
 
 function show() {
@@ -76,7 +74,7 @@ function show() {
     changed("ghost");
   }
   if (share !== null) setText(note, progressText(share, preview));
-  else setText(note, newest ? resultText(newest) : box.checked ? "Changes apply to the whole run: map, trees and scores follow." : "Changes apply from the current scan onwards.");
+  else setText(note, newest ? resultText(newest) : box.checked ? "Each change re-maps the run from its start." : "Changes apply from the current scan onwards.");
 }
 
 const lineOf = (kind, sign, node, why) => el("li", { "data-kind": kind }, el("b", { text: sign, "aria-hidden": "true" }), node, el("small", { text: why }));
@@ -91,8 +89,6 @@ function showChanges() {
       kind === "moved" && was.has(number) ? `${why}, ${was.get(number)}` : why)),
     ...[...was].filter(([now]) => !moved.has(now)).map(([now, before]) => lineOf("renumbered", "#", treeLink(now, ""), before))];
   setText(folded, `${count(lines.length, "change")}`);
-  if (lines.length !== known) all.open = lines.length < FOLDED_FROM;
-  known = lines.length;
   list.replaceChildren(...lines.slice(0, MOST), lines.length > MOST ? el("li", { text: `and ${lines.length - MOST} more` }) : "");
   show();
 }

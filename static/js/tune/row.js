@@ -2,27 +2,9 @@
 
 import { el } from "../core/dom.js";
 import { isChanged, isMoving, newGesture, redo, refuse, reset, setValue, shown, undo, valueOf } from "./parameters.js";
+import { beginDrag, FINE, fromPlace, pressed, toPlace } from "./slider.js";
 
-export const FINE = 1000; // positions of a slider
-const BENT = 3; // exponent of a slider whose usual values are near its lower end
-
-// A slider is nonlinear where a linear one would have all useful values within a few pixels.
-const power = ({ minimum, maximum, default: usual }) => (minimum >= 0 && usual - minimum < 0.2 * (maximum - minimum) ? BENT : 1);
-
-export function toPlace(spec, value) {
-  const part = (value - spec.minimum) / (spec.maximum - spec.minimum);
-  return Math.round(FINE * Math.min(1, Math.max(0, part)) ** (1 / power(spec)));
-}
-
-export function fromPlace(spec, place) {
-  return rounded(spec, spec.minimum + (spec.maximum - spec.minimum) * (place / FINE) ** power(spec));
-}
-
-function rounded(spec, value) {
-  const step = spec.step || 1;
-  const steps = Math.round((value - spec.minimum) / step);
-  return Math.min(spec.maximum, Math.max(spec.minimum, Number((spec.minimum + steps * step).toFixed(9))));
-}
+const THUMB = 16; // [px] width of the thumb
 
 // `further` are nodes next to the name. Returns {node, show}; `show` updates it to the values of the server.
 export function rowOf(spec, ...further) {
@@ -69,21 +51,26 @@ function number(spec, id) {
     slider.value = String(toPlace(spec, value));
     slider.setAttribute("aria-valuetext", shown(value, spec));
   };
-  let gesture = "";
-  const send = (value) => {
+  const send = (value, gesture = "") => {
     typed.value = String(value);
+    slider.value = String(toPlace(spec, value));
     setValue(spec.name, value, gesture);
   };
-  slider.addEventListener("pointerdown", () => { gesture = newGesture(); });
-  slider.addEventListener("input", () => send(fromPlace(spec, Number(slider.value))));
-  slider.addEventListener("change", () => { gesture = ""; }); // released
+  slider.addEventListener("pointerdown", (event) => {
+    if (event.button) return;
+    event.preventDefault();
+    slider.focus();
+    const { left, width } = slider.getBoundingClientRect(), gesture = newGesture();
+    const track = [left + THUMB / 2, left + width - THUMB / 2];
+    const thumb = track[0] + (track[1] - track[0]) * toPlace(spec, valueOf(spec.name)) / FINE;
+    beginDrag(event, spec, valueOf(spec.name), { thumb, track, valueAt: (part) => fromPlace(spec, FINE * part) }, (value) => send(value, gesture));
+  });
+  slider.addEventListener("input", () => send(fromPlace(spec, Number(slider.value)))); // of assistive technology
   slider.addEventListener("keydown", (event) => {
-    gesture = "";
-    const step = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10 }[event.key];
-    if (!step || event.ctrlKey || event.metaKey) return;
+    const value = pressed(spec, Number(typed.value), event);
+    if (value === null) return;
     event.preventDefault(); // by the step of the parameter, not of the slider
-    send(rounded(spec, Number(typed.value) + step * (spec.step || 1)));
-    slider.value = String(toPlace(spec, Number(typed.value)));
+    send(value);
   });
   const take = async () => {
     if (!typed.classList.replace("dirty", "clean")) return;

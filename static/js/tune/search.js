@@ -92,6 +92,7 @@ async function openForm(open) {
     for (const text of known.sensible) addAxis(...text.split("="));
   }
   form.hidden = !open;
+  if (open) searchPart.closest("details").open = true;
   show();
   if (open) goal.focus();
   else opener.focus();

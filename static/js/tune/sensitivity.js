@@ -7,7 +7,7 @@ import { roughly } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { line, svg, text } from "../core/svg.js";
 import { attempt, setValue, shown, specOf, valueOf } from "./parameters.js";
-import { FINE, fromPlace, toPlace } from "./row.js";
+import { FINE, fromPlace, toPlace } from "./slider.js";
 
 const POINTS = 17;
 const [WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [340, 154, 40, 12, 19, 28];

@@ -1,0 +1,80 @@
+// The panel of viser with the main parameters. The page moves its sliders, so that they behave as those of the tab Tune;
+// it names its widgets for screen readers, and collapses it while Tune is open.
+
+import { on } from "../core/store.js";
+import { newGesture, setValue, tuning, valueOf } from "../tune/parameters.js";
+import { beginDrag, near, pressed } from "../tune/slider.js";
+import { throttled } from "../core/timing.js";
+import { visible } from "../shell/tabs.js";
+import { onSceneLoad } from "./scene.js";
+
+const SLIDER = ".mantine-Slider-root", ROW = ".mantine-Flex-root";
+const NAMING_PAUSE = 500; // [ms]
+let inner = null; // document of the scene
+let collapsed = false; // by this page
+
+const rowOf = (node) => node.closest(SLIDER)?.parentElement.closest(ROW)?.parentElement.closest(ROW) ?? null;
+const labelOf = (row) => row?.firstElementChild?.textContent.replace("●", "").trim() ?? "";
+const specAt = (node) => {
+  const label = labelOf(rowOf(node));
+  return label ? tuning.specs.find(({ main, title, unit }) => main && label === (unit ? `${title} [${unit}]` : title)) : undefined;
+};
+
+function press(event) {
+  const root = event.target.closest?.(SLIDER), spec = root && specAt(root);
+  if (!spec || event.button) return;
+  event.preventDefault(); // no mouse event follows, which would move the thumb to the pointer
+  event.stopPropagation();
+  const thumb = root.querySelector("[role=slider]"), track = root.querySelector(".mantine-Slider-track").getBoundingClientRect();
+  const box = thumb.getBoundingClientRect();
+  thumb.focus();
+  const gesture = newGesture();
+  const [low, high] = ["valuemin", "valuemax"].map((name) => Number(thumb.getAttribute(`aria-${name}`))); // viser's sliders are linear
+  const valueAt = (part) => near(spec, low + (high - low) * part);
+  const at = { thumb: box.x + box.width / 2, track: [track.left, track.right], valueAt };
+  beginDrag(event, spec, valueOf(spec.name), at, (value) => setValue(spec.name, value, gesture));
+}
+
+function key(event) {
+  const spec = event.target.getAttribute?.("role") === "slider" ? specAt(event.target) : null;
+  const value = spec ? pressed(spec, valueOf(spec.name), event) : null;
+  if (value === null) return;
+  event.preventDefault();
+  event.stopPropagation();
+  setValue(spec.name, value);
+}
+
+// Touches reach the slider as pointer events only.
+const hold = (event) => { if (event.target.closest?.(SLIDER)) event.stopPropagation(); };
+
+const nameWidgets = throttled(() => {
+  for (const root of inner?.querySelectorAll(SLIDER) ?? []) {
+    const row = rowOf(root), label = labelOf(row);
+    root.style.touchAction = "none";
+    for (const node of row?.querySelectorAll("[role=slider], input[inputmode]") ?? []) {
+      if (node.getAttribute("aria-label") !== label) node.setAttribute("aria-label", label);
+    }
+  }
+}, NAMING_PAUSE);
+
+// viser keeps the panel open or closed in each browser; its button is the only way to change that here.
+function collapse() {
+  const wanted = visible("tune");
+  if (!inner || wanted === collapsed) return;
+  const button = inner.querySelector(`[data-dock-region] [aria-label^="${wanted ? "Collapse" : "Expand"}"]`);
+  if (!button) return; // not built yet, or a person has done it already
+  button.click();
+  collapsed = wanted;
+}
+
+export function startScenePanel() {
+  onSceneLoad((frame) => {
+    inner = frame.document;
+    collapsed = false;
+    inner.addEventListener("pointerdown", press, true);
+    inner.addEventListener("touchstart", hold, true);
+    inner.addEventListener("keydown", key, true);
+    new frame.MutationObserver(() => { nameWidgets(); collapse(); }).observe(inner.body, { childList: true, subtree: true });
+  });
+  on("tab", collapse);
+}
