@@ -9,7 +9,8 @@ from pipeline.jit import compiled
 
 @compiled
 def direction_turn(x: float, y: float) -> float:
-    """Return the direction (x, y) as a share of a whole turn, 0 to 1, from -x over -y, +x and +y.
+    """Return the direction of a finite vector (x, y) as a share of a whole turn, 0 to 1, from -x over -y
+    (0.25), +x (0.5) and +y (0.75).
 
     It is uniform along the diamond |x| + |y| = 1 instead of the circle, which needs no arctangent. The origin
     counts as the direction +x.
@@ -25,9 +26,11 @@ def direction_turn(x: float, y: float) -> float:
 
 @compiled
 def direction_bin(x: float, y: float, bins: int) -> int:
-    """Return in which of `bins` sectors around the origin the direction (x, y) is, counted from -x over -y.
+    """Return in which of `bins` sectors around the origin the direction of a finite vector (x, y) is, 0 to
+    bins - 1, counted from -x over -y, +x and +y.
 
-    The sectors divide the diamond of `direction_turn`; the widest is twice as wide as the narrowest.
+    The sectors divide the diamond of `direction_turn`; the widest is twice as wide as the narrowest. The
+    origin counts as the direction +x.
     """
     return min(int(np.floor(direction_turn(x, y) * bins)), bins - 1)
 

@@ -37,13 +37,15 @@ class Pose(NamedTuple):
 
 @compiled_borrowing
 def pose_of(mu: Float, P: Float) -> Pose:
-    """Return a pose by its mean, shape (3,), and covariance, shape (3, 3)."""
+    """Return a pose by its mean, shape (3,), and covariance, shape (3, 3), of which only the upper triangle
+    is read."""
     return Pose(mu[0], mu[1], mu[2], P[0, 0], P[0, 1], P[0, 2], P[1, 1], P[1, 2], P[2, 2])
 
 
 @compiled_borrowing
 def keep_pose(pose: Pose, mu: Float, P: Float) -> None:
-    """Write a pose into its mean, shape (3,), and covariance, shape (3, 3), the inverse of `pose_of`."""
+    """Write a pose into its mean, shape (3,), and its symmetric covariance, shape (3, 3), both in place: the
+    inverse of `pose_of`."""
     mu[0], mu[1], mu[2] = pose.x, pose.y, pose.yaw
     P[0, 0], P[1, 1], P[2, 2] = pose.xx, pose.yy, pose.tt
     P[0, 1] = P[1, 0] = pose.xy
@@ -116,7 +118,15 @@ def in_map(
 def _put_in_map(
     centre: Float, covariance: Float, pose: Float, Sigma: Float, place: Float, own: Float, added: Float
 ) -> None:
-    """Write the results of `in_map` into `place`, `own` and `added`."""
+    """Write the results of `in_map`, in place.
+
+    Args:
+        centre, covariance: Detections in the base frame, shapes (D, 2) [m] and (D, 2, 2) [m^2].
+        pose, Sigma: Pose x, y, yaw, shape (3,), and its covariance, shape (3, 3).
+        place: Receives the positions in the frame of the map, shape (D, 2) [m].
+        own: Receives C R C^T, shape (D, 2, 2) [m^2].
+        added: Receives J Sigma J^T, shape (D, 2, 2) [m^2].
+    """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for d in range(centre.shape[0]):
         x, y = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
@@ -160,13 +170,14 @@ def by_pose(x: float, y: float, Sigma: Float) -> tuple[float, float, float]:
 def corrected(
     pose: Pose, ax: float, ay: float, S0: float, S1: float, S2: float, y0: float, y1: float
 ) -> Pose:
-    """Return a pose corrected by the observation of one landmark (Kalman update).
+    """Return a pose corrected by the observation of one landmark (Kalman update). The yaw of the result is
+    not wrapped.
 
     Args:
         pose: Pose before.
         ax, ay: Vector from the robot to the detection in the frame of the map [m]; J as in `expected_spread`.
-        S0, S1, S2: Covariance xx, xy, yy of the innovation [m^2].
-        y0, y1: Innovation: landmark minus predicted detection, in the frame of the map [m].
+        S0, S1, S2: Covariance xx, xy, yy of the innovation [m^2], which must be invertible.
+        y0, y1: Innovation: the landmark minus the detection, both in the frame of the map [m].
     """
     scale = 1.0 / (S0 * S2 - S1 * S1)
     a0, a1, a2 = pose.xx - ay * pose.xt, pose.xy - ay * pose.yt, pose.xt - ay * pose.tt
@@ -189,8 +200,13 @@ def corrected(
 
 @compiled_within
 def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
-    """Return cosine and sine of `yaw`. c and s are those of the yaw before it was turned by `by` [rad]; for
-    small turns they are updated by a series without cos and sin."""
+    """Return cosine and sine of a yaw after a turn.
+
+    Args:
+        c, s: Cosine and sine of the yaw before the turn.
+        by: The turn [rad]; up to SMALL_TURN, cosine and sine are updated by a series.
+        yaw: The yaw after the turn [rad], which is used for larger turns only.
+    """
     if abs(by) > SMALL_TURN:
         return np.cos(yaw), np.sin(yaw)
     b2 = by * by
@@ -223,8 +239,9 @@ def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
 
 @compiled
 def factorise(H: Float, L: Float) -> None:
-    """Write the Cholesky factor of H, H = L L^T, into the lower triangle of L; both have the shape (n, n),
-    and H must be positive definite."""
+    """Write the Cholesky factor of H, H = L L^T, into the lower triangle of L, in place; both have the shape
+    (n, n). Only the lower triangle of H is read, and the upper triangle of L is not written. L contains NaN
+    or inf if H is not positive definite; no error is raised."""
     for a in range(H.shape[0]):
         for b in range(a):
             total = H[a, b]
@@ -239,7 +256,13 @@ def factorise(H: Float, L: Float) -> None:
 
 @compiled
 def solve(L: Float, b: Float, x: Float) -> None:
-    """Write the solution x of L L^T x = b into x, shape (n,); L is the lower triangle of `factorise`."""
+    """Write the solution x of L L^T x = b into x, in place.
+
+    Args:
+        L: Result of `factorise`, shape (n, n), of which only the lower triangle is read.
+        b: Right side, shape (n,), not changed unless it is the same array as x.
+        x: Receives the solution, shape (n,).
+    """
     n = b.shape[0]
     for a in range(n):
         total = b[a]

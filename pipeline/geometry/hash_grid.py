@@ -39,13 +39,13 @@ class Cells(NamedTuple):
 
 @compiled
 def cells_for(places: int) -> Cells:
-    """Return empty cells with room for a number of positions."""
+    """Return empty cells with room for `places` positions."""
     return Cells(np.full(SIDE * SIDE, -1, np.int32), np.empty(places, np.int32), np.empty(places, np.int32))
 
 
 @compiled_borrowing
 def per_metre(radius: float) -> float:
-    """Return the number of cells per metre for searches of a radius [m]: two by two cells contain all
+    """Return the number of cells per metre for searches of a radius above 0 [m]: two by two cells contain all
     positions within it."""
     return 0.5 / (WIDER * radius)
 
@@ -66,12 +66,12 @@ def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
 
 @compiled_within
 def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
-    """Put positions into empty cells, the lowest row first in each chain.
+    """Put positions into empty cells, in place, the lowest row first in each chain.
 
     Args:
-        cells: Empty cells.
-        mean: Positions, x, y first, shape (L, 2 or more) [m].
-        known: Number of rows of `mean` to put in.
+        cells: Empty cells with room for `known` positions.
+        mean: Finite positions, x, y first, shape (L, 2 or more) [m].
+        known: Number of rows of `mean` to put in, from row 0 on.
         scale: Cells per metre, see `per_metre`.
     """
     for j in range(known - 1, -1, -1):
@@ -80,7 +80,8 @@ def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
 
 @compiled_within
 def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
-    """Put row j of `mean`, x, y first [m], into its cell, at the start of the chain; see `fill`."""
+    """Put row j of `mean`, x, y first [m], which is in no cell, into its cell, in place, at the start of the
+    chain; see `fill`."""
     at = cell_of(int(np.floor(scale * mean[j, 0])), int(np.floor(scale * mean[j, 1])))
     cells.cell[j] = at
     cells.following[j] = cells.head[at]
@@ -89,7 +90,7 @@ def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
 
 @compiled_within
 def take_out(cells: Cells, j: int) -> None:
-    """Remove row j, which `put_in` added, from its cell."""
+    """Remove row j, which `put_in` added and which was not removed since, from its cell, in place."""
     before = cells.head[cells.cell[j]]
     if before == j:
         cells.head[cells.cell[j]] = cells.following[j]
@@ -101,7 +102,7 @@ def take_out(cells: Cells, j: int) -> None:
 
 @compiled_within
 def clear(cells: Cells, known: int) -> None:
-    """Empty the cells of a number of positions."""
+    """Empty the cells of rows 0 to known - 1, in place; a cell is emptied with all rows of its chain."""
     for j in range(known):
         cells.head[cells.cell[j]] = -1
 
@@ -113,9 +114,9 @@ def holds_unseen(
     """Return whether a position that was not seen is within a radius of x, y [m], the border included.
 
     Args:
-        cells, scale: Grid of the positions for searches within this radius.
-        mean: Positions, x, y first [m].
-        seen: Whether each was seen.
+        cells, scale: Grid of the positions, and its cells per metre for searches within this radius.
+        mean: Positions, x, y first, shape (L, 2 or more) [m].
+        seen: Whether each was seen, shape (L,).
         x, y: Centre [m].
         radius2: Square of the radius [m^2].
     """
@@ -155,15 +156,15 @@ def nearest_in(cells: Cells, mean: Float, x: float, y: float, reach: float, scal
 
 @compiled
 def group_rows(label: Int | Int32, groups: int) -> tuple[Int, Int]:
-    """Sort rows by their group; negative labels belong to none.
+    """Sort rows by their group; rows with a negative label are left out.
 
     Args:
-        label: Group of each row, shape (N,).
-        groups: Number of groups.
+        label: Group of each row, less than `groups`, shape (N,).
+        groups: Number of groups; a group may be empty.
 
     Returns:
-        Rows sorted by group, stable, int64; and the index of the first row of each group in that order,
-        int64, shape (groups + 1,).
+        Rows sorted by group, stable, int64, one for each label >= 0; and the index of the first row of each
+        group in that order and the total, int64, shape (groups + 1,).
     """
     bounds = np.zeros(groups + 1, np.int64)
     for k in label:

@@ -15,7 +15,8 @@ Float = NDArray[np.float64]
 
 
 def wrap_angle(angle: ArrayLike) -> Float:
-    """Return angles [rad] in [-pi, pi)."""
+    """Return angles [rad] in [-pi, pi), float64, in the shape of the input (shape () for one number); NaN
+    stays NaN."""
     wrapped = (np.asarray(angle, dtype=np.float64) + np.pi) % (2.0 * np.pi) - np.pi
     # The remainder of an angle just below -pi is rounded up to a whole turn.
     return np.where(wrapped >= np.pi, -np.pi, wrapped)
@@ -30,7 +31,7 @@ class Pose2:
     yaw: float = 0.0
 
     def __matmul__(self, other: Pose2) -> Pose2:
-        """Compose: `T_a_c = T_a_b @ T_b_c`."""
+        """Compose: `T_a_c = T_a_b @ T_b_c`; the yaw of the result is in [-pi, pi)."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return Pose2(
             float(self.x + c * other.x - s * other.y),
@@ -39,19 +40,20 @@ class Pose2:
         )
 
     def inverse(self) -> Pose2:
-        """Return `T_b_a` of this `T_a_b`."""
+        """Return `T_b_a` of this `T_a_b`; its yaw is in [-pi, pi)."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return Pose2(
             float(-c * self.x - s * self.y), float(s * self.x - c * self.y), float(wrap_angle(-self.yaw))
         )
 
     def apply(self, points: Float) -> Float:
-        """Transform points of shape (N, 2) [m] from frame b to frame a."""
+        """Return points of shape (N, 2) [m] in frame b as points in frame a (this pose is `T_a_b`), same
+        shape."""
         moved: Float = points @ self.rotation().T + np.array([self.x, self.y])
         return moved
 
     def rotation(self) -> Float:
-        """Return the rotation matrix, shape (2, 2)."""
+        """Return the rotation matrix R_a_b of this `T_a_b`, shape (2, 2)."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         return np.array([[c, -s], [s, c]])
 
@@ -97,7 +99,8 @@ class Pose3:
 
     @classmethod
     def from_euler(cls, t: ArrayLike, roll: float, pitch: float, yaw: float) -> Pose3:
-        """Return the pose of a translation (3,) [m] and R = Rz(yaw) Ry(pitch) Rx(roll) [rad]."""
+        """Return the pose of a translation (3,) [m] and R = Rz(yaw) Ry(pitch) Rx(roll), angles [rad]; numbers
+        are not checked."""
         cr, sr = np.cos(roll), np.sin(roll)
         cp, sp = np.cos(pitch), np.sin(pitch)
         cy, sy = np.cos(yaw), np.sin(yaw)
@@ -119,11 +122,13 @@ class Pose3:
         return Pose3(self.R.T, -self.R.T @ self.t)
 
     def apply(self, points: Float) -> Float:
-        """Transform points of shape (N, 3) [m] from frame b to frame a."""
+        """Return points of shape (N, 3) [m] in frame b as points in frame a (this pose is `T_a_b`), same
+        shape."""
         return points @ self.R.T + self.t
 
     def euler(self) -> tuple[float, float, float]:
-        """Return roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+        """Return roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll): roll and yaw in [-pi, pi], pitch
+        in [-pi/2, pi/2]."""
         R = self.R
         return (
             float(np.arctan2(R[2, 1], R[2, 2])),
@@ -162,7 +167,7 @@ class Pose3:
 
 def interpolate(a: Pose2, b: Pose2, fraction: float) -> Pose2:
     """Return the pose at a fraction between a (0) and b (1): linear in x and y, and in yaw along the shorter
-    turn. Other fractions extrapolate."""
+    turn, wrapped to [-pi, pi). Fractions below 0 or above 1 extrapolate."""
     turn = float(wrap_angle(b.yaw - a.yaw))
     return Pose2(
         a.x + fraction * (b.x - a.x),

@@ -18,8 +18,13 @@ T = TypeVar("T", np.float32, np.float64)
 
 
 def rounded(values: NDArray[T], step: float) -> NDArray[T]:
-    """Return values rounded to the nearest multiple of `step`, a power of two, with the type of the
-    values."""
+    """Return values rounded to the nearest multiple of `step`, with their type and shape; a value half-way
+    between two multiples is rounded to the even one, and -0 becomes 0. NaN and infinity remain.
+
+    Args:
+        values: float32 or float64, any shape; not changed.
+        step: A power of two.
+    """
     kind = values.dtype.type
     result: NDArray[T] = np.rint(values * kind(1.0 / step)) * kind(step) + kind(0.0)  # + 0 turns -0 into 0
     return result
