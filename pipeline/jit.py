@@ -34,7 +34,12 @@ _DOTTED = re.compile(r"[\w.]+")
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function to machine code; it releases the interpreter lock while it runs."""
+    """Return a function as a kernel: it is compiled to machine code at its first call with new argument
+    types, or loaded from the cache, and releases the interpreter lock while it runs.
+
+    Indexes are not checked against bounds; a division of floats by zero gives inf or NaN, as in NumPy. The
+    plain function is the attribute `py_func`.
+    """
     # Without _nrt a kernel would inherit the setting of its caller.
     kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=True)(function)
     _keep_by_all_sources(kernel, function.__module__)
@@ -42,16 +47,17 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def compiled_borrowing(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function that neither creates nor keeps an array, without reference counting. The atomic
-    operations of reference counting cost more than the arithmetic of a loop over few landmarks."""
+    """Return a kernel like `compiled`, without reference counting; the function must neither create nor keep
+    an array. The atomic operations of reference counting cost more than the arithmetic of a loop over few
+    landmarks."""
     kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function)
     _keep_by_all_sources(kernel, function.__module__)
     return kernel
 
 
 def compiled_within(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile a function like `compiled_borrowing`, inlined in each kernel that calls it: a call passes each
-    array as eight numbers, which costs more than a short loop."""
+    """Return a kernel like `compiled_borrowing` that is inlined in each kernel that calls it: a call passes
+    each array as eight numbers, which costs more than a short loop."""
     kernel: Callable[P, R] = numba.njit(
         cache=True, nogil=True, error_model="numpy", _nrt=False, inline="always"
     )(function)
@@ -60,9 +66,9 @@ def compiled_within(function: Callable[P, R]) -> Callable[P, R]:
 
 
 def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
-    """Compile sums over arrays with vector registers, which is several times faster. The order of the terms
-    is fixed at compilation: runs on one kind of processor give the same bytes, and two kinds may differ in
-    the last bit, like the matrix products of NumPy."""
+    """Return a kernel like `compiled` for sums over arrays, with vector registers, which is several times
+    faster. The order of the terms is fixed at compilation: runs on one kind of processor give the same bytes,
+    and two kinds may differ in the last bit, like the matrix products of NumPy."""
     kernel: Callable[P, R] = numba.njit(
         cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"}, _nrt=True
     )(function)
@@ -90,8 +96,9 @@ class _CompilationListener(event.Listener):  # type: ignore[misc]
 
 @contextmanager
 def on_compiling(callback: Callable[[], None]) -> Iterator[None]:
-    """Call a function before each kernel that is compiled within the context, in the thread that waits for
-    it, and when other processes compile for it (see `others_compile`)."""
+    """Call a function without arguments before each kernel that any thread of this process compiles within
+    the context, in the thread that compiles, and at each call of `others_compile`. Loading from the cache is
+    no compilation. Contexts may be nested; each calls its own function."""
     _callbacks.append(callback)
     try:
         with event.install_listener("numba:compile", _CompilationListener(callback)):
@@ -101,14 +108,20 @@ def on_compiling(callback: Callable[[], None]) -> Iterator[None]:
 
 
 def others_compile() -> None:
-    """Call the functions of `on_compiling`, because this thread waits for kernels that other processes
-    compile."""
+    """Call the functions of all open contexts of `on_compiling`, in this thread: it waits for kernels that
+    other processes compile. Without an open context, nothing happens."""
     for callback in tuple(_callbacks):
         callback()
 
 
 def _keep_by_all_sources(kernel: Any, module: str) -> None:  # noqa: ANN401
-    """Make the cache of a kernel valid for one digest of all sources that it may include."""
+    """Change the cache of a kernel so that its machine code is valid for one digest of all sources that the
+    kernel may include.
+
+    Args:
+        kernel: Dispatcher of Numba with `cache=True`; its cache object is changed in place.
+        module: Dotted name of the module that defines the kernel.
+    """
     file = kernel._cache._cache_file  # Numba has no public interface for this
     file._source_stamp = sources_digest(
         module
@@ -148,7 +161,9 @@ def _saved_by_one(file: Any, base: str) -> Callable[[Any, Any], None]:  # noqa: 
 
 @contextmanager
 def locked(file: Path) -> Iterator[None]:
-    """Hold the lock of the folder of a file; without effect where the file system has no locks."""
+    """Hold the exclusive lock of the folder of a file within the context, and wait for it if another process
+    holds it. The lock is the file `.lock` in that folder, which is created. Without effect where the system
+    has no locks or the folder cannot be written."""
     with ExitStack() as stack:
         with suppress(ImportError, OSError):
             import fcntl
@@ -159,13 +174,19 @@ def locked(file: Path) -> Iterator[None]:
 
 
 def is_kept(kernel: Callable[..., Any]) -> bool:
-    """Return whether the cache has machine code of a kernel, for any types, of the present sources."""
+    """Return whether the cache on disk has machine code of a kernel (result of `compiled` or its variants),
+    for any argument types, of the present sources. It reads the index of the cache."""
     return bool(kernel._cache._cache_file._load_index())  # type: ignore[attr-defined]
 
 
 def sources_digest(module: str) -> str:
-    """Return the SHA-256 (hex) of the source of a module and of all modules of its package that it imports,
-    directly or indirectly."""
+    """Return the SHA-256 (hex) of the source of a module and of all loaded modules of its top-level package
+    that it imports, directly or indirectly. Sources are read once per process: later changes of the files
+    have no effect.
+
+    Args:
+        module: Dotted name of a loaded module.
+    """
     package = module.partition(".")[0] + "."
     seen = {module}
     waiting = [module]
@@ -181,7 +202,8 @@ def sources_digest(module: str) -> str:
 
 @cache
 def _imported(module: str) -> frozenset[str]:
-    """Return the loaded modules that the imports of a module name."""
+    """Return the dotted names of the loaded modules that the import statements of a module name; a statement
+    is recognised by the beginning of its line, so that indented imports do not count."""
     names: set[str] = set()
     text = _source(module).decode()
     for origin, what in _FROM.findall(text):
@@ -193,5 +215,7 @@ def _imported(module: str) -> frozenset[str]:
 
 @cache
 def _source(module: str) -> bytes:
+    """Return the source of a loaded module, read once per process; empty if the module is not loaded or has
+    no file."""
     file = getattr(sys.modules.get(module), "__file__", None)
     return Path(file).read_bytes() if file else b""

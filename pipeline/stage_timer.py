@@ -10,5 +10,6 @@ StageTimer = Callable[[str], AbstractContextManager[None]]
 
 
 def no_timer(_stage: str) -> AbstractContextManager[None]:
-    """Return a context that measures nothing: the default for callers that need no times."""
+    """Return a context that measures nothing, for any name of a stage: the default for callers that need no
+    times."""
     return nullcontext()

@@ -17,7 +17,7 @@ class Zone(IntEnum):
 
     @property
     def label(self) -> str:
-        """The zone as text."""
+        """The zone as text in lower case, e.g. "slow"."""
         return self.name.lower()
 
 

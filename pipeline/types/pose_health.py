@@ -42,5 +42,6 @@ class Health:
     doubt: str = ""
 
     def warnings(self, reported: str) -> tuple[str, ...]:
-        """Return the doubt about the odometry as a warning, unless it is the one `reported` already."""
+        """Return the doubt about the odometry as a tuple of one warning; empty without a doubt, or if the
+        doubt equals the text `reported`, which was reported before."""
         return (self.doubt,) if self.doubt not in ("", reported) else ()

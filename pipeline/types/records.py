@@ -78,8 +78,9 @@ class Labels:
     """Clusters of the points of one scan.
 
     Attributes:
-        label: int32, shape (N,): cluster of each point, 0..clusters-1 in the order of their first points, -1
-            for noise. Parts that were split off trunks (see `cluster_splitting`) follow all other clusters.
+        label: int32, shape (N,): cluster of each point, 0..clusters-1, -1 for noise. DBSCAN numbers clusters
+            in the order of their first points, range jumps number them counter-clockwise. Parts that were
+            split off trunks (see `cluster_splitting`) follow all other clusters.
         clusters: Number of clusters.
         hidden: shape (clusters,): whether a nearer object hides an edge of the cluster.
     """
@@ -112,7 +113,7 @@ class Verdict(IntEnum):
 
     @property
     def label(self) -> str:
-        """The verdict as text for the page and for files."""
+        """The verdict as text for the page and for files, in lower case, e.g. "too few points"."""
         return self.name.lower().replace("_", " ")
 
 

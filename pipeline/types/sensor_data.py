@@ -100,11 +100,14 @@ class PoseMeasurement:
 
     @property
     def own(self) -> Float:
-        """Covariance of the independent error v, shape (3, 3)."""
+        """Covariance of the independent error v, shape (3, 3): `covariance` less the part of the shared
+        errors."""
         return self.covariance if self.shared is None else self.covariance - self.shared @ self.shared.T
 
     def is_sound(self) -> bool:
-        """Whether all numbers are finite and the covariance is symmetric and positive definite."""
+        """Return whether all numbers are finite, `covariance` has the shape (3, 3), and the covariance of the
+        independent error is symmetric and positive definite. With shared errors, also whether their shape is
+        (3, SHARED) and the number of the source is valid. The gate is not checked."""
         C, pose = self.covariance, self.T_map_base.as_array()
         if C.shape != (3, 3) or not (np.all(np.isfinite(C)) and np.all(np.isfinite(pose))):
             return False
