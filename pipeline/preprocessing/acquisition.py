@@ -17,20 +17,21 @@ Bytes = NDArray[np.uint8]
 
 
 def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float32, Float]:
-    """Return the points of a scan in the level sensor frame, de-skewed.
+    """Return the points of a scan in the level sensor frame, de-skewed, in their order.
 
     The level sensor frame has its origin in the sensor, x along the heading of the robot and, if the scan is
     levelled, z against gravity. De-skewing moves each point to its position at the stamp of the scan: p' =
-    R(w dt) p + v dt in the base frame, where dt is the time offset of the point.
+    R(w dt) p + v dt in the base frame, where dt is the time offset of the point. It is omitted if `deskew` is
+    off, the scan has no time offsets or the velocity is zero.
 
     Args:
         step: Scan with tilt and velocity of the robot.
         T_base_lidar: Pose of the LiDAR on the robot.
-        parameters: Range limits (inclusive), levelling and de-skewing.
+        parameters: Range limits (inclusive, before de-skewing), levelling and de-skewing.
 
     Returns:
-        Points, float32, shape (N, 3) [m]; and the position of the sensor in the level base frame, shape (3,)
-        [m]. Their sum is the point in the level base frame.
+        Points within the range limits, without points with NaN, float32, shape (N, 3) [m]; and the position
+        of the sensor in the level base frame, shape (3,) [m]. Their sum is the point in the level base frame.
     """
     R_level_lidar, sensor_offset = _level_rotation(step, T_base_lidar, parameters)
     offset_ns = step.scan.offset_ns
@@ -49,10 +50,12 @@ def acquire(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[F
 
 
 def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Float32:
-    """Return the points closer than `range_min`, in the level sensor frame, float32, shape (N, 3) [m].
+    """Return the points from HOUSING to below `range_min` from the sensor, in the level sensor frame,
+    float32, shape (N, 3) [m], in their order.
 
-    These returns are from the robot itself or from objects close to it. They are not de-skewed, since the
-    robot does not move relative to itself.
+    These returns are from the robot itself or from objects close to it; still closer ones are returns of the
+    housing. They are not de-skewed, since the robot does not move relative to itself. Empty if `range_min` is
+    not above HOUSING.
     """
     points = step.scan.points
     rows = _rows_in_range(points, min(HOUSING, parameters.range_min), parameters.range_min)
@@ -63,7 +66,8 @@ def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Fl
 
 def _level_rotation(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
     """Return R_level_lidar, shape (3, 3), and the position of the sensor in the level base frame, shape (3,)
-    [m]. Without levelling or a known tilt, the level frame has the axes of the base."""
+    [m]. If `level` is not "imu" or the tilt of the step is unknown, the level frame has the axes of the base.
+    """
     level = parameters.level == "imu" and step.tilt_known
     R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)
     return R_level_base @ T_base_lidar.R, R_level_base @ T_base_lidar.t
@@ -73,8 +77,10 @@ def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, fl
     """Return the velocity of the base at a scan: forward, left [m/s], yaw rate [rad/s].
 
     Args:
-        step: Scan with the velocity by odometry and, if available, the yaw rate of a gyroscope.
-        parameters: `gyro` selects the yaw rate of the gyroscope if it is available.
+        step: Scan with the velocity by odometry (zero if unknown) and, if available, the yaw rate of a
+            gyroscope.
+        parameters: `gyro` selects the yaw rate of the gyroscope if it is available; otherwise that of the
+            odometry is returned.
     """
     if parameters.gyro and step.turn_rate is not None:
         return (step.twist[0], step.twist[1], step.turn_rate)
@@ -83,8 +89,8 @@ def base_velocity(step: Step, parameters: Acquisition) -> tuple[float, float, fl
 
 @compiled
 def _rows_in_range(points: Float32, least: float, below: float) -> Int32:
-    """Return the rows, int32, shape (M,), of the points with `least` <= range < `below` [m]; without rows of
-    NaN."""
+    """Return the ascending rows, int32, shape (M,), of the points (shape (N, 3) [m]) with `least` <= range <
+    `below` [m]; without rows of NaN."""
     rows = np.empty(points.shape[0], np.int32)
     n = 0
     for i in range(points.shape[0]):
@@ -105,8 +111,17 @@ def _transformed_points(
     range_min: float,
     range_max: float,
 ) -> Float32:
-    """Return the points within the range limits, rotated by R and de-skewed; an empty `offset_ns` means no
-    de-skewing. See `acquire`."""
+    """Return the points within the range limits, rotated by R and de-skewed, float32, shape (M, 3) [m]; see
+    `acquire`.
+
+    Args:
+        points: float32, shape (N, 3) [m], sensor frame.
+        offset_ns: Time of each point relative to the scan [ns], shape (N,); empty for no de-skewing.
+        R: R_level_lidar, shape (3, 3).
+        sensor: Position of the sensor in the level base frame, shape (3,) [m].
+        twist: Forward and left velocity [m/s], yaw rate [rad/s], shape (3,).
+        range_min, range_max: Limits, both inclusive [m]; points with NaN are removed.
+    """
     kept = np.empty((points.shape[0], 3), np.float32)
     n = 0
     # Blocks of contiguous rows and simple loops, which the compiler vectorises.
@@ -131,8 +146,15 @@ def _transformed_points(
 def _rotate_block(
     u: Float, v: Float, w: Float, inside: Bytes, R: Float, square_min: float, square_max: float
 ) -> None:
-    """Rotate the points u, v, w of a block by R, in place, and set `inside` to 1 for squared ranges in
-    [square_min, square_max] [m^2], else to 0."""
+    """Rotate a block of points, in place, and mark those within the range limits.
+
+    Args:
+        u, v, w: Coordinates of the points, shape (CHUNK,) [m]; all CHUNK rows are rotated.
+        inside: Receives 1 where the squared range before the rotation is in [square_min, square_max], else 0
+            (also for NaN), shape (CHUNK,).
+        R: Rotation matrix, shape (3, 3).
+        square_min, square_max: Squares of the range limits [m^2].
+    """
     r00, r01, r02 = R[0, 0], R[0, 1], R[0, 2]
     r10, r11, r12 = R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22 = R[2, 0], R[2, 1], R[2, 2]

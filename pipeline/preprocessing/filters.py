@@ -14,7 +14,8 @@ _AXIS_CELLS = 1 << 21  # three axes of 21 bits fit one 64-bit key
 
 
 def pass_through(points: Float32, parameters: Filters) -> Float32:
-    """Return the points inside the box including its faces, float32, shape (M, 3) [m], in their order.
+    """Return the points inside the box including its faces, float32, shape (M, 3) [m], in their order; points
+    with NaN are removed.
 
     Args:
         points: float32, shape (N, 3) [m].
@@ -28,7 +29,8 @@ def pass_through(points: Float32, parameters: Filters) -> Float32:
 
 @compiled
 def _box(points: Float32, low: Float32, high: Float32) -> Float32:
-    """Return the points with low <= point <= high on each axis; low and high have the shape (3,) [m]."""
+    """Return the points, float32, shape (M, 3) [m], with low <= point <= high on each axis; low and high have
+    the shape (3,) [m]. Points with NaN are removed."""
     inside = np.empty_like(points)
     n = 0
     for i in range(points.shape[0]):
@@ -42,10 +44,12 @@ def _box(points: Float32, low: Float32, high: Float32) -> Float32:
 def voxel_grid(points: Float32, parameters: Filters) -> Float32:
     """Replace the points of each voxel by their mean, in the order of the first point of each voxel.
 
-    The voxels are fixed in the frame of the points. A voxel size of 0 returns the points unchanged.
+    The borders of the voxels are multiples of their size in the frame of the points. The points are returned
+    unchanged (the same array) if the voxel size is 0, if there are none, or if a coordinate is farther than
+    about a million voxels from the origin.
 
     Args:
-        points: float32, shape (N, 3) [m].
+        points: float32, shape (N, 3) [m], finite.
         parameters: `voxel_size` is the edge length of a voxel [m].
 
     Returns:
@@ -59,7 +63,8 @@ def voxel_grid(points: Float32, parameters: Filters) -> Float32:
 
 @compiled
 def _voxel_means(points: Float32, size: float) -> Float32:
-    """Return the mean of the points of each cube of the edge length `size` [m]; see `voxel_grid`."""
+    """Return the mean of the points of each cube of the edge length `size` [m], float32, shape (M, 3) [m];
+    the points, shape (N, 3) [m], are finite and within 2^20 cubes of the origin. See `voxel_grid`."""
     n = points.shape[0]
     slots = 2
     while slots < 2 * n:
