@@ -19,10 +19,14 @@ from pipeline.types.records import Clusters, Float32, Int, Labels, Sensor, Verdi
 def moments(points: Float, bounds: Int) -> tuple[Float, Float, Float]:
     """Return the moments of each cluster (Eq. 3).
 
+    Args:
+        points: Points in the order of the clusters, shape (N, 3) [m], sensor frame.
+        bounds: First row of each cluster, and N, shape (K + 1,); no cluster is empty.
+
     Returns:
         Centroid, shape (K, 3) [m]; descending eigenvalues of the horizontal covariance normalised by N, shape
-        (K, 3) [m^2], of which the third is 0; and extent along the ray from the sensor to the centroid,
-        across it and upwards, shape (K, 3) [m].
+        (K, 3) [m^2], of which the third is 0; and extent along the horizontal ray from the sensor to the
+        centroid, across it and upwards, shape (K, 3) [m].
     """
     clusters = bounds.shape[0] - 1
     centroid = np.zeros((clusters, 3))
@@ -90,9 +94,16 @@ def describe_stems(
 ) -> tuple[Labels, Clusters]:
     """Describe each cluster, after trunks are separated from vegetation that is clustered with them.
 
+    Args:
+        points: float32, shape (N, 3) [m], level sensor frame.
+        labels: Cluster of each point; no cluster is empty.
+        sensor: Range sigma and azimuth step of the LiDAR.
+        parameters: Choice of centre, and number of slices of `split_trunks`.
+
     Returns:
-        Labels in which the vegetation forms clusters of its own, and the shape of each cluster; see
-        `describe`. Nothing is separated if `split_slices` is 0 or `centre` is not "circle".
+        Labels in which the vegetation of a separated trunk forms a cluster of its own, numbered after all
+        others; and the shape of each cluster, see `describe`. The labels are those passed in if nothing is
+        separated, which is always so if `split_slices` is 0 or `centre` is not "circle".
     """
     whole = describe(points, labels, sensor, parameters)
     if parameters.split_slices == 0 or parameters.centre != "circle":
@@ -107,8 +118,13 @@ def describe_stems(
 
 
 def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
-    """Return the clusters with the given ascending rows replaced by others; rows beyond the last are
-    appended. `others` has one row for each of `rows`."""
+    """Return the clusters with some rows replaced or appended; the arguments are not changed.
+
+    Args:
+        clusters: K clusters.
+        others: The new rows, one for each of `rows`.
+        rows: Ascending row numbers; those from K on are appended and must be K, K + 1, ... without a gap.
+    """
     columns = []
     for column in fields(Clusters):
         old, new = getattr(clusters, column.name), getattr(others, column.name)
@@ -119,13 +135,16 @@ def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
 
 
 def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape) -> Clusters:
-    """Return the shape of each cluster; all verdicts are OTHER.
+    """Return the shape of each cluster; all verdicts are OTHER and `cut` is False.
+
+    With the centre "centroid", radius and its sigma are NaN and the arc is 0; so are those of clusters with
+    fewer than five points.
 
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.
-        labels: Cluster of each point.
+        labels: Cluster of each point, -1 for none; no cluster is empty.
         sensor: Range sigma and azimuth step of the LiDAR scale the fit.
-        parameters: Choice of covariance and centre.
+        parameters: `centre`: circle fit or centroid.
     """
     order, bounds = group_rows(labels.label, labels.clusters)
     members = points[order].astype(np.float64)
@@ -159,8 +178,8 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
 def eccentricity(eigenvalues: Float) -> Float:
     """Return the eccentricity e = lambda1 / lambda2 (Eq. 4) of each cluster, shape (K,).
 
-    It is infinite for points on a line and 1 for coincident points. The paper calls this ratio eccentricity;
-    the geometric eccentricity is sqrt(1 - lambda2 / lambda1).
+    It is infinite for points on a line and 1 for coincident points (both up to the rounding error FLAT). The
+    paper calls this ratio eccentricity; the geometric eccentricity is sqrt(1 - lambda2 / lambda1).
 
     Args:
         eigenvalues: Descending, shape (K, 2 or 3) [m^2].
@@ -176,8 +195,16 @@ def eccentricity(eigenvalues: Float) -> Float:
 
 
 def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigma: float) -> Float:
-    """Return stems whose centre is the centroid of the visible arc, as in the paper; columns as in
-    `fit_stems`."""
+    """Return stems whose centre is the centroid of the visible arc, as in the paper, shape (K, COLUMNS);
+    columns as in `fit_stems`. Radius, its sigma and the lean are NaN, the arc is 0, and the radial deviation
+    is that of the distances to the centroid.
+
+    Args:
+        members: Points in the order of the clusters, shape (N, 3) [m], level sensor frame.
+        bounds: First row of each cluster, and N, shape (K + 1,); no cluster is empty.
+        centroid: Centroids, shape (K, 3) [m].
+        range_sigma: Standard deviation of a range [m].
+    """
     stem = np.full((len(centroid), COLUMNS), np.nan)
     stem[:, 0:2] = centroid[:, :2]
     x, y = centroid[:, 0], centroid[:, 1]

@@ -62,16 +62,20 @@ def split_trunks(
 ) -> tuple[Labels, Int]:
     """Separate a trunk from each cluster that is not a single trunk but shows one in enough slices.
 
+    Only clusters are examined that are too rough, wide or thick for a trunk (ROUGH, WIDE, THICK), narrower
+    than WIDEST, high enough for the slices, and not hidden at an edge.
+
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.
-        labels: Cluster of each point.
+        labels: Cluster of each point; not changed.
         clusters: Shape of each cluster.
         sensor: Range sigma and azimuth step of the LiDAR.
-        slices: Minimum number of agreeing slices.
+        slices: Minimum number of agreeing slices, at least 1.
 
     Returns:
         Labels in which a trunk keeps the number of its cluster and the remaining points form a new cluster
-        with a number above all others; and the ascending numbers of the new and the reduced clusters.
+        with a number above all others, which counts as not hidden; and the ascending numbers of the reduced
+        and of the new clusters, int64. Without a separated trunk, equal labels and no numbers.
     """
     width = np.maximum(clusters.extent[:, 0], clusters.extent[:, 1])
     odd = (clusters.radial_std > ROUGH) | (width > WIDE) | (clusters.radius > THICK)
@@ -91,17 +95,19 @@ def split_trunks(
 def _split_trunks(
     points: Float32, rows: Int, bounds: Int, step: float, sigma: float, slices: int, label: Int32
 ) -> Int:
-    """Give the points beside trunks new numbers in `label`, in place: each reduced cluster k leaves a further
-    cluster. Return the ascending numbers k.
+    """Give the points that do not belong to trunks new numbers in `label`, in place: the i-th reduced cluster
+    leaves a cluster with the number K + i. Return the ascending numbers of the reduced clusters, int64. A
+    cluster whose points all belong to the trunk is not reduced.
 
     Args:
         points: Points, shape (N, 3) [m], sensor frame.
-        rows: Rows of the points in the order of the clusters.
+        rows: Rows of the points in the order of the clusters; those of clusters that are not examined are
+            missing.
         bounds: First position of each cluster in `rows`, and their number, shape (K + 1,).
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
         slices: Number of slices that must agree.
-        label: Cluster of each point, shape (N,).
+        label: Cluster of each point, shape (N,); changed.
     """
     clusters = bounds.shape[0] - 1
     apart, more = np.empty(clusters, np.int64), 0
@@ -129,19 +135,21 @@ def _split_trunks(
 
 @compiled
 def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs, run: Int, level: Int) -> int:
-    """Find the runs of a cluster that follow the front of a circle.
+    """Find the runs of a cluster that follow the front of a circle, and return their number, at most
+    MOST_RUNS (further ones are ignored).
 
-    Fills the table of runs, the run of each return (-1 for none) and its slice; returns the number of runs.
-    It is 0 for a cluster around the sensor.
+    Fills the table of runs, ordered by slice, the run of each return (unchanged, -1, for none) and its slice.
+    The result is 0 for a cluster that is partly behind the sensor as seen along the direction to its
+    centroid; then the slices are incomplete.
 
     Args:
         points: Points, shape (N, 3) [m], sensor frame.
         own: Rows of the points of the cluster, shape (n,).
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
-        runs: The table, of which at most MOST_RUNS rows are filled.
-        run: Run of each return, shape (n,); must be -1.
-        level: Slice of each return, shape (n,).
+        runs: The table; the columns `agrees` and `best` are not written.
+        run: Run of each return, shape (n,); must be -1; changed.
+        level: Receives the slice of each return, counted from the lowest return, shape (n,).
     """
     n = own.shape[0]
     x, y, lowest = 0.0, 0.0, np.inf
@@ -192,13 +200,13 @@ def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs,
 def _follows_circle(
     part: Int, across: Float, reach: Float, step: float, sigma: float, c: float, s: float, runs: Runs, at: int
 ) -> bool:
-    """Return whether a run follows the front of a circle as wide as the run, and if so write the circle into
-    the table.
+    """Return whether a run follows the front of a circle as wide as the run (radius RADIUS_MIN to RADIUS_MAX,
+    root mean square residual up to BENT sigma), and if so write x, y and radius of the circle into the table.
 
     Args:
-        part: Returns of the run, from right to left.
-        across: Tangent of the azimuth of each return of the cluster, from its middle.
-        reach: Horizontal range of each return [m].
+        part: Returns of the run, from right to left: indexes of `across` and `reach`.
+        across: Tangent of the azimuth of each return of the cluster, from its middle, shape (n,).
+        reach: Horizontal range of each return [m], shape (n,).
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
         c, s: Cosine and sine of the azimuth of the middle of the cluster.
@@ -235,10 +243,15 @@ def _follows_circle(
 
 @compiled
 def _find_trunk(runs: Runs, found: int, level: Int, slices: int) -> bool:
-    """Mark the runs of the trunk with the most agreeing slices, and among these the most returns.
+    """Mark the runs of the trunk with the most agreeing slices, and among these the most returns, in
+    `runs.best`, and return whether it is accepted: at least `slices` agree, and at least the share SHARE of
+    the slices with returns between its lowest and its highest run.
 
-    Returns whether enough slices agree. `found` is the number of runs, `level` the slice of each return, and
-    `slices` the least number of slices.
+    Args:
+        runs: Table of the runs, ordered by slice; `agrees` and `best` are overwritten.
+        found: Number of runs, at least 1.
+        level: Slice of each return of the cluster, shape (n,).
+        slices: Minimum number of agreeing slices.
     """
     most, returns = 0, 0
     for seed in range(found):
@@ -261,9 +274,16 @@ def _find_trunk(runs: Runs, found: int, level: Int, slices: int) -> bool:
 
 @compiled
 def _count_agreeing_slices(runs: Runs, found: int, seed: int) -> tuple[int, int]:
-    """Mark in each slice the run whose circle is most similar to that of the seed run, within the limits.
+    """Mark in `runs.agrees`, in each slice, the run whose circle is most similar to that of the seed run, if
+    one is within the limits of distance and radius; the seed agrees with itself.
 
-    Returns the number of agreeing slices and the number of their returns.
+    Args:
+        runs: Table of the runs, ordered by slice.
+        found: Number of runs.
+        seed: Row of the seed run.
+
+    Returns:
+        Number of agreeing slices, and number of the returns of the marked runs.
     """
     agree, returns, a = 0, 0, 0
     near = ALIKE * runs.radius[seed] + ALIKE_LEAST

@@ -50,8 +50,8 @@ def dbscan_grid(
     """Cluster points with DBSCAN on the compiled grid.
 
     Args:
-        points: Shape (N, 2) or (N, 3) [m].
-        eps: Maximum distance between neighbours [m].
+        points: Shape (N, 2) or (N, 3) [m], finite; may be empty.
+        eps: Maximum distance between neighbours, inclusive [m].
         min_points: Neighbours, including the point itself, that make a core point.
         weight: Number of neighbours that each point counts for, at least 1, int32, shape (N,); None means 1.
             The result equals that of a cloud in which each point is repeated this many times.
@@ -61,7 +61,7 @@ def dbscan_grid(
         mask of the core points, shape (N,).
 
     Raises:
-        ValueError: The cloud is wider than 2^21 cells.
+        ValueError: The cloud is wider than about 2^21 cells (eps / sqrt(axes)) along an axis.
     """
     n, dimensions = points.shape
     if n == 0:
@@ -80,7 +80,8 @@ def dbscan_grid(
 @cache
 def _row_offsets(dimensions: int) -> Int:
     """Return the key differences between a cell and the middle cell of each row along the last axis that can
-    contain a neighbour: the row of the cell itself first, then by distance."""
+    contain a neighbour, int64, shape (5,) in the plane and (25,) in space: the row of the cell itself (0)
+    first, then by distance. `dimensions` is 2 or 3."""
     reach = np.arange(-_REACH, _REACH + 1)
     rows = np.stack(np.meshgrid(*([reach] * (dimensions - 1)), indexing="ij"), -1).reshape(-1, dimensions - 1)
     rows = rows[np.argsort((rows**2).sum(axis=1), kind="stable")]
@@ -95,16 +96,17 @@ def _cluster(
     """Sort the points by cell and label them; see `dbscan_grid`.
 
     Args:
-        points: Points, shape (N, 2 or 3) [m].
-        key_of: Key of the cell of each point.
-        order: Rows of the points by ascending key.
-        rows: Offsets of the keys of the neighbouring rows of cells.
+        points: Points, shape (N, 2 or 3) [m], N at least 1.
+        key_of: Key of the cell of each point, not negative, shape (N,).
+        order: Rows of the points by ascending key, shape (N,).
+        rows: Result of `_row_offsets`.
         eps2: Square of the radius [m^2].
-        min_points: Least weight within the radius of a core point.
-        weight: Weight of each point.
+        min_points: Least weight within the radius of a core point, including its own.
+        weight: Weight of each point, shape (N,).
 
     Returns:
-        Cluster of each point, -1 for noise, and whether it is a core point, shape (N,).
+        Cluster of each point, numbered in the order of their first point, -1 for noise, and whether it is a
+        core point, shape (N,).
     """
     n = points.shape[0]
     keys, bounds = np.empty(n, np.int64), np.empty(n + 1, np.int64)
@@ -142,7 +144,8 @@ def _cluster(
 
 @compiled
 def number_by_first_point(label: Int32) -> Int32:
-    """Return the labels, int32, shape (N,), renumbered in the order of their first point; -1 stays."""
+    """Return the labels, int32, shape (N,), renumbered 0, 1, ... in the order of their first point; negative
+    labels become -1. The argument is not changed."""
     most = 0
     for each in label:
         most = max(most, each)
@@ -158,10 +161,14 @@ def number_by_first_point(label: Int32) -> Int32:
 
 @compiled
 def _in_reach(keys: Int, rows: Int) -> Int32:
-    """Return, for each cell and row, the range of cells that can contain a neighbour.
+    """Return, for each cell and row, the range of filled cells that can contain a neighbour.
+
+    Args:
+        keys: Ascending keys of the filled cells, shape (cells,).
+        rows: Result of `_row_offsets`, shape (rows,).
 
     Returns:
-        First cell and one past the last cell, int32, shape (cells, rows, 2).
+        First cell and one past the last cell (equal for none), int32, shape (cells, rows, 2).
     """
     cells = keys.shape[0]
     reach = np.empty((cells, rows.shape[0], 2), np.int32)
@@ -179,6 +186,17 @@ def _in_reach(keys: Int, rows: Int) -> Int32:
 
 @compiled
 def _find_cores(laid: Float, bounds: Int, reach: Int32, eps2: float, min_points: int, weight: Int32) -> Bool:
+    """Return whether each point is a core point: the weight within the radius, including its own, is at least
+    `min_points`; shape (N,), in the order of `laid`.
+
+    Args:
+        laid: Points sorted by cell, shape (_AXES, N) [m].
+        bounds: First point of each cell, and N, shape (cells + 1,).
+        reach: Result of `_in_reach`.
+        eps2: Square of the radius [m^2].
+        min_points: Minimum weight.
+        weight: Weight of each point in the order of `laid`, shape (N,).
+    """
     core = np.zeros(laid.shape[1], np.bool_)
     x, y, z = laid[0], laid[1], laid[2]
     for c in range(reach.shape[0]):
@@ -205,7 +223,15 @@ def _find_cores(laid: Float, bounds: Int, reach: Int32, eps2: float, min_points:
 def _weight_within(
     x: Float, y: Float, z: Float, weight: Int32, first: int, after: int, i: int, eps2: float
 ) -> int:
-    """Return the total weight of the points first..after-1 within eps of point i."""
+    """Return the total weight of the points first..after-1 within eps (inclusive) of point i.
+
+    Args:
+        x, y, z: Coordinates of all points, shape (N,) [m].
+        weight: Weights, shape (N,).
+        first, after: Range of the points.
+        i: Row of the centre; it is counted if it is in the range.
+        eps2: Square of the radius [m^2].
+    """
     count = 0
     # An unsigned index avoids the check for negative (wrap-around) indexing.
     for j in range(np.uint64(first), np.uint64(after)):
@@ -217,6 +243,14 @@ def _weight_within(
 
 @compiled
 def _lay_cores(laid: Float, bounds: Int, core: Bool) -> Cores:
+    """Return the core points sorted by cell with the bounding boxes of the cells; the box of a cell without a
+    core point is empty (inf to -inf).
+
+    Args:
+        laid: Points sorted by cell, shape (_AXES, N) [m].
+        bounds: First point of each cell, and N, shape (cells + 1,).
+        core: Whether each point is a core point, shape (N,).
+    """
     cells = bounds.shape[0] - 1
     place, first = np.empty((_AXES, core.sum())), np.empty(cells + 1, np.int64)
     box = np.empty((cells, 2 * _AXES))
@@ -238,10 +272,18 @@ def _lay_cores(laid: Float, bounds: Int, core: Bool) -> Cores:
 
 @compiled
 def _join(cores: Cores, rows: Int, reach: Int32, eps2: float) -> Int:
-    """Return the parent of each cell in a union-find forest with one tree per cluster of cells.
+    """Return the parent of each cell in a union-find forest with one tree per cluster of cells, shape
+    (cells,).
 
-    The cell with the smallest index of a cluster is its root. Near rows are joined first, since most cells of
-    one cluster are then already joined and need no distance computation.
+    The cell with the smallest index of a cluster is its root; a cell without core points is its own root.
+    Near rows are joined first, since most cells of one cluster are then already joined and need no distance
+    computation.
+
+    Args:
+        cores: Core points by cell.
+        rows: Result of `_row_offsets`, shape (rows,).
+        reach: Result of `_in_reach`, shape (cells, rows, 2).
+        eps2: Square of the radius [m^2].
     """
     cells = cores.box.shape[0]
     parent = np.arange(cells)
@@ -272,7 +314,8 @@ def root_of(parent: Int, c: int) -> int:
 
 @compiled_borrowing
 def _touch(cores: Cores, c: int, d: int, eps2: float) -> bool:
-    """Return whether a core point of cell c is within eps of a core point of cell d."""
+    """Return whether a core point of cell c is within eps (inclusive) of a core point of cell d; False if
+    either has none. `eps2` is the square of eps [m^2]."""
     place, box = cores.place, cores.box
     for i in range(cores.bounds[c], cores.bounds[c + 1]):
         x, y, z = place[0, i], place[1, i], place[2, i]
@@ -291,9 +334,18 @@ def _touch(cores: Cores, c: int, d: int, eps2: float) -> bool:
 
 @compiled_borrowing
 def _cell_of_nearest_core(laid: Float, i: int, cores: Cores, c: int, reach: Int32, eps2: float) -> int:
-    """Return the cell of the core point nearest to point i of cell c, or -1 if none is within eps.
+    """Return the cell of the core point nearest to point i of cell c, or -1 if none is within eps
+    (inclusive).
 
     Of several cells at the same distance, the first in the order of the keys is returned.
+
+    Args:
+        laid: Points sorted by cell, shape (_AXES, N) [m].
+        i: Column of the point in `laid`.
+        cores: Core points by cell.
+        c: Cell of the point.
+        reach: Result of `_in_reach`.
+        eps2: Square of eps [m^2].
     """
     best, best2 = -1, eps2
     x, y, z = laid[0, i], laid[1, i], laid[2, i]
@@ -315,14 +367,14 @@ UNKNOWN_RING_STEP = float(np.radians(0.8))
 def weigh(points: Float32, sensor: Sensor, parameters: Clustering) -> Int32:
     """Return the number of neighbours that each point counts for, int32, shape (N,), 1 to `weight_max`.
 
-    A visible stem area A gives n(r) = A / (r^2 da de) returns at range r, where da and de are the angles
-    between successive shots and between rings. Where n(r) is below `min_points`, a return has the weight
-    min_points / n(r), rounded down. DBSCAN then finds stems over the whole range.
+    A visible stem area A gives n(r) = A / (r^2 da de) returns at the horizontal range r, where da and de are
+    the angles between successive shots and between rings. Where n(r) is below `min_points`, a return has the
+    weight min_points / n(r), rounded down. DBSCAN then finds stems over the whole range.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame.
-        sensor: Angles between shots and between rings.
-        parameters: `stem_area` is A [m^2].
+        points: float32, shape (N, 3) [m], level sensor frame, finite.
+        sensor: Angles between shots and between rings; UNKNOWN_RING_STEP for a sensor without rings.
+        parameters: `stem_area` is A [m^2], above 0.
     """
     rings = sensor.ring_step if sensor.ring_step > 0.0 else UNKNOWN_RING_STEP
     scale = parameters.min_points * sensor.azimuth_step * rings / parameters.stem_area
@@ -331,6 +383,8 @@ def weigh(points: Float32, sensor: Sensor, parameters: Clustering) -> Int32:
 
 @compiled
 def _weigh(points: Float32, scale: float, most: int) -> Int32:
+    """Return scale * (x^2 + y^2) of each point, rounded down and limited to 1..most, int32, shape (N,);
+    `scale` [1/m^2] is that of `weigh`."""
     weight = np.empty(points.shape[0], np.int32)
     for i in range(points.shape[0]):
         x, y = np.float64(points[i, 0]), np.float64(points[i, 1])
@@ -339,17 +393,19 @@ def _weigh(points: Float32, scale: float, most: int) -> Int32:
 
 
 def range_jump(points: Float32, jump: float, min_points: int, azimuth_step: float) -> tuple[Int32, Bool]:
-    """Cluster the beams of a planar laser: a cluster ends where the range jumps or a beam is missing.
+    """Cluster the beams of a planar laser: a cluster ends where the range jumps or more than one beam is
+    missing. The beams are sorted by azimuth; the circle is closed, so that a cluster may extend over the seam
+    behind the sensor.
 
     Args:
-        points: float32, shape (N, 3) [m], sensor frame.
+        points: float32, shape (N, 3) [m], sensor frame; z is ignored.
         jump: Maximum difference in range between neighbouring beams of one cluster [m].
         min_points: Smaller clusters are noise.
-        azimuth_step: Angle between neighbouring beams [rad].
+        azimuth_step: Angle between neighbouring beams [rad]; beams up to 2.5 steps apart are neighbours.
 
     Returns:
-        Labels, int32, shape (N,), -1 for noise; and for each cluster whether the return of a neighbouring
-        beam is closer and hides one of its edges.
+        Labels, int32, shape (N,), -1 for noise, numbered counter-clockwise; and for each cluster whether the
+        return of a neighbouring beam is closer and hides one of its edges, shape (clusters,).
     """
     if len(points) == 0:
         return np.zeros(0, np.int32), np.zeros(0, np.bool_)
@@ -363,6 +419,16 @@ def range_jump(points: Float32, jump: float, min_points: int, azimuth_step: floa
 def _cut(
     azimuth: Float, distance: Float, order: Int, jump: float, min_points: int, gap: float
 ) -> tuple[Int32, Bool]:
+    """Cluster beams in the order of their azimuth; result as in `range_jump`.
+
+    Args:
+        azimuth: Ascending azimuth of each beam, shape (N,), N at least 1 [rad].
+        distance: Horizontal range of each beam [m], same order.
+        order: Row of each beam in the scan, in which the labels are returned.
+        jump: Maximum difference in range between neighbours of one cluster [m].
+        min_points: Smaller clusters are noise.
+        gap: Maximum angle between neighbours [rad].
+    """
     n = azimuth.shape[0]
     # neighbours[i], begins[i]: relation of beam i to beam i - 1. The circle is closed: the first beam follows
     # the last one.
@@ -410,10 +476,12 @@ class Engine(Protocol):
 
 
 def _grid(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
+    """Run `dbscan_grid`, which returns core points and raises its errors."""
     return Dbscan(*dbscan_grid(points.astype(np.float64), eps, min_points, weight))
 
 
 def _sklearn(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
+    """Run DBSCAN of scikit-learn, with core points; no points give empty arrays."""
     from sklearn.cluster import DBSCAN
 
     if len(points) == 0:
@@ -425,6 +493,8 @@ def _sklearn(points: Float32, eps: float, min_points: int, weight: Int32 | None 
 
 
 def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
+    """Run DBSCAN of Open3D, without core points (None); no points give empty labels. Memory grows with the
+    sum of the weights, because Open3D gets each point repeated."""
     import open3d
 
     if len(points) == 0:
@@ -452,12 +522,18 @@ def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
     """Cluster the points of a scan.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame.
+        points: float32, shape (N, 3) [m], level sensor frame, finite; may be empty.
         sensor: The LiDAR, whose angular resolution sets weights and beam gaps.
-        parameters: Method and thresholds.
+        parameters: Method and thresholds. The method "range_jump" uses `eps` as the maximum jump; otherwise
+            `engine` runs DBSCAN on the first two or three coordinates, with weights if `stem_area` is above
+            0.
 
     Returns:
-        Cluster label of each point, and for each cluster whether one of its edges is hidden.
+        Cluster of each point, -1 for noise, and for each cluster whether one of its edges is hidden, which
+        only "range_jump" finds (False for DBSCAN).
+
+    Raises:
+        ValueError: The cloud is too wide for the cells of the engine "grid", see `dbscan_grid`.
     """
     if parameters.method == "range_jump":
         label, hidden = range_jump(points, parameters.eps, parameters.min_points, sensor.azimuth_step)

@@ -43,17 +43,22 @@ def normal_equations(
 ) -> tuple[float, float]:
     """Compute the normal equations of the cylinder fit, with the priors on lean and radius.
 
-    Fills the lower triangle of H = J^T W J, shape (5, 5), and the gradient g = J^T W r, shape (5,). The
-    Jacobian of a return is (nx, ny, nx h, ny h, -1), where n is the normal from the return to the axis; its
-    weight is Tukey's weight divided by the variance. With the range error sigma and the angle phi between ray
-    and normal, E[r] = sigma^2 sin^2 phi / 2 r and, beyond that, E[n r] = sigma^2 / r cos phi (u - n cos phi).
+    Fills the lower triangle of H = J^T W J, shape (5, 5), and the gradient g = J^T W r, shape (5,), in place.
+    The Jacobian of a return is (nx, ny, nx h, ny h, -1), where n is the normal from the return to the axis;
+    its weight is Tukey's weight divided by the variance. With the range error sigma and the angle phi between
+    ray and normal, E[r] = sigma^2 sin^2 phi / 2 r and, beyond that, E[n r] = sigma^2 / r cos phi (u - n cos
+    phi).
 
     Args:
         rays: shape (RAY, capacity), of which n columns are valid.
-        p: Parameters of the cylinder, shape (5,).
-        sigma: Standard deviation of a range [m].
+        n: Number of returns.
+        p: Parameters of the cylinder, shape (5,); the radius p[4] is positive.
+        sigma: Standard deviation of a range, above 0 [m].
         within: Returns with a larger residual have no weight [m].
-        back: Returns farther behind the axis have no weight [m], since no beam reaches the back of a trunk.
+        back: Returns farther behind the axis have no weight [m], since no beam reaches the back of a trunk;
+            may be infinite.
+        g: Receives the gradient.
+        H: Receives the lower triangle; the upper one is not written.
 
     Returns:
         Sum of all squared residuals, and the sum of squared residuals clipped to `within` [m^2].
@@ -125,12 +130,12 @@ def normal_equations(
 @compiled
 def angular_width(rays: Float, n: int) -> tuple[float, float]:
     """Return the bearing half-way between the outermost rays of a cluster, not wrapped, and the angle between
-    them [rad].
+    them [rad], 0 for one return.
 
     Args:
         rays: Direction x, y of each return, its horizontal range [m] and height [m]; shape (RAY, capacity),
             of which n columns are valid.
-        n: Number of returns.
+        n: Number of returns, at least 1.
     """
     mean_x, mean_y = 0.0, 0.0
     for i in range(n):
@@ -178,6 +183,7 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf
 
     Args:
         rays: shape (RAY, capacity), of which n columns are valid.
+        n: Number of returns, at least 1.
         lean_x, lean_y: Shift of the axis per metre of height, which is removed before the width is measured.
     """
     x, y = 0.0, 0.0
@@ -208,7 +214,8 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf
 
 @compiled
 def quantile(ordered: Float, part: float) -> float:
-    """Return the quantile `part`, 0 to 1, of ascending numbers, shape (N,), with linear interpolation."""
+    """Return the quantile `part`, 0 to 1, of ascending numbers, shape (N,), N at least 1, with linear
+    interpolation."""
     at = part * (ordered.shape[0] - 1)
     k = int(at)
     after = ordered[min(k + 1, ordered.shape[0] - 1)]
@@ -217,8 +224,15 @@ def quantile(ordered: Float, part: float) -> float:
 
 @compiled
 def visible_arc(rays: Float, n: int, p: Float) -> float:
-    """Return the visible arc [rad] around the axis p (x, y, lean x, lean y first) by the first n rays: a full
-    turn minus the largest gap between returns."""
+    """Return the visible arc around the axis [rad], 0 to 2 pi: a full turn minus the largest gap between
+    returns.
+
+    Args:
+        rays: shape (RAY, capacity), of which n columns are valid.
+        n: Number of returns, at least 1.
+        p: x, y of the axis at z0 [m] and its shift in x and y per metre of height; further values are not
+            used.
+    """
     away = max(np.sqrt(p[0] * p[0] + p[1] * p[1]), 1e-9)
     c, s = -p[0] / away, -p[1] / away  # from the axis to the sensor
     least, most = np.inf, -np.inf
@@ -235,12 +249,15 @@ def visible_arc(rays: Float, n: int, p: Float) -> float:
 
 @compiled
 def _from_axis(rays: Float, i: int, p: Float) -> tuple[float, float]:
+    """Return the horizontal vector x, y [m] from the axis p (x, y, lean x, lean y first), at the height of
+    the return, to return i of `rays`."""
     reach, h = rays[2, i], rays[3, i]
     return rays[0, i] * reach - p[0] - p[2] * h, rays[1, i] * reach - p[1] - p[3] * h
 
 
 @compiled
 def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
+    """Return the visible arc [rad] for returns on any side of the axis; arguments as in `visible_arc`."""
     angle = np.empty(n)
     for i in range(n):
         x, y = _from_axis(rays, i, p)
@@ -273,16 +290,18 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
     """Fit a leaning cylinder to each cluster.
 
     Args:
-        points: shape (N, 3) [m], level sensor frame, sorted by cluster.
-        bounds: Index of the first point of each cluster, shape (K + 1,).
-        range_sigma: Standard deviation of a range [m].
+        points: shape (N, 3) [m], level sensor frame, sorted by cluster; of each cluster at most MOST_POINTS
+            evenly drawn points are used.
+        bounds: Index of the first point of each cluster, and N, shape (K + 1,); no cluster is empty.
+        range_sigma: Standard deviation of a range [m]; at least SIGMA_MIN is used.
         azimuth_step: Angle between successive shots [rad].
 
     Returns:
-        Shape (K, 11): centre x, y [m]; its covariance xx, xy, yy [m^2]; radius and its sigma [m]; standard
-        deviation of the residuals [m]; visible arc [rad]; shift of the axis in x and y per metre of height.
-        For clusters with fewer than five points, radius and sigma are NaN and the centre is estimated from
-        the angular width.
+        Shape (K, 11): centre x, y at the mean height of the points [m]; its covariance xx, xy, yy [m^2];
+        radius and its sigma [m]; root mean square of the residuals, outliers included [m]; visible arc [rad];
+        shift of the axis in x and y per metre of height. For clusters with fewer than five points, radius and
+        its sigma are NaN, the last four columns are 0, and the centre is estimated from the angular width. A
+        poor fit is not reported as such: it shows in the residuals and the sigmas.
     """
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
@@ -299,7 +318,14 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
 @compiled
 def _to_rays(points: Float, begin: int, end: int, rays: Float) -> int:
     """Fill `rays` from points begin..end-1, at most MOST_POINTS evenly drawn ones: rows are x and y of the
-    horizontal direction, horizontal range [m], and height above the mean [m]. Return the number of rays."""
+    horizontal direction, horizontal range [m], and height above the mean of the drawn points [m]. Return the
+    number of rays.
+
+    Args:
+        points: Shape (N, 3) [m], sensor frame.
+        begin, end: Range of the points, not empty.
+        rays: Shape (RAY, MOST_POINTS), changed in place; columns beyond the result are not written.
+    """
     n = min(end - begin, MOST_POINTS)
     z0 = 0.0
     for k in range(n):
@@ -317,14 +343,15 @@ def _to_rays(points: Float, begin: int, end: int, rays: Float) -> int:
 def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> None:
     """Estimate the centre of a trunk with too few points for a circle from its angular width.
 
-    The radius is r = R sin w / (1 - sin w), where w is half the angular width and R the mean range.
+    The radius is r = R sin w / (1 - sin w), at most 1 m, where w is half the angular width and R the mean
+    range.
 
     Args:
         rays: Rays, see `_to_rays`.
-        n: Number of rays.
+        n: Number of rays, at least 1.
         azimuth_step: Azimuth step of the sensor [rad].
-        stem: Receives centre and covariance, see `fit_stems`; radius and its sigma become NaN, the other
-            columns 0.
+        stem: Receives centre and covariance, see `fit_stems`; radius and its sigma become NaN, the columns
+            after them 0.
     """
     distance = 0.0
     for i in range(n):
@@ -347,15 +374,15 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
 @compiled
 def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, stem: Float) -> None:
     """Fit one cluster by a robust circle with lean and write the result to `stem`, a row of the result of
-    `fit_stems`.
+    `fit_stems`. At most ITERATIONS steps are made; whether they converged is not reported.
 
     Args:
         rays: Rays, see `_to_rays`.
-        n: Number of rays.
-        some: Buffer of the shape of `rays` for a subset.
-        sigma: Standard deviation of the ranges [m].
+        n: Number of rays, at least 5.
+        some: Buffer of the shape of `rays` for a subset; overwritten.
+        sigma: Standard deviation of the ranges, at least SIGMA_MIN [m].
         azimuth_step: Azimuth step of the sensor [rad].
-        stem: Receives the result.
+        stem: Receives the result, shape (COLUMNS,).
     """
     half = middle_half(rays, n, 0.0, 0.0)
     away = np.hypot(half.x, half.y)
@@ -412,9 +439,13 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
 
 @compiled
 def _some(rays: Float, n: int, some: Float) -> int:
-    """Fill `some` with every third ray, or all rays if they are few; return the number of rays.
+    """Fill `some` with every third ray, or with all rays up to ENOUGH, and return their number; the first
+    iterations use this subset.
 
-    The first iterations use this subset; the last ones use all rays.
+    Args:
+        rays: Shape (RAY, capacity), of which n columns are valid.
+        n: Number of rays.
+        some: Same shape as `rays`, changed in place.
     """
     stride = 3 if n > ENOUGH else 1
     few = (n + stride - 1) // stride
@@ -426,8 +457,15 @@ def _some(rays: Float, n: int, some: Float) -> int:
 
 @compiled
 def _write(p: Float, L: Float, inflate: float, stem: Float) -> None:
-    """Write centre, radius and their covariance, (L L^T)^-1 times `inflate` plus that of the model, to
-    `stem`; p holds x, y, lean x, lean y, radius."""
+    """Write centre, radius and their covariance to the first seven values of `stem`, a row of the result of
+    `fit_stems`. The covariance is (L L^T)^-1 times `inflate` plus that of the model.
+
+    Args:
+        p: x, y [m], lean x, lean y, radius [m], shape (5,).
+        L: Cholesky factor of the normal equations, shape (5, 5).
+        inflate: Factor of the covariance.
+        stem: Row that is changed.
+    """
     unit, column = np.zeros(5), np.empty(5)
     stem[0], stem[1], stem[5] = p[0], p[1], p[4]
     unit[0] = 1.0
@@ -466,7 +504,13 @@ class StemFit:
 
 
 def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
-    """Return the fit for the points of one cluster, shape (N, 3) [m], or None if the points are too few."""
+    """Return the fit for the points of one cluster, or None with fewer than five points or if the fit is not
+    finite.
+
+    Args:
+        points: Shape (N, 3) [m], level sensor frame; `offset` and `residual` of the result have their rows.
+        sensor: Range sigma and azimuth step of the LiDAR.
+    """
     if not len(points):
         return None
     stem = fit_stems(points, np.array([0, len(points)]), sensor.range_sigma, sensor.azimuth_step)[0]
@@ -490,8 +534,12 @@ def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
 
 
 def arc_start(angle: Float) -> float:
-    """Return the direction [rad] at which the arc covered by angles of shape (N,) begins: after the largest
-    gap."""
+    """Return the direction [rad] at which the arc covered by angles begins, counter-clockwise: the first
+    angle after the largest gap.
+
+    Args:
+        angle: Angles in [-pi, pi], shape (N,), N at least 1.
+    """
     ordered = np.sort(angle)
     gaps = np.diff(np.append(ordered, ordered[0] + 2.0 * np.pi))
     return float(ordered[(int(np.argmax(gaps)) + 1) % len(ordered)])

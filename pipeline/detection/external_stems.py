@@ -21,21 +21,23 @@ AXES_TO_LEVEL = 5
 def external_clusters(
     step: Step, stems: Stems, T_base_lidar: Pose3, parameters: Acquisition
 ) -> tuple[Float32, Float, Clusters]:
-    """Return the stems of a scan in the level sensor frame, each as a cluster of one point.
+    """Return the stems of a scan in the level sensor frame, each as a cluster of one point with the verdict
+    TREE.
 
     The positions are rotated by the tilt of the step or, if it is unknown, by the median of the stem axes,
     which are vertical on average. Without levelling, pitch of the robot would displace stems far below the
-    sensor.
+    sensor. Stems outside of the range limits (inclusive) or with NaN in their position are left out.
 
     Args:
         step: Step whose scan points are the stem positions in the sensor frame.
-        stems: Axes and diameters.
+        stems: Axes and diameters, one row per point.
         T_base_lidar: Pose of the sensor on the robot.
         parameters: Range limits and levelling.
 
     Returns:
         Positions, float32, shape (N, 3) [m]; position of the sensor in the level base frame, shape (3,) [m];
-        and the clusters, in which unknown values are NaN.
+        and the clusters: centre and radius (NaN for an unknown DBH) are those of the stem, covariance and arc
+        are 0, `hidden` and `cut` are False, other unknown values are NaN.
     """
     R_level_base = _levelling(step, stems, T_base_lidar, parameters)
     place = step.scan.points.astype(np.float64)
@@ -64,7 +66,12 @@ def _levelling(step: Step, stems: Stems, T_base_lidar: Pose3, parameters: Acquis
 
 
 def _clusters(place: Float, dbh: Float) -> Clusters:
-    """Return clusters of one point each at positions of shape (N, 3) [m]."""
+    """Return clusters of one point each with the verdict TREE, see `external_clusters`.
+
+    Args:
+        place: Positions, level sensor frame, shape (N, 3) [m].
+        dbh: Diameters, shape (N,) [m]; NaN if unknown.
+    """
     n = len(place)
     unknown = np.full(n, np.nan)
     radius = 0.5 * dbh

@@ -20,16 +20,17 @@ FIELD = 10  # bins; a direction without a return within this distance may be out
 
 @compiled
 def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
-    """Return the free distance by direction in the base frame, shape (BINS,), in the order of `direction_bin`
-    [m].
+    """Return the free distance from the base by direction in the base frame, shape (BINS,), in the order of
+    `direction_bin` [m].
 
-    The free distance is the distance to the nearest filtered point; infinite without a point; and 0 where the
-    direction may be outside of the field of view: without a return in the neighbourhood, or in the largest
-    gap between dense returns, which a sensor that looks one way does not observe.
+    The free distance is the distance to the nearest filtered point in the direction or one of its two
+    neighbours; infinite without a point; and 0 where one of the three may be outside of the field of view:
+    without a return within FIELD bins, or in the largest gap between dense returns, which a sensor that looks
+    one way does not observe. It is 0 everywhere for an empty scan.
 
     Args:
         raw: The scan before the filters, float32, shape (N, 3) [m], level sensor frame.
-        filtered: The scan after the filters, float32, shape (M, 3) [m].
+        filtered: The scan after the filters, float32, shape (M, 3) [m], same frame.
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
     """
     looked = np.zeros(BINS, np.bool_)
@@ -63,9 +64,14 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
 
 @compiled
 def directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
-    """Return the `direction_bin` of each point, uint16, shape (N,).
+    """Return the `direction_bin` (of BINS) of each point as seen from the base, uint16, shape (N,).
 
     The loop has no branches and reads contiguous rows, so that the compiler vectorises it.
+
+    Args:
+        points: Float32, shape (N, 2 or 3) [m], level sensor frame, finite.
+        sensor_offset: Position of the sensor in the level base frame, x, y first [m]; zeros for directions
+            from the sensor.
     """
     n = points.shape[0]
     xs, ys = np.empty(n), np.empty(n)

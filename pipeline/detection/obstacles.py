@@ -39,18 +39,21 @@ def find_clearance(
     twist: tuple[float, float, float],
     parameters: Obstacles,
 ) -> Clearance | None:
-    """Return the clearance of the path of the robot, or None if obstacle detection is off.
+    """Return the clearance of the path of the robot, or None if obstacle detection is off (`method` is
+    "none").
 
     An obstacle beside the robot, within the path width, has distance 0. Without terrain and with a sensor
     below the minimum obstacle height (for example with an unknown mounting), lower obstacles would be missed;
-    the zone of such a path is never free but unknown.
+    then each zone except STOP becomes UNKNOWN, SLOW included.
 
     Args:
-        points: The whole scan beyond `acquisition.range_min`, float32, shape (N, 3) [m], level sensor frame.
+        points: The whole scan beyond `acquisition.range_min`, float32, shape (N, 3) [m], level sensor frame;
+            rows with NaN are ignored.
         near: Closer returns, float32, shape (M, 3) [m], same frame; returns inside the robot are removed.
         terrain: Terrain of the scan; without it, heights are relative to the base.
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
-        twist: Velocity of the base: forward, left [m/s], yaw rate [rad/s].
+        twist: Velocity of the base: forward, left [m/s], yaw rate [rad/s]; the velocity to the left is not
+            used.
         parameters: Path width, zones and thresholds.
     """
     if parameters.method == "none":
@@ -78,14 +81,21 @@ def find_clearance(
 
 
 def _reach(sensor_offset: Float, backward: bool, parameters: Obstacles) -> tuple[float, float]:
-    """Return the extent of the robot in the direction in which it drives and in the other one [m]; each is at
-    least that of its sensor, which is at `sensor_offset` x, y, z [m] in the base frame."""
+    """Return the extent of the robot from its base in the direction in which it drives and in the other one
+    [m]; each is at least that of its sensor.
+
+    Args:
+        sensor_offset: Position of the sensor in the base frame, x first [m].
+        backward: Whether the robot drives backwards.
+        parameters: `reach` is the extent in both directions.
+    """
     along = -float(sensor_offset[0]) if backward else float(sensor_offset[0])
     return max(parameters.reach, along), max(parameters.reach, -along)
 
 
 def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles) -> Float32:
-    """Return the points outside of the box of the robot, which contains its base and its sensor.
+    """Return the points outside of the box of the robot, which contains its base and its sensor, float32,
+    shape (M, 3) [m], in the frame of the points. Points with NaN are kept.
 
     Args:
         near: Points, shape (N, 3) [m], level frame at the sensor.
@@ -100,7 +110,9 @@ def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles
 
 
 def way_of(twist: tuple[float, float, float]) -> float:
-    """Return the curvature [1/m] of the path that results from the velocities, bounded by `TIGHTEST`."""
+    """Return the curvature [1/m] of the path that results from the velocities forward, left [m/s] and turn
+    [rad/s], positive to the left, at most 1 / TIGHTEST in size. It is 0 below the forward speed STANDING and
+    for NaN. When driving backwards it is turn / forward too."""
     forward, _, turn = twist
     if abs(forward) < STANDING or not math.isfinite(turn / forward):
         return 0.0
@@ -119,6 +131,26 @@ def _along(
     zones: Float,
     least: int,
 ) -> tuple[int, float, float, float, float]:
+    """Find the obstacles along the path of the robot.
+
+    Args:
+        points: float32, shape (N, 3) [m], level sensor frame; rows with NaN are ignored.
+        ground: `Terrain.height`; shape (0, 0) if unknown: then heights are relative to the base.
+        sensor: Position of the sensor in the level base frame, shape (3,) [m].
+        curvature: Curvature of the path [1/m].
+        backward: Whether the robot drives backwards.
+        band: Lowest and highest height of obstacles, inclusive, shape (2,) [m].
+        robot: Extent of the robot in and against the direction of driving and half of its width, shape (3,)
+            [m].
+        zones: Lengths of the zones STOP and SLOW from the end of the robot, shape (2,) [m].
+        least: Number of returns within DEPTH that form an obstacle.
+
+    Returns:
+        Zone as an integer (CLEAR becomes UNKNOWN with fewer than `least` returns within 30 degrees of the
+        direction of driving); distance along the path from the end of the robot, and least lateral distance
+        from its sides up to BESIDE [m], infinite without an obstacle; x, y of a return of the nearest
+        obstacle on the path in the level base frame [m], NaN without.
+    """
     reach, behind, half = robot[0], robot[1], robot[2]
     stop, slow = zones[0], zones[1]
     most = reach + slow
@@ -182,7 +214,8 @@ def _on_the_way(x: float, y: float, curvature: float) -> float:
 
 @compiled
 def _nearest(values: Float, least: int) -> float:
-    """Return the smallest value that starts a group of `least` values within DEPTH, or infinity.
+    """Return the smallest of the values, shape (N,) [m], that starts a group of `least` values within DEPTH,
+    or infinity without such a group.
 
     Fewer returns, such as rain or an insect, are not an obstacle.
     """

@@ -51,13 +51,15 @@ def is_truncated(
     filters: Filters,
     acquisition: Acquisition,
 ) -> Bool:
-    """Return whether each cluster extends to within two shots of a border, shape (K,).
+    """Return whether each cluster may be cut off: a point of it is within two shots (at least the range
+    sigma) of a vertical face of the box, of a range limit, or of an edge of the field of view at which OTHERS
+    or more returns at other ranges end too; shape (K,).
 
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.
         labels: Cluster of each point.
         raw: The whole scan, from which the field of view is estimated, float32, shape (M, 3) [m], same frame.
-        sensor: Angle between shots and maximum range of the LiDAR.
+        sensor: Angle between shots, range sigma and maximum range of the LiDAR.
         filters: The pass-through box, whose vertical faces are borders.
         acquisition: Minimum and maximum range.
     """
@@ -70,7 +72,8 @@ def is_truncated(
 
 
 def field_of_view(raw: Float32) -> FieldOfView:
-    """Estimate the horizontal field of view from the points of a scan, shape (M, 3) [m], sensor frame."""
+    """Estimate the horizontal field of view from the points of a scan, shape (M, 3) [m], sensor frame. It is
+    360 degrees unless BLIND bins or more in a row have no return; also for an empty scan."""
     bins = directions(raw, np.zeros(3))
     first, blind = _widest_gap(bins)
     if blind < BLIND:
@@ -83,7 +86,8 @@ def field_of_view(raw: Float32) -> FieldOfView:
 
 @compiled
 def _widest_gap(bins: UInt16) -> tuple[int, int]:
-    """Return the first bin and the length of the longest run of empty bins; length 0 for an empty scan."""
+    """Return the first bin and the length of the longest run of empty bins, which may extend over the seam;
+    length 0 for an empty scan. `bins` are the bins of the returns, shape (N,)."""
     lit = np.zeros(BINS, np.bool_)
     for k in bins:
         lit[k] = True
@@ -96,14 +100,21 @@ def _widest_gap(bins: UInt16) -> tuple[int, int]:
 
 
 def _within(bins: UInt16, first: int) -> Bool:
-    """Return the mask of the returns in the EDGE bins from `first` on."""
+    """Return the mask of the returns in the EDGE bins from `first` on, shape (N,); `bins` are the bins of the
+    returns, and `first` is taken modulo BINS."""
     inside: Bool = (bins.astype(np.int64) - first) % BINS < EDGE
     return inside
 
 
 def _end(beside: Float32, c: float, s: float, side: float) -> tuple[float, Float]:
-    """Return the largest bearing of the returns to a side (1 left, -1 right) [rad], and their ranges [m]. c
-    and s are cosine and sine of the direction from which bearings are counted; `beside` is not empty."""
+    """Return the largest bearing of returns to a side [rad], and the horizontal ranges of all of them, shape
+    (N,) [m].
+
+    Args:
+        beside: Returns at one edge of the field of view, shape (N, 3) [m], N at least 1.
+        c, s: Cosine and sine of the direction from which bearings are counted.
+        side: 1 for bearings that increase to the left, -1 to the right.
+    """
     x, y = beside[:, 0].astype(np.float64), beside[:, 1].astype(np.float64)
     turn = side * np.arctan2(c * y - s * x, c * x + s * y)
     return float(turn.max()), np.hypot(x, y)
@@ -120,6 +131,18 @@ def _touches(
     least: float,
     view: FieldOfView,
 ) -> Bool:
+    """Return whether each cluster has a point at a border, see `is_truncated`, shape (K,).
+
+    Args:
+        points: float32, shape (N, 3) [m], sensor frame.
+        label: Cluster of each point, -1 for none, shape (N,).
+        clusters: Number of clusters K.
+        box: x_min, x_max, y_min, y_max [m].
+        ranges: Minimum and maximum range, shape (2,) [m].
+        azimuth_step: Angle between shots [rad].
+        least: Distance from a border that counts at least [m].
+        view: Field of view; its edges count only if it is less than 360 degrees.
+    """
     cut = np.zeros(clusters, np.bool_)
     one_way = np.isfinite(view.left)
     for i in range(points.shape[0]):
@@ -143,7 +166,8 @@ def _touches(
 
 @compiled
 def _others(away: Float, reach: float) -> bool:
-    """Return whether enough returns at other ranges end at the same edge."""
+    """Return whether OTHERS or more returns at an edge have ranges `away`, shape (N,) [m], that differ by
+    more than APART from `reach` [m]."""
     others = 0
     for d in away:
         others += abs(d - reach) > APART

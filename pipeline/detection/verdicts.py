@@ -13,8 +13,9 @@ from pipeline.types.records import Bool, Clusters, Detections, Verdict
 
 
 def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
-    """Return the clusters with their verdicts: the first check that fails, in the order of `checks`, else
-    TREE."""
+    """Return the clusters with new verdicts: that of the first check that fails, in the order of `checks`,
+    else TREE. The argument is not changed; its verdicts have no effect. A check of an unknown value (NaN)
+    does not fail."""
     verdict = np.full(len(clusters.size), Verdict.TREE, np.int32)
     for check in reversed(checks(clusters, parameters)):  # the first check that fails is written last
         verdict[check.fails] = check.verdict
@@ -22,9 +23,14 @@ def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
 
 
 def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) -> Detections:
-    """Return the clusters with the verdict TREE in the base frame (Eq. 8: p_base = T_base_lidar p_lidar). The
-    covariance of the bearing and the range of the parameters is added to that of the fit; `sensor_offset` is
-    the position of the sensor in the base frame, x, y first [m]."""
+    """Return the clusters with the verdict TREE in the base frame (Eq. 8: p_base = T_base_lidar p_lidar), in
+    their order; the arrays are copies.
+
+    Args:
+        clusters: Clusters with verdicts, level sensor frame.
+        sensor_offset: Position of the sensor in the level base frame, x, y first [m].
+        parameters: `sigma_range` and `sigma_bearing`, whose covariance is added to that of the fit.
+    """
     rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
     place, covariance = clusters.centre[rows], clusters.covariance[rows]
     reach = np.maximum(np.sqrt(place[:, 0] * place[:, 0] + place[:, 1] * place[:, 1]), 1e-6)
@@ -72,8 +78,9 @@ class Check:
 
 
 def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
-    """Return the checks of `classify_clusters` in their order, with all values and limits, as an
-    explanation."""
+    """Return the checks of `classify_clusters` in their order, with all values and limits, as an explanation.
+    All checks are returned for all clusters, also those that come after a failed one; the verdicts of the
+    clusters are not read. Radius and arc are NaN for clusters without a circle."""
     p, c = parameters, clusters
     has_circle = np.isfinite(c.radius)
     radius = np.where(has_circle, c.radius, np.nan)
@@ -111,12 +118,30 @@ def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
 
 
 def _flag(verdict: Verdict, figure: str, is_set: Bool, parameter: str) -> Check:
+    """Return a yes/no check that fails where `is_set`, shape (K,), is true.
+
+    Args:
+        verdict: Verdict of a cluster that fails.
+        figure: Name of the checked quantity.
+        is_set: Whether each cluster fails.
+        parameter: Dotted name of the parameter; empty without one.
+    """
     return Check(verdict, figure, "", is_set.astype(np.float64), "", np.nan, parameter, is_set)
 
 
 def _at_least(verdict: Verdict, figure: str, unit: str, value: Float, limit: float, name: str) -> Check:
+    """Return a check that fails below a limit, not for NaN.
+
+    Args:
+        verdict: Verdict of a cluster that fails.
+        figure, unit: Name and unit of the quantity.
+        value: Quantity of each cluster, shape (K,).
+        limit: The limit, which passes.
+        name: Name of the parameter of the stage `detection` that sets it.
+    """
     return Check(verdict, figure, unit, value, "at least", limit, f"detection.{name}", value < limit)
 
 
 def _at_most(verdict: Verdict, figure: str, unit: str, value: Float, limit: float, name: str) -> Check:
+    """Return a check that fails above a limit, not for NaN; arguments as in `_at_least`."""
     return Check(verdict, figure, unit, value, "at most", limit, f"detection.{name}", value > limit)
