@@ -29,15 +29,17 @@ LOW, AT_X, AT_Y, TOTAL, COUNT, ABOVE_LAYER, SPREAD = range(7)
 
 @compiled
 def lowest_returns(points: Float32) -> tuple[Int32, Float]:
-    """Return the cell of each point and the lowest return of each cell, without ghost echoes.
+    """Return the cell of each point and the lowest return of each cell, without ghost echoes: a return more
+    than GHOST below the second lowest one of its cell is replaced by that one. The result does not depend on
+    the order of the points.
 
     Args:
         points: Points in the level sensor frame, float32, shape (N, 3) [m].
 
     Returns:
         Cell of each point (sector * RINGS + ring), int32, shape (N,), -1 for a point that is not finite or
-        has |z| >= FARTHEST; and x, y, z [m] of the lowest return of each cell, shape (SECTORS, rings, 3),
-        with infinite z for an empty cell. `rings` is the number of rings up to the farthest point.
+        has |z| >= FARTHEST; and x, y, z [m] of the lowest return of each cell, shape (SECTORS, rings, 3), all
+        infinite for an empty cell. `rings` is the number of rings up to the farthest point, at least 1.
     """
     cell, rings = _cell_of(points)
     row = np.full((SECTORS * RINGS, 2), -1, np.int32)  # rows of the lowest and second lowest return
@@ -68,7 +70,8 @@ def lowest_returns(points: Float32) -> tuple[Int32, Float]:
 
 @compiled
 def _cell_of(points: Float32) -> tuple[Int32, int]:
-    """Return the cell of each point, see `lowest_returns`, and the number of rings."""
+    """Return the cell of each point, see `lowest_returns`, int32, shape (N,), and the number of rings up to
+    the farthest valid point, at least 1."""
     n = points.shape[0]
     sector, ring = on_the_grid(points)
     cell = np.empty(n, np.int32)
@@ -86,7 +89,12 @@ def _cell_of(points: Float32) -> tuple[Int32, int]:
 @compiled
 def _comes_first(points: Float32, i: int, other: int) -> bool:
     """Return whether point i is first of two points of equal height, by x and then by y, so that the result
-    does not depend on the order of the points. `other` is the row of the second point."""
+    does not depend on the order of the points.
+
+    Args:
+        points: Shape (N, 3) [m].
+        i, other: Rows of the two points.
+    """
     x, y = points[i, X], points[i, Y]
     return bool(x < points[other, X] or (x == points[other, X] and y < points[other, Y]))
 
@@ -97,7 +105,8 @@ def remove_overhanging(lowest: Float, slope: float) -> None:
     crowns.
 
     The limit of a cell is the lowest height that any other candidate plus the slope times the distance gives,
-    computed by two passes in each direction over the grid. A removed candidate gets an infinite z.
+    computed by two passes in each direction over the grid; TOLERANCE and the rise over one ring are added. A
+    removed candidate gets an infinite z, its x and y remain.
 
     Args:
         lowest: Lowest returns, see `lowest_returns`, shape (SECTORS, rings, 3) [m]; changed in place.
@@ -138,9 +147,9 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
 
     Returns:
         Mean height of the lowest layer above the plane, shape (SECTORS, rings) [m], NaN without a candidate;
-        and its weight from 0 to 1, same shape. With n returns in the layer and m returns above it between
-        OBJECT_BOTTOM and OBJECT_TOP, the weight is (n / (n + 2 m))^2; a layer wider than a trunk has at least
-        WIDE_WEIGHT.
+        and its weight from 0 (also without a candidate) to 1, same shape. With n returns in the layer and m
+        returns above it between OBJECT_BOTTOM and OBJECT_TOP, the weight is (n / (n + 2 m))^2; the spread of
+        the layer gives a lower limit, which rises to WIDE_WEIGHT for a layer wider than a trunk.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     # One row per cell, so that each point accesses one cache line: residual, x and y of the lowest return;
@@ -181,7 +190,8 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
 
 @compiled
 def _above_plane(points: Float32, plane: Float) -> Float32:
-    """Return the height of each point above a plane (see `evidence`), float32, shape (N,) [m]."""
+    """Return the height of each point (shape (N, 3) [m]) above a plane (see `evidence`), float32, shape (N,)
+    [m]."""
     above = np.empty(points.shape[0], np.float32)
     at, along, across = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     for i in range(points.shape[0]):
@@ -202,7 +212,7 @@ X, Y, Z = 0, 1, 2
 @compiled
 def trend(lowest: Float, slope: float) -> Float:
     """Fit a plane through the candidates by iteratively reweighted least squares with asymmetric Huber
-    weights.
+    weights and a prior of a level plane.
 
     Args:
         lowest: Ground candidates, shape (SECTORS, rings, 3) [m], with infinite z for none.
@@ -251,17 +261,19 @@ def trend(lowest: Float, slope: float) -> Float:
 
 @compiled
 def smooth_surface(height: Float, weight: Float, plane: Float) -> tuple[Float, Bool]:
-    """Return the membrane h that minimises sum w (h - z)^2 + sum c (h_i - h_j)^2 over neighbouring cells i,
-    j.
+    """Return the trend plus the membrane h that minimises sum w (h - z)^2 + sum c (h_i - h_j)^2 over
+    neighbouring cells i, j. Without candidates it is the trend.
 
     Rays and circles are solved in turn (alternating direction). Residuals have asymmetric Huber weights.
 
     Args:
-        height, weight: Candidates, shape (SECTORS, rings), see `evidence`.
+        height, weight: Candidates above the trend, shape (SECTORS, rings), see `evidence`.
         plane: Trend, shape (3,).
 
     Returns:
-        Heights of the nodes [m] and whether the ground was seen there, both of shape (SECTORS, rings).
+        Heights of the nodes in the level sensor frame [m], trend included, and whether the ground was seen
+        there (a candidate of weight above 0.25 within SEEN_WITHIN of the surface), both of shape (SECTORS,
+        rings).
     """
     sectors, rings = height.shape
     along, across = _couplings(rings)
@@ -360,7 +372,13 @@ def _solve_circles(h: Float, w: Float, wz: Float, along: Float, across: Float) -
 
 @compiled
 def _middle(sector: int, ring: int) -> tuple[float, float]:
-    """Return the position of a node [m]: the inverse of `direction_turn` at the middle of its cell."""
+    """Return the position x, y of a node in the sensor frame [m]: the inverse of `direction_turn` at the
+    middle of its cell.
+
+    Args:
+        sector: Number of the sector, 0 to SECTORS - 1.
+        ring: Number of the ring, less than RINGS - 0.5.
+    """
     turn = 4.0 * (sector + 0.5) / SECTORS - 1.0
     if turn < 0.0:
         x, y = -abs(turn), -(1.0 - abs(turn))
@@ -375,14 +393,15 @@ def _middle(sector: int, ring: int) -> tuple[float, float]:
 
 
 def find_terrain(points: Float32, parameters: Ground) -> Terrain:
-    """Return the terrain of one scan.
+    """Return the terrain of one scan: level at height 0 and nowhere seen for a scan without finite points.
 
     A cell with many returns above its lowest layer has a small weight, since that layer may belong to a
     trunk. The force that pulls the surface down to a candidate below it is stronger than the one that lifts
     it (Huber weights).
 
     Args:
-        points: The whole scan, float32, shape (N, 3) [m], level sensor frame.
+        points: The whole scan, float32, shape (N, 3) [m], level sensor frame; points that are not finite are
+            ignored.
         parameters: `slope_max` is used.
     """
     slope = float(np.tan(np.radians(parameters.slope_max)))
@@ -395,7 +414,7 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
 
 def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
     """Return the points whose height above the ground is in [height_min, height_max], float32, shape (M, 3)
-    [m].
+    [m], in their order; points of unknown height (NaN) are removed.
 
     Args:
         points: Points, float32, shape (N, 3) [m].
@@ -407,8 +426,13 @@ def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
 
 @compiled
 def _between(points: Float32, height: Float32, band: Float32) -> Float32:
-    """Return the points with band[0] <= height <= band[1]. `height` and the points have the same rows; NaN is
-    outside."""
+    """Return the points with band[0] <= height <= band[1], float32, shape (M, 3) [m]; NaN is outside.
+
+    Args:
+        points: Shape (N, 3) [m].
+        height: Height of each point, shape (N,) [m].
+        band: Lowest and highest height, shape (2,) [m].
+    """
     low, high = band[0], band[1]
     inside = np.empty_like(points)
     n = 0

@@ -40,8 +40,9 @@ class Terrain:
 
 
 def shows_ground(terrain: Terrain) -> bool:
-    """Return whether a scan shows the ground: LEAST_SEEN cells or more with ground returns, and the ground
-    below the sensor. A scan of a wall, a ceiling or scattered points does not."""
+    """Return whether a scan shows the ground: LEAST_SEEN cells or more with ground returns, and a ground
+    height below 0, i.e. below the sensor, at the sensor. A scan of a wall, a ceiling or scattered points does
+    not."""
     seen = int(np.count_nonzero(terrain.seen))
     return seen >= LEAST_SEEN and ground_at(terrain.height, 0.0, 0.0) < 0.0
 
@@ -51,7 +52,7 @@ def heights_of_places(places: Float, height: Float) -> Float:
     """Return the heights of places above the ground, shape (N,) [m].
 
     Args:
-        places: Level sensor frame, shape (N, 3) [m].
+        places: Level sensor frame, shape (N, 3) [m]; x and y are finite.
         height: `Terrain.height`.
     """
     above = np.empty(places.shape[0])
@@ -62,7 +63,7 @@ def heights_of_places(places: Float, height: Float) -> Float:
 
 def height_above(points: Float32, terrain: Terrain) -> Float32:
     """Return the height of each point above the terrain, float32, shape (N,) [m]; NaN for a point that is not
-    finite.
+    finite. Beyond the last ring, the height of the last ring counts as ground.
 
     Args:
         points: Points in the level sensor frame, float32, shape (N, 3) [m].
@@ -73,22 +74,29 @@ def height_above(points: Float32, terrain: Terrain) -> Float32:
 
 @compiled
 def ring_at(distance: float) -> float:
-    """Return the (fractional) number of rings within a distance from the sensor [m], less than RINGS."""
+    """Return the (fractional) number of rings within a distance from the sensor, 0 or more [m]; less than
+    RINGS."""
     return float(RINGS * distance / (distance + HALF_WAY))
 
 
 @compiled
 def ring_distance(ring: float) -> float:
-    """Return the distance from the sensor [m] that contains the given number of rings: the inverse of
-    `ring_at`."""
+    """Return the distance from the sensor [m] that contains the given number of rings, 0 or more and less
+    than RINGS: the inverse of `ring_at`."""
     return float(HALF_WAY * ring / (RINGS - ring))
 
 
 @compiled
 def ground_at(height: Float, x: float, y: float) -> float:
-    """Return the height of the ground at (x, y) [m], level sensor frame, by bilinear interpolation.
+    """Return the height of the ground at a finite position x, y [m], level sensor frame, by bilinear
+    interpolation between the nodes.
 
-    Beyond the last ring, the height of the last ring is used. `height` is `Terrain.height`.
+    Beyond the last ring, the height of the last ring is used, and within half a ring of the sensor that of
+    the first one.
+
+    Args:
+        height: `Terrain.height`, shape (SECTORS, rings) [m].
+        x, y: The position [m]; not checked.
     """
     sectors, rings = height.shape
     turn = direction_turn(x, y) * sectors - 0.5
@@ -106,7 +114,8 @@ def ground_at(height: Float, x: float, y: float) -> float:
 
 @compiled
 def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
-    """Return the (fractional) sector and ring of each point, both float32, shape (N,).
+    """Return the (fractional) sector, 0 to SECTORS, and ring, 0 to RINGS, of each point, both float32, shape
+    (N,). `points` has the shape (N, 2 or 3) [m], level sensor frame.
 
     The loops are simple so that the compiler vectorises them. The ring of a point that is not finite is NaN
     or RINGS.
@@ -131,8 +140,7 @@ def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
 
 @compiled
 def _height_above(points: Float32, height: Float) -> Float32:
-    """Return the same as `height_above`, from `Terrain.height`, by bilinear interpolation between the
-    nodes."""
+    """Return the result of `height_above`, from `Terrain.height`, by bilinear interpolation of the nodes."""
     rings = height.shape[1]
     corners = _corners(height)
     node, f, g = _nodes(*on_the_grid(points), height.shape[0], rings)
@@ -168,9 +176,13 @@ def _corners(height: Float) -> Float32:
 def _nodes(
     sector: Float32, ring: Float32, sectors: int, rings: int
 ) -> tuple[NDArray[np.uint32], Float32, Float32]:
-    """Return the grid cell of each point and its fractional position in it; NaN for a point without a ring.
+    """Return the grid cell of each point (row of the result of `_corners`), uint32, and its fractional
+    position along the circle and along the ray in it, 0 to 1, float32, each of shape (N,). For a point
+    without a ring (NaN), the cell is 0 and the position along the ray is NaN.
 
-    The fractions overwrite `sector` and `ring`, the results of `on_the_grid`.
+    Args:
+        sector, ring: Results of `on_the_grid`; the fractions overwrite them.
+        sectors, rings: Shape of `Terrain.height`.
     """
     node = np.empty(sector.shape[0], np.uint32)
     zero, half, last = np.float32(0.0), np.float32(0.5), np.float32(rings - 1)

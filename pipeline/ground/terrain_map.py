@@ -35,11 +35,12 @@ def observe_cells(
         at: Position of the sensor in the map frame, shape (2,) [m].
         yaw: Yaw of the sensor [rad].
         height, seen: Arrays of the Terrain of the scan.
-        reach: Maximum distance of a cell [m].
+        reach: Maximum distance of the middle of a cell from the sensor [m].
 
     Returns:
-        Height of the ground in the level sensor frame [m], NaN if not seen; and the weight of the view
-        [1/m^2], 0 if not seen; both of shape (T, SIDE, SIDE).
+        Height of the ground in the level sensor frame at the middle of each cell [m], NaN if not seen or
+        beyond `reach`; and the weight of the view [1/m^2], 0 there; both of shape (T, SIDE, SIDE), indexed by
+        tile, x and y.
     """
     tiles = corner.shape[0]
     below, weight = np.full((tiles, SIDE, SIDE), np.nan), np.zeros((tiles, SIDE, SIDE))
@@ -62,10 +63,11 @@ def observe_cells(
 
 @compiled
 def fuse(block: Float32, below: Float, weight: Float, sensor_z: float) -> None:
-    """Update the weighted mean and variance of the cells with one view, in place.
+    """Update the weighted mean and variance of the cells with one view, in place; cells without weight
+    remain. The weight of a cell is limited to MOST views.
 
     Args:
-        block: Cells, shape (T, SIDE, SIDE, COLUMNS).
+        block: Cells, float32, shape (T, SIDE, SIDE, COLUMNS); changed.
         below, weight: Results of `observe_cells`.
         sensor_z: Height of the sensor in the map frame [m].
     """
@@ -91,14 +93,16 @@ Tile = tuple[int, int]
 
 
 def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -> dict[Tile, Float32]:
-    """Return the tiles after a correction of the path.
+    """Return the tiles after a correction of the path; the argument is not changed.
 
-    Each cell moves by whole cells, rigidly with the nearest scan of the path before the correction. Cells
-    that coincide afterwards are averaged by their weights.
+    Each cell moves by whole cells, with the nearest scan of the path before the correction. Cells that
+    coincide afterwards are averaged by their weights, and their weights and views are added. The number of
+    tiles is not limited. Remaining tiles keep their order, new ones follow; a tile without a known cell is
+    left out.
 
     Args:
-        tiles: Cells by tile index, see HeightMapState.
-        correction: Path before and after.
+        tiles: Cells by tile index, see HeightMapState; may be empty.
+        correction: Path before and after, with at least one scan.
     """
     from scipy.spatial import cKDTree
 
@@ -189,10 +193,12 @@ class HeightMapper:
         self.state = HeightMapState({}, None, 0, no_height_map())
 
     def add(self, terrain: Terrain, T_map_base: Pose2, sensor_offset: Float) -> None:
-        """Add the terrain of one scan.
+        """Add the terrain of one scan, and replace the state. A scan whose sensor is 1,000 km or more from
+        the origin, or at NaN, is ignored.
 
         The weight of a cell is bounded, so that later views replace heights that were added before a
-        correction of the pose.
+        correction of the pose. With more than MOST_TILES tiles, the least recently seen ones are removed. The
+        published map is updated after the first two scans and then every RENEW or more scans.
 
         Args:
             terrain: Terrain in the level sensor frame.
@@ -222,7 +228,8 @@ class HeightMapper:
         self.state = HeightMapState(tiles, z, scans, _record(tiles) if due else old.record)
 
     def correct(self, correction: PathCorrection) -> None:
-        """Move the terrain with a corrected path, in place, and publish it.
+        """Replace the state by one whose terrain is moved with a corrected path, and publish it. The height
+        of the sensor and the number of scans remain.
 
         Args:
             correction: Path before and after; each cell moves with the nearest scan of the path before.
@@ -236,19 +243,20 @@ class HeightMapper:
         return _record(self.state.tiles)
 
     def heights(self, places: Float) -> Float:
-        """Return the height of the ground at places, shape (N,) [m].
+        """Return the height of the ground in the frame of the map at places, shape (N,) [m].
 
-        A place in an unknown cell takes the weighted mean of the known cells among its eight neighbours;
-        without any, its height is NaN.
+        A place takes the height of its cell. In an unknown cell it is the weighted mean of the known cells
+        among its eight neighbours; without any, its height is NaN.
 
         Args:
-            places: x, y in the frame of the map, shape (N, 2) [m].
+            places: Finite x, y in the frame of the map, shape (N, 2) [m].
         """
         cell = np.floor(places / CELL).astype(np.int64)
         return np.array([self._at(int(i), int(j)) for i, j in cell])
 
     def _at(self, i: int, j: int) -> float:
-        """Return the height at the cell with the indices i, j along x and y [m]; see `heights`."""
+        """Return the height at the cell with the indices i, j along x and y (of the whole map) [m], NaN if it
+        and its neighbours are unknown; see `heights`."""
         mean, weight = 0.0, 0.0
         for di, dj in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
             tile = self.state.tiles.get(((i + di) // SIDE, (j + dj) // SIDE))
@@ -261,13 +269,13 @@ class HeightMapper:
 
 
 def no_height_map() -> HeightMap:
-    """Return an empty map."""
+    """Return an empty map: no rows, cells of side CELL."""
     return _record({})
 
 
 def _around(at: Float) -> list[Tile]:
-    """Return the indices of the tiles that overlap the square of half side REACH around a position, shape
-    (2,) [m]."""
+    """Return the indices along x and y of the tiles that overlap the square of half side REACH around a
+    finite position, shape (2,) [m], in the frame of the map; sorted."""
     low, high = np.floor((at - REACH) / TILE), np.floor((at + REACH) / TILE)
     return [
         (i, j) for i in range(int(low[0]), int(high[0]) + 1) for j in range(int(low[1]), int(high[1]) + 1)
@@ -281,7 +289,7 @@ def _register(block: Float32, below: Float, weight: Float, before: float | None)
     Cells within 12 m (NEAR_WEIGHT) are used if there are LEAST of them, else all.
 
     Args:
-        block, below, weight: See `fuse`.
+        block, below, weight: Cells of the map before the scan, and the view; see `fuse`. Not changed.
         before: Height at the scan before, None before the first; returned if fewer than LEAST cells are
             known.
     """
@@ -294,7 +302,8 @@ def _register(block: Float32, below: Float, weight: Float, before: float | None)
 
 
 def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
-    """Return the published map of tiles; cells are sorted by tile."""
+    """Return the map of tiles as a table of the known cells, sorted by tile; without tiles an empty one. The
+    arrays are copies."""
     keys = sorted(tiles)
     cells = np.stack([tiles[key] for key in keys]) if keys else np.zeros((0, SIDE, SIDE, COLUMNS), np.float32)
     n, i, j = np.nonzero(cells[..., VIEWS])
@@ -340,14 +349,15 @@ class PackedHeightMap:
 
     @classmethod
     def empty(cls) -> PackedHeightMap:
-        """Return an empty map."""
+        """Return the state before the first scan, as plain arrays."""
         return cls.of(HeightMapState({}, None, 0, no_height_map()))
 
     def unpacked(self) -> HeightMapState:
-        """Return the state, identical to the bit.
+        """Return the state, identical to the bit; the tiles are copies.
 
         Raises:
-            ValueError: The arrays, which come from a file, do not match each other.
+            ValueError: The arrays, which come from a file, do not match each other, contain numbers that are
+                not finite, or hold more than MOST_TILES tiles.
         """
         n = len(self.tile)
         if self.tile.shape != (n, 2) or self.cells.shape != (n * SIDE * SIDE, COLUMNS) or n > MOST_TILES:
