@@ -33,7 +33,12 @@ LOW, HIGH = 0.6, 1.6  # m above the ground; voxels in this band decide when a co
 
 def corrected_voxels(memory: VoxelMap, correction: PathCorrection) -> VoxelMap:
     """Return the voxels after a correction of the path: each moves with the last scan that saw it, and voxels
-    in the same cell are joined. Tiles that changed become due for classification."""
+    in the same cell are joined: returns are added, the mean is weighted by them, and the largest `scans` and
+    `latest` are kept. All tiles become due for classification.
+
+    Voxels that leave the limits of the map (1,000 km) are removed; heights do not change. The argument is not
+    changed.
+    """
     n = memory.used
     mean = memory.mean[:n].copy()
     latest = memory.latest[:n].astype(np.int64)
@@ -61,8 +66,13 @@ def corrected_voxels(memory: VoxelMap, correction: PathCorrection) -> VoxelMap:
 
 
 def _room(room: int, keys: Int) -> int:
-    """Return the number of rows for the tiles of some voxels: `room`, doubled until they fit. A rotated tile
-    covers up to four tiles."""
+    """Return the number of rows for the tiles of some voxels: `room`, doubled until it exceeds the number of
+    tiles. A rotated tile covers up to four tiles.
+
+    Args:
+        room: Rows so far, a power of two.
+        keys: Keys of the voxels, see `keys_of`, without negative ones, shape (N,).
+    """
     tiles = len(np.unique(tiles_of(keys)))
     while room <= tiles:
         room *= 2
@@ -70,11 +80,12 @@ def _room(room: int, keys: Int) -> int:
 
 
 def corrected_columns(columns: Columns, memory: VoxelMap, correction: PathCorrection) -> Columns:
-    """Return the columns after a correction of the path: each moves with the scan that saw the
-    nearest voxel between LOW and HIGH last.
+    """Return the columns after a correction of the path: position and lean move with the scan that last saw
+    the nearest voxel between LOW and HIGH, and tiles are updated. Without columns or such voxels, the columns
+    are returned as they are.
 
     Args:
-        columns: The columns.
+        columns: The columns; not changed.
         memory: The voxels before the correction.
         correction: The correction.
     """
@@ -100,8 +111,9 @@ _LOOKED, _RAYS = NAMES.index("looked at up to"), NAMES.index("rays up to")
 
 
 def seen_higher(columns: Columns) -> Int:
-    """Return at most MOST_STALE tiles, shape (T, 2), with columns above which scans have looked since they
-    were classified, largest increase of the visible height first.
+    """Return at most MOST_STALE tiles, int64, shape (T, 2), with columns above which scans have looked at
+    least HIGHER since they were classified, largest increase of the visible height first; none without
+    columns.
 
     A person next to the robot at the start is seen from two metres, where no ring reaches above the head.
     Later views from a distance add few returns, so that the tile does not count as grown.
@@ -118,10 +130,12 @@ def seen_higher(columns: Columns) -> Int:
 @compiled
 def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
     """Return the increase of the visible height of each column since its features were computed, shape (K,)
-    [m]. It is negative if less is visible now.
+    [m]: the larger of those by views and by rays. It is negative if less is visible now.
 
     Args:
-        viewed, met, passed, figures: Columns of `Columns`.
+        viewed: Greatest height that a scan observed, shape (K,) [m].
+        met, passed: Rays by slice of height, shape (K, SLICES).
+        figures: Features at the classification, shape (K, COUNT).
     """
     gain = np.zeros(viewed.shape[0])
     for k in range(gain.shape[0]):
@@ -150,7 +164,8 @@ class ColumnClassifierState:
     columns: Columns
 
     def folded(self) -> VoxelMap:
-        """Return an independent voxel map with the scans since."""
+        """Return an independent voxel map with the scans since; the state does not change. The tiles that
+        were classified after these scans are marked as classified."""
         memory = self.base.unpacked()
         for points, scan, most in self.since:
             memory.add(points, scan, most)
@@ -183,7 +198,8 @@ class ColumnClassifier:
 
     @property
     def parameters(self) -> Classification:
-        """Parameters; changes apply from the next scan onwards."""
+        """Parameters. Setting them loads the forest (StemmapError if there is none of that name); the next
+        scan classifies all columns again with it."""
         return self._parameters
 
     @parameters.setter
@@ -194,19 +210,22 @@ class ColumnClassifier:
 
     @property
     def memory(self) -> VoxelMap:
-        """The voxels of all scans. After `restore` they are unpacked on demand."""
+        """The voxels of all scans, not a copy. After `restore` they are unpacked at the first access, which
+        takes time."""
         if self._memory is None:
             assert self._folded is not None  # noqa: S101 - one of both exists
             self._memory, self._folded = self._folded(), None
         return self._memory
 
     def add(self, points: Float32, height: Float32, scan: int, view: ScanView) -> None:
-        """Integrate a scan and classify the columns of the tiles that are due.
+        """Integrate a scan and classify the columns of the tiles that are due; afterwards `columns` is a new
+        table. Existing columns in view update their visibility, and all columns get their verdict again.
 
         Args:
             points: Points in the level sensor frame, float32, shape (N, 3) [m].
-            height: Their heights above the ground, shape (N,) [m].
-            scan: Number of the scan.
+            height: Their heights above the ground, shape (N,) [m]; points of unknown height (NaN) or above
+                SLICES * SLICE are ignored.
+            scan: Number of the scan, not negative, ascending.
             view: Pose and visibility of the scan.
         """
         p, pose = self.parameters, view.T_map_base.as_array()
@@ -225,33 +244,45 @@ class ColumnClassifier:
         self._classify(first)
 
     def snapshot(self) -> ColumnClassifierState:
-        """Return the state without the parameters."""
+        """Return the state without the parameters. It shares its arrays with the classifier, which never
+        changes them later."""
         return ColumnClassifierState(self._base, tuple(self._since), self.columns)
 
     def restore(self, state: ColumnClassifierState) -> None:
-        """Return to a state; the state itself does not change."""
+        """Return to a state of `snapshot`; the state itself does not change. The parameters remain, and the
+        next scan classifies all columns again."""
         self._base, self._since = state.base, list(state.since)
         self._memory, self._folded = None, state.folded
         self.columns = state.columns
         self._vote_again = True  # another forest may have voted at that time
 
     def correct(self, correction: PathCorrection) -> None:
-        """Move voxels and columns with a corrected path."""
+        """Move voxels and columns with a corrected path, and settle. All tiles become due; verdicts change at
+        the next scan."""
         self.columns = corrected_columns(self.columns, self.memory, correction)
         self._memory = corrected_voxels(self.memory, correction)
         self.settle()
 
     @property
     def is_unsettled(self) -> bool:
-        """Whether `settle` is due."""
+        """Whether `settle` is due: FOLD or more scans were added since the last call."""
         return len(self._since) >= FOLD
 
     def settle(self) -> None:
-        """Fold the scans since the last call into the packed voxels of later states. The result of the
-        classification does not depend on it; if it is not called between two scans, `add` calls it."""
+        """Fold the scans since the last call into the packed voxels of later states, which copies all voxels.
+        The result of the classification does not depend on it; if it is not called between two scans, `add`
+        calls it when it is due."""
         self._base, self._since = PackedVoxelMap.of(self.memory), []
 
     def _remember(self, points: Float32, scan: int, most: int) -> Int:
+        """Add points of a scan to the voxels and return the tiles that are due for classification, shape (T,
+        2); settles first if that is due.
+
+        Args:
+            points: x, y in the frame of the map and height above the ground, float32, shape (N, 3) [m].
+            scan: Number of the scan.
+            most: Maximum number of voxels, a power of two.
+        """
         if self.is_unsettled:
             self.settle()
         self._since.append((points, scan, most))
@@ -259,7 +290,14 @@ class ColumnClassifier:
         return self.memory.due_tiles(GROWN)
 
     def _extract_columns(self, tiles: Int) -> Float:
-        """Extract the columns of tiles again, at the end of a new table; return their profiles."""
+        """Extract the columns of tiles again; return their profiles, shape (K, SLICES, PROFILE).
+
+        `columns` is replaced by a new table: first the columns of other tiles, then the K new ones, with axis
+        and tile and the visibility of the nearest earlier column within SAME; their features and votes are 0.
+
+        Args:
+            tiles: Indices of the tiles, shape (T, 2).
+        """
         old = self.columns
         kept = ~_among(old.tile, tiles)
         axes, homes, profiles = [old.axis[kept]], [old.tile[kept]], [np.zeros((0, SLICES, PROFILE))]
@@ -281,8 +319,8 @@ class ColumnClassifier:
         return np.concatenate(profiles)
 
     def _classify(self, first: int) -> None:
-        """Classify the columns from a row onwards; all columns get their verdict, because objects may have
-        left."""
+        """Compute the votes of the columns from row `first` onwards, or of all after a change of the forest;
+        all columns get their verdict, because objects may have left."""
         c = self.columns
         if self._vote_again:
             first, self._vote_again = 0, False
@@ -296,6 +334,12 @@ def no_columns() -> Columns:
 
 
 def _rows(axis: Float, tile: Int) -> Columns:
+    """Return columns with zeros for statistics, features and votes, and the verdict OTHER.
+
+    Args:
+        axis: Axes, shape (K, 5), see `find_columns`; not copied.
+        tile: Tile of each, int64, shape (K, 2); not copied.
+    """
     n = len(axis)
     zero = np.zeros(n)
     return Columns(
@@ -313,11 +357,12 @@ def _rows(axis: Float, tile: Int) -> Columns:
 
 
 def _joined(tiles: Int, more: Int) -> Int:
-    """Return the tiles and those of the others that are not among them."""
+    """Return the tiles of `tiles`, then those of `more` that are not among them; shape (T, 2) each."""
     return np.concatenate([tiles, more[~_among(more, tiles)]])
 
 
 def _among(home: Int, tiles: Int) -> Bool:
+    """Return whether each tile of `home`, int64, shape (K, 2), is among `tiles`, shape (T, 2); shape (K,)."""
     there: Bool = np.isin((home[:, 0] << 32) + home[:, 1], (tiles[:, 0] << 32) + tiles[:, 1])
     return there
 
@@ -325,14 +370,15 @@ def _among(home: Int, tiles: Int) -> Bool:
 @compiled
 def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_max: float) -> Float32:
     """Return x, y in the frame of the map and height above the ground [m] of the points in range and between
-    0 and SLICES * SLICE above the ground, float32, shape (M, 3).
+    0 and SLICES * SLICE above the ground, both exclusive, float32, shape (M, 3), in their order; points with
+    NaN are left out.
 
     Args:
         points: Level sensor frame, shape (N, 3) [m].
         height: Their heights above the ground, shape (N,) [m].
         pose: x, y [m], yaw [rad] of the base.
         offset: Position of the sensor in the base frame, shape (3,) [m].
-        range_max: Maximum horizontal distance from the base [m].
+        range_max: Maximum horizontal distance from the base, exclusive [m].
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     kept = np.empty((points.shape[0], 3), np.float32)
@@ -349,7 +395,13 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
 @compiled
 def _nearest_before(old: Float, axis: Float, first: int) -> Int:
     """Return for each column from row `first` of `axis` onwards the row of the nearest column of `old` within
-    SAME, -1 without; shape (K - first,)."""
+    SAME (exclusive, at 1.3 m), -1 without; int64, shape (K - first,).
+
+    Args:
+        old: Axes of earlier columns, shape (M, 5).
+        axis: Axes of all columns, shape (K, 5).
+        first: First row to search for.
+    """
     nearest = np.full(axis.shape[0] - first, -1, np.int64)
     for k in range(first, axis.shape[0]):
         best = SAME * SAME

@@ -25,10 +25,10 @@ PROFILE = 20  # columns of a profile, see `profile`
 
 @compiled
 def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Float:
-    """Return the columns with their foot in or near a square tile.
+    """Return the candidates for columns with their foot in or near a square tile.
 
-    The search uses all heights, and then the low ones only, where a trunk is visible below a crown that
-    dominates the count over all heights.
+    The search uses all heights up to 3 m, and then the low ones only, where a trunk is visible below a crown
+    that dominates the count over all heights. A column that both find appears twice.
 
     Args:
         mean: Voxels in and around the tile, x, y, height [m], shape (N, 3).
@@ -37,7 +37,8 @@ def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Floa
         side: Its side [m].
 
     Returns:
-        Axis (x, y at 1.3 m above the ground and shift per metre of height) and strength, shape (K, 5).
+        Axis (x, y at 1.3 m above the ground at the middle of a cell of SIDE, and shift per metre of height,
+        which is 0) and strength, shape (K, 5).
     """
     cells = int(np.ceil((side + 2 * MARGIN) / SIDE))
     reach, border = int(APART / SIDE), int(MARGIN / SIDE) - 4
@@ -57,6 +58,14 @@ def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Floa
 
 @compiled
 def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
+    """Return whether no cell within a square of half side `reach` is stronger than cell i, j; of equal cells,
+    the first in the order of rows and columns is the peak.
+
+    Args:
+        strength: Result of `_strength`, shape (cells, cells).
+        i, j: Row and column of the cell, at least `reach` from the border.
+        reach: Half side in cells.
+    """
     for di in range(-reach, reach + 1):
         for dj in range(-reach, reach + 1):
             other = strength[
@@ -106,8 +115,18 @@ def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) 
 
 @compiled
 def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
-    """Sort the voxels into horizontal buckets of side `BUCKET`. Return the order of the voxels, shape (N,),
-    and the first row of each bucket in this order, shape (buckets + 1,). Arguments as in `find_columns`."""
+    """Sort the voxels into horizontal buckets of side `BUCKET` over the tile with MARGIN; a voxel outside
+    counts to the nearest bucket.
+
+    Args:
+        mean: Voxels, x, y first, shape (N, 3) [m].
+        low: Corner of the tile, shape (2,) [m].
+        side: Its side [m].
+
+    Returns:
+        Order of the voxels by bucket, shape (N,), and the first row of each bucket in this order, shape
+        (buckets + 1,).
+    """
     across = int(np.ceil((side + 2 * MARGIN) / BUCKET))
     bucket = np.empty(mean.shape[0], np.int64)
     for i in range(mean.shape[0]):
@@ -119,8 +138,8 @@ def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
 
 @compiled
 def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
-    """Return the rows of the three by three buckets around a position as runs (first, one past the last),
-    shape (3, 2).
+    """Return the rows of the three by three buckets around a position as runs (first, one past the last; 0, 0
+    for a row of buckets outside), shape (3, 2).
 
     Args:
         x, y: The position [m].
@@ -140,13 +159,15 @@ def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
 
 @compiled
 def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Float, Float]:
-    """Return the columns of a tile and their profiles.
+    """Return the columns of a tile and their profiles. The axis of each candidate of `find_columns` is
+    refined; duplicates and those that leave the tile are dropped.
 
     Args:
         mean, returns, low, side: See `find_columns`.
 
     Returns:
-        Columns with their foot in the tile, shape (K, 5), and their profiles, shape (K, SLICES, PROFILE).
+        Columns whose axis at 1.3 m is in the tile, shape (K, 5), and their profiles, shape (K, SLICES,
+        PROFILE).
     """
     found = find_columns(mean, returns, low, side)
     order, bounds = in_buckets(mean, low, side)
@@ -180,8 +201,9 @@ def _is_known(axis: Float, found: Float, kept: int) -> bool:
 
 @compiled
 def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: float) -> None:
-    """Refine an axis, in place. The weight of a slice depends mainly on the share of its returns that is at
-    the axis, less on their number, so that foliage does not shift the axis. A weak prior keeps it upright.
+    """Refine an axis, in place; without returns at the axis it remains. The weight of a slice depends mainly
+    on the share of its returns that is at the axis, less on their number, so that foliage does not shift the
+    axis. A weak prior keeps it upright, and the shift per metre is limited to 0.5.
 
     Args:
         axis: See `find_columns`; position and shift per metre are changed.
@@ -267,6 +289,14 @@ def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) 
 
 @compiled
 def _count(dx: float, dy: float, n: float, row: Float, octant: Bool) -> None:
+    """Add one voxel to the sums of a slice, see `profile`; a voxel beyond RING_FAR changes nothing.
+
+    Args:
+        dx, dy: Its position from the axis [m].
+        n: Number of its returns.
+        row: Profile of the slice, shape (PROFILE,), changed in place.
+        octant: Filled octants of the ring, shape (OCTANTS,), changed in place.
+    """
     r2 = dx * dx + dy * dy
     if r2 < RING_NEAR * RING_NEAR:
         for a, v in enumerate((1.0, dx, dy, dx * dx, dx * dy, dy * dy, dx * r2, dy * r2, r2 * r2)):

@@ -40,14 +40,15 @@ class ColumnVotes:
 
     @property
     def nbytes(self) -> int:
-        """Size of all columns."""
+        """Memory of all arrays [bytes]."""
         return self.place.nbytes + self.votes.nbytes + self.otherwise.nbytes + self.forced.nbytes
 
     def verdict(self, tree_share: float) -> Int32:
-        """Return the verdict of each column, shape (K,).
+        """Return the verdict of each column, int32, shape (C,): `forced` if there is one, else TREE with
+        enough votes, else `otherwise`.
 
         Args:
-            tree_share: Least share of the votes of a tree.
+            tree_share: Least share of the votes of a tree, inclusive.
         """
         voted = np.where(self.votes[:, 0] >= tree_share, np.int32(Verdict.TREE), self.otherwise)
         verdict: Int32 = np.where(self.forced == UNFORCED, voted, self.forced).astype(np.int32)
@@ -55,7 +56,9 @@ class ColumnVotes:
 
 
 def column_votes(columns: Columns) -> ColumnVotes:
-    """Return everything that decides the verdicts of columns."""
+    """Return everything that decides the verdicts of columns, as copies; without columns, empty arrays. Of
+    several forced verdicts, gone (MOVING) comes before too few voxels (TOO_FEW_POINTS), and this before
+    TOO_LOW."""
     c = columns
     if not len(c.share):
         nothing = np.zeros(0, np.int32)
@@ -89,6 +92,7 @@ def is_transparent(columns: Columns, slices: slice) -> Bool:
 
 
 def too_few(figures: Float) -> Bool:
-    """Return which columns have so few voxels that they may have been found by chance, shape (C,)."""
+    """Return which columns have so few voxels up to 3 m, less than LEAST_VOXELS, that they may have been
+    found by chance, shape (C,). `figures` are their features, shape (C, COUNT)."""
     few: Bool = figures[:, VOXELS] < LEAST_VOXELS
     return few

@@ -91,6 +91,15 @@ def features(
 
 @compiled
 def _features(axis: Float, rows: Float, viewed: float, present: float, absent: float, out: Float) -> None:
+    """Write the features of one column that do not come from rays into `out`; see NAMES.
+
+    Args:
+        axis: Its axis, shape (5,).
+        rows: Its profile, shape (SLICES, PROFILE).
+        viewed: Greatest height that a scan observed there [m].
+        present, absent: Number of scans in which it was there or not.
+        out: Features in the order of NAMES, changed in place; those from RAYS onwards are not written.
+    """
     for b in range(BANDS.shape[0]):
         _band(rows, BANDS[b, 0], BANDS[b, 1], out[3 * b : 3 * b + 3])
     k = 3 * BANDS.shape[0]
@@ -135,17 +144,17 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
 
 @compiled
 def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
-    """Write into `out` the features of rays: for each band the share of rays that ended at the column; the
-    free height above the clean slices up to the next return, and above the highest return; the height up to
-    which there are rays; and the gap between the clean slices and the next return, as far as there are rays
-    [m].
+    """Write into `out` the features of rays: for each band the share of rays that ended at the column, UNSEEN
+    without rays; the free height above the clean slices up to the next return, and above the highest return;
+    the height up to which there are rays; and the gap between the clean slices and the next return, as far as
+    there are rays [m].
 
     Args:
-        rows: Sums over the returns of each slice; the first three are the numbers at the axis, near it and in
-            the ring.
-        met, passed: Rays by slice that ended at the column and that passed it.
+        rows: Profile of the column, shape (SLICES, PROFILE); a slice has a return if its first value, the
+            returns at the axis, is above 0.
+        met, passed: Rays by slice that ended at the column and that passed it, shape (SLICES,).
         last: Last clean slice.
-        out: Shares by band, then the four lengths.
+        out: Shares by band, then the four lengths, shape (bands + 4,).
     """
     n = BANDS.shape[0]
     for b in range(n):
@@ -174,8 +183,15 @@ def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None
 
 @compiled
 def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
-    """Write into `out` the share of the returns within 0.9 m that is within 0.45 m, and the share of the
-    latter that is at the axis; UNSEEN without returns."""
+    """Write into `out`, shape (2,), the share of the returns within 0.9 m that is within 0.45 m, UNSEEN
+    without returns within 0.45 m; and the share of the latter that is at the axis, UNSEEN without returns at
+    the axis.
+
+    Args:
+        rows: Profile of the column, shape (SLICES, PROFILE).
+        first, end: First slice, and one past the last slice.
+        out: Receives both shares.
+    """
     inside, near, ring = 0.0, 0.0, 0.0
     for s in range(first, end):
         inside += rows[s, 0]
@@ -216,11 +232,11 @@ def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
 @compiled
 def _circle(rows: Float, last: int, out: Float) -> None:
     """Write into `out` the radius of the circle through the returns of all clean slices, at most 1 [m], their
-    rms distance from it [m], and the ratio of both; UNSEEN where the fit fails (Kasa 1976: z + B x + C y + D
-    = 0 by least squares).
+    rms distance from it [m], and the ratio of distance and radius; UNSEEN with fewer than six returns or
+    where the fit fails (Kasa 1976: z + B x + C y + D = 0 by least squares).
 
     Args:
-        rows: Returns by slice; those of slices 1 to `last` that are clean are used.
+        rows: Profile of the column, shape (SLICES, PROFILE); slices 1 to `last` that are clean are used.
         last: Last slice.
         out: Shape (3,).
     """
@@ -252,9 +268,15 @@ def _circle(rows: Float, last: int, out: Float) -> None:
 
 @compiled
 def _band(rows: Float, first: int, end: int, out: Float) -> None:
-    """Write into `out` for the slices from `first` to `end` - 1 the share with returns at the axis, the share
-    of the returns that is at the axis (UNSEEN for 0), and the share of the octants of the ring without
-    returns."""
+    """Write into `out`, shape (3,), for the slices of a band the share with returns at the axis, the share of
+    the returns that is at the axis (UNSEEN if none is), and the share of the octants of the ring without
+    returns.
+
+    Args:
+        rows: Profile of the column, shape (SLICES, PROFILE).
+        first, end: First slice, and one past the last slice.
+        out: Receives the shares.
+    """
     inside, around, filled, octants = 0.0, 0.0, 0.0, 0.0
     for s in range(first, end):
         inside += rows[s, 0]

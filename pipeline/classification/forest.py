@@ -71,10 +71,10 @@ ForestOf = Callable[[str, bool], Forest]
 
 
 def package_alone(name: str, all_around: bool) -> Forest:
-    """Return the forest of the package.
+    """Return the forest of the package for sensors that see all around, or for those that look one way.
 
     Raises:
-        StemmapError: The name is that of another forest.
+        StemmapError: The name is not PACKAGE, or the file cannot be read.
     """
     if name != PACKAGE:
         raise StemmapError(f"the decision trees {name} are not known here")
@@ -84,21 +84,26 @@ def package_alone(name: str, all_around: bool) -> Forest:
 @cache
 def standard_forest(all_around: bool) -> Forest:
     """Return the forest of the package for sensors that see all around, or for sensors that look one way:
-    their views of a trunk differ too much for a common forest."""
+    their views of a trunk differ too much for a common forest. The file is read once per process.
+
+    Raises:
+        StemmapError: See `read_forest`.
+    """
     return read_forest(FILE, ALL_AROUND if all_around else ONE_WAY)
 
 
 def read_forest(path: Path, kind: str) -> Forest:
-    """Return a forest for a kind of sensor, ALL_AROUND or ONE_WAY.
+    """Return a forest of a JSON file for a kind of sensor, ALL_AROUND or ONE_WAY.
 
     Raises:
-        StemmapError: The file is too large, is not such JSON, or names unknown features.
+        StemmapError: The file is missing, too large (4 MB), not such JSON, without this kind, trained for
+            other classes, or names unknown features.
     """
     return read_forests(path, kind)[1][0]
 
 
 def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]:
-    """Return the JSON of a file, and the forests for some kinds of sensors.
+    """Return the JSON of a file, and the forests for some kinds of sensors in their order.
 
     Raises:
         StemmapError: See `read_forest`.
@@ -115,6 +120,7 @@ def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]
 
 
 def _damaged(path: Path, why: str) -> StemmapError:
+    """Return the error for a file of decision trees that cannot be read; `why` is the reason in short."""
     return StemmapError(
         f"the decision trees cannot be read: {why}",
         where=str(path),
@@ -123,11 +129,15 @@ def _damaged(path: Path, why: str) -> StemmapError:
 
 
 def forest_of(data: dict[str, Any], kind: str) -> Forest:
-    """Return the forest of a JSON for a kind of sensor; for sensors that look one way with the forest of
-    FREE_END, which earlier files do not have.
+    """Return the forest of a JSON for a kind of sensor; for ONE_WAY with the forest of FREE_END, which
+    earlier files do not have.
+
+    Args:
+        data: JSON with the names of the classes and, by kind, a list of trees of nested nodes.
+        kind: ALL_AROUND, ONE_WAY or FREE_END.
 
     Raises:
-        ValueError, TypeError, KeyError: The JSON is not that of a forest.
+        ValueError, TypeError, KeyError, RecursionError: The JSON is not that of a forest.
     """
     if data["classes"] != [verdict.label for verdict in CLASSES]:
         raise ValueError("it was trained for other classes")
@@ -148,7 +158,16 @@ def forest_of(data: dict[str, Any], kind: str) -> Forest:
 
 
 def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
-    """Append a node and the nodes below it; return its row."""
+    """Append a node and the nodes below it to `rows`, in place; return the row of the node.
+
+    Args:
+        node: JSON of a leaf ("share") or of a split ("figure", "at_most", "yes", "no").
+        rows: Feature (-1 for a leaf), threshold, left, right, shares of each node so far.
+
+    Raises:
+        ValueError, TypeError, KeyError: The node is damaged, names an unknown feature, or there are more than
+            100,000 nodes.
+    """
     row, nothing = len(rows), [0.0] * len(CLASSES)
     if row >= _MOST_NODES:
         raise ValueError("it has too many nodes")
@@ -166,7 +185,8 @@ def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
 
 
 def vote(figures: Float, forest: Forest) -> Float:
-    """Return the class shares in the order of CLASSES, mean over the trees, shape (K, classes).
+    """Return the class shares in the order of CLASSES, mean over the trees, shape (K, classes); `figures` are
+    the features in the order of NAMES, shape (K, COUNT).
 
     For columns with a free upper end, votes for a tree count for a pole where `free_end` decides so, because
     the training examples of the main forest contain too few poles (docs/trunks.md).
@@ -179,8 +199,8 @@ def vote(figures: Float, forest: Forest) -> Float:
 
 
 def tree_in_free_air(figures: Float, forest: Forest) -> Float:
-    """Return the share of `free_end` for a tree, shape (K,); NaN for columns without a free end and without
-    such a forest."""
+    """Return the share of `free_end` for a tree, shape (K,); NaN for columns without a free end and if the
+    forest has no `free_end`. `figures` has the shape (K, COUNT)."""
     share = np.full(len(figures), np.nan)
     if forest.free_end is not None:
         ends = ends_in_free_air(figures)
@@ -189,14 +209,16 @@ def tree_in_free_air(figures: Float, forest: Forest) -> Float:
 
 
 def ends_in_free_air(figures: Float) -> Bool:
-    """Return which columns of sufficient height have a free upper end, above which rays passed, shape
-    (K,)."""
+    """Return which columns of sufficient height (2 m) have a free upper end, above which rays passed for 1 m,
+    shape (K,). `figures` has the shape (K, COUNT)."""
     ends: Bool = (figures[:, _TOP] >= _TALL) & (figures[:, _FREE] >= _SEEN_FREE)
     return ends
 
 
 @compiled
 def _vote(figures: Float, trees: DecisionTrees) -> Float:
+    """Return the mean class shares of the leaves that columns reach, shape (K, classes); `figures` has the
+    shape (K, COUNT). A NaN counts as above each threshold."""
     root, feature, threshold, left, right, share = trees
     votes = np.zeros((figures.shape[0], share.shape[1]))
     for k in range(figures.shape[0]):
@@ -216,12 +238,12 @@ def feature_effects(figures: Float, forest: Forest, kind: Verdict) -> Float:
     """Return by how much each feature of a column raises the share of votes for a class.
 
     The effect of a feature is the share of votes minus the share when the feature is unknown, where both
-    branches of each split on it count by half.
+    branches of each split on it count by half. The forest `free_end` is not considered.
 
     Args:
         figures: Features of one column, shape (F,).
         forest: The forest.
-        kind: One of CLASSES.
+        kind: One of CLASSES (ValueError for another verdict).
 
     Returns:
         Effects between -1 and 1, shape (F,); 0 for features that no tree uses for this column.
@@ -231,6 +253,7 @@ def feature_effects(figures: Float, forest: Forest, kind: Verdict) -> Float:
 
 @compiled
 def _feature_effects(figures: Float, trees: DecisionTrees, kind: int) -> Float:
+    """Return the result of `feature_effects` for the trees of a forest; `kind` is the index in CLASSES."""
     effects = np.zeros(figures.shape[0])
     for root in trees.root:
         known = _share(figures, -2, root, trees, kind)
@@ -241,14 +264,15 @@ def _feature_effects(figures: Float, trees: DecisionTrees, kind: int) -> Float:
 
 @compiled
 def _share(figures: Float, unknown: int, root: int | np.int32, trees: DecisionTrees, kind: int) -> float:
-    """Return the share at the leaf, averaged over both branches of each split on the unknown feature.
+    """Return the share of a class at the leaf that a column reaches in one tree, averaged over both branches
+    of each split on the unknown feature.
 
     Args:
-        figures: Features of a column.
+        figures: Features of a column, shape (F,).
         unknown: Number of the feature that counts as unknown; negative for none.
         root: Row of the root of the tree.
         trees: The trees.
-        kind: Class whose share is returned.
+        kind: Index of the class in CLASSES.
     """
     _, feature, threshold, left, right, share = trees
     waiting, weight = np.empty(_DEEPEST, np.int64), np.empty(_DEEPEST)

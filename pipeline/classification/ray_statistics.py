@@ -45,11 +45,12 @@ NEAR = 0.6  # m; a return this near to a column belongs to it
 
 @compiled
 def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> Float:
-    """Return the tangent of the steepest elevation in each direction of the base frame, shape (BINS,).
+    """Return the tangent of the steepest elevation of a return in each direction of the base frame, shape
+    (BINS,); -1 without a return beyond 1 m from the sensor, and at least -1.
 
     Args:
-        points: Points in the level sensor frame, shape (N, 3) [m].
-        offset: Position of the sensor in the base frame, shape (3,).
+        points: Points in the level sensor frame, shape (N, 3) [m], finite.
+        offset: Position of the sensor in the base frame, shape (3,) [m].
         all_around: Whether the sensor has the same elevations in all directions, so that the maximum applies
             to all.
     """
@@ -78,7 +79,11 @@ def update_visibility(
     terrain: Float,
     range_max: float,
 ) -> None:
-    """Update for each column in view whether it was present or absent, and how high the scan looked.
+    """Update for each column in range whether it was present or absent, and how high the scan looked, in
+    place.
+
+    A column is present if the free range ends within NEAR of it, absent if it ends more than BEHIND beyond
+    it; neither is counted if something nearer hides it. The observed height counts in each case.
 
     Args:
         axis: Axes of the columns, shape (K, 5).
@@ -87,7 +92,7 @@ def update_visibility(
         clear_range, steepest: By direction in the base frame, shape (BINS,).
         offset: Position of the sensor in the base frame, shape (3,) [m].
         terrain: Terrain of this scan, as `Terrain.height`.
-        range_max: Columns farther away are skipped [m].
+        range_max: Columns farther from the base are skipped [m].
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for k in range(axis.shape[0]):
@@ -108,11 +113,12 @@ def update_visibility(
 
 @compiled
 def depth_image(points: Float32) -> UInt16:
-    """Return the horizontal distance of the nearest return by direction and elevation [cm], 0 without a
-    return, uint16, shape (BINS, ELEVATIONS).
+    """Return the horizontal distance of the nearest return by direction from the sensor and elevation [cm], 0
+    without a return, at most 65535, uint16, shape (BINS, ELEVATIONS). Returns within 0.3 m of the sensor, or
+    with an elevation outside of the image, are ignored.
 
     Args:
-        points: Points in the level sensor frame, shape (N, 3) [m].
+        points: Points in the level sensor frame, shape (N, 3) [m], finite.
     """
     depth = np.zeros((BINS, ELEVATIONS), np.uint16)
     for i in range(points.shape[0]):
@@ -139,8 +145,9 @@ def count_rays(
     terrain: Float,
     range_max: float,
 ) -> None:
-    """Count for each column and slice the rays that ended at it, and those that passed its axis and ended
-    behind it. Rays that end before it, or have no return, do not count.
+    """Count for each column and slice the rays that ended within MET of it, and those that ended more than
+    PASSED behind its axis, in place. Rays that end before it, or have no return, do not count. Columns within
+    0.3 m of the sensor, or beyond `range_max` from it, are skipped; the lean of a column is not considered.
 
     Args:
         axis: Axes of the columns, shape (K, 5).

@@ -22,7 +22,8 @@ SMALL = 1 << 16  # bytes; smaller arrays use the heap
 
 
 def zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros like numpy.zeros; of a large array only pages that were written to take memory.
+    """Return zeros like numpy.zeros; of a large array (SMALL bytes or more) only pages that were written to
+    take memory.
 
     The system provides a page at the first write and takes back all pages when the array is deleted. On the
     heap of the allocator, long-lived arrays of different sizes leave holes, which the process keeps.
@@ -35,13 +36,14 @@ def zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
 
 
 def _mapped(size: int) -> mmap.mmap:
+    """Return anonymous private memory of `size` bytes, filled with zeros."""
     if sys.platform == "win32":
         return mmap.mmap(-1, size)
     return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 
 
 def copied(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a copy on separate pages."""
+    """Return a copy, on separate pages if it is large, see `zeros`."""
     copy = zeros(array.shape, array.dtype)
     copy[...] = array
     return copy
@@ -116,10 +118,14 @@ class VoxelMap:
 
     @classmethod
     def empty(cls, room: int = 1 << 12, tile_room: int = 1 << 8) -> VoxelMap:
-        """Return an empty map; `room` and `tile_room` are powers of two.
+        """Return an empty map.
 
         All columns are zero, so the system provides pages when rows are first used: unused rows take no
         memory.
+
+        Args:
+            room: Rows for voxels, a power of two.
+            tile_room: Rows for tiles, a power of two.
         """
         return cls(
             key=zeros(room, np.int64),
@@ -145,13 +151,16 @@ class VoxelMap:
         return self._with_room(np.arange(self.used), len(self.key), len(self.tile_key))
 
     def add(self, points: Float32, scan: int, most: int) -> None:
-        """Add the points of a scan.
+        """Add the points of a scan, in place. Points below the ground, higher than SLICES * SLICE, farther
+        than 1,000 km, or with NaN are ignored; the scan counts in `added` even without points.
 
-        When there are more than `most` voxels, the half that was seen longest ago is removed.
+        When the map is full, its room grows to `most` voxels; a map with `most` voxels or more of room
+        removes the half that was seen longest ago instead. A smaller `most` than before does not shrink the
+        map.
 
         Args:
             points: x, y in the frame of the map, height above the ground [m], float32, shape (N, 3).
-            scan: Number of the scan.
+            scan: Number of the scan, not negative.
             most: Largest number of voxels, a power of two.
         """
         begin = 0
@@ -163,21 +172,32 @@ class VoxelMap:
             self._make_room(most)
 
     def due_tiles(self, grown: float) -> Int:
-        """Return the tiles, shape (T, 2), whose returns have grown by the factor `grown` since they were last
-        classified, and mark them as classified. After the first scans at most the `MOST_TILES` with the
-        largest growth are returned, which bounds the time of a scan."""
+        """Return the tiles, int64, shape (T, 2), whose returns have grown by more than the factor `grown`
+        since they were last classified, and mark them as classified. After FIRST_SCANS scans at most the
+        `MOST_TILES` with the largest growth are returned, which bounds the time of a scan; the others remain
+        due."""
         most = MOST_TILES if self.added > FIRST_SCANS else self.tiles
         return _select_due(self._tables(), self.tiles, grown, most)
 
     def around(self, tile: Int, margin: float) -> tuple[Float32, Int32]:
-        """Return mean (N, 3) and returns (N,) of the voxels of a tile and `margin` [m] around it."""
+        """Return mean (N, 3) [m] and number of returns (N,) of the voxels of a tile and within `margin` [m]
+        around it, as copies; empty where nothing was seen.
+
+        Args:
+            tile: Indices of the tile along x and y, shape (2,).
+            margin: Width of the border around the tile [m].
+        """
         rows = _rows_around(tile[0], tile[1], margin, self._tables())
         return self.mean[rows], self.returns[rows]
 
     def _tables(self) -> _Tables:
+        """Return the columns for the kernels; they share their memory with this map."""
         return _Tables(*(getattr(self, name) for name in _Tables._fields))
 
     def _make_room(self, most: int) -> None:
+        """Make room for at least one voxel and tile, in place: double the rows of tiles if they are full,
+        else enlarge the rows of voxels to `most`, or, if there are that many, remove the half of the voxels
+        that was seen longest ago."""
         rows = np.arange(self.used)
         room, tile_room = len(self.key), len(self.tile_key)
         if self.tiles == tile_room:
@@ -191,6 +211,12 @@ class VoxelMap:
             setattr(self, f.name, getattr(fresh, f.name))
 
     def _with_room(self, rows: Int, room: int, tile_room: int) -> VoxelMap:
+        """Return a new map of some voxels.
+
+        Args:
+            rows: Rows of the voxels to copy, in the new order, shape (N,).
+            room, tile_room: Rows for voxels and tiles of the new map, powers of two that suffice.
+        """
         fresh = VoxelMap.empty(room, tile_room)
         for name in KEPT:
             np.take(getattr(self, name), rows, axis=0, out=getattr(fresh, name)[: len(rows)])
@@ -202,8 +228,8 @@ class VoxelMap:
 
 @compiled
 def keys_of(mean: Float32) -> Int:
-    """Return the key of each position, int64, shape (N,): cell along x and y and the slice, -1 outside of the
-    map.
+    """Return the key of each position, int64, shape (N,): cell along x and y and the slice; -1 outside of the
+    map (height below 0 or from SLICES * SLICE on, about 1,000 km from the origin) and for NaN.
 
     Args:
         mean: Positions, the third column the height above the ground, shape (N, 3) [m].
@@ -218,21 +244,30 @@ def keys_of(mean: Float32) -> Int:
 
 
 def tiles_of(keys: Int) -> Int:
-    """Return the tiles of cells, shape (N,)."""
+    """Return the key of the tile of each cell, int64, shape (N,), for keys of `keys_of`, which must not be
+    negative."""
     ix, iy = keys >> 36, (keys >> 5) & ((1 << 31) - 1)
     return (ix // TILE_CELLS) << 31 | (iy // TILE_CELLS)
 
 
 @compiled
 def _first_place(key: int | np.int64, mask: int) -> int:
+    """Return the position in a hash table at which the search for a key begins; `mask` is the length of the
+    table, a power of two, minus 1."""
     # The upper bits of the product are well mixed; 26 bits are enough for the largest table.
     return int(np.int64((np.uint64(key) * _SPREAD) >> np.uint64(38)) & mask)
 
 
 @compiled
 def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
-    """Return the position of a key in a hash table, or the free position for it. `slot` holds row + 1 in
-    `keys` or 0 for free; its length is a power of two, with at least one free position."""
+    """Return the position of a key in a hash table, or the free position for it.
+
+    Args:
+        key: The key.
+        keys: Keys by row.
+        slot: Row + 1 in `keys` at each position, 0 for free; its length is a power of two, with at least one
+            free position.
+    """
     mask = slot.shape[0] - 1
     at = _first_place(key, mask)
     while slot[at] > 0 and keys[slot[at] - 1] != key:
@@ -241,21 +276,28 @@ def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
 
 
 def index(memory: VoxelMap, rows: int) -> None:
-    """Fill the tables of a map whose first rows are set."""
+    """Fill the hash tables, tiles and counts of a map whose first rows are set, in place.
+
+    Args:
+        memory: Map whose tables are empty, and whose columns KEPT are set in the first rows; its rows for
+            tiles must suffice.
+        rows: Number of these rows.
+    """
     memory.used = rows
     memory.tiles = _index(rows, memory._tables())
 
 
 @compiled
 def _tile_of(key: int | np.int64) -> int:
+    """Return the key of the tile of one cell, see `tiles_of`."""
     ix, iy = key >> 36, (key >> 5) & ((1 << 31) - 1)
     return int(((ix // TILE_CELLS) << 31) | (iy // TILE_CELLS))
 
 
 @compiled
 def _link(row: int | np.int64, tables: _Tables, tiles: int) -> int:
-    """Add the voxel `row` to the chain of its tile, and the tile to the tables if it is new. Return the
-    number of tiles; `tiles` is the number before."""
+    """Add the voxel `row` to the chain of its tile, in place, and the tile to the tables if it is new. Return
+    the number of tiles; `tiles` is the number before."""
     tile = _tile_of(tables.key[row])
     at = _find(tile, tables.tile_key, tables.tile_slot)
     if tables.tile_slot[at] == 0:
@@ -272,7 +314,7 @@ def _link(row: int | np.int64, tables: _Tables, tiles: int) -> int:
 
 @compiled
 def _index(used: int, tables: _Tables) -> int:
-    """Fill the hash tables and chains of existing rows; return the number of tiles."""
+    """Fill the hash tables and chains of the first `used` rows, in place; return the number of tiles."""
     tiles = 0
     for row in range(used):
         tables.slot[_find(tables.key[row], tables.key, tables.slot)] = row + 1
@@ -284,7 +326,7 @@ def _index(used: int, tables: _Tables) -> int:
 @compiled
 def _keep_judged(old: _Tables, tiles: int, fresh: _Tables) -> None:
     """Copy the number of returns at the last classification from each of the first `tiles` tiles of `old` to
-    the same tile of `fresh`, where it exists."""
+    the same tile of `fresh`, where it exists; `fresh.tile_judged` is changed in place."""
     for t in range(tiles):
         at = _find(old.tile_key[t], fresh.tile_key, fresh.tile_slot)
         if fresh.tile_slot[at] > 0:
@@ -293,9 +335,16 @@ def _keep_judged(old: _Tables, tiles: int, fresh: _Tables) -> None:
 
 @compiled
 def _select_due(tables: _Tables, tiles: int, grown: float, most: int) -> Int:
-    """Return the tiles that are due, at most `most` with the largest growth, shape (T, 2), in the order of
-    the table, and mark them as classified. A tile is due if its returns exceed `grown` times those at its
-    last classification."""
+    """Return the tiles that are due, at most `most` with the largest growth, int64, shape (T, 2), in the
+    order of the table, and mark them as classified. A tile is due if its returns exceed `grown` times those
+    at its last classification.
+
+    Args:
+        tables: Tables of the map; `tile_judged` is changed in place.
+        tiles: Number of tiles in use.
+        grown: Factor.
+        most: Maximum number of tiles.
+    """
     key, returns, judged = tables.tile_key, tables.tile_returns, tables.tile_judged
     growth = np.zeros(tiles)
     due = 0
@@ -322,8 +371,9 @@ def _select_due(tables: _Tables, tiles: int, grown: float, most: int) -> Int:
 def _add(
     points: Float32, begin: int, scan: int, tables: _Tables, used: int, tiles: int
 ) -> tuple[int, int, int]:
-    """Add points from row `begin` onwards until the tables are full. Return the first point without room (the
-    number of points when all fit), and the numbers of voxels and tiles in use.
+    """Add points from row `begin` onwards until the tables are full, in place; points without a key (see
+    `keys_of`) are skipped. Return the first point without room (the number of points when all fit), and the
+    numbers of voxels and tiles in use.
 
     Args:
         points: See `VoxelMap.add`.
@@ -364,6 +414,13 @@ def _add(
 
 @compiled
 def _rows_around(tx: int, ty: int, margin: float, tables: _Tables) -> Int:
+    """Return the rows of the voxels whose mean is in a tile or within `margin` of it, int64, shape (N,).
+
+    Args:
+        tx, ty: Indices of the tile along x and y.
+        margin: Width of the border [m].
+        tables: Tables of the map.
+    """
     tile_key, tile_slot, mean, following = tables.tile_key, tables.tile_slot, tables.mean, tables.following
     low_x, low_y = tx * TILE - margin, ty * TILE - margin
     high_x, high_y = (tx + 1) * TILE + margin, (ty + 1) * TILE + margin
@@ -408,7 +465,7 @@ class PackedVoxelMap:
 
     @classmethod
     def of(cls, memory: VoxelMap) -> PackedVoxelMap:
-        """Return a packed copy."""
+        """Return a packed copy, which later changes of the map do not affect."""
         columns = {name: copied(getattr(memory, name)[: memory.used]) for name in KEPT}
         judged = memory.tile_judged[: memory.tiles].copy()
         return cls(
@@ -420,7 +477,7 @@ class PackedVoxelMap:
         )
 
     def unpacked(self) -> VoxelMap:
-        """Return the voxel map with the same bits."""
+        """Return an independent voxel map with the same bits."""
         n = len(self.key)
         memory = VoxelMap.empty(self.room, self.tile_room)
         for name in KEPT:
