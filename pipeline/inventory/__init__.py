@@ -106,11 +106,13 @@ def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = pack
 
     Args:
         cloud: The cloud, which is read three times.
-        parameters: All parameters.
+        parameters: All parameters; of the stages ground, detection, tracking and classification a few are
+            used.
         forests: Returns the random forest by its name.
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or is larger than a plot.
+        StemmapError: There is no such forest.
     """
     r_min, r_max = parameters.detection.radius_min, parameters.detection.radius_max
     ground, near, counts = find_ground(cloud, parameters.ground.slope_max)
@@ -152,11 +154,15 @@ def find_ground(
     Args:
         cloud: The cloud, which is read three times.
         slope_max: Largest slope of the terrain against the plane of the plot [degrees].
-        band: Lowest and highest height above the ground that is kept [m].
+        band: Lowest and highest height above the ground that is kept, both exclusive [m].
         most: Largest number of points after thinning, a power of two.
 
+    Returns:
+        Ground; points, of which there may be none; and the numbers of points "read", "apart from the plot"
+        (left out) and "below the ground" (more than 0.3 m).
+
     Raises:
-        SourceError: The cloud cannot be read, has no points, or is larger than a plot.
+        SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER bytes.
     """
     extent = find_extent(cloud.parts(), cloud.description.uri)
     room = LowestReturns.room(extent.low, extent.high)
@@ -185,7 +191,9 @@ def find_ground(
 
 
 def _reject_other_objects(figures: Float, verdict: Int32, places: Float, share: Float) -> None:
-    """Change the verdict of stems that the forest classifies as poles, persons or walls, in place.
+    """Change the verdict of trees that the forest classifies as poles, persons or walls, in place: the
+    nearest column within SAME_OBJECT has more than the share SURE for that class. Stems with another verdict
+    than TREE remain.
 
     Args:
         figures: Models of the stems, shape (K, COLUMNS).
@@ -208,6 +216,13 @@ def _reject_other_objects(figures: Float, verdict: Int32, places: Float, share: 
 
 
 def _trees(stems: Float, arc_min: float) -> Trees:
+    """Return the tree table of stems, numbered from 1 in their order, all confirmed; velocities are 0,
+    eccentricities NaN, times NEVER, and the observations are the slices.
+
+    Args:
+        stems: Models of the stems, shape (T, COLUMNS).
+        arc_min: Least visible arc of a diameter [rad]; DBH is NaN otherwise, see `diameters`.
+    """
     n = len(stems)
     dbh, sigma = diameters(stems, arc_min)
     covariance = np.zeros((n, 2, 2))
@@ -229,8 +244,9 @@ def _trees(stems: Float, arc_min: float) -> Trees:
 
 
 def _candidates(figures: Float, verdict: Int32, places: Float, share: Float) -> Candidates:
-    """Return the stems, and the upright columns that are not stems, as candidates; arguments as in
-    `_reject_other_objects`."""
+    """Return the stems, and after them the upright columns farther than SAME_OBJECT from each stem, as
+    candidates. A column has the verdict of its strongest class, NO_ARC in place of TREE, and NaN for all
+    measures; arguments as in `_reject_other_objects`, not changed."""
     others = _away_from(places, figures[:, [X, Y]]) > SAME_OBJECT
     places, share = places[others], share[others]
     kind = np.array(CLASSES, np.int32)[share.argmax(axis=1)] if len(share) else np.zeros(0, np.int32)
@@ -251,6 +267,8 @@ def _candidates(figures: Float, verdict: Int32, places: Float, share: Float) -> 
 
 
 def _away_from(places: Float, others: Float) -> Float:
+    """Return the distance of each position, shape (N, 2), from the nearest finite one of `others`, shape (M,
+    2), shape (N,) [m]; infinite without one."""
     from scipy.spatial import cKDTree
 
     others = others[np.isfinite(others).all(axis=1)]
@@ -261,6 +279,8 @@ def _away_from(places: Float, others: Float) -> Float:
 
 
 def _warnings(cloud: WholeCloud, near: Thinned, slices: Slices, ground: TerrainRaster) -> tuple[str, ...]:
+    """Return the warnings of the cloud and those about coarse thinning, missing points above the ground and
+    little visible ground."""
     warnings = list(cloud.description.warnings)
     if near.side > COARSE:
         warnings.append(

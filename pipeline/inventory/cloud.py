@@ -54,7 +54,8 @@ class WholeCloud(Protocol):
         """Points left out in the latest reading, by reason."""
 
     def parts(self) -> Iterator[Float32]:
-        """Yield all points in parts: x, y, z minus the offset [m], finite, float32, shape (N, 3).
+        """Yield all points in parts: x, y, z minus the offset [m], finite, float32, shape (N, 3). Each call
+        reads the cloud from its beginning.
 
         Raises:
             SourceError: Nothing can be read.
@@ -87,11 +88,11 @@ def find_extent(parts: Iterable[Float32], where: str) -> Extent:
     and counted; if no square is dense, all points are inside.
 
     Args:
-        parts: Points in parts, shape (N, 3) [m] each.
+        parts: Points in parts, shape (N, 3) [m] each, finite; read once. A part may be empty.
         where: Name of the cloud in errors.
 
     Raises:
-        SourceError: There are no points, or they are in too many squares.
+        SourceError: There are no points, or they are in more than MOST_SQUARES squares.
     """
     squares: dict[int, tuple[int, Float]] = {}
     for part in parts:
@@ -117,6 +118,13 @@ def find_extent(parts: Iterable[Float32], where: str) -> Extent:
 
 
 def _count(part: Float32, squares: dict[int, tuple[int, Float]]) -> None:
+    """Add the points of a part to the counts of squares, in place.
+
+    Args:
+        part: Points, shape (N, 3) [m], N at least 1.
+        squares: By key of the square, number of points and their bounds x, y low and x, y high, shape (4,)
+            [m].
+    """
     cell = np.floor(part[:, :2] / SQUARE).astype(np.int64) + (1 << 30)
     key = (cell[:, 0] << 32) + cell[:, 1]
     order = np.argsort(key, kind="stable")
@@ -152,6 +160,7 @@ class Thinned:
         self._begin(min(1 << 16, most))
 
     def _begin(self, room: int) -> None:
+        """Replace the cubes by an empty table with `room` rows, a power of two."""
         self._key = np.zeros(room, np.int64)
         self._mean = np.zeros((room, 4), np.float32)
         self._count = np.zeros(room, np.int32)
@@ -159,10 +168,12 @@ class Thinned:
         self._used = 0
 
     def add(self, points: Float32) -> None:
-        """Add points of shape (N, 4): x, y, z within 10 km of the origin [m], and another value."""
+        """Add points of shape (N, 4): x, y, z within 10 km of the origin [m], and another value, which is
+        averaged too. `side` grows if the table is full."""
         self._add(points, np.ones(len(points), np.int32))
 
     def _add(self, points: Float32, weight: Int32) -> None:
+        """Add points (see `add`), each of which represents `weight` points, int32, shape (N,)."""
         begin = 0
         while True:
             begin, self._used = _add(
@@ -173,6 +184,8 @@ class Thinned:
             self._make_room()
 
     def _make_room(self) -> None:
+        """Double the room for cubes or, at the limit, enlarge `side` by COARSER, and insert the means so far
+        again."""
         mean, count, room = self._mean[: self._used], self._count[: self._used], len(self._key)
         if 2 * room <= self._most:
             room *= 2
@@ -183,7 +196,8 @@ class Thinned:
 
     @property
     def points(self) -> Float32:
-        """The means in the order of the first points of their cubes, float32, shape (M, 4)."""
+        """The means in the order of the first points of their cubes, float32, shape (M, 4). It is a view that
+        a later `add` changes."""
         return self._mean[: self._used]
 
 

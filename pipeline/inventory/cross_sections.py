@@ -30,16 +30,18 @@ BESIDE, BESIDE_OF_RADIUS = 0.1, 0.5  # m, and share of the radius; width of the 
 @compiled
 def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Float) -> float:
     """Find the circle through three of the points that has the most other points on it. Return the number of
-    points on it minus the number inside; 0 without a circle.
+    points on it minus the number inside, where a point on it counts less the farther it is from the circle; 0
+    without a circle with a positive result.
 
     Points inside count against a circle, because the cross-section of a trunk is hollow and that of a bush is
-    not.
+    not. TRIES circles are tried; of many points only some are counted, and the result is scaled up. The same
+    points give the same circle.
 
     Args:
-        xy: Points, shape (N, 2) [m].
+        xy: Points, shape (N, 2) [m], N at least 1.
         tolerance: Maximum distance of a point on the circle [m].
         r_min, r_max: Minimum and maximum radius [m].
-        out: Filled with x, y and radius of the circle [m].
+        out: Its first three values receive x, y and radius of the circle [m]; unchanged if the result is 0.
     """
     n = xy.shape[0]
     best = 0.0
@@ -68,6 +70,8 @@ def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Fl
 
 @compiled
 def _through_three(a: Float, b: Float, c: Float) -> tuple[float, float, float]:
+    """Return x, y and radius [m] of the circle through three points, shape (2,) each; radius -1 if they are
+    on a line."""
     bx, by, cx, cy = b[0] - a[0], b[1] - a[1], c[0] - a[0], c[1] - a[1]
     d = 2.0 * (bx * cy - by * cx)
     if abs(d) < 1e-9:
@@ -156,7 +160,8 @@ def without_scatter(radius: Float, scatter: Float) -> Float:
 
 @compiled
 def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tuple[float, float]:
-    """Return the angle of a circle that points on it cover [rad], and the number of these points.
+    """Return the angle of a circle that points on it cover [rad], in steps of 2 pi / SECTORS, and the number
+    of these points.
 
     Args:
         xy: Points, shape (N, 2) [m].
@@ -180,7 +185,8 @@ def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tupl
 
 @compiled
 def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered: float, on: float) -> float:
-    """Return the ratio of the densities of points on the visible part of a circle and in the ring around it.
+    """Return the ratio of the densities of points on the visible part of a circle and in the ring around it;
+    NaN without points on it.
 
     Args:
         xy, x, y, r, tolerance: As in `_coverage`.
@@ -197,7 +203,8 @@ def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered
 
 @compiled
 def share_inside(xy: Float, x: float, y: float, r: float) -> float:
-    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r.
+    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r; 0 without
+    points.
 
     Args:
         xy: Points, shape (N, 2) [m].
@@ -213,7 +220,8 @@ def share_inside(xy: Float, x: float, y: float, r: float) -> float:
 
 @compiled
 def on_circle(xy: Float, x: float, y: float, r: float, tolerance: float) -> Bool:
-    """Return which points are on or inside a circle, shape (N,); arguments as in `_coverage`."""
+    """Return which points, shape (N, 2) [m], are on or inside a circle, closer to its centre than r +
+    tolerance, shape (N,); arguments as in `_coverage`."""
     on = np.empty(xy.shape[0], np.bool_)
     for i in range(xy.shape[0]):
         on[i] = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) < r + tolerance
@@ -249,7 +257,8 @@ class Slices:
     spacing: float
 
     def slab(self, k: int) -> Float:
-        """Return the points of slice k: x, y, height above the ground, shape (M, 3) [m]."""
+        """Return the points of slice k (THICK steps from step k on, so that neighbours overlap): x, y, height
+        above the ground, shape (M, 3) [m], a view."""
         return self.points[self.bounds[k] : self.bounds[min(k + THICK, len(self.bounds) - 1)]]
 
     @property
@@ -265,10 +274,11 @@ class Slices:
 
 
 def cut(points: Float32) -> Slices:
-    """Return the points sorted into slices.
+    """Return the points sorted into slices; points below LOWEST, from HIGHEST on or of unknown height (NaN)
+    are left out.
 
     Args:
-        points: x, y, z, height above the ground [m], shape (N, 4).
+        points: x, y, z, height above the ground [m], shape (N, 4); may be empty.
     """
     steps = round((HIGHEST - LOWEST) / STEP)
     step = np.floor((points[:, 3] - LOWEST) / STEP).astype(np.int64)
@@ -278,6 +288,8 @@ def cut(points: Float32) -> Slices:
 
 
 def _spacing(points: Float) -> float:
+    """Return the median distance of points, shape (N, 3) [m], to their eighth neighbour, estimated from a
+    part of them [m]; EPS_MAX with too few points."""
     from scipy.spatial import cKDTree
 
     if len(points) <= NEAREST:
@@ -290,14 +302,16 @@ def _spacing(points: Float) -> float:
 
 
 def find_circles(slices: Slices, r_min: float, r_max: float) -> Float:
-    """Return all circles of all slices that may be stems.
+    """Return all circles of all slices that may be stems: at least LEAST points on the arc ARC or more,
+    hollow, and with little scatter.
 
     Args:
         slices: Slices of the plot.
         r_min, r_max: Smallest and largest radius [m].
 
     Returns:
-        Values of `fit_circle`, the slice, and the share of the points inside, shape (K, FIGURES + 2).
+        Values of `fit_circle`, the slice, and the share of the points inside, in the order of slices, shape
+        (K, FIGURES + 2); K may be 0. One trunk may give several circles in a slice.
     """
     eps = float(np.clip(1.3 * slices.spacing, EPS_MIN, EPS_MAX))
     tolerance = float(np.clip(0.3 * slices.spacing, 0.01, 0.03))
@@ -312,6 +326,16 @@ def find_circles(slices: Slices, r_min: float, r_max: float) -> Float:
 
 @compiled
 def _circles(xy: Float, bounds: Int, tolerance: float, r_min: float, r_max: float, k: float) -> Float:
+    """Return the circles of the clusters of one slice, shape (K, FIGURES + 2). Clusters with fewer than LEAST
+    points are skipped; those wider than WIDE are searched in overlapping windows.
+
+    Args:
+        xy: Points sorted by cluster, shape (N, 2) [m].
+        bounds: First point of each cluster, and N, shape (clusters + 1,).
+        tolerance: Maximum distance of a point on the circle [m].
+        r_min, r_max: Minimum and maximum radius [m].
+        k: Number of the slice, which is written into the result.
+    """
     out = np.empty((64, FIGURES + 2))
     n = 0
     for c in range(bounds.shape[0] - 1):
@@ -375,8 +399,9 @@ def _window(xy: Float, order: Int, cells: Int, across: int, a: int, b: int) -> F
 def _peel(
     xy: Float, tolerance: float, r_min: float, r_max: float, k: float, n: int, out: Float
 ) -> tuple[int, Float]:
-    """Find the circles of a cluster one after the other; the points of a circle are removed before the next
-    is sought. Return the number of circles in `out`, and `out`, which may have been enlarged.
+    """Find the circles of a cluster one after the other, at most CIRCLES; the points on or inside a circle
+    are removed before the next is sought. Circles that cannot be stems (see `find_circles`) are not added.
+    Return the number of circles in `out`, and `out`, which may have been enlarged.
 
     Args:
         xy: Points of the cluster, shape (N, 2) [m].
@@ -384,7 +409,7 @@ def _peel(
         r_min, r_max: Minimum and maximum radius [m].
         k: Number of the slice.
         n: Number of circles in `out`.
-        out: Circles so far, shape (M, FIGURES + 2).
+        out: Circles so far, shape (M, FIGURES + 2); changed in place.
     """
     rest = xy
     row = np.zeros(FIGURES + 2)

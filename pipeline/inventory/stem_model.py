@@ -33,7 +33,9 @@ COLUMNS = 20
 
 @compiled
 def describe_stems(slices: Float, height: Float) -> Float:
-    """Return the model of each stem, shape (K, COLUMNS).
+    """Return the model of each stem, shape (K, COLUMNS), columns as named by the constants X to CONTRAST.
+    Position and radius are those at breast height [m]. A stem with circles in fewer than two slices has NaN
+    in all columns except the number of slices.
 
     Args:
         slices: Result of `follow`, shape (K, S, FIGURES).
@@ -93,7 +95,8 @@ def _evenness(rows: Float, h: Float, out: Float) -> None:
 
 
 def classify_stems(stems: Float, r_min: float, r_max: float) -> Int32:
-    """Return the verdict of each stem, shape (K,).
+    """Return the verdict of each stem, int32, shape (K,): TREE, or the reason of the rejection;
+    TOO_FEW_POINTS for a stem without a radius (NaN).
 
     Args:
         stems: Result of `describe_stems`.
@@ -147,11 +150,12 @@ def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
 
 
 def is_repeated(stems: Float, verdict: Int32) -> Bool:
-    """Return which stems are duplicates of a stem with more slices or of a tree, shape (K,).
+    """Return which stems are duplicates, shape (K,): of stems at the same place, the trees come first, then
+    those with more slices, then the earlier ones; the others are repeated.
 
     Args:
-        stems: Result of `describe_stems`.
-        verdict: Result of `classify_stems`.
+        stems: Result of `describe_stems`, shape (K, COLUMNS).
+        verdict: Result of `classify_stems`, shape (K,).
     """
     if len(stems) == 0:
         return np.zeros(0, np.bool_)
@@ -163,6 +167,13 @@ def is_repeated(stems: Float, verdict: Int32) -> Bool:
 
 @compiled
 def _again(stems: Float, tree: Bool) -> Bool:
+    """Return whether each stem is at the place of an earlier one that is not repeated itself, shape (K,).
+
+    Args:
+        stems: Models in the order of precedence, without NaN, shape (K, COLUMNS).
+        tree: Whether each is a tree; a tree is repeated only within the radius of the earlier stem, another
+            stem also next to it.
+    """
     again = np.zeros(stems.shape[0], np.bool_)
     for i in range(stems.shape[0]):
         for j in range(i):

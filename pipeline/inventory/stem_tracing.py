@@ -43,10 +43,11 @@ BUCKET = 0.5  # m
 
 
 def chain(circles: Float) -> tuple[Int, int]:
-    """Return the number of the stem of each circle, -1 for none, shape (K,), and the number of stems.
+    """Return the number of the stem of each circle, -1 for none, int64, shape (K,), and the number of stems.
+    A stem has circles in LEAST_SLICES or more slices; stems with the most visible arc come first.
 
     Args:
-        circles: Result of `find_circles`, in the order of slices.
+        circles: Result of `find_circles`, in the order of slices; may be empty.
     """
     if len(circles) == 0:
         return np.zeros(0, np.int64), 0
@@ -66,6 +67,13 @@ def chain(circles: Float) -> tuple[Int, int]:
 
 @compiled
 def _link(circles: Float, bounds: Int) -> Int:
+    """Return for each circle the lowest row of a circle of its chain, int64, shape (K,). Circles up to
+    LINK_STEPS slices apart are linked if their centres are near and their radii alike.
+
+    Args:
+        circles: Result of `find_circles`, shape (K, FIGURES + 2).
+        bounds: First circle of each slice, and K, shape (slices + 1,).
+    """
     n = circles.shape[0]
     parent = np.arange(n)
     for i in range(n):
@@ -95,7 +103,8 @@ def follow(slices: Slices, circles: Float, number: Int, stems: int, r_min: float
         r_min, r_max: Minimum and maximum radius [m].
 
     Returns:
-        Values of `fit_circle`, NaN in slices without a circle, shape (stems, slices, FIGURES).
+        Values of `fit_circle`, NaN in slices without a circle, shape (stems, slices, FIGURES). Two stems may
+        follow the same trunk; a stem may have no circle at all.
     """
     return _follow(_buckets_of(slices), slices.count, circles, number, stems, r_min, r_max)
 
@@ -117,6 +126,8 @@ class _Buckets(NamedTuple):
 
 
 def _buckets_of(slices: Slices) -> _Buckets:
+    """Return the points of slices in horizontal buckets of side BUCKET; without points, one empty bucket per
+    step."""
     xy = slices.points[:, :2]
     steps = len(slices.bounds) - 1
     low = xy.min(axis=0) if len(xy) else np.zeros(2)
@@ -131,13 +142,13 @@ def _buckets_of(slices: Slices) -> _Buckets:
 
 @compiled
 def _around(buckets: _Buckets, k: int, x: float, y: float, reach: float) -> Float:
-    """Return the points of slice k within `reach` [m] of x, y [m], shape (M, 2).
+    """Return the points of slice k within `reach` [m] of x, y [m], shape (M, 2), M may be 0.
 
     Args:
         buckets: Points of all slices.
         k: Number of the slice.
-        x, y: The position [m].
-        reach: Radius [m].
+        x, y: The position [m]; may be outside of the plot.
+        reach: Radius, exclusive [m].
     """
     xy, start, low, across = buckets
     a0, a1 = int((x - reach - low[0]) / BUCKET), int((x + reach - low[0]) / BUCKET)
@@ -167,6 +178,13 @@ def _follow(
     r_min: float,
     r_max: float,
 ) -> Float:
+    """Return the result of `follow`; a stem ends after more than LOST slices without a circle.
+
+    Args:
+        buckets: Points of all slices.
+        slabs: Number of slices.
+        circles, number, stems, r_min, r_max: See `follow`.
+    """
     out = np.full((stems, slabs, FIGURES), np.nan)
     best = np.full(stems, -1, np.int64)
     for i in range(circles.shape[0]):
@@ -200,18 +218,21 @@ def _follow(
 
 @compiled
 def _worth(circle: Float) -> float:
+    """Return how good a circle (row of `find_circles`) is as the start of a stem; more is better: visible
+    arc, number of points up to 60, few points inside, little scatter."""
     return float(circle[8] * (1.0 - circle[INSIDE]) * min(circle[9], 60.0) / (0.01 + circle[7]))
 
 
 @compiled
 def _fits(near: Float, row: Float, r_min: float, r_max: float, missed: int) -> bool:
-    """Fit a circle from the predicted one; return whether it can be the next circle of the stem.
+    """Fit a circle from the predicted one; return whether it can be the next circle of the stem. If not,
+    `row` is undefined.
 
     Args:
         near: Points around the predicted circle, shape (N, 2) [m].
-        row: Predicted circle; filled with the result, shape (FIGURES,).
+        row: Predicted x, y, radius first [m]; filled with the result, shape (FIGURES,).
         r_min, r_max: Minimum and maximum radius [m].
-        missed: Number of slices without a circle since the last one.
+        missed: Number of slices without a circle since the last one; more of them allow a larger offset.
     """
     x, y, r = row[0], row[1], row[2]
     if near.shape[0] < LEAST or not fit_circle(near, max(0.04, 0.4 * r), r_min, r_max, row):
@@ -235,8 +256,8 @@ def lines(height: Float, value: Float, weight: Float) -> tuple[float, float, flo
     metre, and the standard deviations of both. A weak prior keeps the slope near 0.
 
     Args:
-        height: shape (N,) [m].
-        value, weight: Values and their weights, shape (N,).
+        height: Heights above the ground, shape (N,) [m], N at least 1.
+        value, weight: Values and their weights, shape (N,); the sum of weights is positive.
     """
     n = height.shape[0]
     a, b, scale = np.median(value), 0.0, 1.0
@@ -270,14 +291,16 @@ def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
     """Return upright columns of voxels and the votes of a forest on them.
 
     A whole cloud is treated as if a robot had seen it from everywhere: each position was visible up to the
-    height in which stems are traced, and no column was ever absent.
+    height in which stems are traced, and no column was ever absent. Of columns within TWICE of each other the
+    strongest is kept. Of a cloud with more than MOST_VOXELS voxels, only a part is searched.
 
     Args:
-        points: x, y, z, height above the ground [m], shape (N, 4).
+        points: x, y, z, height above the ground [m], shape (N, 4); may be empty.
         forest: The forest.
 
     Returns:
-        Positions, shape (K, 2) [m], and class shares in the order of CLASSES, shape (K, 6).
+        Positions at 1.3 m above the ground, strongest column first, shape (K, 2) [m], and class shares in the
+        order of CLASSES, shape (K, 6).
     """
     memory = VoxelMap.empty()
     memory.add(np.ascontiguousarray(points[:, [0, 1, 3]]), 0, MOST_VOXELS)
@@ -300,8 +323,8 @@ def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
 
 
 def _apart(places: Float) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return which positions have no earlier one within TWICE, shape (K,), for positions of shape (K, 2)
-    [m]."""
+    """Return which positions are kept if, in their order, each one removes the later ones within TWICE, shape
+    (K,), for positions of shape (K, 2) [m]."""
     from scipy.spatial import cKDTree
 
     kept = np.ones(len(places), np.bool_)

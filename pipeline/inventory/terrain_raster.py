@@ -45,12 +45,13 @@ class TerrainRaster:
     seen: Bool
 
     def at(self, x: Float, y: Float) -> Float:
-        """Return heights [m] at positions x, y of shape (N,) each [m], by bilinear interpolation. Outside of
-        the raster, the height at its border is returned."""
+        """Return heights [m], shape (N,), at positions x, y of shape (N,) each [m], finite, by bilinear
+        interpolation. Outside of the raster, the height at its border is returned."""
         return self.evaluate(x, y)[:, 0]
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m]; shape (N, 3)."""
+        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m], finite; shape (N, 3).
+        Outside of the raster, the values at its border are returned."""
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         return _evaluate(self.height, self.low, self.cell, np.ascontiguousarray(x), np.ascontiguousarray(y))
 
@@ -71,16 +72,18 @@ class LowestReturns:
 
     @staticmethod
     def room(low: Float, high: Float) -> int:
-        """Return the memory that a raster between two corners [m] needs [bytes]."""
+        """Return the memory that a raster between two corners, shape (2,) [m], needs [bytes], before it is
+        taken."""
         columns, rows = (max(int(np.ceil(v / CELL)), 1) for v in (high - low).tolist())
         return columns * rows * (12 * KEPT + 4 + 8)
 
     def add(self, points: Float32) -> None:
-        """Add points of shape (N, 3) [m]."""
+        """Add points of shape (N, 3) [m], finite; points outside of the raster are ignored."""
         _keep_lowest(points, self._low, self._lowest, self._count, self._occupied)
 
     def ground(self, slope_max: float) -> TerrainRaster:
-        """Return the ground below all points so far.
+        """Return the ground below all points so far; more points may follow. Without any point, the height is
+        0 and nothing is seen.
 
         Args:
             slope_max: Largest slope of the terrain against the plane of the plot [rad].
@@ -101,12 +104,23 @@ class LowestReturns:
 
 
 def heights_above(points: Float32, ground: TerrainRaster) -> Float32:
-    """Return the height of each point (N, 3) above the ground, float32, shape (N,) [m]."""
+    """Return the height of each point (N, 3) [m], finite, above the ground, float32, shape (N,) [m]; outside
+    of the raster, above the ground at its border."""
     return _heights_above(points, ground.height, ground.low, ground.cell)
 
 
 @compiled
 def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occupied: UInt64) -> None:
+    """Add points to the tables of `LowestReturns`, in place; points outside are ignored.
+
+    Args:
+        points: float32, shape (N, 3) [m].
+        low: Corner of the raster, shape (2,) [m].
+        lowest: KEPT lowest returns of each cell in ascending order, infinite where there are fewer, shape
+            (columns, rows, KEPT, 3) [m].
+        count: Number of returns of each cell, shape (columns, rows).
+        occupied: Bits of the occupied height bins, see `_height_bit`, shape (columns, rows).
+    """
     columns, rows = count.shape
     for i in range(points.shape[0]):
         a = int(np.floor((points[i, 0] - low[0]) / CELL))
@@ -130,7 +144,8 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
 
 @compiled
 def _height_bit(z: float, bins_above: int) -> np.uint64:
-    """Return a mask with the bit of one height bin; bins are half of PIT high.
+    """Return a mask with the bit of one height bin; bins are half of PIT high, and 64 bins in a row share no
+    bit.
 
     Args:
         z: Height [m].
@@ -144,10 +159,11 @@ def _supported(lowest: Float32, count: Int32) -> Float:
     """Return the lowest return of each cell that has two more returns close above it, shape (columns, rows,
     3) [m].
 
-    Cells with fewer than three returns give their lowest return. An empty cell has infinite z.
+    Cells with fewer than three returns give their lowest return, and cells in which no return is supported
+    the highest of the kept ones. An empty cell has infinite z.
 
     Args:
-        lowest: Lowest returns of each cell.
+        lowest: Lowest returns of each cell, shape (columns, rows, KEPT, 3) [m].
         count: Number of returns of each cell, shape (columns, rows).
     """
     columns, rows = count.shape
@@ -170,10 +186,10 @@ def _supported(lowest: Float32, count: Int32) -> Float:
 
 def _trend(ground: Float) -> Float:
     """Return a, b, c of the plane z = a x + b y + c through the lowest cells of squares of 4 m, fitted
-    robustly, shape (3,).
+    robustly, shape (3,). With fewer than six squares it is level at their median height, without any at 0.
 
     Args:
-        ground: Lowest returns, shape (columns, rows, 3) [m].
+        ground: Lowest returns, shape (columns, rows, 3) [m], infinite z for none.
     """
     squares = 8
     columns, rows = (-(-n // squares) * squares for n in ground.shape[:2])
@@ -292,7 +308,7 @@ def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
     ground; shape (columns, rows) each.
 
     The height is that of a plane fitted to the lowest returns of the cells up to WINDOW away; with fewer than
-    three of them it is that of the cell's own lowest return.
+    three of them, the cell included, it is that of the cell's own lowest return.
 
     Args:
         ground: Lowest returns, shape (columns, rows, 3) [m], with infinite z in cells without ground.
@@ -326,6 +342,15 @@ def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
 
 @compiled
 def _add_row(H: Float, g: Float, dx: float, dy: float, z: float, w: float) -> None:
+    """Add one point to normal equations of a plane, in place.
+
+    Args:
+        H: Normal matrix, shape (3, 3).
+        g: Right side, shape (3,).
+        dx, dy: Position from the middle [m].
+        z: Height [m].
+        w: Weight.
+    """
     row = (dx, dy, 1.0)
     for k in range(3):
         g[k] += w * row[k] * z
@@ -335,7 +360,7 @@ def _add_row(H: Float, g: Float, dx: float, dy: float, z: float, w: float) -> No
 
 def _fill(height: Float) -> None:
     """Replace NaN in heights, shape (columns, rows), by interpolated means of coarser and coarser cells (a
-    pyramid), in place."""
+    pyramid), in place; by 0 if all are NaN."""
     if not np.isfinite(height).any():
         height[:] = 0.0
         return
@@ -357,6 +382,7 @@ def _fill(height: Float) -> None:
 
 @compiled
 def _evaluate(height: Float, low: Float, cell: float, x: Float, y: Float) -> Float:
+    """Return `ground_at` for positions x, y of shape (N,) each [m], shape (N, 3); arguments as in it."""
     out = np.empty((x.shape[0], 3))
     for i in range(x.shape[0]):
         out[i, 0], out[i, 1], out[i, 2] = ground_at(height, low, cell, x[i], y[i])
@@ -389,6 +415,7 @@ def ground_at(height: Float, low: Float, cell: float, x: float, y: float) -> tup
 
 @compiled
 def _heights_above(points: Float32, height: Float, low: Float, cell: float) -> Float32:
+    """Return the result of `heights_above`; arguments of the raster as in `ground_at`."""
     above = np.empty(points.shape[0], np.float32)
     for i in range(points.shape[0]):
         above[i] = points[i, 2] - ground_at(height, low, cell, points[i, 0], points[i, 1])[0]
