@@ -19,7 +19,7 @@ class Stage(BaseModel):
 
     @classmethod
     def title(cls) -> str:
-        """Return the title of the stage: its docstring up to the first colon."""
+        """Return the title of the stage: its docstring up to the first colon, without spaces at its ends."""
         return (cls.__doc__ or cls.__name__).partition(":")[0].strip()
 
 
@@ -34,7 +34,8 @@ def number(
     *,
     main: bool = False,
 ) -> Any:  # noqa: ANN401 - pydantic's Field is the default of a field of any type
-    """Return the declaration of a floating-point parameter.
+    """Return the declaration of a floating-point parameter: pydantic's Field with the bounds, and with unit,
+    step, `shown` and `main` in the JSON schema.
 
     Args:
         default: Value in the preset `forest`.
@@ -42,8 +43,8 @@ def number(
         unit: Unit symbol; empty if dimensionless.
         low, high: Bounds, inclusive.
         step: Increment of the slider by a key.
-        shown: Range of the slider. By default, from a tenth to ten times of a positive default within the
-            bounds, else the bounds.
+        shown: Range of the slider; not compared with the bounds. By default, from a tenth to ten times of the
+            default within the bounds if the default is positive and `low` not negative, else the bounds.
         main: Whether the parameter has a slider next to the 3D scene.
     """
     if shown is None:
@@ -53,7 +54,8 @@ def number(
 
 
 def count(default: int, title: str, unit: str, low: int, high: int, *, main: bool = False) -> Any:  # noqa: ANN401
-    """Return the declaration of an integer parameter.
+    """Return the declaration of an integer parameter, as `number` with the step 1 and the default range of
+    the slider, whose ends need not be whole numbers.
 
     Args:
         default: Value in the preset `forest`.
@@ -72,6 +74,6 @@ def name(default: str, title: str, pattern: str) -> Any:  # noqa: ANN401
 
 
 def choice(default: str | bool, title: str) -> Any:  # noqa: ANN401
-    """Return the declaration of a parameter of type bool or Literal, which lists the valid words. See
-    `number` for the arguments."""
+    """Return the declaration of a parameter of type bool or Literal, which lists the valid words; the type is
+    that of the annotation. See `number` for the arguments."""
     return Field(default=default, title=title)

@@ -53,10 +53,12 @@ class Parameters(BaseModel):
     def replace(self, changes: Mapping[str, Any]) -> Parameters:
         """Return a copy with values changed by their dotted names, validated as a whole.
 
-        Names of earlier versions are accepted with a RenamedParameterWarning.
+        Names of earlier versions are accepted with a RenamedParameterWarning; removed parameters are ignored
+        with one.
 
         Raises:
-            ParameterError: A name is unknown, a value is out of bounds, or two values contradict each other.
+            ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
+                contradict each other.
         """
         tree = self.model_dump()
         for name, value in current_names(changes).items():
@@ -78,13 +80,15 @@ class Parameters(BaseModel):
         }
 
     def changes_from(self, other: Parameters) -> dict[str, Value]:
-        """Return the values of this set, by dotted name, that differ from those of another set."""
+        """Return the values of this set, by dotted name, that differ from those of another set; empty for
+        equal sets."""
         others = other.flat()
         return {name: value for name, value in self.flat().items() if others[name] != value}
 
 
 def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by dotted name with the names of earlier versions replaced by the current names.
+    """Return values by dotted name with the names of earlier versions, and choices that no longer exist,
+    replaced by the current ones. Removed parameters are left out; unknown names stay as they are.
 
     Each renamed or removed parameter gives one RenamedParameterWarning. A value under the current name takes
     precedence over one under an earlier name.
@@ -107,23 +111,28 @@ def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _current_name(name: str) -> str | None:
-    """Return the current dotted name of a parameter, or None if the parameter was removed."""
+    """Return the current dotted name of a parameter, an unknown name as it is, or None if the parameter was
+    removed."""
     stage, dot, field_name = RENAMED.get(name, name).partition(".")
     name = f"{RENAMED_STAGES.get(stage, stage)}{dot}{field_name}"
     return None if name in REMOVED else name
 
 
 def _warn(message: str) -> None:
+    """Issue a RenamedParameterWarning with a message."""
     warnings.warn(message, RenamedParameterWarning, stacklevel=2)
 
 
 def validated(tree: Mapping[str, Any]) -> Parameters:
-    """Return parameters from nested mappings (stage, parameter).
+    """Return parameters from nested mappings (stage, parameter). Stages and parameters that are missing have
+    their defaults, those of the preset `forest`.
 
     Names of earlier versions are accepted with a RenamedParameterWarning.
 
     Raises:
-        ParameterError: One line that names the parameter, its bound and the value given.
+        ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
+            contradict each other. The message has one line and names the first such parameter, its bound and
+            the value given.
     """
     try:
         return Parameters.model_validate(_current_tree(tree))
@@ -132,7 +141,9 @@ def validated(tree: Mapping[str, Any]) -> Parameters:
 
 
 def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings with the names of earlier versions replaced by the current names."""
+    """Return nested mappings (stage, parameter) with the names of earlier versions replaced by the current
+    names, see `current_names`; a stage whose value is not a mapping is returned as it is, to be refused by
+    the validation."""
     nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
     result = {stage: values for stage, values in tree.items() if stage not in nested}
     flat = {f"{stage}.{name}": value for stage, values in nested.items() for name, value in values.items()}
@@ -207,8 +218,13 @@ def field_specs() -> tuple[FieldSpec, ...]:
 
 
 def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
-    """Return the description of the parameter `name` of the stage `stage_name`, whose declaration is in
-    `stage_model`."""
+    """Return the description of one parameter.
+
+    Args:
+        stage_name: Name of the stage in dotted names.
+        stage_model: Class with the declaration.
+        name: Name of the parameter in the stage.
+    """
     field = stage_model.model_fields[name]
     extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
     bounds = {type(m).__name__: m for m in field.metadata}

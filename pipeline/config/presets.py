@@ -125,10 +125,10 @@ PRESETS: dict[str, tuple[str, dict[str, object]]] = {
 
 @cache
 def preset(name: str) -> Parameters:
-    """Return the parameters of a preset.
+    """Return the parameters of a preset, the same object in each call.
 
     Raises:
-        ParameterError: There is no preset of this name.
+        ParameterError: There is no preset of this name; the message lists the presets.
     """
     if name not in PRESETS:
         raise ParameterError(f"there is no preset {name!r}", remedy=f"Presets: {', '.join(PRESETS)}")

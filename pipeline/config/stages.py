@@ -49,6 +49,7 @@ class Acquisition(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        """Return the parameters; ValueError if the range limits are not in order."""
         _require_less(self, "acquisition", ("range_min", "range_max"))
         return self
 
@@ -79,6 +80,7 @@ class Filters(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        """Return the parameters; ValueError if two faces of the box are not in order."""
         _require_less(self, "filters", ("x_min", "x_max"), ("y_min", "y_max"), ("z_min", "z_max"))
         return self
 
@@ -100,6 +102,7 @@ class Ground(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        """Return the parameters; ValueError if the height limits are not in order."""
         _require_less(self, "ground", ("height_min", "height_max"))
         return self
 
@@ -181,6 +184,7 @@ class Detection(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        """Return the parameters; ValueError if the limits of eccentricity or radius are not in order."""
         _require_less(self, "detection", ("e_min", "e_max"), ("radius_min", "radius_max"))
         return self
 
@@ -344,6 +348,7 @@ class Obstacles(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
+        """Return the parameters; ValueError if the height limits or the zones are not in order."""
         _require_less(self, "obstacles", ("height_min", "height_max"), ("stop_distance", "slow_distance"))
         return self
 

@@ -15,7 +15,8 @@ _DEEP_NAME = re.compile(r"(?:\.[^.,=\n]{0,100}){20}")
 
 
 def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
-    """Return parameters changed by `stage.name=value` texts of the command line.
+    """Return parameters changed by `stage.name=value` texts of the command line; of two texts with one name
+    the later one counts. Names of earlier versions give a RenamedParameterWarning.
 
     Raises:
         ParameterError: A text has no "=", a name is unknown, or a value is not valid.
@@ -36,7 +37,8 @@ def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
 
 
 def parsed(spec: FieldSpec, text: str) -> Value:
-    """Return the value of a parameter from its text; bounds are checked later, with the whole set.
+    """Return the value of a parameter from its text; bounds and choices are checked later, with the whole
+    set. The text of a bool other than "true" and "false" is returned as it is, so that this check refuses it.
 
     Raises:
         ParameterError: The text of a numeric parameter is not a number.
@@ -55,22 +57,24 @@ def parsed(spec: FieldSpec, text: str) -> Value:
 
 
 def to_toml(parameters: Parameters) -> str:
-    """Return all values as TOML with one table per stage."""
+    """Return all values as TOML text with one table per stage."""
     import tomli_w
 
     return tomli_w.dumps(parameters.model_dump())
 
 
 def from_toml(text: str, base: Parameters, where: str) -> Parameters:
-    """Return the base set with the values of a TOML text; the text may omit stages and values.
+    """Return the base set with the values of a TOML text; the text may omit stages and values. Names of
+    earlier versions give a RenamedParameterWarning.
 
     Args:
         text: Content of the file.
-        base: Values of the parameters that the text omits.
+        base: Values of the parameters that the text omits; not changed.
         where: Name of the file, for error messages.
 
     Raises:
-        ParameterError: The text is not TOML, or a value is not valid.
+        ParameterError: The text is not TOML (see `toml_table`), a value is not in a table, a name is unknown,
+            or a value is not valid.
     """
     given = toml_table(text, where)
     for stage, values in given.items():
@@ -91,14 +95,14 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
 
 
 def toml_table(text: str, where: str) -> dict[str, Any]:
-    """Return the contents of a TOML text from outside.
+    """Return the contents of a TOML text from outside, without a check of names and values.
 
     Args:
         text: Content of the file.
         where: Name of the file, for error messages.
 
     Raises:
-        ParameterError: The text is not TOML, is too long, or has names of too many parts.
+        ParameterError: The text is not TOML, is longer than LONGEST_TOML, or has names of too many parts.
     """
     if len(text) > LONGEST_TOML:
         raise ParameterError(f"the file is longer than {LONGEST_TOML:,} characters", where=where)
@@ -111,7 +115,12 @@ def toml_table(text: str, where: str) -> dict[str, Any]:
 
 
 def markdown_table(presets: dict[str, Parameters]) -> str:
-    """Return a Markdown table of every parameter with its bounds and its value in each preset."""
+    """Return a Markdown table of every parameter with unit, bounds, its value in each preset, and meaning;
+    one row per parameter, with a final line break.
+
+    Args:
+        presets: Parameters by the name of the preset; each gives a column.
+    """
     values = {name: parameters.flat() for name, parameters in presets.items()}
     head = ["parameter", "unit", "bounds", *(f"`{name}`" for name in presets), "meaning"]
     rows = [
@@ -123,6 +132,7 @@ def markdown_table(presets: dict[str, Parameters]) -> str:
 
 
 def _bounds(spec: FieldSpec) -> str:
+    """Return the bounds of a number as "low to high", else the choices, "true, false" or "a name"."""
     if spec.kind == "name":
         return "a name"
     if spec.minimum is None or spec.maximum is None:
@@ -131,4 +141,5 @@ def _bounds(spec: FieldSpec) -> str:
 
 
 def _shown(value: Value) -> str:
+    """Return a value as text; floating-point numbers in their shortest form with up to six digits."""
     return f"{value:g}" if isinstance(value, float) else str(value)
