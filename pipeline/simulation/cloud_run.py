@@ -47,7 +47,8 @@ class PlotGround:
     yaw: float
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m]; shape (N, 3)."""
+        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m] in the frame of the
+        first pose; shape (N, 3). Outside of the raster, the values at its border are returned."""
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         there = self.height.evaluate(self.start[0] + c * x - s * y, self.start[1] + s * x + c * y)
         z, gx, gy = there.T
@@ -69,7 +70,9 @@ class CloudRun(SimulatedRun):
     warnings: tuple[str, ...]
 
     def sweep(self, k: int) -> Sweep:
-        """Simulate scan k (from 0); the result does not depend on other scans."""
+        """Simulate scan k, 0 to `scans` - 1; the result does not depend on other scans. Ranges outside of the
+        limits of the sensor give no return; all returns have the reflectance REFLECTANCE and no solid (-1).
+        """
         lidar = self.lidar
         _, R, o = self.sensor_poses(k)
         ranges = first_surfels(self.surfels, R, o, lidar.beams(), lidar.optics)
@@ -92,16 +95,18 @@ class CloudRun(SimulatedRun):
 def open_cloud_run(
     request: RunRequest, cloud: WholeCloud, trees: TruthTrees | None, T_base_lidar: Pose3 | None = None
 ) -> CloudRun:
-    """Plan a path through a cloud and drive it; no scan is simulated yet.
+    """Plan a path through a cloud and drive it; no scan is simulated yet. The cloud is read three times.
 
     Args:
-        request: Requested options; a duration of 0 means one loop.
-        cloud: WholeCloud of the plot.
-        trees: Trees of the plot in the coordinates of the cloud.
+        request: Requested options; a duration of 0 means one loop, of SHORTEST to LONGEST seconds. A longer
+            loop is cut short with a warning.
+        cloud: The cloud of the plot.
+        trees: Trees of the plot in the coordinates of the file, i.e. with the offset; None without ground
+            truth.
         T_base_lidar: Extrinsics of the LiDAR; None uses those of simulated robots.
 
     Raises:
-        SourceError: The cloud cannot be read, or has no path for a robot.
+        SourceError: The cloud cannot be read, is too large for a plot, or has no path for a robot.
     """
     ground, near, _ = find_ground(cloud, SLOPE, band=BAND, most=MOST)
     points = near.points
@@ -134,12 +139,19 @@ def open_cloud_run(
 
 
 def _cut_short(way: float, lap: float) -> tuple[str]:
+    """Return the warning for a loop that is not driven to its end.
+
+    Args:
+        way: Length of the loop [m].
+        lap: Time that it takes [s].
+    """
     drives = f"duration={lap:.0f} drives all of it" if lap <= 3600.0 else "duration=3600 drives most of it"
     return (f"the loop through the plot is {way:.0f} m long, of which {LONGEST:.0f} s are driven: {drives}",)
 
 
 def _heading(way: Float) -> float:
-    """Return the heading of the smooth line through a closed row of waypoints at the first one [rad]."""
+    """Return the heading of the smooth line through a closed row of waypoints, shape (N, 2) [m], at the first
+    one [rad]."""
     from scipy.interpolate import CubicSpline
 
     knots = np.vstack([way, way[:1]])
@@ -149,6 +161,13 @@ def _heading(way: Float) -> float:
 
 
 def _from(points: Float32, start: Float, yaw: float) -> Float32:
+    """Return points, shape (N, 3) [m], in the frame of a pose, float32.
+
+    Args:
+        points: Points in the frame of the cloud minus its offset.
+        start: Position of the pose in this frame, shape (3,) [m].
+        yaw: Yaw of the pose [rad].
+    """
     c, s = np.cos(yaw), np.sin(yaw)
     R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     seen: Float32 = ((points - start) @ R.T).astype(np.float32)
@@ -156,11 +175,12 @@ def _from(points: Float32, start: Float, yaw: float) -> Float32:
 
 
 def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> SimulatedScene:
-    """Return a scene that only has a ground truth: its objects are the surfels.
+    """Return a scene that only has a ground truth: its objects are the surfels, so that it has no solids and
+    flat ground.
 
     Args:
-        trees: Ground truth in the frame of the cloud; None for an empty one.
-        start: Position of the first pose in this frame, shape (2,) [m]. The scene begins there.
+        trees: Ground truth in the coordinates of the file; None for an empty one.
+        start: Position of the first pose in these coordinates, x, y first [m]. The scene begins there.
         yaw: Yaw of the first pose [rad].
     """
     none = np.zeros(0)
@@ -191,7 +211,9 @@ SPACING = 0.8  # m; between waypoints
 
 
 def loop_through(points: Float32, ground: TerrainRaster, where: str) -> Float:
-    """Return waypoints of a closed loop, shape (N, 2) [m]; the same cloud gives the same loop.
+    """Return waypoints of a closed loop, shape (N, 2) [m], the first not repeated, in the frame of the
+    points; the same cloud gives the same loop. The widest clearance for which there is a loop is used; where
+    there is none, sparse vegetation counts as free.
 
     Args:
         points: shape (N, 4): x, y, z, height above the ground [m].
@@ -213,9 +235,14 @@ def loop_through(points: Float32, ground: TerrainRaster, where: str) -> Float:
 
 
 def _obstacles(points: Float32, ground: TerrainRaster) -> Int:
-    """Return the number of points that are obstacles in each cell of side CELL, shape (R, C), over the extent
-    of `ground`. `points` holds x, y, z and height above the ground [m]; those above LOW and below HIGH are
-    obstacles."""
+    """Return the number of points that are obstacles in each cell of side CELL, int64, shape (R, C), over the
+    extent of `ground`; points outside of it do not count.
+
+    Args:
+        points: x, y, z and height above the ground, shape (N, 4) [m]; those above LOW and below HIGH are
+            obstacles.
+        ground: Ground of the plot.
+    """
     times = round(ground.cell / CELL)
     shape = (ground.seen.shape[0] * times, ground.seen.shape[1] * times)
     way = points[(points[:, 3] > LOW) & (points[:, 3] < HIGH)]
@@ -227,7 +254,13 @@ def _obstacles(points: Float32, ground: TerrainRaster) -> Int:
 
 
 def _clearance(free: Bool, ground: TerrainRaster) -> Float:
-    """Return the distance to obstacles of cells of SIDE [m]; cells without visible ground are obstacles."""
+    """Return the distance to obstacles of cells of SIDE [m], 0 in obstacles; cells far from visible ground
+    and outside of the raster are obstacles. The shape is half of that of `free`, rounded down.
+
+    Args:
+        free: Whether each cell of side CELL is free, shape (R, C).
+        ground: Ground of the plot, over the same extent.
+    """
     from scipy.ndimage import binary_dilation, distance_transform_edt
 
     seen = binary_dilation(ground.seen, iterations=1)
@@ -244,7 +277,8 @@ def _clearance(free: Bool, ground: TerrainRaster) -> Float:
 
 def _loop(clearance: Float, least: float) -> Float | None:
     """Return a closed path over the largest region of cells with at least a clearance [m]: rows and columns
-    of cells, shape (N, 2). None if it does not lead around a large enough part of the cloud.
+    of cells, float64, shape (N, 2), about SPACING apart. None if there is no such cell, or if the path does
+    not lead around a large enough part of the cloud.
 
     Args:
         clearance: Distance of each cell to obstacles, shape (R, C) [m].
@@ -300,9 +334,9 @@ def _joined(clearance: Float, region: Bool, stations: Int) -> Int:
     detours along the same cells are removed.
 
     Args:
-        clearance: Distance of each cell to the next obstacle, shape (R, C).
-        region: Cells that the robot can reach, shape (R, C).
-        stations: Rows and columns of the stations, shape (S, 2).
+        clearance: Distance of each cell to the next obstacle, shape (R, C) [m], above 0 in the region.
+        region: Connected cells that the robot can reach, shape (R, C).
+        stations: Rows and columns of the stations, in the region, shape (S, 2).
 
     Returns:
         Rows and columns of the cells of the path, shape (N, 2).

@@ -36,7 +36,8 @@ GROUND_REFLECTIVITY = 0.25
 def count_echoes(
     kind: int, shape: Float, surface: Float, o: Float, d: Float, d_next: Float, divergence: float
 ) -> tuple[int, float]:
-    """Divide a beam into eight rays; return how many meet a shape, and the sum of their ranges.
+    """Divide a beam into eight rays side by side in azimuth; return how many meet a shape, 0 to 8, and the
+    sum of their ranges [m].
 
     Args:
         kind, shape, surface, o, d: As in `meet_solid`.
@@ -148,11 +149,12 @@ def measure(
     key: int,
     last: bool,
 ) -> tuple[Float, Float, Int32]:
-    """Return what the receiver reports: range [m] (0 without a return), reflectance 0..255 and shape, (C, K)
+    """Return what the receiver reports: range [m] (0 without a return, for a lost weak echo and outside of
+    the measured ranges), reflectance 0..255 (0 without a return) and shape (row, GROUND or NOTHING), (C, K)
     each.
 
     Args:
-        ranges, hit: Result of `first_returns`.
+        ranges, hit: Result of `first_returns`, shape (C, K).
         solids, terrain, o, directions, optics, key: See `first_returns`.
         noise: Error of each range [m], shape (C, K).
         last: Whether the last of two separate echoes is reported, not the stronger one.
@@ -195,13 +197,14 @@ def measure(
 def scan_of_returns(
     lidar: SpinningLidar, stamp_ns: int, reported: Float, reflectance: Float, source: Int32
 ) -> Sweep:
-    """Make a scan of the returns of a sweep, in the order of time, then ring.
+    """Return a scan of the returns of a sweep in the field of view, in the order of time, then ring, then
+    echo, with the solid of each point.
 
     Args:
         lidar: The sensor.
         stamp_ns: Start of the sweep.
-        reported: Range of each echo of each beam [m], 0 without a return, shape (C, K, echoes); reflectance,
-            source: See `measure`; of the same shape.
+        reported: Range of each echo of each beam [m], 0 without a return, shape (C, K, echoes).
+        reflectance, source: See `measure`; of the same shape.
     """
     column, ring, echo_number = np.nonzero(reported > 0.0)
     points = lidar.beams()[column, ring] * reported[column, ring, echo_number, None]
@@ -255,7 +258,7 @@ class SpinningLidar:
 
     @property
     def sensor(self) -> Sensor:
-        """The sensor as the pipeline describes it."""
+        """The sensor as the pipeline describes it; its range sigma is at least 1 mm."""
         return Sensor(
             name=f"{self.name} (simulated)",
             rings=self.rings,
@@ -277,18 +280,21 @@ class SpinningLidar:
         return offsets.astype(np.int32)
 
     def beams(self) -> Float:
-        """Return the unit directions of all rays in the sensor frame, shape (C, K, 3)."""
+        """Return the unit directions of all rays in the sensor frame, shape (C, K, 3). The array is shared
+        between calls and must not be changed."""
         return _beams(self)
 
     def at_scan(self, k: int) -> SpinningLidar:  # noqa: ARG002 - all turns are alike
-        """Return the sensor with the pattern of scan k."""
+        """Return the sensor with the pattern of scan k: this sensor, because all turns are alike."""
         return self
 
     def sees(self, points: Float32) -> Bool:
-        """Return which points (N, 3) are in the field of view, shape (N,)."""
+        """Return which points (N, 3) are in the field of view, shape (N,): all."""
         return np.ones(len(points), np.bool_)
 
     def _directions(self) -> Float:
+        """Return the unit directions of all rays in the sensor frame, shape (C, K, 3); column c has the
+        azimuth pi - c 2 pi / C."""
         azimuth = np.pi - np.arange(self.columns) * (2.0 * np.pi / self.columns)
         elevation = self.lowest + np.arange(self.rings) * self.ring_step
         out = np.empty((self.columns, self.rings, 3))
@@ -300,6 +306,8 @@ class SpinningLidar:
 
 @lru_cache(maxsize=4)
 def _beams(lidar: SpinningLidar) -> Float:
+    """Return the rays of a sensor, see `SpinningLidar.beams`, computed once for each of the last four
+    sensors."""
     return lidar._directions()
 
 
@@ -325,20 +333,22 @@ class SolidStateLidar(SpinningLidar):
 
     @property
     def sensor(self) -> Sensor:
-        """The sensor as the pipeline describes it, without rings."""
+        """The sensor as the pipeline describes it, without rings; the range sigma may be 0."""
         return Sensor(f"{self.name} (simulated)", azimuth_step=0.0035, range_sigma=self.range_sigma)
 
     def at_scan(self, k: int) -> SolidStateLidar:
-        """Return the sensor with the pattern of scan k."""
+        """Return a copy of the sensor with the pattern of scan k: the seed `pattern` + k."""
         return replace(self, pattern=self.pattern + k)
 
     def sees(self, points: Float32) -> Bool:
-        """Return which points (N, 3) are in the cone, shape (N,)."""
+        """Return which points (N, 3) in the sensor frame are in the cone of CONE around x, shape (N,); False
+        at the origin."""
         ahead: Bool = points[:, 0] > np.cos(CONE) * np.linalg.norm(points, axis=1)
         return ahead
 
     def _directions(self) -> Float:
-        """A grid of rays, each moved at random by less than half a step, shape (C, K, 3)."""
+        """Return a grid of rays, each moved at random by less than half a step, shape (C, K, 3); the seed
+        `pattern` decides."""
         rng = np.random.default_rng(self.pattern)
         step, shape = 2.0 * np.pi / self.columns, (self.columns, self.rings)
         azimuth = np.pi - step * (np.arange(self.columns)[:, None] + rng.uniform(-0.45, 0.45, shape))
@@ -369,15 +379,19 @@ def sweep_scene(
     stamp_ns: int,
     rng: np.random.Generator,
 ) -> Sweep:
-    """Simulate a sweep.
+    """Simulate a sweep of a scene.
 
     Args:
         lidar: The sensor.
-        solids: All solids at this time.
+        solids: All solids at this time, of any number.
         terrain: The ground.
         R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
         stamp_ns: Start of the sweep.
         rng: Random generator of this sweep.
+
+    Returns:
+        The returns in the sensor frame at their own time, without correction of the motion; there may be
+        none. A sensor with `dual` reports up to two per beam.
     """
     key = int(rng.integers(0, 2**62))
     noise = lidar.range_sigma * rng.standard_normal((lidar.columns, lidar.rings))

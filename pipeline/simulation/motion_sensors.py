@@ -20,7 +20,8 @@ SPIN, SPIN_TURN = (0.02, 0.15), np.radians(1.0)  # m and rad that spinning wheel
 
 
 def wheel_odometry(motion: TrueMotion, quality: WheelQuality, rng: np.random.Generator) -> Float:
-    """Return x, y [m] and yaw [rad] by the wheels at 50 Hz, shape (N, 3); the first row is zero.
+    """Return x, y [m] and yaw [rad, not wrapped] by the wheels at 50 Hz, shape (N, 3), from the start of the
+    motion; the first row is zero.
 
     The distance is measured along the ground. On a slope it is longer than its projection on the map, so
     planar odometry is wrong there even without noise.
@@ -84,13 +85,18 @@ class Inertial:
     attitude: Float
 
     def orientation(self, n: int) -> Float:
-        """Return the quaternion w, x, y, z of reading n."""
+        """Return the quaternion w, x, y, z of reading n, shape (4,), by the measured attitude."""
         roll, pitch, yaw = self.attitude[n]
         return Pose3.from_euler(np.zeros(3), roll, pitch, yaw).quaternion()
 
 
 def inertial_readings(motion: TrueMotion, rng: np.random.Generator) -> Inertial:
-    """Return the readings of the IMU for a motion."""
+    """Return the readings of the IMU at 100 Hz for a motion, from its start, with bias and noise.
+
+    Args:
+        motion: True motion.
+        rng: Source of the errors.
+    """
     step, dt = RATE_HZ // IMU_HZ, 1.0 / RATE_HZ
     d = motion.drive
     roll, pitch = motion.roll, motion.pitch

@@ -24,15 +24,16 @@ _TICKS = RATE_HZ * _LIDAR.period_ns // 1_000_000_000  # per sweep
 def obstacle_aware_drive(
     course: Course, speed: float, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, duration_s: float
 ) -> Drive:
-    """Drive a course one sweep at a time; the clearance after a sweep decides the speed of the next one.
+    """Drive a course one sweep at a time from rest; the clearance after a sweep, by the default parameters,
+    decides the speed of the next one. Each sweep is simulated with a coarse LiDAR.
 
     Args:
-        course: The course.
+        course: The course. An open one is driven to its end, where the robot stops; a closed one repeatedly.
         speed: Speed on the straight [m/s].
         scene: The scene.
         T_base_lidar: Extrinsics of the LiDAR.
         seed: Random seed of the sensor.
-        duration_s: Duration [s].
+        duration_s: Duration [s]; the result is a little longer.
     """
     limit, step = speed_limit(course, speed), 1.0 / RATE_HZ
     speeds, along = [0.0], [0.0]
@@ -55,11 +56,11 @@ def obstacle_aware_drive(
 
 
 def _drive(course: Course, along: list[float], speeds: list[float], first: int) -> Drive:
-    """Return the drive along a course from tick `first` onwards.
+    """Return the drive along a course from tick `first` onwards, at RATE_HZ.
 
     Args:
         course: The course.
-        along: Distance driven at each tick [m].
+        along: Distance driven at each tick since the start [m].
         speeds: Speed at each tick [m/s].
         first: First tick.
     """

@@ -46,7 +46,7 @@ class Section:
 
     @property
     def widest(self) -> float:
-        """Factor between r and a radius that encloses the section."""
+        """Factor between r and a radius that encloses the section, at least 1."""
         return 1.0 + self.oval + self.fluted
 
     def perimeter_factor(self) -> float:
@@ -79,7 +79,8 @@ class Solids(NamedTuple):
     owner: Int32
 
     def join(self, other: Solids) -> Solids:
-        """Return these shapes followed by others."""
+        """Return new columns with these shapes followed by others; the numbers of the objects are not
+        changed."""
         return Solids(
             np.concatenate([self.kind, other.kind]),
             np.concatenate([self.shape, other.shape]),
@@ -89,7 +90,8 @@ class Solids(NamedTuple):
         )
 
     def placed(self, offset: Float, yaw: float) -> Solids:
-        """Return the shapes turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]."""
+        """Return the shapes turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]; these
+        shapes are not changed. Capsules and axes turn with the shapes."""
         c, s = np.cos(yaw), np.sin(yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         shape, capsule = self.shape.copy(), self.capsule.copy()
@@ -168,7 +170,16 @@ class SolidsBuilder:
         free_path: float = 0.0,
         reflectivity: float = 0.3,
     ) -> None:
-        """Add an ellipsoid with half sizes (3,) [m], turned by `yaw` about z; porous if `free_path` > 0."""
+        """Add an ellipsoid.
+
+        Args:
+            owner: Number of the object that it belongs to.
+            centre: Centre, shape (3,) [m].
+            half: Half sizes, shape (3,) [m].
+            yaw: Turn about z [rad].
+            free_path: Mean free path of light in a porous ellipsoid [m]; 0 for a solid one.
+            reflectivity: Share of the light that is reflected.
+        """
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)
         shape = [*c, *h, np.cos(yaw), np.sin(yaw), free_path]
         self._rows.append((ELLIPSOID, shape, [*c, *c, float(h.max())], _surface(reflectivity), owner))
@@ -176,17 +187,17 @@ class SolidsBuilder:
     def box(
         self, owner: int, centre: ArrayLike, half: ArrayLike, *, yaw: float = 0.0, reflectivity: float = 0.5
     ) -> None:
-        """Add an upright box with half sizes (3,) [m], turned by `yaw` about z."""
+        """Add an upright box; arguments as in `ellipsoid`."""
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)
         shape = [*c, *h, np.cos(yaw), np.sin(yaw), 0.0]
         self._rows.append((BOX, shape, [*c, *c, float(np.linalg.norm(h))], _surface(reflectivity), owner))
 
     def extend(self, solids: Solids) -> None:
-        """Add all shapes of a table."""
+        """Add all shapes of a table with the numbers of their objects."""
         self._rows += zip(*(column.tolist() for column in solids), strict=True)
 
     def build(self) -> Solids:
-        """Return all shapes so far as columns."""
+        """Return all shapes so far as new columns, without rows if there are none; more shapes may follow."""
         kind, shape, capsule, surface, owner = zip(*self._rows, strict=True) if self._rows else [()] * 5
         return Solids(
             np.array(kind, dtype=np.int32),
@@ -198,4 +209,5 @@ class SolidsBuilder:
 
 
 def _surface(reflectivity: float, roughness: float = 0.0) -> list[float]:
+    """Return a row of `Solids.surface` of a shape that is not a STEM."""
     return [reflectivity, roughness, *[0.0] * (SURFACE - 2)]

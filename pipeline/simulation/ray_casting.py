@@ -43,8 +43,8 @@ class Optics(NamedTuple):
 
 @compiled
 def meet_cone(shape: Float, o: Float, d: Float, widest: float = 1.0) -> float:
-    """Return the range [m] at which a ray enters the mantle of a tapered cylinder; MISS if it does not, or if
-    the origin is inside.
+    """Return the range [m] at which a ray enters the mantle of a tapered cylinder from outside; MISS if it
+    does not, or if the origin is inside. The cylinder has no caps: a ray through an open end misses.
 
     Args:
         shape: Row of the shape, see `Solids.shape`.
@@ -136,8 +136,9 @@ def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
 
 @compiled
 def meet_ellipsoid(shape: Float, o: Float, d: Float) -> tuple[float, float]:
-    """Return the ranges [m] at which a ray enters and leaves an ellipsoid, negative behind the origin; both
-    are MISS if it passes. Arguments as in `meet_cone`."""
+    """Return the ranges [m] at which a ray enters and leaves an ellipsoid, negative behind the origin (both,
+    if the ellipsoid is behind); both are MISS if the line of the ray passes it. Arguments as in `meet_cone`.
+    """
     cos, sin = shape[6], shape[7]
     wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
     px, py, pz = (cos * wx + sin * wy) / shape[3], (cos * wy - sin * wx) / shape[4], wz / shape[5]
@@ -191,17 +192,18 @@ def waves_at(terrain: Float, o: Float, waves: Float) -> None:
 
 @compiled
 def meet_ground(terrain: Float, waves: Float, d: Float, farthest: float, rate: Float) -> float:
-    """Return the range at which a ray first goes below the terrain, infinite if not before `farthest`.
+    """Return the range [m] at which a ray first goes below the terrain; MISS (infinite) if not before
+    `farthest`, or if the origin is not above the terrain.
 
     Along the ray the waves rise no faster than `steepest` and curve no more than `bend`. Both bound how far
     it is safe to advance; near the ground the second converges as fast as Newton's method.
 
     Args:
-        terrain: Packed, see `Terrain`.
-        waves: Waves at the origin of the ray, see `waves_at`.
-        d: Unit direction.
-        farthest: [m].
-        rate: Working space of shape (W,).
+        terrain: `SimulatedTerrain.packed`, shape (W, 4).
+        waves: Waves at the origin of the ray, see `waves_at`, shape (W, 3).
+        d: Unit direction, shape (3,).
+        farthest: Largest range [m].
+        rate: Working space of shape (W,), overwritten.
     """
     count = terrain.shape[0]
     fall = terrain[0, 0] * d[0] + terrain[0, 1] * d[1] - d[2]
@@ -283,16 +285,17 @@ def solid_incidence(kind: int, shape: Float, o: Float, d: Float, t: float) -> fl
 def interval_of_capsule(
     capsule: Float, R: Float, o: Float, lowest: float, highest: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the angles that a capsule covers as seen by the sensor with rotation R (3, 3) at o (3,).
-
-    Returns:
-        Azimuth of its middle, half its width in azimuth, lowest and highest elevation [rad], and the nearest
-        range at which it can be met [m]. The width is negative when it is out of view.
+    """Return the angles that a capsule covers as seen by the sensor.
 
     Args:
         capsule: Ends of its axis and its radius, shape (7,) [m].
-        R, o: Pose of the sensor.
+        R, o: Rotation (3, 3) and position (3,) [m] of the sensor in the world.
         lowest, highest: Elevations of the outer rings [rad].
+
+    Returns:
+        Azimuth of its middle, half its width in azimuth (pi if the capsule is around or above the sensor),
+        lowest and highest elevation [rad], and the nearest range at which it can be met [m]. The width is -1
+        when the capsule is above or below all elevations.
     """
     a, b = np.empty(3), np.empty(3)
     for i in range(3):
@@ -326,17 +329,18 @@ def interval_of_capsule(
 def window_of_capsule(
     capsule: Float, R: Float, o: Float, lowest: float, ring_step: float, rings: int
 ) -> tuple[int, int, int, int, float]:
-    """Return the rays of a sweep that can meet a capsule, as seen from the poses R (C, 3, 3) and o (C, 3).
-
-    Returns:
-        First and last column (modulo C), first and last ring, and the nearest range at which it can be met
-        [m]. The columns are empty when it is out of view.
+    """Return the rays of a sweep that can meet a capsule.
 
     Args:
         capsule: Ends of its axis and its radius, shape (7,) [m].
-        R, o: Poses of the sensor.
+        R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
         lowest, ring_step: Elevation of the lowest ring, and between two rings [rad].
         rings: Number of rings.
+
+    Returns:
+        First and last column (may be negative or above C - 1, to be taken modulo C), first and last ring, and
+        the nearest range at which it can be met [m]. The columns are empty (last before first) when it is out
+        of view; the rings are empty when it is between two of them.
     """
     columns = R.shape[0]
     step = 2.0 * np.pi / columns
@@ -372,7 +376,7 @@ NOTHING, GROUND = -1, -2
 
 @compiled
 def random_unit(key: int, a: int, b: int) -> float:
-    """Return a number in (0, 1) that only depends on the key and two counters."""
+    """Return a random number in (0, 1) that only depends on the key and the two counters a and b."""
     h = (
         np.uint64(key)
         ^ (np.uint64(a + 1) * np.uint64(0x9E3779B97F4A7C15))
@@ -399,7 +403,8 @@ def ray_directions(R: Float, beams: Float) -> Float:
 
 @compiled
 def meet_solid(kind: int, shape: Float, surface: Float, o: Float, d: Float, chance: float) -> float:
-    """Return the range [m] of the first return from a shape, infinite without one.
+    """Return the range [m] of the first return from a shape, infinite without one. A ray passes a porous
+    ellipsoid if the drawn depth is greater than its way in it.
 
     Args:
         kind, shape, surface: Row of `Solids`.
@@ -432,12 +437,12 @@ def first_returns(
     key: int,
     order: Int,
 ) -> tuple[Float, Int32]:
-    """Return range [m] and shape (or NOTHING, GROUND) of each ray of a sweep, shape (C, K) each.
-
-    `order` lists the shapes; with near shapes first, rays that they stop are not tested again.
+    """Return range [m] and shape (row of `solids`, GROUND or NOTHING) of each ray of a sweep, shape (C, K)
+    each.
 
     Column c looks along the azimuth pi - c 2 pi / C from the pose R[c], o[c]. Ranges are infinite for
-    NOTHING, and beyond `optics.range_max` or outside of its field there is no return.
+    NOTHING. Columns outside of `optics.field` have no returns; the ground ends at `optics.range_max`, and
+    shapes that are entirely beyond it are skipped.
 
     Args:
         solids: The shapes.
@@ -446,7 +451,8 @@ def first_returns(
         directions: Unit directions of the rays in the scene, shape (C, K, 3).
         optics: Range, field and rings.
         key: Random seed of foliage.
-        order: Rows of the shapes, shape (M,).
+        order: Rows of the shapes that are tested, shape (M,); with near shapes first, rays that they stop are
+            not tested again.
     """
     kind, shape, surface = solids.kind, solids.shape, solids.surface
     capsule, farthest = solids.capsule, optics.range_max
@@ -487,10 +493,10 @@ def first_returns(
 @compiled
 def first_along(solids: Solids, directions: Float, key: int) -> Float:
     """Return the range [m] at which each ray from the origin first meets a shape, infinite without, shape
-    (N,).
+    (N,). There is no ground.
 
     Args:
-        solids: Solids.
+        solids: The shapes, relative to the origin of the rays.
         directions: Unit vectors, shape (N, 3).
         key: Seed of the depths at which foliage stops light.
     """

@@ -41,8 +41,8 @@ def sharp_cells(s: Float, yaw: Float) -> Bool:
 
 
 def neighbouring_curvature(sharp: Bool, s: Float, yaw: Float, closed: bool) -> Float:
-    """Return the curvature [1/m] at each sample, the mean change of yaw in its neighbouring cells that are
-    not sharp; 0 if both are.
+    """Return the curvature [1/m] at each sample, shape (N,), the mean change of yaw in its neighbouring cells
+    that are not sharp; 0 if both are.
 
     Args:
         sharp: Whether each cell between two samples has a sharp turn, shape (N - 1,).
@@ -59,7 +59,8 @@ def neighbouring_curvature(sharp: Bool, s: Float, yaw: Float, closed: bool) -> F
 
 
 def runs_of(sharp: Bool) -> Int:
-    """Return the first and last sample of each run of sharp cells, shape (K, 2)."""
+    """Return the first and last sample of each run of sharp cells, shape (K, 2), K may be 0. `sharp` has the
+    shape (N - 1,) for N samples."""
     edges = np.diff(np.concatenate([[0], sharp.astype(np.int8), [0]]))
     return np.stack([np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)], axis=1)
 
@@ -128,7 +129,8 @@ class Spin(NamedTuple):
         return cls(0.0, 1.0 / (gain * ramp) + ramp, gain, ramp, first, way, yaw, turn)
 
     def at(self, t: Float) -> tuple[Float, Float]:
-        """Return f and f' [1/s] at times of shape (N,) [s]."""
+        """Return the share f of the turn and f' [1/s] at times of shape (N,) [s]; 0 and 0 before the turn, 1
+        and 0 after it."""
         up = np.clip(t - self.begin, 0.0, self.takes)
         left = self.takes - up
         even = self.gain * self.ramp * (up - 0.5 * self.ramp)
@@ -175,8 +177,13 @@ class Course:
 
 
 def lay_course(waypoints: Float, closed: bool) -> Course:
-    """Return a smooth course through waypoints of shape (N, 2) [m], moved and turned to begin at the origin
-    along x."""
+    """Return a smooth course (cubic spline) through waypoints, moved and turned to begin at the origin along
+    x.
+
+    Args:
+        waypoints: Shape (N, 2) [m], no two in a row equal; the first is not repeated for a closed course.
+        closed: Whether the course returns to the first waypoint; its last sample is the first one then.
+    """
     knots = np.vstack([waypoints, waypoints[:1]]) if closed else waypoints
     chord = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(knots, axis=0).T))])
     spline = CubicSpline(chord, knots, bc_type="periodic" if closed else "natural")
@@ -195,13 +202,14 @@ def lay_course(waypoints: Float, closed: bool) -> Course:
 
 
 def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
-    """Drive a course from rest for `duration_s`: repeatedly when it is closed, else to its end.
+    """Drive a course from rest for `duration_s`: repeatedly when it is closed, else to its end, where the
+    robot stops.
 
     Args:
         course: The course.
         speed: Speed on the straight [m/s]. Turns are driven at 0.5 rad/s at most; where the course reverses,
             the robot stops and turns on the spot.
-        duration_s: Duration of the run [s]; the result is a little longer.
+        duration_s: Duration of the run [s]; the result is half a second longer.
     """
     until = duration_s + 0.5
     laps = max(1, int(np.ceil(until * speed / course.s[-1])) + 1) if course.closed else 1
@@ -223,13 +231,13 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
 
 def on_course(course: Course, t: Float, along: Float, speed: Float) -> Drive:
     """Return the motion along a course; a closed course is driven any number of times, and the yaw grows with
-    each.
+    each. An open course ends at its last sample.
 
     Args:
         course: The course.
         t: Times, shape (T,) [s].
-        along: Distance driven at these times [m].
-        speed: Speed at these times [m/s].
+        along: Distance driven at these times, shape (T,) [m].
+        speed: Speed at these times, shape (T,) [m/s].
     """
     lap, rest = np.divmod(along, course.s[-1]) if course.closed else (np.zeros_like(along), along)
     x, y, yaw, curvature = (
@@ -241,7 +249,8 @@ def on_course(course: Course, t: Float, along: Float, speed: Float) -> Drive:
 
 
 def lap_time(course: Course, speed: float) -> float:
-    """Return the time to drive a course once from rest [s], see `drive_course`."""
+    """Return the time to drive a course once from rest [s], for a speed on the straight [m/s], see
+    `drive_course`."""
     return float(_timetable(course, speed, 1).time[-1])
 
 
@@ -258,6 +267,13 @@ class _Timetable:
 
 
 def _timetable(course: Course, speed: float, laps: int) -> _Timetable:
+    """Return when a robot that starts at rest reaches each sample of a course.
+
+    Args:
+        course: The course.
+        speed: Speed on the straight [m/s].
+        laps: Number of laps, 1 for an open course, which ends at rest.
+    """
     sharp = sharp_cells(course.s, course.yaw)
     if sharp.any():
         curvature = neighbouring_curvature(sharp, course.s, course.yaw, course.closed)
@@ -290,7 +306,8 @@ def _timetable(course: Course, speed: float, laps: int) -> _Timetable:
 
 
 def speed_limit(course: Course, speed: float) -> Float:
-    """Return the highest speed at each sample of a course [m/s]: turns are driven at 0.5 rad/s at most."""
+    """Return the highest speed at each sample of a course, shape (N,) [m/s]: turns are driven at 0.5 rad/s at
+    most, and the limit is smooth. `speed` is that on the straight [m/s]."""
     mode = "wrap" if course.closed else "nearest"
     limit = np.minimum(speed, YAW_RATE / np.maximum(np.abs(course.curvature), 1e-6))
     window = int(0.6 / _DS)
@@ -307,7 +324,7 @@ class TerrainModel(Protocol):
     """The ground below the robot."""
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
+        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m]; shape (N, 3)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -326,7 +343,9 @@ class TrueMotion:
     pitch: Float
 
     def at(self, t: Float) -> tuple[Float, Float]:
-        """Return rotations (N, 3, 3) and positions (N, 3) [m] of the base in the world at times (N,) [s]."""
+        """Return rotations (N, 3, 3) and positions (N, 3) [m] of the base in the world at ascending times
+        (N,) since the start [s], interpolated; N is at least 1, and the first time is during the motion.
+        Later times than its end give the last pose."""
         first = max(int(t[0] * RATE_HZ) - 1, 0)
         part = slice(first, int(np.ceil(t[-1] * RATE_HZ)) + 2)
         d = self.drive
@@ -345,7 +364,13 @@ class TrueMotion:
 
 def lay_on_terrain(drive: Drive, terrain: TerrainModel, rng: np.random.Generator) -> TrueMotion:
     """Return the motion of a drive on the ground, with the base perpendicular to it, and with random
-    vibration of roll and pitch while the robot moves."""
+    vibration of roll and pitch while the robot moves.
+
+    Args:
+        drive: Planar motion.
+        terrain: The ground.
+        rng: Draws the phases of the vibration.
+    """
     z, gx, gy = terrain.evaluate(drive.x, drive.y).T
     c, s = np.cos(drive.yaw), np.sin(drive.yaw)
     ahead, left = gx * c + gy * s, gy * c - gx * s
@@ -372,6 +397,7 @@ def rotations(roll: Float, pitch: Float, yaw: Float) -> Float:
 
 
 def _vibration(t: Float, rng: np.random.Generator) -> Float:
+    """Return a vibration angle at times t, shape (T,) [s], as shape (T,) [rad], with random phases."""
     phase = rng.uniform(0.0, 2.0 * np.pi, _VIBRATION_HZ.size)
     waves = np.sin(2.0 * np.pi * np.outer(t, _VIBRATION_HZ) + phase)
     shaken: Float = waves @ _VIBRATION_ANGLE / np.sqrt(2.0)

@@ -68,19 +68,22 @@ class SimulatedRun:
         return START_NS + np.arange(self.scans, dtype=np.int64) * self.lidar.period_ns
 
     def sensor_poses(self, k: int) -> tuple[Float, Float, Float]:
-        """Return times [s] (C,), rotations (C, 3, 3) and positions (C, 3) [m] of the LiDAR in scan k."""
+        """Return the poses of the LiDAR in scan k (from 0): time of each column since the start of the run
+        [s] (C,), rotations (C, 3, 3) and positions (C, 3) [m] in the world."""
         times = (k * self.lidar.period_ns + self.lidar.column_offsets_ns().astype(np.int64)) / 1e9
         return times, *self.motion.sensor_at(times, self.T_base_lidar)
 
     def sweep(self, k: int) -> Sweep:
-        """Simulate scan k (from 0); the result does not depend on other scans."""
+        """Simulate scan k, 0 to `scans` - 1; the result does not depend on other scans, and is the same in
+        each call."""
         times, R, o = self.sensor_poses(k)
         rng, stamp_ns = random_stream(SCAN, self.request, k), START_NS + k * self.lidar.period_ns
         solids = self.scene.solids_at(times, R, o)
         return sweep_scene(self.lidar.at_scan(k), solids, self.scene.terrain, R, o, stamp_ns, rng)
 
     def odometry_record(self, n: int) -> Odometry:
-        """Return reading n of the odometry."""
+        """Return reading n of the odometry (50 Hz, from 0): the planar pose by the wheels, or, with the
+        quality "exact", the true pose with height and tilt."""
         t_ns = n * (1_000_000_000 // ODOMETRY_HZ)
         if self.request.odometry == EXACT:
             R, p = self.motion.at(np.array([t_ns / 1e9]))
@@ -89,20 +92,22 @@ class SimulatedRun:
         return Odometry(START_NS + t_ns, Pose3.from_euler(np.array([x, y, 0.0]), 0.0, 0.0, yaw))
 
     def imu_record(self, n: int) -> Imu:
-        """Return reading n of the IMU."""
+        """Return reading n of the IMU (100 Hz, from 0), with its orientation."""
         stamp = START_NS + n * (1_000_000_000 // IMU_HZ)
         unit = self.inertial
         return Imu(stamp, unit.angular_velocity[n], unit.linear_acceleration[n], unit.orientation(n))
 
     def true_trees(self) -> TruthTrees:
-        """Return the objects of the ground truth; in `sim:wild`, trees out of view are HIDDEN."""
+        """Return the objects of the ground truth in the frame of the map. In `sim:wild`, trees out of view
+        are HIDDEN; this casts the rays of one scan per second of the run in each call."""
         if self.request.name != WILD:
             return self.scene.truth
         poses = (self.sensor_poses(k) for k in range(0, self.scans, 1_000_000_000 // self.lidar.period_ns))
         return truth_in_view(self.lidar, self.scene, poses)
 
     def true_path(self) -> TruthPath:
-        """Return the true pose of the base at the stamp of each scan, in the frame of the map."""
+        """Return the true pose of the base at the stamp of each scan, in the frame of the map, with the yaw
+        in [-pi, pi)."""
         rows = np.arange(self.scans) * (RATE_HZ * self.lidar.period_ns // 1_000_000_000)
         d = self.motion.drive
         yaw = wrap_angle(d.yaw[rows])
@@ -119,14 +124,19 @@ class SimulatedRun:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _mounting(self) -> list[float]:
+        """Return the rotation (row by row) and the translation of the extrinsics as twelve numbers."""
         return [*self.T_base_lidar.R.ravel().tolist(), *self.T_base_lidar.t.tolist()]
 
 
 def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> SimulatedRun:
     """Build the scene and drive through it; no scan is simulated yet.
 
+    Args:
+        request: A scenario with its options; not a run through a cloud, see `open_cloud_run`.
+        T_base_lidar: Extrinsics of the LiDAR; None uses MOUNTING.
+
     Raises:
-        SourceError: The scene has no space for so many trees.
+        SourceError: The scene has no space for so many trees or other objects.
     """
     scenario = request.scenario
     lidar = SpinningLidar(range_sigma=request.sigma)
@@ -158,7 +168,8 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
 
 
 def odometry_of(motion: TrueMotion, request: RunRequest) -> Float:
-    """Return x, y [m] and yaw [rad] by wheels of the requested quality at 50 Hz, shape (N, 3)."""
+    """Return x, y [m] and yaw [rad, not wrapped] by wheels of the requested quality at 50 Hz, shape (N, 3);
+    with "exact" the true planar pose."""
     if request.odometry == EXACT:
         drive = motion.drive
         return np.stack([drive.x, drive.y, drive.yaw], axis=1)[:: RATE_HZ // ODOMETRY_HZ]
@@ -166,10 +177,15 @@ def odometry_of(motion: TrueMotion, request: RunRequest) -> Float:
 
 
 def random_stream(part: int, request: RunRequest, k: int = 0) -> np.random.Generator:
-    """Return the random generator of a part of the run, or of scan k of that part.
+    """Return a new random generator of a part of the run, or of scan k of that part.
 
     Each part, scan and drive has its own generator, so that none shifts the numbers of another. The part
     SCENE is equal for all drives.
+
+    Args:
+        part: SCENE, SHAKE, WHEELS, INERTIAL, SCAN or SENSE.
+        request: Its name, seed and drive are used.
+        k: Number of the scan.
     """
     drive = [request.drive] if request.drive and part != SCENE else []
     return np.random.default_rng([part, zlib.crc32(request.name.encode()), request.seed, k, *drive])

@@ -216,7 +216,8 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def scenarios() -> dict[str, str]:
-    """Return the description of each scenario by its URI."""
+    """Return the description of each scenario by its URI, e.g. "sim:stand"; runs through clouds are not
+    included."""
     return {f"sim:{name}": scenario.line for name, scenario in SCENARIOS.items()}
 
 
@@ -305,7 +306,7 @@ class RunRequest:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario with the requested objects."""
+        """The scenario with the requested objects. KeyError for a run through a cloud, which has none."""
         scenario = replace(SCENARIOS[self.name], trees=self.trees)
         if not self.furnished or self.name not in FURNISHED:
             return scenario
@@ -314,16 +315,18 @@ class RunRequest:
 
 
 def parse_uri(uri: str, seed: int = 0) -> RunRequest:
-    """Parse `sim:NAME?key=value&...`; "sim:" may be omitted.
+    """Return the request of `sim:NAME?key=value&...`; "sim:" may be omitted. Options that are missing have
+    the defaults of the scenario.
 
-    A duration of 0 in the request for a run through a cloud stands for one loop.
+    A duration of 0 in the request for a run through a cloud means one loop. Files are not opened.
 
     Args:
         uri: As the user wrote it.
         seed: Seed of a URI that names none.
 
     Raises:
-        UsageError: No such scenario or key, a key twice, a value that is not a number or out of bounds.
+        UsageError: No such scenario or key, a key twice, a value that is not a number or out of bounds, or a
+            run through a cloud without a file.
     """
     name, _, query = uri.removeprefix(SCHEME).partition("?")
     if name != CLOUD and name not in SCENARIOS:
@@ -358,6 +361,16 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
 
 
 def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
+    """Return the options of a URI by key; empty without a query.
+
+    Args:
+        uri: The URI, for errors.
+        query: Its part after "?", percent-encoded.
+        keys: Valid keys and what their values mean.
+
+    Raises:
+        UsageError: The query is not key=value pairs, or a key is unknown or given twice.
+    """
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True) if query else []
     except ValueError:
@@ -375,14 +388,30 @@ def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
 
 
 def _allowed(keys: dict[str, str]) -> str:
+    """Return the text "Options: ..." with all keys and what their values mean."""
     return "Options: " + "; ".join(f"{key} ({meaning})" for key, meaning in keys.items())
 
 
 def _refusal(uri: str, key: str, text: str) -> UsageError:
+    """Return the error for an option whose value is not valid.
+
+    Args:
+        uri: The URI, for the message.
+        key: Name of the option, one of `_KEYS`.
+        text: Its value.
+    """
     return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_KEYS[key]}")
 
 
 def _whole(uri: str, key: str, text: str, most: int) -> int:
+    """Return a whole number from 0 to `most`; UsageError for another text.
+
+    Args:
+        uri: The URI, for the error.
+        key: Name of the option.
+        text: Its value; ASCII digits only.
+        most: Largest number.
+    """
     if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
         refusal = _refusal(uri, key, text)
         if key == "trees" and most < 2000:
@@ -392,6 +421,14 @@ def _whole(uri: str, key: str, text: str, most: int) -> int:
 
 
 def _real(uri: str, key: str, text: str, low: float, high: float) -> float:
+    """Return a decimal number from `low` to `high`, both inclusive; UsageError for another text.
+
+    Args:
+        uri: The URI, for the error.
+        key: Name of the option.
+        text: Its value; ASCII digits only, an exponent is allowed.
+        low, high: Bounds.
+    """
     # float() alone would also take 1_0, spaces and digits of other scripts.
     if not (len(text) < 40 and _NUMBER.fullmatch(text)):
         raise _refusal(uri, key, text)

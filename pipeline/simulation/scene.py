@@ -49,7 +49,8 @@ class Person:
     phase: float
 
     def place(self, t: float) -> tuple[Float, float]:
-        """Return the position (2,) [m] and the heading [rad] at time t [s]."""
+        """Return the position (2,) [m] and the heading [rad, not wrapped] at time t since the start of the
+        run [s]."""
         if self.speed == 0.0:
             sway = np.array([np.sin(0.9 * (t + self.phase)), np.cos(0.7 * (t - self.phase))])
             return self.start + 0.012 * sway, self.heading + 0.03 * float(sway[0])
@@ -61,7 +62,7 @@ class Person:
         return position, float(np.arctan2(way[1], way[0])) + (np.pi if back else 0.0)
 
     def solids(self, t: float, terrain: SimulatedTerrain) -> Solids:
-        """Return the body in the world at time t [s]."""
+        """Return the body in the world, on the ground, at time t since the start of the run [s]."""
         at, heading = self.place(t)
         ground = float(terrain.height(at[:1], at[1:])[0])
         stride = _STRIDE * np.sin(2.0 * np.pi * _STEP_HZ * (t + self.phase)) if self.speed > 0.0 else 0.0
@@ -92,7 +93,8 @@ class SimulatedScene:
     wind: float = 0.0
 
     def solids_at(self, times: Float, R: Float, o: Float) -> Solids:
-        """Return all solids, each person at the time when the beam of a sweep passes them.
+        """Return all solids, each person at the time when the beam of a sweep passes them, leaves at the
+        middle of the sweep. Without persons and wind it is `still` itself.
 
         Args:
             times: Times of the columns of the sweep, shape (C,) [s].
@@ -109,8 +111,9 @@ class SimulatedScene:
         return solids
 
     def _blown(self, t: float) -> Solids:
-        """Return the solids at time t [s] with the leaves moved by the wind: each volume of leaves swings
-        with a phase of its own, in proportion to its height."""
+        """Return the solids at time t [s] with the leaves (porous ellipsoids) moved along x by the wind: each
+        swings with a phase of its own, in proportion to its height above the ground. `still` is not changed.
+        """
         solids = self.still
         leaves = np.flatnonzero((solids.kind == ELLIPSOID) & (solids.shape[:, 8] > 0.0))
         x, y, z = solids.shape[leaves, :3].T
@@ -140,12 +143,13 @@ class Plot:
         self._taken = np.empty((0, 3))
 
     def from_course(self, places: Float) -> Float:
-        """Return the distances of places (N, 2) from the middle of the course [m]."""
+        """Return the distances of places (N, 2) [m] from the line of the course, shape (N,) [m]."""
         distance: Float = self._line.query(places)[0]
         return distance
 
     def from_objects(self, places: Float) -> Float:
-        """Return the distances of places (N, 2) from the nearest surface of an object [m]."""
+        """Return the distances of places (N, 2) [m] from the nearest surface of an object, shape (N,) [m];
+        negative inside of one, infinite without objects."""
         if self._taken.shape[0] == 0:
             return np.full(places.shape[0], np.inf)
         away = np.hypot(places[:, :1] - self._taken[:, 0], places[:, 1:] - self._taken[:, 1])
@@ -153,7 +157,7 @@ class Plot:
         return free
 
     def take(self, x: float, y: float, radius: float) -> None:
-        """Mark a disc as occupied."""
+        """Mark a disc around x, y with a radius [m] as occupied; it may overlap others."""
         self._taken = np.vstack([self._taken, [x, y, radius]])
 
     def find(
@@ -166,7 +170,7 @@ class Plot:
         what: str,
         edge: float = np.inf,
     ) -> tuple[float, float]:
-        """Find a free position and mark it as occupied.
+        """Find a free position and mark it as occupied. About 9,500 random positions are tried.
 
         Args:
             radius: Radius of the object [m].
@@ -175,6 +179,9 @@ class Plot:
             rng: Draws the positions.
             what: Name of the object, for the error.
             edge: Greatest distance from the edge of the plot [m].
+
+        Returns:
+            x, y [m].
 
         Raises:
             SourceError: The plot is full.
@@ -193,7 +200,7 @@ class Plot:
 
     @staticmethod
     def full(what: str) -> SourceError:
-        """Return the error for an object that does not fit."""
+        """Return (not raise) the error for an object that does not fit; `what` is its name."""
         return SourceError(
             f"no place is left for another {what} in the simulated stand",
             remedy="Ask for fewer trees with trees=N",
@@ -203,6 +210,12 @@ class Plot:
 def build_scene(scenario: Scenario, course: Course, rng: np.random.Generator) -> SimulatedScene:
     """Build the scene of a scenario: terrain, placed objects, then random trees and other objects beside the
     course.
+
+    Args:
+        scenario: Numbers and sizes of the objects. Its number of trees includes placed ones, of which surplus
+            ones are left out.
+        course: Course of the robot, which stays free of random objects.
+        rng: Draws everything.
 
     Raises:
         SourceError: There is no position left for an object.
@@ -226,7 +239,8 @@ class _Planter:
         self._persons: list[Person] = []
 
     def add_placed(self, placed: Placed) -> None:
-        """Add an object at its given position."""
+        """Add an object at its given position, even if this is occupied, and mark the position as occupied. A
+        kind other than "tree", "pole" and "bush" gives a standing person."""
         x, y, radius = placed.x, placed.y, 0.5 * placed.diameter
         self._plot.take(x, y, radius)
         if placed.kind == "tree":
@@ -239,7 +253,8 @@ class _Planter:
             self._add_standing(x, y)
 
     def add_trees(self, count: int) -> None:
-        """Add trees at free positions, the thick ones first."""
+        """Add trees at free positions, the thick ones first; none for a negative count. SourceError if the
+        plot is full."""
         low, high = self._scenario.dbh
         sizes = low + (high - low) * self._rng.beta(1.3, self._scenario.thin, max(count, 0))
         for dbh in np.sort(sizes)[::-1]:
@@ -247,7 +262,8 @@ class _Planter:
             self._add_tree(x, y, float(dbh))
 
     def add_others(self) -> None:
-        """Add the objects that are not trees, near enough to the course to be seen."""
+        """Add the objects that are not trees, near enough to the course to be seen. SourceError if the plot
+        is full; undergrowth is left out on the course."""
         scenario, scene, rng, find = self._scenario, self._scene, self._rng, self._plot.find
         for _ in range(scenario.boxes):
             add_box(scene, *find(0.9, 0.5, 1.2, 9.0, rng, "box"))
@@ -270,7 +286,7 @@ class _Planter:
                 add_undergrowth(scene, float(place[0]), float(place[1]))
 
     def built(self) -> SimulatedScene:
-        """Return the scene."""
+        """Return the scene with all objects so far."""
         return SimulatedScene(
             terrain=self._scene.terrain,
             still=self._scene.solids.build(),
@@ -281,6 +297,7 @@ class _Planter:
         )
 
     def _add_tree(self, x: float, y: float, dbh: float) -> None:
+        """Add a tree of a DBH [m] at x, y [m] with random height, lean, crown and branches."""
         rng, scenario = self._rng, self._scenario
         lean = np.clip(np.radians(scenario.lean) * rng.standard_normal(2), -0.09, 0.09)
         low, high = scenario.crown_base
@@ -290,12 +307,15 @@ class _Planter:
         add_tree(self._scene, x, y, dbh, (float(lean[0]), float(lean[1])), top, crown, branches)
 
     def _add_standing(self, x: float, y: float) -> None:
+        """Add a person who stands at x, y [m], to scene and ground truth."""
         at: Float = np.array([x, y])
         heading, phase = self._rng.uniform(0.0, 6.0, 2)
         owner = self._scene.true_object("person", x, y)
         self._persons.append(Person(owner, at, at, float(heading), 0.0, float(phase)))
 
     def _add_walker(self) -> None:
+        """Add a person who walks to and fro on a free line near the course, not to the ground truth.
+        SourceError if 2,000 random lines are not free."""
         rng, plot = self._rng, self._plot
         for _ in range(2000):
             start = plot.centre + plot.half_side * rng.uniform(-0.8, 0.8, 2)

@@ -44,7 +44,8 @@ class SceneBuilder:
         self.owners: list[int] = []
 
     def owner(self, kind: str) -> int:
-        """Return the number of a new object or part of a kind."""
+        """Add an object or a part of one to `kinds` and return its number; it is not added to the ground
+        truth."""
         self.kinds.append(kind)
         return len(self.kinds) - 1
 
@@ -61,7 +62,7 @@ class SceneBuilder:
         return self.owners[-1]
 
     def true_objects(self) -> TruthTrees:
-        """Return the ground truth."""
+        """Return the ground truth so far; without objects, empty columns."""
         x, y, dbh, kind = zip(*self.truth, strict=True) if self.truth else ((), (), (), ())
         return TruthTrees(np.array(x), np.array(y), np.array(dbh), tuple(kind))
 
@@ -70,15 +71,18 @@ class SceneBuilder:
         return np.array([x, y, self.terrain.height(np.array([x]), np.array([y]))[0]])
 
     def uniform(self, low: float, high: float) -> float:
-        """Draw a number from a uniform distribution."""
+        """Draw a number from a uniform distribution between `low` and `high`; the generator advances."""
         return float(self.rng.uniform(low, high))
 
 
 def _up(height: float) -> Float:
+    """Return the vector of a height along z, shape (3,) [m]."""
     return np.array([0.0, 0.0, height])
 
 
 def _ahead(angle: float, rise: float = 0.0) -> Float:
+    """Return the vector of length 1 in the plane at an angle from x [rad] with the vertical component `rise`,
+    shape (3,)."""
     return np.array([np.cos(angle), np.sin(angle), rise])
 
 
@@ -95,7 +99,7 @@ def add_tree(
     crown_base: float,
     branches: int,
 ) -> None:
-    """Add a tapered, leaning trunk with rough bark, branches and a crown.
+    """Add a tapered, leaning trunk with rough bark, branches and a crown, to scene and ground truth.
 
     Args:
         scene: The scene.
@@ -103,7 +107,7 @@ def add_tree(
         dbh: Diameter at 1.3 m [m].
         lean: Shift of the axis per metre of height along x and y.
         top: Height of the tree above the ground [m].
-        crown_base: Lower end of the foliage [m]; a tree with a crown base above `top` has none.
+        crown_base: Lower end of the foliage [m]; a tree with a crown base at or above `top` has none.
         branches: Number of branches below the crown.
     """
     rng, owner = scene.rng, scene.true_object("tree", x, y, dbh)
@@ -141,7 +145,8 @@ def add_tree(
 
 
 def add_pole(scene: SceneBuilder, x: float, y: float, radius: float) -> None:
-    """Add a straight, upright pole of 1.8 to 4 m above the ground at x, y [m] to scene and ground truth."""
+    """Add a straight, upright pole of a radius [m], 1.8 to 4 m above the ground, at x, y [m] to scene and
+    ground truth."""
     owner, foot = scene.true_object("pole", x, y), scene.foot(x, y)
     top = foot + _up(scene.uniform(1.8, 4.0))
     scene.solids.cone(owner, foot - _up(0.3), top, (radius, radius), reflectivity=0.6)
@@ -169,14 +174,14 @@ def add_box(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_undergrowth(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a tuft of ferns or grass, up to half a metre high."""
+    """Add a tuft of ferns or grass at x, y [m], up to half a metre high; not to the ground truth."""
     half = np.array([scene.uniform(0.2, 0.5), scene.uniform(0.2, 0.5), scene.uniform(0.15, 0.5)])
     centre = scene.foot(x, y) + _up(0.1 * half[2])
     _foliage(scene, scene.owner("undergrowth"), centre, half, 0.35, reflectivity=0.45)
 
 
 def person(owner: int, stride: float = 0.0) -> Solids:
-    """Return a person of 1.74 m at the origin who looks along x.
+    """Return the shapes of a person of 1.74 m at the origin who looks along x.
 
     Args:
         owner: Number of the object.
@@ -200,7 +205,8 @@ def person(owner: int, stride: float = 0.0) -> Solids:
 
 
 def add_street_tree(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a trunk, in most cases with a crown, in some with branches, more stems, ivy, shrubs or a stake."""
+    """Add a trunk at x, y [m], to scene and ground truth (kind "trunk", without DBH), in most cases with a
+    crown, in some with branches, more stems, ivy, shrubs or a stake."""
     rng = scene.rng
     radius = 0.5 * (scene.uniform(0.08, 0.2) if rng.random() < 0.35 else scene.uniform(0.15, 0.7))
     height = float(np.clip(5.0 + 30.0 * radius, 3.0, 12.0)) * scene.uniform(0.8, 1.2)
@@ -229,7 +235,8 @@ def add_street_tree(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_young_tree(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a thin tree of up to 7 m whose upper end is in free air, like that of a pole.
+    """Add a thin tree of up to 7 m at x, y [m], whose upper end is in free air, like that of a pole, to scene
+    and ground truth (kind "trunk", without DBH).
 
     Its crown is sparse, dense or narrow, or it only has branches; some have stakes or a second stem.
     """
@@ -273,7 +280,13 @@ def add_shrub(
     radius: tuple[float, float] = (0.3, 1.4),
     height: tuple[float, float] = (0.4, 3.2),
 ) -> None:
-    """Add porous blobs and thin stems; radius and height [m] are uniform in their bounds."""
+    """Add porous blobs and thin stems at x, y [m], kind "foliage", not to the ground truth.
+
+    Args:
+        scene: The scene.
+        x, y: Position [m].
+        radius, height: Bounds from which radius and height are drawn uniformly [m].
+    """
     rng, owner, foot = scene.rng, scene.owner("foliage"), scene.foot(x, y)
     wide, tall, free_path = scene.uniform(*radius), scene.uniform(*height), scene.uniform(0.1, 0.45)
     for _ in range(int(rng.integers(2, 6))):
@@ -287,13 +300,21 @@ def add_shrub(
 
 
 def add_crown(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add foliage that hangs over from a tree out of view."""
+    """Add foliage above x, y [m] that hangs over from a tree out of view; not to the ground truth."""
     _crown(scene, scene.foot(x, y) + _up(scene.uniform(1.0, 3.5)), scene.uniform(2.0, 5.0), 2.0)
 
 
 def _trunk(
     scene: SceneBuilder, x: float, y: float, start: Float, end: Float, radii: tuple[float, float]
 ) -> int:
+    """Add a trunk to scene and ground truth (kind "trunk"); return its number.
+
+    Args:
+        scene: Receives it.
+        x, y: Position in the ground truth [m].
+        start, end: Ends of the axis, shape (3,) [m].
+        radii: Radius at `start` and at `end` [m].
+    """
     owner = scene.true_object("trunk", x, y)
     scene.solids.cone(owner, start, end, radii, roughness=0.018 * radii[0])
     return owner
@@ -322,6 +343,14 @@ def _foliage(
 
 
 def _crown(scene: SceneBuilder, base: Float, depth: float, width: float) -> None:
+    """Add the foliage of a crown: 4 to 11 porous ellipsoids.
+
+    Args:
+        scene: Receives it.
+        base: Middle of its lower end, shape (3,) [m].
+        depth: Its height [m].
+        width: About its radius [m].
+    """
     rng, owner = scene.rng, scene.owner("foliage")
     free_path = float(rng.choice([rng.uniform(0.15, 0.5), rng.uniform(0.5, 1.5)]))
     for _ in range(int(rng.integers(4, 12))):
@@ -351,8 +380,13 @@ def _further_stems(scene: SceneBuilder, owner: int, foot: Float, radius: float, 
 
 
 def _ivy(scene: SceneBuilder, start: Float, end: Float, radius: float) -> None:
-    """Add leaves around a trunk up to 20 to 60 % of it. The trunk has the ends `start`, `end` (3,) [m] and
-    the radius `radius` [m]."""
+    """Add leaves around the lower 20 to 60 % of a trunk.
+
+    Args:
+        scene: Receives them.
+        start, end: Ends of the trunk, shape (3,) [m].
+        radius: Its radius [m].
+    """
     owner = scene.owner("foliage")
     thick, top = radius + scene.uniform(0.05, 0.2), scene.uniform(0.2, 0.6)
     for part in np.arange(0.05, top, 0.08):
@@ -363,6 +397,8 @@ def _ivy(scene: SceneBuilder, start: Float, end: Float, radius: float) -> None:
 
 
 def _leafy_branch(scene: SceneBuilder, owner: int, start: Float) -> None:
+    """Add a branch that begins at `start`, shape (3,) [m], to the object `owner`; half of the branches have
+    leaves."""
     rng = scene.rng
     way = scene.uniform(0.4, 1.5) * _ahead(scene.uniform(0.0, 2.0 * np.pi), scene.uniform(-0.1, 1.0))
     scene.solids.cone(owner, start, start + way, (scene.uniform(0.01, 0.03), 0.004))
@@ -377,12 +413,19 @@ def _leafy_branch(scene: SceneBuilder, owner: int, start: Float) -> None:
 def add_post(
     scene: SceneBuilder, x: float, y: float, radius: tuple[float, float], height: tuple[float, float]
 ) -> None:
-    """Add a bare upright post; radius and height [m] are uniform in their bounds."""
+    """Add a bare, nearly upright post at x, y [m], kind "pole", not to the ground truth.
+
+    Args:
+        scene: The scene.
+        x, y: Position [m].
+        radius, height: Bounds from which radius and height are drawn uniformly [m].
+    """
     _post(scene, scene.owner("pole"), x, y, scene.uniform(*radius), scene.uniform(*height))
 
 
 def add_lamp(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a lamp post with a thicker base and an arm or a head."""
+    """Add a lamp post of 3 to 9 m at x, y [m] with an arm, often with a thicker base; kind "pole", not to the
+    ground truth."""
     owner = scene.owner("pole")
     radius, height = scene.uniform(0.04, 0.12), scene.uniform(3.0, 9.0)
     _post(scene, owner, x, y, radius, height)
@@ -395,7 +438,8 @@ def add_lamp(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_sign(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a thin post with one to three plates or boxes."""
+    """Add a thin post at x, y [m] with one to three plates or boxes, kinds "pole" and "sign"; not to the
+    ground truth."""
     owner, plate = scene.owner("pole"), scene.owner("sign")
     height, yaw = scene.uniform(1.2, 4.0), scene.uniform(0.0, np.pi)
     _post(scene, owner, x, y, scene.uniform(0.02, 0.06), height)
@@ -408,7 +452,7 @@ def add_sign(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_car(scene: SceneBuilder, x: float, y: float, yaw: float) -> None:
-    """Add a parked car or van at x, y [m] with the yaw `yaw` [rad]."""
+    """Add a parked car or van at x, y [m] with a yaw [rad], kind "vehicle"; not to the ground truth."""
     owner, foot = scene.owner("vehicle"), scene.foot(x, y)
     length, is_van = scene.uniform(1.8, 2.6), scene.rng.random() < 0.25
     top = scene.uniform(1.8, 2.4) if is_van else scene.uniform(0.85, 1.05)
@@ -422,7 +466,7 @@ def add_car(scene: SceneBuilder, x: float, y: float, yaw: float) -> None:
 
 
 def add_motorcycle(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a motorcycle or a bicycle on its stand."""
+    """Add a motorcycle or a bicycle on its stand at x, y [m], kind "vehicle"; not to the ground truth."""
     owner, foot, solids = scene.owner("vehicle"), scene.foot(x, y), scene.solids
     yaw, thick = scene.uniform(0.0, np.pi), scene.uniform(0.02, 0.2)
     way, across = _ahead(yaw), 0.35 * _ahead(yaw + 0.5 * np.pi)
@@ -437,14 +481,15 @@ def add_motorcycle(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_bin(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a bin or a switch box."""
+    """Add a bin or a switch box at x, y [m], kind "vehicle"; not to the ground truth."""
     half = np.array([scene.uniform(0.2, 0.6), scene.uniform(0.2, 0.4), scene.uniform(0.4, 0.8)])
     centre = scene.foot(x, y) + _up(half[2])
     scene.solids.box(scene.owner("vehicle"), centre, half, yaw=scene.uniform(0.0, np.pi))
 
 
 def add_drum(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a round object as wide as a trunk: a barrel, an advertising column, a thick bollard."""
+    """Add a round object as wide as a trunk at x, y [m]: a barrel, an advertising column, a thick bollard;
+    kind "vehicle", not to the ground truth."""
     owner, foot = scene.owner("vehicle"), scene.foot(x, y)
     radius, top = scene.uniform(0.12, 0.6), foot + _up(scene.uniform(0.6, 2.8))
     scene.solids.cone(owner, foot - _up(0.2), top, (radius, radius * scene.uniform(0.7, 1.1)))
@@ -452,13 +497,14 @@ def add_drum(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_person(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a person who stands."""
+    """Add a person who stands at x, y [m] with a random heading, kind "person"; not to the ground truth."""
     body = person(scene.owner("person"), scene.uniform(-0.3, 0.3))
     scene.solids.extend(body.placed(scene.foot(x, y), scene.uniform(0.0, 2.0 * np.pi)))
 
 
 def add_hedge(scene: SceneBuilder, start: Float, end: Float) -> None:
-    """Add a row of dense foliage between two places (2,) [m], with a rough or a flat top."""
+    """Add a row of dense foliage between two places (2,) [m], with a rough or a flat top, kind "foliage"; not
+    to the ground truth."""
     rng, owner = scene.rng, scene.owner("foliage")
     height, half = scene.uniform(0.6, 2.6), scene.uniform(0.25, 0.6)
     free_path, rough = scene.uniform(0.05, 0.25), scene.uniform(0.02, 0.3)
@@ -470,7 +516,8 @@ def add_hedge(scene: SceneBuilder, start: Float, end: Float) -> None:
 
 
 def add_fence(scene: SceneBuilder, start: Float, end: Float) -> None:
-    """Add posts between two places (2,) [m], with rails, with slats, or with neither between them."""
+    """Add posts between two places (2,) [m], with rails, with slats, or with neither between them; kind
+    "fence", not to the ground truth."""
     owner, form = scene.owner("fence"), int(scene.rng.integers(0, 3))
     height, radius = scene.uniform(0.8, 1.9), scene.uniform(0.025, 0.07)
     for x, y in _stations(start, end, scene.uniform(1.2, 3.0)):
@@ -485,7 +532,15 @@ def add_fence(scene: SceneBuilder, start: Float, end: Float) -> None:
 
 
 def add_wall(scene: SceneBuilder, start: Float, end: Float, height: float, thickness: float) -> None:
-    """Add a wall or the face of a house between two places (2,) [m]; a high one may have a pipe."""
+    """Add a wall or the face of a house between two places; one higher than 2.5 m may have a pipe (kind
+    "pole"). Kind "building", not to the ground truth.
+
+    Args:
+        scene: The scene.
+        start, end: Ends, shape (2,) [m]; they must differ.
+        height: Height above the ground [m].
+        thickness: Thickness [m].
+    """
     way = end - start
     half = [0.5 * float(np.hypot(*way)), 0.5 * thickness, 0.5 * height + 0.3]
     centre = scene.foot(*(0.5 * (start + end))) + _up(0.5 * height)
@@ -505,13 +560,22 @@ def _stations(start: Float, end: Float, spacing: float) -> Float:
 
 
 def _post(scene: SceneBuilder, owner: int, x: float, y: float, radius: float, height: float) -> None:
+    """Add a nearly upright post to an object.
+
+    Args:
+        scene: Receives it.
+        owner: Number of the object.
+        x, y: Position of the foot [m].
+        radius: Radius at the foot [m].
+        height: Height above the ground [m].
+    """
     foot = scene.foot(float(x), float(y))
     top = foot + np.array([*(0.01 * height * scene.rng.standard_normal(2)), height])
     scene.solids.cone(owner, foot - _up(0.3), top, (radius, 0.8 * radius), reflectivity=0.6)
 
 
 def add_bench(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a bench with a back."""
+    """Add a bench with a back at x, y [m], kind "vehicle"; not to the ground truth."""
     owner, foot, yaw = scene.owner("vehicle"), scene.foot(x, y), scene.uniform(0.0, np.pi)
     half = scene.uniform(0.6, 1.0)
     scene.solids.box(owner, foot + _up(0.45), [half, 0.22, 0.03], yaw=yaw)
@@ -521,7 +585,7 @@ def add_bench(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_stump(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add the stump of a felled tree."""
+    """Add the stump of a felled tree at x, y [m], kind "trunk"; not to the ground truth."""
     owner, foot = scene.owner("trunk"), scene.foot(x, y)
     radius, top = scene.uniform(0.1, 0.3), foot + _up(scene.uniform(0.15, 0.6))
     scene.solids.cone(owner, foot - _up(0.2), top, (1.3 * radius, radius), roughness=0.01)
@@ -529,7 +593,8 @@ def add_stump(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def add_log(scene: SceneBuilder, x: float, y: float) -> None:
-    """Add a log on the ground with stubs of branches."""
+    """Add a log on the ground that begins at x, y [m], with stubs of branches, kind "trunk"; not to the
+    ground truth."""
     owner, way = scene.owner("trunk"), _ahead(scene.uniform(0.0, 2.0 * np.pi))
     radius, length = scene.uniform(0.08, 0.25), scene.uniform(1.5, 6.0)
     ends = [scene.foot(x + side * way[0], y + side * way[1]) + _up(radius) for side in (0.0, length)]
@@ -541,6 +606,7 @@ def add_log(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def _free_hedge(scene: SceneBuilder, x: float, y: float) -> None:
+    """Add a hedge of 2 to 10 m that begins at x, y [m], in a random direction."""
     start = np.array([x, y])
     add_hedge(scene, start, start + scene.uniform(2.0, 10.0) * _ahead(scene.uniform(0.0, np.pi))[:2])
 

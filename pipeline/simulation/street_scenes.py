@@ -61,12 +61,13 @@ class StreetScans:
 
 
 def simulate_street(seed: int, *, one_way: bool) -> StreetScans:
-    """Simulate a street or a park that is drawn from the seed, seen in one, two or four scans.
+    """Simulate a street or a park that is drawn from the seed, seen in one, two or four scans, which may be
+    made from one place. The same arguments give the same scans.
 
     Args:
-        seed: Random seed.
-        one_way: Whether a solid-state LiDAR looks in one direction from one place; else a spinning LiDAR
-            moves.
+        seed: Random seed, not negative.
+        one_way: Whether a solid-state LiDAR looks in one direction from one place; else a spinning LiDAR,
+            which moves in most scenes.
     """
     rng = np.random.default_rng([seed, int(one_way), 0x57AEE7])
     slope = float(rng.choice([0.0, rng.uniform(-0.12, 0.12)]))
@@ -87,7 +88,8 @@ def simulate_street(seed: int, *, one_way: bool) -> StreetScans:
 
 
 def _spinning_lidar(scene: SceneBuilder) -> tuple[SpinningLidar, float]:
-    """Draw a spinning LiDAR and its height [m]."""
+    """Draw a spinning LiDAR (see SPINNING) and its height above the ground [m]; the generator of the scene
+    advances."""
     sigma = scene.uniform(0.01, 0.03)
     rings, low, high, on_car, _ = SPINNING[int(scene.rng.choice(len(SPINNING), p=[p for *_, p in SPINNING]))]
     height = scene.uniform(1.6, 2.1) if on_car else scene.uniform(0.6, 1.4)
@@ -134,7 +136,13 @@ def _scanned(scene: SceneBuilder, lidar: SpinningLidar, height: float, poses: li
 
 
 def add_any(scene: SceneBuilder, kinds: Mapping[str, float], x: float, y: float) -> None:
-    """Add an object of a kind drawn with its probability at x, y [m]; "nothing" adds none."""
+    """Add an object of a kind drawn with its probability at x, y [m]; "nothing" adds none.
+
+    Args:
+        scene: Receives it.
+        kinds: Probabilities by the name of the kind (of KINDS, or "nothing"), sum 1.
+        x, y: Position [m].
+    """
     kind = str(scene.rng.choice(list(kinds), p=list(kinds.values())))
     if kind != "nothing":
         KINDS[kind](scene, x, y)
@@ -203,7 +211,7 @@ def _add_verge(scene: SceneBuilder, side: float, kerb: float) -> None:
 
 
 def _add_park(scene: SceneBuilder) -> None:
-    """Add rows and groups of trees on a lawn with other objects."""
+    """Add rows of trees with gaps on a lawn with other objects; the surroundings of the sensor stay free."""
     rng = scene.rng
     spacing, turn = scene.uniform(3.0, 9.0), scene.uniform(0.0, np.pi)
     c, s = np.cos(turn), np.sin(turn)

@@ -42,7 +42,8 @@ class Surfels(NamedTuple):
 
 
 def lay_surfels(points: Float32) -> Surfels:
-    """Return surfels at the points of a cloud, shape (N, 3) [m]."""
+    """Return surfels at the points of a cloud, float32, shape (N, 3) [m]; balls that block nothing for a
+    cloud of NEIGHBOURS or fewer points. The array of points is not copied."""
     from scipy.spatial import cKDTree
 
     n = len(points)
@@ -61,6 +62,16 @@ def lay_surfels(points: Float32) -> Surfels:
 def _lay(
     points: Float32, near: Int, distance: Float, normals: Float32, radius: Float32, blocks: Float32
 ) -> None:
+    """Fill normal, radius and blocking radius of a part of the points, in place. Where the neighbours form no
+    surface, the normal stays as it is and the point blocks nothing.
+
+    Args:
+        points: All points, shape (N, 3) [m].
+        near: Rows of each point of the part and its neighbours, nearest first, shape (M, NEIGHBOURS + 1).
+        distance: Their distances, same shape [m].
+        normals, radius, blocks: Rows of the part in the columns of `Surfels`, which must be 0 for normals and
+            blocks.
+    """
     C, mean = np.empty((3, 3)), np.empty(3)
     for i in range(near.shape[0]):
         mean[:] = 0.0
@@ -87,11 +98,12 @@ def _lay(
 
 @compiled
 def first_surfels(surfels: Surfels, R: Float, o: Float, beams: Float, optics: Optics) -> Float:
-    """Return the range [m] of each beam of a sweep, infinite when it meets nothing, shape (C, K).
+    """Return the range [m] of each beam of a sweep, shape (C, K); infinite when it meets nothing up to
+    `optics.range_max`, or only surfels hidden behind another point.
 
     Each surfel is seen from the pose of the sensor when the beam passes it, and only the beams within its
-    angle are tested. The range is the mean of the nearest hit and of those within MELT behind it, weighted
-    towards the middle of the discs.
+    angle are tested. Surfels very close to the sensor are ignored. The range is the mean of the nearest hit
+    and of those within MELT behind it, weighted towards the middle of the discs.
 
     Args:
         surfels: The surfels.
@@ -152,6 +164,8 @@ def first_surfels(surfels: Surfels, R: Float, o: Float, beams: Float, optics: Op
 
 @compiled
 def _turn(point: Float32, R: Float, o: Float, v: Float) -> None:
+    """Write the position of a point in the sensor frame into v, shape (3,) [m]; R (3, 3) and o (3,) are the
+    pose of the sensor in the world."""
     x, y, z = point[0] - o[0], point[1] - o[1], point[2] - o[2]
     for a in range(3):
         v[a] = R[0, a] * x + R[1, a] * y + R[2, a] * z
@@ -159,6 +173,15 @@ def _turn(point: Float32, R: Float, o: Float, v: Float) -> None:
 
 @compiled
 def _melt(nearest: Float, beam: Int, met: Float, weight: Float) -> Float:
+    """Return the range of each beam [m], shape (C, K): the weighted mean of its hits up to MELT behind the
+    nearest one; infinite without a hit.
+
+    Args:
+        nearest: Range of the nearest hit of each beam, shape (C, K) [m].
+        beam: Beam of each hit, column * K + ring, shape (N,).
+        met: Range of each hit, shape (N,) [m].
+        weight: Weight of each hit, shape (N,).
+    """
     rings = nearest.shape[1]
     total, share = np.zeros(nearest.shape), np.zeros(nearest.shape)
     for i in range(beam.shape[0]):

@@ -12,8 +12,8 @@ from pipeline.types.records import Float
 
 @compiled
 def sine_of_turns(turns: float) -> float:
-    """Return sin(2 pi turns) with an error of 4e-6. The polynomial has no branch: it is several times faster
-    than the C library and gives the same bits on every machine."""
+    """Return sin(2 pi turns) for any finite number of turns, with an error of 4e-6. The polynomial has no
+    branch: it is several times faster than the C library and gives the same bits on every machine."""
     u = turns - np.floor(turns + 0.5)
     x = 6.283185307179586 * (0.25 - abs(abs(u) - 0.25))
     q = x * x
@@ -24,7 +24,7 @@ def sine_of_turns(turns: float) -> float:
 
 @compiled
 def height_at(terrain: Float, x: float, y: float) -> float:
-    """Return the height [m] of the terrain (see `SimulatedTerrain.packed`) at one position."""
+    """Return the height [m] of the terrain (see `SimulatedTerrain.packed`) at one position x, y [m]."""
     z: float = terrain[0, 0] * x + terrain[0, 1] * y + terrain[0, 2]
     for i in range(1, terrain.shape[0]):
         z += terrain[i, 0] * sine_of_turns(terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3])
@@ -45,6 +45,8 @@ def gradient_at(terrain: Float, x: float, y: float) -> tuple[float, float]:
 
 @compiled
 def _evaluate(terrain: Float, x: Float, y: Float) -> Float:
+    """Return height [m], dz/dx and dz/dy of the terrain (see `SimulatedTerrain.packed`) at positions x, y of
+    shape (N,) each [m], shape (N, 3)."""
     out = np.empty((x.shape[0], 3))
     for n in range(x.shape[0]):
         out[n, 0] = height_at(terrain, x[n], y[n])
@@ -67,13 +69,14 @@ class SimulatedTerrain:
     def grow(
         cls, slope: float, amplitude: float, shortest: float, rng: np.random.Generator
     ) -> SimulatedTerrain:
-        """Return a random terrain with height 0 at the origin.
+        """Return a random terrain with height 0 at the origin: a plane with four waves, or without waves if
+        the amplitude is 0.
 
         Args:
-            slope: Slope of the plane along x.
+            slope: Slope of the plane along x (rise over run).
             amplitude: Amplitude of the longest wave [m]; those of the others are proportional to their
                 length.
-            shortest: Shortest wavelength [m].
+            shortest: Shortest wavelength [m]; the longest is 3.1 times as long.
             rng: Draws directions and phases.
         """
         wavelengths = shortest * np.array([3.1, 2.2, 1.5, 1.0])
@@ -92,7 +95,7 @@ class SimulatedTerrain:
     def with_ditches(
         self, depth: float, width: float, spacing: float, direction: float, phase: float
     ) -> SimulatedTerrain:
-        """Return this terrain with parallel drainage ditches; the origin keeps the height 0.
+        """Return a copy of this terrain with parallel drainage ditches; the origin keeps the height 0.
 
         Args:
             depth: Depth of a ditch [m].
@@ -115,11 +118,11 @@ class SimulatedTerrain:
         return SimulatedTerrain(packed)
 
     def height(self, x: Float, y: Float) -> Float:
-        """Return heights [m] at positions of shape (N,) [m]."""
+        """Return heights [m], shape (N,), at positions x, y of shape (N,) each [m]."""
         return self.evaluate(x, y)[:, 0]
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
+        """Return height [m], dz/dx and dz/dy at positions x, y of shape (N,) each [m]; shape (N, 3)."""
         result: Float = _evaluate(self.packed, np.ascontiguousarray(x), np.ascontiguousarray(y))
         return result
 
@@ -134,7 +137,8 @@ class WheelContact:
     terrain: SimulatedTerrain
 
     def evaluate(self, x: Float, y: Float) -> Float:
-        """Return height, dz/dx and dz/dy at positions of shape (N,) [m]; shape (N, 3)."""
+        """Return height [m], dz/dx and dz/dy of the wheel contact at positions x, y of shape (N,) each [m];
+        shape (N, 3)."""
         half = 0.5 * WHEELBASE
         west, east, south, north = (
             self.terrain.height(x + dx, y + dy)

@@ -38,7 +38,7 @@ class Uniform:
     reason: str
 
     def draw(self, rng: np.random.Generator) -> float:
-        """Draw a value."""
+        """Return a value of the distribution; the generator advances."""
         return float(rng.uniform(self.low, self.high))
 
 
@@ -113,7 +113,7 @@ SENSORS = (
 def build_wild_scene(
     scenario: Scenario, course: Course, range_sigma: float, rng: np.random.Generator
 ) -> tuple[SpinningLidar, SimulatedScene]:
-    """Draw the sensor and the scene.
+    """Draw the sensor (one of SENSORS) and the scene.
 
     Args:
         scenario: Number of trees and size of the plot.
@@ -152,10 +152,12 @@ def build_wild_scene(
 
 
 def _draw(name: str, rng: np.random.Generator) -> float:
+    """Return a value of the distribution `name` of DISTRIBUTIONS."""
     return DISTRIBUTIONS[name].draw(rng)
 
 
 def _terrain(rng: np.random.Generator) -> SimulatedTerrain:
+    """Draw a terrain with waves and ditches."""
     slope, waves, shortest = (_draw(name, rng) for name in ("slope", "waves", "shortest wave"))
     depth, width, spacing = (_draw(f"ditch {name}", rng) for name in ("depth", "width", "spacing"))
     terrain = SimulatedTerrain.grow(slope, waves, shortest, rng)
@@ -163,6 +165,8 @@ def _terrain(rng: np.random.Generator) -> SimulatedTerrain:
 
 
 def _add_object(scene: SceneBuilder, plot: Plot, name: str, x: float, y: float) -> None:
+    """Add an object of a kind of KINDS at x, y [m] to the scene, not to the ground truth; a hedge of 2 to 8 m
+    is parallel to the nearest edge of the plot."""
     if name != "hedge":
         KINDS[name](scene, x, y)
         return
@@ -174,7 +178,7 @@ def _add_object(scene: SceneBuilder, plot: Plot, name: str, x: float, y: float) 
 
 
 def draw_section(dbh: float, rng: np.random.Generator) -> Section:
-    """Draw the section of a stem of a DBH [m]."""
+    """Draw the section of a stem of a DBH [m]; the depth of its furrows is that at breast height."""
     return Section(
         oval=_draw("oval", rng),
         oval_phase=float(rng.uniform(0.0, np.pi)),
@@ -187,8 +191,16 @@ def draw_section(dbh: float, rng: np.random.Generator) -> Section:
 
 
 def add_wild_tree(scene: SceneBuilder, plot: Plot, x: float, y: float, dbh: float) -> None:
-    """Add a tree with its undergrowth. Its axis is at x, y at breast height, and a tape around it there has
-    the length pi dbh [m]."""
+    """Add a tree with crown, dead branches and undergrowth, to scene and ground truth. Its axis is at x, y
+    [m] at breast height, and a tape around it there has the length pi dbh [m].
+
+    Args:
+        scene: Receives it; its generator draws the shape.
+        plot: Gives the distance from the course, on which no undergrowth grows. The position is not marked as
+            occupied.
+        x, y: Position [m].
+        dbh: Diameter at breast height [m].
+    """
     rng = scene.rng
     owner = scene.true_object("tree", x, y, dbh)
     section = draw_section(dbh, rng)
@@ -245,6 +257,14 @@ def _towards(rng: np.random.Generator) -> Float:
 
 
 def _add_crown(scene: SceneBuilder, tip: Float, base: float, top: float, dbh: float) -> None:
+    """Add three porous ellipsoids below the tip of a stem, kind "foliage".
+
+    Args:
+        scene: Receives them.
+        tip: Upper end of the stem, shape (3,) [m].
+        base, top: Height of the lower end of the crown and of the stem above the ground [m].
+        dbh: Diameter of the stem, which scales the width [m].
+    """
     rng, owner = scene.rng, scene.owner("foliage")
     free_path, width = _draw("crown free path", rng), float(np.clip(0.9 + 3.0 * dbh, 1.0, 2.4))
     depth = top + 0.8 - base
@@ -256,8 +276,15 @@ def _add_crown(scene: SceneBuilder, tip: Float, base: float, top: float, dbh: fl
 
 
 def _add_undergrowth(scene: SceneBuilder, plot: Plot, x: float, y: float, radius: float) -> None:
-    """Add plants around the foot of a stem, except where the robot drives. x, y [m] is the middle of the
-    stem, and `radius` [m] its radius."""
+    """Add two to five plants around the foot of a stem, except where the robot drives; not to the ground
+    truth.
+
+    Args:
+        scene: Receives them.
+        plot: Gives the distance from the course.
+        x, y: Middle of the stem [m].
+        radius: Radius of the stem [m].
+    """
     rng, owner = scene.rng, scene.owner("undergrowth")
     high, free_path = LOWER_STEM * _draw("undergrowth height", rng), _draw("undergrowth free path", rng)
     for _ in range(int(rng.integers(*PLANTS))):
@@ -275,12 +302,14 @@ LEAST_BEAMS = 30  # as many returns make a trunk of labelled scans count (`bench
 def truth_in_view(
     lidar: SpinningLidar, scene: SimulatedScene, poses: Iterable[tuple[Float, Float, Float]]
 ) -> TruthTrees:
-    """Return the ground truth. A tree is HIDDEN if fewer than LEAST_BEAMS beams of all given scans meet its
-    stem up to LOWER_STEM above the ground; leaves and stems before it stop beams.
+    """Return the ground truth of a scene. A tree is HIDDEN if fewer than LEAST_BEAMS beams of all given scans
+    meet its stem up to LOWER_STEM above the ground; leaves and stems before it stop beams. Persons and wind
+    are ignored. All trees are HIDDEN without scans.
 
     Args:
         lidar, scene: The sensor and the scene.
-        poses: Times, rotations and positions of the sensor in some scans, see `SimulatedRun.sensor_poses`.
+        poses: Times, rotations and positions of the sensor in some scans, see `SimulatedRun.sensor_poses`;
+            read once. The pattern of a solid-state sensor is that of the number of the scan in this row.
     """
     solids, met = scene.still, np.zeros(len(scene.kinds), np.int64)
     for k, (_, R, o) in enumerate(poses):
