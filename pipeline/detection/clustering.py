@@ -405,7 +405,8 @@ def range_jump(points: Float32, jump: float, min_points: int, azimuth_step: floa
 
     Returns:
         Labels, int32, shape (N,), -1 for noise, numbered counter-clockwise; and for each cluster whether the
-        return of a neighbouring beam is closer and hides one of its edges, shape (clusters,).
+        return of a neighbouring beam is closer and hides one of its edges, shape (clusters,). A cluster that
+        surrounds the sensor without a gap counts as hidden if the ranges at its seam differ.
     """
     if len(points) == 0:
         return np.zeros(0, np.int32), np.zeros(0, np.bool_)

@@ -151,7 +151,8 @@ def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
 
 def is_repeated(stems: Float, verdict: Int32) -> Bool:
     """Return which stems are duplicates, shape (K,): of stems at the same place, the trees come first, then
-    those with more slices, then the earlier ones; the others are repeated.
+    those with more slices, then the earlier ones; the others are repeated. Stems without a model (NaN) count
+    as one place.
 
     Args:
         stems: Result of `describe_stems`, shape (K, COLUMNS).
