@@ -22,6 +22,7 @@ from app.common.settings import DEFAULT_PORT, Settings
 from app.dashboard.parameters import ParameterState
 from app.web.app import build
 from app.web.auth import new_token, viewer_token
+from app.web.http_protocol import HttpProtocol
 from app.worker.protocol import Open
 from pipeline.errors import StemmapError
 
@@ -139,6 +140,7 @@ def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
     contains the token, and without compression of websockets."""
     return uvicorn.Config(
         app,
+        http=HttpProtocol,
         ws="websockets-sansio",
         ws_max_size=settings.message_limit,
         ws_per_message_deflate=False,  # point clouds do not compress well, and compression costs a core
