@@ -23,9 +23,10 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
+from app.sources.opening import open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers import open_source
+from pipeline.io.readers import check_existence
 from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.clouds import is_cloud
 from pipeline.io.readers.topics import TYPES_BY_ROLE
@@ -69,6 +70,8 @@ async def ask(
         TookTooLongError: There was no answer in time.
     """
     path = question.get("path", "")
+    if path:
+        check_existence(path)  # at once: the child process needs seconds to start
     free = _semaphores.setdefault(asyncio.get_running_loop(), asyncio.Semaphore(_MOST_AT_ONCE))
     async with free, await ChildProcess.start(command, line_limit=LARGEST_ANSWER) as child:
         try:

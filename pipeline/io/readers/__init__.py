@@ -45,6 +45,23 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         ) from error
 
 
+def check_existence(uri: str) -> None:
+    """Check that a URI without a scheme names a file or a folder.
+
+    Raises:
+        SourceError: There is none.
+    """
+    try:
+        if _SCHEME.match(uri) is None and not Path(uri).expanduser().exists():
+            raise _no_such_file(uri)
+    except (RuntimeError, ValueError, OSError):  # an unknown home, a zero byte, a name that is too long
+        raise _no_such_file(uri) from None
+
+
+def _no_such_file(uri: str) -> SourceError:
+    return SourceError("there is no such file or folder", where=uri, remedy=READABLE)
+
+
 def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
     if scheme == "sim":
         from pipeline.io.readers.simulated import open_simulated
@@ -65,7 +82,7 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
 
 def _find_opener(path: Path, uri: str) -> Opener:
     if "\0" in uri or not path.exists():
-        raise SourceError("there is no such file or folder", where=uri, remedy=READABLE)
+        raise _no_such_file(uri)
     if path.is_dir():
         opener = folder_opener(path)
         if opener is None:

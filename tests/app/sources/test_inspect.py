@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from app.common.child_process import ChildProcess
 from app.common.settings import Settings
 from app.robot.link import Inbox
 from app.robot.source import open_any
@@ -55,6 +56,16 @@ async def test_a_recording_tells_its_topics_and_where_the_lidar_stands(both: Run
     np.testing.assert_allclose(told["mount"], MOUNT, atol=2e-3)
     missing = await client.post("/api/inside", json={"uri": "/no/such.mcap"})
     assert (missing.status_code, missing.json()["error"]["where"]) == (409, "/no/such.mcap")
+
+
+@pytest.mark.parametrize("path", ["/no/such.mcap", "~nobody9/x.mcap", "a" * 4000, "x\0.mcap"])
+async def test_a_path_that_does_not_exist_is_refused_without_a_process(
+    both: Running, path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ChildProcess, "start", lambda *_, **__: pytest.fail("a process was started"))
+    reply = await both[0].post("/api/inside", json={"uri": path})
+    assert reply.status_code == 409
+    assert "no such file" in reply.json()["error"]["what"]
 
 
 def test_what_has_no_topics_says_so():
