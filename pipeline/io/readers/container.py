@@ -7,10 +7,11 @@ sizes in a file; mcap decompresses without a limit and gives up at the first dam
 from __future__ import annotations
 
 import bz2
+import contextlib
 import heapq
 import struct
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from operator import attrgetter
@@ -32,6 +33,9 @@ _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 DAMAGE = (McapError, struct.error, ValueError, KeyError, OverflowError)
 #: A file with more damaged or unknown records has another format, and would take long to read.
 STRANGE_LIMIT = 1000
+#: A channel whose times of recording go back by more shows that the clock of the recorder was set [ns].
+STEP_BACK_NS = 2_000_000_000
+MOST_STEPS = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,11 +77,14 @@ class Container:
         kind: Name of the format, e.g. "ROS 2 MCAP".
         channels: All channels.
         damage: Parts that could not be read when the file was opened, by reason.
+        clock_steps: How often the clock of the recorder was set back. Later times are shifted, so
+            that they continue in the order of the file.
     """
 
     kind: str
     channels: list[Channel]
     damage: dict[str, int]
+    clock_steps: int = 0
 
     def tail_ns(self, numbers: Collection[int]) -> int:
         """Return a time [ns] from which a few messages of some channels are left to read, the last ones of
@@ -205,6 +212,8 @@ class Chunk:
         size: Bytes after unpacking.
         crc: CRC-32 of the unpacked bytes, 0 when the file has none.
         counts: Number of messages by channel, None when it is not known yet.
+        shifts: What is added to the times of recording [ns], each from a message of the chunk on; `start_ns`
+            and `end_ns` include it.
     """
 
     offset: int
@@ -215,6 +224,7 @@ class Chunk:
     size: int
     crc: int
     counts: dict[int, int] | None
+    shifts: tuple[tuple[int, int], ...] = ((0, 0),)
 
 
 class ChunkedFile(Container):
@@ -247,6 +257,7 @@ class ChunkedFile(Container):
             ]  # fmt: skip
             if not self._known:
                 raise damaged("the recording holds no messages that can be read", path)
+            self._shift_after_steps()
         except BaseException:
             self.close()
             raise
@@ -347,12 +358,65 @@ class ChunkedFile(Container):
             BrokenChunkError: It is damaged.
         """
         try:
+            shifts, shift_ns = deque(chunk.shifts), 0
             for number, message in enumerate(self._parse(self._bytes_of(chunk), define=define)):
                 if number >= MOST_IN_CHUNK:
                     raise BrokenChunkError
-                yield message
+                while shifts and number >= shifts[0][0]:
+                    shift_ns = shifts.popleft()[1]
+                yield replace(message, log_ns=message.log_ns + shift_ns) if shift_ns else message
         except DAMAGE as error:
             raise BrokenChunkError from error
+
+    def _shift_after_steps(self) -> None:
+        """Shift the times of chunks behind steps of the recorder's clock. Only chunks that begin earlier than
+        others before them are unpacked."""
+        shift_ns, newest_ns = 0, 0
+        before: Chunk | None = None
+        for place, chunk in enumerate(self._chunks):
+            if not chunk.counts:
+                continue
+            shifted = chunk
+            if shift_ns:
+                start_ns, end_ns = chunk.start_ns + shift_ns, chunk.end_ns + shift_ns
+                shifted = replace(chunk, start_ns=start_ns, end_ns=end_ns, shifts=((0, shift_ns),))
+            # The first chunk is read anyway.
+            is_back = shifted.start_ns < (shifted.end_ns if before is None else newest_ns) - STEP_BACK_NS
+            if is_back and self.clock_steps < MOST_STEPS:
+                shifted = self._after_step(shifted, before)
+                shift_ns = shifted.shifts[-1][1]
+                self.clock_steps += len(shifted.shifts) - 1
+            self._chunks[place] = before = shifted
+            newest_ns = max(newest_ns, shifted.end_ns)
+
+    def _after_step(self, chunk: Chunk, before: Chunk | None) -> Chunk:
+        """Return a chunk with a further shift from each message on that is earlier than one of its channel
+        before; unchanged if there is none, as in files that are sorted by topic."""
+        newest, pause_ns = dict[int, int](), dict[int, int]()
+
+        def note(channel: int, time_ns: int) -> None:
+            if time_ns > newest.get(channel, -1):
+                pause_ns[channel] = time_ns - newest.get(channel, time_ns)
+                newest[channel] = time_ns
+
+        with contextlib.suppress(BrokenChunkError):
+            for message in self._contents(before, define=False) if before is not None else ():
+                note(message.channel, message.log_ns)
+        first_shift_ns = chunk.shifts[0][1]
+        shifts, further_ns, times = [(0, first_shift_ns)], 0, list[int]()
+        with contextlib.suppress(BrokenChunkError):
+            for number, message in enumerate(self._contents(chunk, define=False)):
+                time_ns = message.log_ns + further_ns
+                if time_ns < newest.get(message.channel, 0) - STEP_BACK_NS:
+                    due_ns = newest[message.channel] + pause_ns[message.channel]
+                    further_ns += max(due_ns, *newest.values()) - time_ns
+                    time_ns = message.log_ns + further_ns
+                    shifts.append((number, first_shift_ns + further_ns))
+                note(message.channel, time_ns)
+                times.append(time_ns)
+        if not further_ns:
+            return chunk
+        return replace(chunk, shifts=tuple(shifts), start_ns=min(times), end_ns=max(times))
 
     def _survey(self, chunk: Chunk) -> Chunk:
         """Return a chunk with the number and times of its messages, which are counted by unpacking it.

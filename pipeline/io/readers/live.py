@@ -305,22 +305,24 @@ class LiveRunHeader(msgspec.Struct, frozen=True):
 
 
 def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
-    """Return the settings of a live run; None if the file is not the recording of a live run.
+    """Return the settings of a live run; None if the file is not the recording of a live run, or the settings
+    are damaged, which is counted.
 
     Args:
         container: The file.
         where: Its name in errors.
 
     Raises:
-        SourceError: They are damaged or of a newer version.
+        SourceError: They are of a newer version.
     """
-    content = container.attachment(NAME, _LIMIT)
-    if content is None:
-        return None
     try:
+        content = container.attachment(NAME, _LIMIT)
+        if content is None:
+            return None
         run = msgspec.json.decode(content, type=LiveRunHeader)
-    except (msgspec.DecodeError, RecursionError) as error:
-        raise SourceError(f"the settings of the live run cannot be read: {error}", where=where) from error
+    except (SourceError, msgspec.DecodeError, RecursionError):
+        count_loss(container.damage, "settings of the live run that cannot be read")
+        return None
     if run.version != VERSION or not 0 < len(run.topics) + len(run.camera) <= _MOST_TOPICS:
         raise SourceError("the recording is of a newer version of stemmap", where=where)
     return run

@@ -55,14 +55,15 @@ class McapFile(ChunkedFile):
             raw = self._read(offset, min(length, limit + 4096))
             try:
                 found = records.Attachment.read(ReadDataStream(io.BytesIO(raw)))
-                (crc,) = struct.unpack("<I", raw[-4:])
                 if len(found.data) > limit:
                     raise ValueError("too long")
             except DAMAGE as error:
                 what = f"the attachment {name} is damaged or longer than {limit >> 20} MB"
                 raise damaged(what, self._path) from error
-            if crc and zlib.crc32(raw[:-4]) != crc:
-                raise damaged(f"the attachment {name} has a wrong checksum", self._path)
+            try:
+                _check_crc(raw)
+            except ValueError:
+                raise damaged(f"the attachment {name} has a wrong checksum", self._path) from None
             return bytes(found.data)
         return None
 
@@ -73,10 +74,16 @@ class McapFile(ChunkedFile):
         yield from self._definitions.values()
         for opcode, offset, length in self._further:
             try:
-                raw = RECORD.pack(opcode, length) + self._read(offset, min(length, BLOCK_LIMIT))
+                content = self._read(offset, min(length, BLOCK_LIMIT))
+                if opcode == Opcode.ATTACHMENT:
+                    _check_crc(content)
+                raw = RECORD.pack(opcode, length) + content
                 yield next(StreamReader(io.BytesIO(raw), skip_magic=True).records)
             except (*DAMAGE, StopIteration):
-                count_loss(self.damage, "damaged records of the recording")
+                is_file = opcode == Opcode.ATTACHMENT
+                count_loss(
+                    self.damage, "damaged attachments" if is_file else "damaged records of the recording"
+                )
         for chunk in self._chunks:
             try:
                 raw = self._bytes_of(chunk)
@@ -230,6 +237,17 @@ class McapFile(ChunkedFile):
             elif define and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self._define(opcode, bytes(view[at : at + min(length, DEFINITION_LIMIT)]))
             at += length
+
+
+def _check_crc(attachment: bytes) -> None:
+    """Check the sum at the end of an attachment; 0 means that there is none.
+
+    Raises:
+        ValueError: The sum is wrong.
+    """
+    crc = int.from_bytes(attachment[-4:], "little")
+    if crc and zlib.crc32(attachment[:-4]) != crc:
+        raise ValueError("wrong checksum")
 
 
 def _attachment_name(head: bytes) -> str:

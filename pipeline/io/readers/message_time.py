@@ -12,8 +12,13 @@ from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 
 SECOND_NS = 1_000_000_000
-#: A stamp that differs more from the time of recording, after the offset of the clocks, is damaged.
-STAMP_LIMIT_NS = 60 * SECOND_NS
+#: A stamp that differs more from the time of recording, after the offset of the clocks, is damaged, or the
+#: clock was set.
+STAMP_LIMIT_NS = 4 * SECOND_NS
+#: Topics whose stamps differ more from each other use different clocks.
+_SAME_CLOCK_NS = 10 * SECOND_NS
+#: A channel of a live robot whose offset differs more from those of others has no usable stamps.
+_LIVE_LIMIT_NS = 60 * SECOND_NS
 #: A record is sorted into its place when it is recorded at most this much later than its neighbours.
 WINDOW_NS = SECOND_NS
 _HELD_LIMIT = 20_000  # records
@@ -54,17 +59,23 @@ class Clock:
     def __init__(self, offsets_ns: list[int | None]) -> None:
         known = [offset for offset in offsets_ns if offset is not None]
         self.by_stamp = (
-            bool(known) and len(known) == len(offsets_ns) and max(known) - min(known) <= STAMP_LIMIT_NS // 6
+            bool(known) and len(known) == len(offsets_ns) and max(known) - min(known) <= _SAME_CLOCK_NS
         )
         self.offset_ns = known[0] if self.by_stamp else 0
 
     def time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a message [ns], None when its stamp is impossible."""
-        if not self.by_stamp:
-            return message.log_ns if message.log_ns < 2**63 else None
-        if stamp_ns is None or abs(stamp_ns - message.log_ns - self.offset_ns) > STAMP_LIMIT_NS:
-            return None
-        return stamp_ns
+        """Return the time of a message [ns], None when it has none.
+
+        The time of recording replaces a stamp that is impossible or behind a step of the clock.
+        """
+        time_ns = stamp_ns
+        if not self.by_stamp or time_ns is None or self.is_stepped(time_ns, message):
+            time_ns = message.log_ns + self.offset_ns
+        return time_ns if 0 <= time_ns < 2**63 else None
+
+    def is_stepped(self, stamp_ns: int, message: Message) -> bool:
+        """Return whether the stamp of a message [ns] does not fit to its time of recording."""
+        return abs(stamp_ns - message.log_ns - self.offset_ns) > STAMP_LIMIT_NS
 
 
 @dataclass(slots=True)
@@ -128,7 +139,7 @@ class ClockStepFilter(Clock):
         if not self._channels:
             return _ChannelClock(offset_ns, stamp_ns, 0, 0)
         nearest = min(self._channels.values(), key=lambda known: abs(known.offset_ns - offset_ns))
-        if abs(nearest.offset_ns - offset_ns) > STAMP_LIMIT_NS:
+        if abs(nearest.offset_ns - offset_ns) > _LIVE_LIMIT_NS:
             return None
         return _ChannelClock(offset_ns, stamp_ns, nearest.shift_ns, nearest.steps)
 

@@ -34,6 +34,8 @@ from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
 
 #: Number of unreadable scans at the start after which the recording is refused.
 _TRIES = 20
+#: Number of scans at the end whose stamps show whether the clock was set.
+_LAST = 3
 
 
 class RosSource(MessageSource):
@@ -243,6 +245,16 @@ class RosSource(MessageSource):
         for message in self._container.messages(self._topics.numbers("scan"), log_start, {}):
             yield from self._stamped(message, {})
 
+    def _is_clock_set(self) -> bool:
+        """Return whether no stamp of the last few scans fits to their times of recording."""
+        numbers = self._topics.numbers("scan")
+        stamps = [
+            self._clock.is_stepped(stamp_ns, message)
+            for message in self._container.messages(numbers, self._container.tail_ns(numbers), {})
+            if (stamp_ns := header_stamp(self._channels[message.channel], message.payload)) is not None
+        ]
+        return bool(stamps) and all(stamps[-_LAST:])
+
     def _last_stamp(self) -> int | None:
         tail_ns = self._container.tail_ns(self._topics.numbers("scan"))
         return max((arrival.stamp_ns for arrival in self._scan_arrivals(tail_ns)), default=None)
@@ -287,6 +299,17 @@ class RosSource(MessageSource):
         if read:
             warnings.append(
                 f"the recording does not name the serialization format of {', '.join(read)}: CDR is assumed"
+            )
+        if self._container.clock_steps:
+            times = self._container.clock_steps
+            warnings.append(
+                f"the recorder's clock was set back {'once' if times == 1 else f'{times} times'}: "
+                "the run goes on in the order of the file"
+            )
+        if self._clock.by_stamp and self._is_clock_set():
+            warnings.append(
+                "the clock of the time stamps was set during the recording: times of recording are used from "
+                "then on"
             )
         if not self._clock.by_stamp:
             warnings.append("the time stamps in the messages are inconsistent: times of recording are used")

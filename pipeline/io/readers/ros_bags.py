@@ -18,6 +18,8 @@ from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
     DAMAGE,
+    MOST_STEPS,
+    STEP_BACK_NS,
     STRANGE_LIMIT,
     BrokenChunkError,
     Channel,
@@ -121,6 +123,7 @@ class Db3File(Container):
         except sqlite3.Error:
             count_loss(self.damage, "pages of the database that cannot be read")
         table = np.array(rows, dtype=np.int64).reshape(-1, 3)
+        self.clock_steps = _shift_after_steps(table[:, 1], table[:, 2])
         table = table[np.argsort(table[:, 2], kind="stable")]
         return table[:, 0], table[:, 1], table[:, 2]
 
@@ -145,6 +148,27 @@ class Db3File(Container):
             return {str(name): (str(kind), str(text)) for name, kind, text in self._database.execute(query)}
         except sqlite3.Error:
             return {}
+
+
+def _shift_after_steps(topic: Int, stamp: Int) -> int:
+    """Shift times behind steps of the recorder's clock, see `Container.clock_steps`; return their number.
+
+    Args:
+        topic: Topic of each message in the order of the file, shape (N,).
+        stamp: Time of recording [ns], shape (N,); changed in place.
+    """
+    for steps in range(MOST_STEPS):
+        back = np.zeros(len(stamp), dtype=np.bool_)
+        for number in np.unique(topic):
+            own = np.flatnonzero(topic == number)
+            back[own[1:]] = stamp[own[1:]] < np.maximum.accumulate(stamp[own])[:-1] - STEP_BACK_NS
+        if not back.any():
+            return steps
+        first = int(np.argmax(back))
+        own = stamp[:first][topic[:first] == topic[first]]
+        due_ns = 2 * own[-1] - own[-2] if len(own) > 1 else own[-1]
+        stamp[first:] += max(due_ns, stamp[:first].max()) - stamp[first]
+    return MOST_STEPS
 
 
 #: The channels of the n-th file are numbered from n times this value.
@@ -204,6 +228,7 @@ class BagFolder(Container):
         if not self._parts:
             raise SourceError("none of the files of the recording can be read", where=str(files[0].parent))
         self.kind = self._parts[0].kind
+        self.clock_steps = sum(part.clock_steps for part in self._parts)
         self.channels = []
         for index, part in enumerate(self._parts):
             self.channels += [replace(c, number=c.number + _STRIDE * index) for c in part.channels]

@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
 from pipeline.errors import SourceError
@@ -97,6 +98,9 @@ def test_an_attachment_is_read_with_its_size_and_checksum(tmp_path: Path):
     path.write_bytes(path.read_bytes().replace(b"0123456789", b"0123456780"))
     with closing(McapFile(path)) as container, pytest.raises(SourceError, match="checksum"):
         container.attachment(ATTACHMENT, 10)
+    with closing(McapFile(path)) as container:
+        assert not any(isinstance(record, Attachment) for record in container.whole_records())
+        assert container.damage == {"damaged attachments": 1}
 
 
 @pytest.mark.parametrize(
