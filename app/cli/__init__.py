@@ -32,6 +32,7 @@ COMMANDS = (
     "stand",
     "georeference",
     "export",
+    "report",
     "params",
     "train",
     "tune",

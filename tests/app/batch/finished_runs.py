@@ -66,7 +66,7 @@ def write_run(folder, position, dbh, *, dbh_sigma=0.01, side=20.0, seen=True, nu
         "distance_m": 28.3,
         "trees": n,
         "points": {},
-        "health": {},
+        "health": {"scans": {"good": 40, "weak": 1, "lost": 0}, "worst": {"sigma_xy_m": 0.05}},
         "verdicts": {"tree": n, "pole": 2},
         "evaluation": None,
         "path_error": None,

@@ -1,0 +1,305 @@
+"""The report of a finished run: one self-contained HTML page with print style, or PDF."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import subprocess
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from app.batch.export import ExportedRun, read_for_export
+from app.batch.run_folder import read_run_record
+from app.batch.stand import StandResult, stand_of
+from app.common.text import version
+from pipeline.config.stages import Stand
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Float
+from pipeline.io.atomic_files import write_beside
+from pipeline.stand.figures import FIGURES, Estimate
+from pipeline.stand.plots import Plot
+
+LANGUAGES = ("en", "de")
+SUFFIXES = (".html", ".pdf")
+_BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+_PDF_SECONDS = 120.0
+_LABELS_MAX = 400  # trees with a number on the map
+_PATH_POINTS = 2000
+
+
+def texts_of(language: str) -> dict[str, str]:
+    """Return the texts of a language by key, from texts.toml.
+
+    Raises:
+        StemmapError: The language is unknown.
+    """
+    catalogue = tomllib.loads((files(__package__) / "texts.toml").read_text(encoding="utf-8"))
+    if language not in catalogue:
+        raise StemmapError(f"there is no language {language!r}", remedy=f"Languages: {', '.join(catalogue)}")
+    return dict(catalogue[language])
+
+
+@dataclass(frozen=True, slots=True)
+class Numbers:
+    """Numbers as texts of a language: decimal point and group separator."""
+
+    point: str
+    group: str
+
+    def __call__(self, value: float | None, digits: int = 1) -> str:
+        """Return a number with `digits` decimals; a dash if it is unknown."""
+        if value is None or not math.isfinite(value):
+            return "\N{EN DASH}"
+        text = f"{value:,.{digits}f}"
+        return text.replace(",", "\0").replace(".", self.point).replace("\0", self.group)
+
+
+def report_page(
+    folder: FilePath, *, language: str = "en", plots: Sequence[Plot] = (), parameters: Stand | None = None
+) -> str:
+    """Return the report of a run as the text of one HTML file without scripts or links.
+
+    Args:
+        folder: Folder of the run.
+        language: One of LANGUAGES.
+        plots: Plots in the frame of the map.
+        parameters: Parameters of the stand figures; None for the defaults.
+
+    Raises:
+        StemmapError: The run cannot be read, a plot is not valid, or the language is unknown.
+    """
+    from jinja2 import Environment, PackageLoader
+
+    texts = texts_of(language)
+    parameters = parameters or Stand()
+    whole = stand_of(folder, parameters)
+    of_plots = stand_of(folder, parameters, plots) if plots else None
+    run, record = read_for_export(folder, plots, parameters), read_run_record(folder)
+    number = Numbers(texts["point"], texts["group"])
+    environment = Environment(
+        loader=PackageLoader("app.batch.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
+    )
+    figures = whole.figures["all"]
+    warnings = [*record.get("warnings", []), *whole.warnings]
+    if of_plots is not None:
+        warnings += [text for text in of_plots.warnings if text not in warnings]
+    return environment.get_template("report.html.j2").render(
+        t=texts,
+        language=language,
+        number=number,
+        digits=_digits,
+        version=version(),
+        record=record,
+        run=run,
+        whole=whole,
+        infinity=math.inf,
+        figures=figures,
+        figure_names=list(FIGURES),
+        units={name: unit for name, (_, unit) in FIGURES.items()},
+        of_plots=of_plots,
+        map=stand_map(run, whole, plots, texts, number),
+        histogram=histogram(whole, texts, number),
+        trees=tree_rows(run, number),
+        warnings=warnings,
+        verdicts={k: v for k, v in record.get("verdicts", {}).items() if k != "tree"},
+        parameters=parameters.model_dump(),
+    )
+
+
+def _digits(estimate: Estimate) -> int:
+    """Return the number of decimals that the size of a figure deserves."""
+    size = abs(estimate.value)
+    return 0 if not math.isfinite(size) or size >= 100 else 1 if size >= 10 else 2
+
+
+def tree_rows(run: ExportedRun, number: Numbers) -> list[list[str]]:
+    """Return the trees as cells: number, two coordinates, diameter, its sigma, observations, coverage."""
+    c = run.columns
+    return [
+        [
+            str(c["tree"][k]),
+            number(float(run.place[k, 0]), 2),
+            number(float(run.place[k, 1]), 2),
+            number(float(c["dbh_cm"][k]), 1),
+            number(float(c["sigma_dbh_cm"][k]), 1),
+            str(c["observations"][k]),
+            number(float(c["coverage_deg"][k]), 0),
+        ]
+        for k in range(len(run.place))
+    ]
+
+
+def _step(length: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten up to a length."""
+    power = 10.0 ** math.floor(math.log10(length))
+    return max(k * power for k in (1.0, 2.0, 5.0) if k * power <= length * (1 + 1e-9))
+
+
+def stand_map(
+    run: ExportedRun, whole: StandResult, plots: Sequence[Plot], texts: dict[str, str], number: Numbers
+) -> dict[str, Any]:
+    """Return what the template draws on the map: sizes in millimetres of a page, north (or y) upwards.
+
+    Returns:
+        width, height; `seen` and `path` (SVG path data), plots (name, path data, place of the name), trees
+        (x, y, radius, number or ""), the scale bar (length, text), and the factor 1 : scale.
+    """
+    import shapely
+
+    seen = shapely.transform(whole.plots[0].shape, run.frame.to_crs)
+    shapes = [shapely.transform(plot.shape, run.frame.to_crs) for plot in plots]
+    points = [run.place, run.path, np.reshape(seen.bounds, (2, 2))]
+    points += [np.reshape(shape.bounds, (2, 2)) for shape in shapes]
+    every = np.concatenate([np.reshape(p, (-1, 2)) for p in points])
+    low, high = every.min(axis=0) - 1.0, every.max(axis=0) + 1.0
+    size = high - low
+    scale = min(180.0 / size[0], 190.0 / size[1])  # mm per metre
+    thin = run.path[:: max(1, len(run.path) // _PATH_POINTS)]
+
+    def paper(xy: Float) -> Float:
+        place: Float = (np.reshape(xy, (-1, 2)) - low) * [scale, -scale] + [0.0, size[1] * scale]
+        return place
+
+    def data(rings: Sequence[Float], *, close: bool) -> str:
+        parts = []
+        for ring in rings:
+            place = " L".join(f"{x:.2f} {y:.2f}" for x, y in paper(ring).tolist())
+            parts.append(f"M{place}{'Z' if close else ''}")
+        return " ".join(parts)
+
+    def rings(shape: Any) -> list[Float]:  # noqa: ANN401 - a shapely polygon
+        return [
+            np.array(ring.coords)
+            for part in getattr(shape, "geoms", [shape])
+            for ring in (part.exterior, *part.interiors)
+        ]
+
+    labelled = len(run.place) <= _LABELS_MAX
+    dbh = np.nan_to_num(run.columns["dbh_cm"], nan=15.0)
+    radius = np.maximum(0.7, 0.005 * dbh * scale)
+    bar = _step(min(50.0 / scale, 0.3 * size[0]))
+    return {
+        "width": round(size[0] * scale, 2),
+        "height": round(size[1] * scale, 2),
+        "seen": data(rings(seen), close=True),
+        "path": data([thin], close=False) if len(thin) > 1 else "",
+        "plots": [
+            (plot.name, data(rings(shape), close=True), *paper(np.array(shape.centroid.coords))[0].tolist())
+            for plot, shape in zip(plots, shapes, strict=True)
+        ],
+        "trees": [
+            (x, y, r, str(n) if labelled else "", bool(known))
+            for (x, y), r, n, known in zip(
+                paper(run.place).tolist(),
+                radius.tolist(),
+                run.columns["tree"],
+                np.isfinite(run.columns["dbh_cm"]),
+                strict=True,
+            )
+        ],
+        "bar": bar * scale,
+        "bar_text": f"{number(bar, 0 if bar >= 1 else 1)} m",
+        "scale": f"1 : {number(1000.0 / scale, 0)}",
+        "up": texts["north"] if run.frame.crs else "y",
+    }
+
+
+def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dict[str, Any]:
+    """Return what the template draws of the diameter classes: bars as x, y, width, height, half error, label
+    [mm], marks of the axis, and its title."""
+    classes = whole.figures["all"].classes
+    width, height = 170.0, 60.0
+    top = max((c.n_ha.value + c.n_ha.se for c in classes), default=0.0)
+    step = _step(max(top, 1e-9) / 3.0)
+    top = max(math.ceil(top / step), 1) * step
+    each = width / max(len(classes), 1)
+    bars = [
+        {
+            "x": k * each + 0.1 * each,
+            "middle": (k + 0.5) * each,
+            "y": height * (1.0 - c.n_ha.value / top),
+            "width": 0.8 * each,
+            "height": height * c.n_ha.value / top,
+            "high": height * (1.0 - (c.n_ha.value + c.n_ha.se) / top),
+            "low": height * (1.0 - max(c.n_ha.value - c.n_ha.se, 0.0) / top),
+            "label": number(c.low, 0 if float(c.low).is_integer() else 1),
+            "edge": k * each,
+        }
+        for k, c in enumerate(classes)
+    ]
+    marks = [(height * (1.0 - v / top), number(v, 0)) for v in np.arange(0.0, top + 0.5 * step, step)]
+    last = number(classes[-1].high, 0) if classes else ""
+    return {
+        "bars": bars,
+        "marks": marks,
+        "width": width,
+        "height": height,
+        "last": last,
+        "title": texts["n_ha"],
+    }
+
+
+def write_report(page: str, file: FilePath) -> None:
+    """Write a report as HTML, or as PDF by a Chromium of this machine.
+
+    Args:
+        page: Its HTML.
+        file: File .html or .pdf.
+
+    Raises:
+        StemmapError: The suffix is another one, there is no Chromium, or it failed.
+        OSError: The file cannot be written.
+    """
+    suffix = file.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise StemmapError(f"{file.name!r} is no .html or .pdf file")
+    if suffix == ".html":
+        with write_beside(file) as partial:
+            partial.write_text(page, encoding="utf-8", newline="")
+        return
+    browser = find_browser()
+    with TemporaryDirectory(prefix=".report-", dir=file.parent) as folder:
+        html, pdf = FilePath(folder) / "report.html", FilePath(folder) / "report.pdf"
+        html.write_text(page, encoding="utf-8", newline="")
+        words = [browser, "--headless=new", "--disable-gpu", "--no-first-run", "--disable-sync",
+                 "--disable-background-networking", "--disable-component-update", "--no-pdf-header-footer",
+                 "--disable-javascript", f"--user-data-dir={folder}/profile",
+                 f"--print-to-pdf={pdf.resolve()}", html.resolve().as_uri()]  # fmt: skip
+        if hasattr(os, "geteuid") and os.geteuid() == 0:
+            words.insert(1, "--no-sandbox")  # Chromium refuses to start as root otherwise; the page is ours
+        try:
+            subprocess.run(words, capture_output=True, timeout=_PDF_SECONDS, check=False)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise StemmapError(
+                f"the browser could not print the report: {error}", where=browser, remedy="Write .html"
+            ) from None
+        if not pdf.is_file():
+            raise StemmapError(
+                "the browser printed no PDF", where=browser, remedy="Write .html and print it yourself"
+            )
+        os.replace(pdf, file)  # noqa: PTH105
+
+
+def find_browser() -> str:
+    """Return the path of a Chromium or Chrome: the environment variable CHROMIUM, else one on the PATH.
+
+    Raises:
+        StemmapError: There is none.
+    """
+    named = os.environ.get("CHROMIUM")
+    for name in (named,) if named else _BROWSERS:
+        found = shutil.which(name)
+        if found:
+            return found
+    raise StemmapError(
+        "a PDF needs Chromium or Chrome" + (f", and {named} is not there" if named else ""),
+        remedy="Install one, name it with CHROMIUM=/path/to/chrome, or write .html and print it",
+    )

@@ -1,0 +1,46 @@
+"""`stemmap report`: a page for the file about a mapped run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from app.cli.flags import cannot_write
+from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, stand_parameters
+
+HELP = "write a report of a mapped run as one HTML page or PDF"
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("run", metavar="DIR", type=Path, help="folder that `stemmap map` wrote")
+    parser.add_argument("--out", metavar="FILE", type=Path, required=True, help=".html, or .pdf by Chromium")
+    parser.add_argument("--language", metavar="en|de", default="en", help="language (default: en)")
+    add_plot_flags(parser)
+    add_stand_flags(parser)
+    parser.epilog = (
+        "The page has a map, stand tables, the distribution of diameters, the list of trees, the method and\n"
+        "what was left out. It needs no other file and no network."
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the report.
+
+    Raises:
+        StemmapError: The run cannot be read, or there is no Chromium for a PDF.
+    """
+    from app.batch.report import report_page, write_report
+
+    page = report_page(
+        arguments.run,
+        language=arguments.language,
+        plots=chosen_plots(arguments),
+        parameters=stand_parameters(arguments),
+    )
+    try:
+        write_report(page, arguments.out)
+    except OSError as error:
+        raise cannot_write(error, arguments.out) from None
+    print(f"report in {arguments.out}")
+    return 0

@@ -1,0 +1,175 @@
+"""The report of a run."""
+
+from __future__ import annotations
+
+import os
+import re
+import tomllib
+from html.parser import HTMLParser
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.batch.report import LANGUAGES, Numbers, find_browser
+from tests.app.batch.finished_runs import grid_run, write_run
+from tests.app.cli.test_commands import stemmap
+
+
+class Page(HTMLParser):
+    """Tags, attributes and texts of a page."""
+
+    def __init__(self, text) -> None:
+        super().__init__()
+        self.tags, self.links, self.texts, self.open = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.links += [value for name, value in attrs if name in ("src", "href", "action")]
+
+    def handle_data(self, data):
+        self.texts.append(data)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A finished run."""
+    return grid_run(tmp_path_factory.mktemp("report") / "run")
+
+
+def page_of(capsys, run, file, words=()):
+    """The text of a report."""
+    told = stemmap(capsys, "report", run, "--out", file, *words)
+    assert told.code == 0, told.err
+    return file.read_text(encoding="utf-8")
+
+
+def test_every_language_has_the_same_texts():
+    catalogue = tomllib.loads((files("app.batch.report") / "texts.toml").read_text(encoding="utf-8"))
+    assert set(catalogue) == set(LANGUAGES)
+    first, *others = catalogue.values()
+    for other in others:
+        assert list(other) == list(first)
+    template = (files("app.batch.report") / "report.html.j2").read_text(encoding="utf-8")
+    assert set(re.findall(r"\bt\.(\w+)", template)) <= set(first)
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_the_page_is_complete_and_needs_nothing_else(run, tmp_path, capsys, language):
+    words = ["--circle", "10,10,5", "--along", "12", "--language", language]
+    text = page_of(capsys, run, tmp_path / "r.html", words)
+    page = Page(text)
+    assert not {"script", "link", "img", "iframe"} & set(page.tags)
+    assert page.links == []
+    assert "http" not in text.replace("http-equiv", "")
+    assert page.tags.count("circle") >= 100
+    shown = " ".join(page.texts)
+    texts = tomllib.loads((files("app.batch.report") / "texts.toml").read_text(encoding="utf-8"))[language]
+    for key in (
+        "title",
+        "map",
+        "scale",
+        "plots",
+        "distribution",
+        "tree_list",
+        "method",
+        "left_out",
+        "health",
+    ):
+        assert texts[key] in shown
+    assert ("2,500" if language == "en" else "2.500") in shown
+    assert ("19.00" if language == "en" else "19,00") in shown
+    assert f'<html lang="{language}">' in text
+    assert "None" not in shown
+    assert "nan" not in shown
+
+
+def test_the_same_run_gives_the_same_page(run, tmp_path, capsys):
+    assert page_of(capsys, run, tmp_path / "a.html") == page_of(capsys, run, tmp_path / "b.html")
+
+
+def test_the_map_is_drawn_to_scale(run, tmp_path, capsys):
+    text = page_of(capsys, run, tmp_path / "r.html")
+    circles = np.array(
+        re.findall(r'<circle cx="([\d.]+)" cy="([\d.]+)" r="([\d.]+)" fill="#1e5b24"/>', text)[:100]
+    )
+    x = np.unique(circles[:, 0].astype(float))
+    per_metre = np.diff(x).mean() / 2.0
+    bar = re.search(r"M0 0 V2 H([\d.]+) V0", text)
+    length = re.search(r'text-anchor="middle">(\d+) m<', text)
+    assert bar is not None
+    assert length is not None
+    assert float(bar[1]) / float(length[1]) == pytest.approx(per_metre, rel=1e-3)
+    scale = re.search(r"1 : ([\d,]+)", text)
+    assert scale is not None
+    assert int(scale[1].replace(",", "")) == pytest.approx(1000.0 / per_metre, abs=1)
+
+
+def test_the_report_says_where_north_is_only_when_it_is_known(run, tmp_path, capsys):
+    assert "the direction of north is unknown" in page_of(capsys, run, tmp_path / "r.html")
+    placed = grid_run(tmp_path / "placed")
+    stemmap(capsys, "georeference", placed, "--by-hand", "500000,5300000,90", "--crs", "EPSG:25832")
+    text = page_of(capsys, placed, tmp_path / "p.html")
+    assert "the direction of north is unknown" not in text
+    assert "EPSG:25832: by hand" in text
+    assert "499,981.00" in text  # y 19 m of the map points west
+
+
+def test_names_from_files_cannot_bring_markup(tmp_path, capsys):
+    import geopandas
+    import shapely
+
+    run = grid_run(tmp_path / "run")
+    stemmap(capsys, "georeference", run, "--by-hand", "500000,5300000,0", "--crs", "EPSG:25832")
+    file = tmp_path / "plots.gpkg"
+    shape = shapely.box(500005, 5300005, 500015, 5300015)
+    geopandas.GeoDataFrame({"name": ["<script>x</script>"]}, geometry=[shape], crs=25832).to_file(file)
+    text = page_of(capsys, run, tmp_path / "r.html", ["--plots", file])
+    assert "<script" not in text
+    assert "&lt;script&gt;" in text
+
+
+def test_a_run_without_trees_has_a_report(tmp_path, capsys):
+    run = write_run(tmp_path / "run", np.zeros((0, 2)), [])
+    assert "the plot has no trees" in page_of(capsys, run, tmp_path / "r.html")
+
+
+def test_numbers_are_those_of_the_language():
+    english, german = Numbers(".", ","), Numbers(",", ".")
+    assert (english(1234.56, 1), german(1234.56, 1)) == ("1,234.6", "1.234,6")
+    assert english(float("nan")) == english(None) == "\N{EN DASH}"
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "says"),
+    [
+        (["--out", "r.txt"], 1, ".html or .pdf"),
+        (["--out", "r.html", "--language", "fr"], 1, "Languages: en, de"),
+        (["--out", "missing/r.html"], 1, "no such folder"),
+    ],
+)
+def test_what_cannot_be_written_is_refused(run, tmp_path, capsys, monkeypatch, words, code, says):
+    monkeypatch.chdir(tmp_path)
+    stemmap(capsys, "report", run, *words).refused(code, says)
+
+
+def test_a_pdf_without_a_browser_says_what_to_do(run, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("CHROMIUM", "/nowhere/chrome")
+    told = stemmap(capsys, "report", run, "--out", tmp_path / "r.pdf")
+    told.refused(1, "/nowhere/chrome is not there", "CHROMIUM=")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.browser
+def test_a_pdf_has_pages_and_leaves_nothing_else(run, tmp_path, capsys):
+    if not Path(os.environ.get("CHROMIUM", "/usr/bin/chromium")).exists():
+        pytest.skip("no Chromium")
+    assert find_browser()
+    told = stemmap(capsys, "report", run, "--out", tmp_path / "r.pdf", "--language", "de")
+    assert told.code == 0, told.err
+    content = (tmp_path / "r.pdf").read_bytes()
+    assert content.startswith(b"%PDF")
+    assert len(re.findall(rb"/Type\s*/Page\b", content)) >= 4
+    assert [file.name for file in tmp_path.iterdir()] == ["r.pdf"]
