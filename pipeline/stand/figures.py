@@ -223,34 +223,46 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
     thickest = min(parameters.dominant_per_ha * seen / HECTARE, float(len(d)))
     stems = HECTARE * len(trees.dbh) / seen
 
-    def dominant(values: Float) -> float:
-        order = np.sort(values)[::-1]
-        weight = np.clip(min(thickest, len(order)) - np.arange(len(order)), 0.0, 1.0)
-        return math.sqrt(float(weight @ np.square(order)) / float(weight.sum()))
+    def dominant(values: Float) -> tuple[float, Float]:
+        order = np.argsort(-values, kind="stable")
+        weight = np.zeros(len(values))
+        weight[order] = np.clip(min(thickest, len(values)) - np.arange(len(values)), 0.0, 1.0)
+        weight /= weight.sum()
+        figure = math.sqrt(float(weight @ np.square(values)))
+        return figure, weight * values / figure
 
-    def quadratic(values: Float) -> float:
-        return math.sqrt(float(np.square(values).mean()))
+    def quadratic(values: Float) -> tuple[float, Float]:
+        figure = math.sqrt(float(np.square(values).mean()))
+        return figure, values / (len(values) * figure)
 
-    def density(values: Float) -> float:
-        return float(stems * len(values) / len(d) * (quadratic(values) / INCH_10) ** REINEKE)
+    def mean(values: Float) -> tuple[float, Float]:
+        return float(values.mean()), np.full(len(values), 1.0 / len(values))
 
-    figures: dict[str, Callable[[Float], float]] = {
-        "dg_cm": quadratic,
-        "mean_dbh_cm": lambda values: float(values.mean()),
-        "dominant_dbh_cm": dominant,
-        "sdi": density,
-    }
+    def density(values: Float) -> tuple[float, Float]:
+        dg, slope = quadratic(values)
+        figure = float(stems * len(values) / len(d) * (dg / INCH_10) ** REINEKE)
+        return figure, REINEKE * figure / dg * slope
+
+    figures = {"dg_cm": quadratic, "mean_dbh_cm": mean, "dominant_dbh_cm": dominant, "sdi": density}
     return {name: _with_error(figure, d, sigma, found) for name, figure in figures.items()}
 
 
-def _with_error(figure: Callable[[Float], float], d: Float, sigma: Float, found: float) -> Estimate:
-    n, value = len(d), figure(d)
-    step = 1e-4
-    slope = np.array([(figure(d + step * (np.arange(n) == k)) - value) / step for k in range(n)])
+def _with_error(
+    figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, found: float
+) -> Estimate:
+    """Return a figure with its standard error.
+
+    Args:
+        figure: Returns the figure of diameters, and its derivatives by them.
+        d, sigma: Diameters and their standard deviations [cm].
+        found: Share of all trees that was found and observed.
+    """
+    n = len(d)
+    value, slope = figure(d)
     measured = float(np.square(slope * sigma).sum())
     sampled = 0.0
     if n > 1 and found < 1.0:
-        without = np.array([figure(np.delete(d, k)) for k in range(n)])
+        without = np.array([figure(np.delete(d, k))[0] for k in range(n)])
         sampled = (1.0 - found) * (n - 1) / n * float(np.square(without - without.mean()).sum())
     return Estimate(value, math.sqrt(measured + sampled) if n > 1 or found >= 1.0 else math.nan)
 

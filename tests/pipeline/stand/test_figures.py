@@ -66,6 +66,11 @@ def test_errors_of_diameters_reach_the_figures_as_by_propagation():
     assert v["n_ha"].se == pytest.approx(0.0, abs=1e-5)
 
 
+def test_equal_diameters_do_not_inflate_the_error_of_the_dominant_one():
+    dominant = figures(trees_of([0.2] * 40, 0.01)).values["dominant_dbh_cm"]
+    assert dominant == pytest.approx((20.0, 1.0 / math.sqrt(10)))
+
+
 def test_the_unseen_part_of_a_plot_has_a_sampling_error_like_that_of_drawn_stands():
     """Stands drawn at random, a quarter of the plot seen: the errors agree with the spread of the figures."""
     random = np.random.default_rng(1)
