@@ -143,8 +143,8 @@ def _check_command(words: list[str]) -> None:
     Raises:
         UsageError: The first word is not a source but similar to a command.
     """
-    if len(words) < 2 or words[0] != "serve" or words[1].startswith("-"):
-        return
+    if len(words) < 2 or words[0] != "serve" or words[1].startswith("-") or ":" in words[1]:
+        return  # a flag, or an address such as sim:stand
     near = difflib.get_close_matches(words[1], COMMANDS, n=1, cutoff=0.6)
     if near and words[1] not in COMMANDS and not os.path.lexists(words[1]):
         raise UsageError(f"there is no command {words[1]!r}", remedy=f"Did you mean `stemmap {near[0]}`?")

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from app.cli import COMMANDS, main
+from app.cli import COMMANDS, _check_command, main
 from pipeline.config import PRESETS, field_specs, from_toml, preset
 
 RUN = "sim:paper?duration=2"
@@ -222,6 +222,10 @@ def test_a_mistyped_command_is_named(capsys, tmp_path, monkeypatch, word, meant)
     monkeypatch.chdir(tmp_path)
     stemmap(capsys, word, RUN, "--out", "out").refused(2, f"no command '{word}'", f"`stemmap {meant}`")
     stemmap(capsys, word).refused(2, f"`stemmap {meant}`")
+
+
+def test_an_address_is_not_a_mistyped_command():
+    _check_command(["serve", "sim:stand"])  # there is a command stand
 
 
 @pytest.mark.parametrize("ask", ["SIGINT", "SIGTERM"])
