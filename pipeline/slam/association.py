@@ -15,9 +15,15 @@ from pipeline.types.records import Detections, Float32, Int, Int32, Landmarks, P
 
 
 def hits_less_misses(hits: Int32, score: Float32 | Float, misses_per_hit: int) -> Float:
-    """Return the hits less the misses of landmarks, shape (L,), from their scores.
+    """Return the hits less the misses of landmarks, float64, shape (L,), from their scores; negative if
+    misses prevail.
 
     A score is hits - misses / misses_per_hit, and counts no more than SCORE_MAX hits.
+
+    Args:
+        hits: Number of detections, int32, shape (L,).
+        score: Scores, shape (L,).
+        misses_per_hit: Number of misses that cancel one hit.
     """
     counted = np.minimum(hits, SCORE_MAX)
     return np.subtract(counted, misses_per_hit * (counted - score), dtype=np.float64)
@@ -25,7 +31,8 @@ def hits_less_misses(hits: Int32, score: Float32 | Float, misses_per_hit: int) -
 
 def births_of(detections: Detections, estimate: PoseEstimate, landmarks: Landmarks) -> Int:
     """Return the birth of the landmark of each detection at an estimated pose, int64, shape (D,); -1 for a
-    detection without landmark. The map stays unchanged."""
+    detection without landmark within the gate and distance of `landmarks`. The map stays unchanged. The
+    covariance of the pose is `relative` of the estimate, if it has one."""
     relative = estimate.covariance if estimate.relative is None else estimate.relative
     pose = estimate.T_map_base.as_array()
     position, own, added = in_map(detections.centre, detections.covariance, pose, relative)
@@ -59,7 +66,8 @@ class _Pairs(NamedTuple):
 def associate(
     centre: Float, R: Float, mean: Float, covariance: Float, gate: float, distance_max: float
 ) -> tuple[Int, Float]:
-    """Associate detections with landmarks one to one, most likely pairs first.
+    """Associate detections with landmarks one to one, most likely pairs first. Without detections or
+    landmarks, no pair exists.
 
     Args:
         centre: Detections, shape (D, 2) [m].
@@ -171,7 +179,8 @@ def _add_pairs(
 
 @compiled_borrowing
 def _is_one_to_one(pairs: _Pairs, n: int) -> bool:
-    """Return whether each landmark and each detection is in at most one pair."""
+    """Return whether each landmark and each detection is in at most one of the first n pairs, which are
+    sorted by landmark."""
     clear = True
     for d in range(pairs.of_detection.shape[0]):
         clear = clear and pairs.of_detection[d] <= 1

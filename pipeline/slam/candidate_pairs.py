@@ -172,7 +172,8 @@ def find_ambiguous(pairs: int, found: int, room: Room) -> int:
 @compiled_borrowing
 def fill_levels(pairs: int, room: Room) -> int:
     """Fill the levels of the search with at most MOST ambiguous detections, lowest cost first, and the free
-    landmarks of their pairs; return the number of levels."""
+    landmarks of their pairs, at most CHOICES each; return the number of levels. `pairs` is the number of
+    pairs, which are sorted in `room.order`; `room.search` is written."""
     search, n = room.search, 0
     for i in range(pairs):
         k = room.order[i]

@@ -63,13 +63,24 @@ class FastSlam:
     def process(
         self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
     ) -> PoseEstimate:
-        """Predict the particles by the odometry, weigh them by the detections, and resample when it is due.
+        """Predict the particles by the odometry, weigh them by the detections, and resample when it is due;
+        replaces `state`.
+
+        Detections are used in the first scan (index 0), after `update_distance`, or when trees contradict the
+        odometry. In other scans the particles only move, the map is unchanged, and `landmark_of` of the
+        result comes from an association with the unchanged map. A changed number of particles takes effect
+        here.
 
         Args:
-            index: Number of the scan.
-            motion: T_base(t-1)_base(t) by the odometry, or the same with its uncertainty.
-            detections: Trees in the base frame.
-            clear_range: Free distance by azimuth, shape (bins,) [m]; see `detection.free_space`.
+            index: Number of the scan; seeds the random numbers of the scan.
+            motion: T_base(t-1)_base(t) by the odometry, or the same with its uncertainty and a measured pose.
+            detections: Trees in the base frame; may be empty.
+            clear_range: Free distance by azimuth in the base frame, shape (bins,) [m]; see
+                `detection.free_space`.
+
+        Returns:
+            Pose after the scan with its health. `landmarks` contains only those of the best particle with
+            `hits_to_weigh` hits.
         """
         p = self.parameters
         noise, offset = draws(self.seed, index, p.particles)
@@ -130,16 +141,21 @@ class FastSlam:
         return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
 
     def without_shared_error(self, pose: PoseMeasurement) -> PoseMeasurement:
-        """Return a measured pose corrected by the estimated error that all poses of its source share."""
+        """Return a measured pose corrected by the estimated error that all poses of its source share. It is
+        unchanged if its source has no shared errors or no such pose was used before."""
         return self.state.shared.without_shared_error(pose, normalised(self.state.log_weight))
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
-        """Set the pose of all particles by another source; they keep the map of the best particle.
+        """Set the pose of all particles by another source; they keep the map and the path of the best
+        particle. Weights, health statistics, shared errors and the motion since the last used scan are reset.
+
+        If the graph has keyframes, it gets one more without odometry to the one before, and a loop from its
+        first keyframe with this pose.
 
         Args:
             index: Number of the scan, which seeds the random numbers.
             T_map_base: The pose.
-            covariance: Covariance of x, y [m], yaw [rad], shape (3, 3).
+            covariance: Covariance of x, y [m], yaw [rad], shape (3, 3); the particles are drawn from it.
         """
         self._put(index, T_map_base, covariance)
         graph = self.state.graph
@@ -156,7 +172,14 @@ class FastSlam:
         )
 
     def _put(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
-        """Draw all particles from a Gaussian; they keep the map and the path of the best particle."""
+        """Draw all particles from a Gaussian, in place of `state`; they keep the map and the path of the best
+        particle.
+
+        Args:
+            index: Number of the scan, which seeds the random numbers.
+            T_map_base: Mean.
+            covariance: Covariance of x, y [m], yaw [rad], shape (3, 3); negative eigenvalues count as 0.
+        """
         rng = np.random.default_rng([self.seed, index, PLACED])
         noise = rng.standard_normal((self.parameters.particles, 3))
         values, axes = np.linalg.eigh(covariance)
@@ -166,7 +189,8 @@ class FastSlam:
 
     @property
     def is_smoothing_due(self) -> bool:
-        """Whether the newest scan is a keyframe, the graph is due, and no other source measures the pose."""
+        """Whether the newest scan is a keyframe, the graph is due (`KeyframeGraph.is_due`), and no measured
+        pose with shared errors was used."""
         graph, scan = self.state.graph, len(self.state.genealogy) - 1
         return graph.is_due and graph.newest_scan == scan and not self.state.shared.begun
 
@@ -174,10 +198,12 @@ class FastSlam:
         """Solve the graph. All particles continue from its newest pose with its path and landmarks.
 
         Args:
-            index: Number of the newest scan, which seeds the random numbers.
+            index: Number of the newest scan, which seeds the random numbers. This scan must be a keyframe,
+                see `is_smoothing_due`.
 
         Returns:
-            The correction; None where the graph has no solution.
+            The correction. None where the graph has no solution; the particles are unchanged then, and the
+            next smoothing waits for another revisit.
         """
         graph, solution = self.state.graph, self.state.graph.solve()
         if solution is None:
@@ -187,14 +213,16 @@ class FastSlam:
 
     def close(self, index: int, loop: Loop) -> PathCorrection | None:
         """Close a loop that ends at the newest scan: solve the graph with it, and correct path and landmarks.
-        All particles continue from the corrected pose with the map of the best one.
+        All particles continue from the corrected pose with the map of the best one, in which landmarks at the
+        same place from before and after the loop are joined.
 
         Args:
             index: Number of the scan, which seeds the random numbers.
             loop: The loop.
 
         Returns:
-            The correction; None if the graph contradicts the loop. The state is unchanged then.
+            The correction; None if the graph has no solution, or if it gives the loop a weight below
+            LOOP_WEIGHT_MIN. The state is unchanged then.
         """
         state, path = self.state, self.path()
         graph = state.graph
@@ -220,14 +248,14 @@ class FastSlam:
         names: tuple[Int, Int] | None = None,
     ) -> PathCorrection:
         """Put all particles at the newest keyframe of a solution, which is the newest scan, with its path and
-        landmarks.
+        landmarks; return the correction of the path.
 
         Args:
             index: Number of the newest scan.
-            graph: The graph.
+            graph: The graph, with at least one keyframe.
             solution: Its solution.
             covariance: Covariance of the pose of the particles, shape (3, 3).
-            names: Landmarks that are joined; see `joined`.
+            names: Landmarks that are joined; see `joined`. None for none.
         """
         before, path = self.state, self.path()
         best = before.map_of(before.best)
@@ -253,17 +281,20 @@ class FastSlam:
 
     @property
     def is_lost(self) -> bool:
-        """Whether most known trees are missing where they should be visible."""
+        """Whether too few known trees are found where they should be visible; see `pose_quality.is_lost`."""
         return is_lost(self.state.recent)
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
-        """Return the pose after `place`, with the health and the associations of an estimate before it."""
+        """Return the pose of the present state, for example after `place`, with the health and the
+        associations of an earlier estimate. The state is unchanged and `resampled` is False."""
         weights = normalised(self.state.log_weight)
         estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
         return replace(estimate, health=before.health, landmark_of=before.landmark_of)
 
     def lost(self, estimate: PoseEstimate) -> Health:
-        """Return the health of an estimate without any tree."""
+        """Return the health of an estimate for a scan that detected no tree and has no doubt about the
+        odometry. Whether it is "lost" depends on the running statistics and on the covariance of the
+        estimate."""
         ancestors = self.state.genealogy.distinct_ancestors
         return pose_health(
             self.state.recent, ScanStatistics(), estimate.n_eff, ancestors, _relative(estimate)
@@ -274,24 +305,30 @@ class FastSlam:
         self.state = replace(self.state, recent=RunningStatistics(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
-        """Return the path of the best particle: x, y [m], yaw [rad] at every scan, shape (N, 3)."""
+        """Return the path of the best particle: x, y [m], yaw [rad] at each processed scan, shape (N, 3), (0,
+        3) before the first one. `place` does not change it. Recent poses have the resolution of float32."""
         return self.state.genealogy.path(self.state.best)
 
     def landmarks(self) -> Landmarks:
-        """Return all landmarks of the best particle."""
+        """Return all landmarks of the best particle, those with few hits and in inactive places as well, with
+        the gate and the maximum distance of the parameters."""
         known, p = self.state.map_of(self.state.best), self.parameters
         score = hits_less_misses(known.hits, known.score, p.misses_per_hit)
         return Landmarks(known.birth, known.mean, known.covariance, score, p.gate, p.distance_max)
 
     def begun_since(self, scan: int) -> tuple[Float, Float]:
         """Return the landmarks of the best particle that were begun at a scan or later and have at least
-        `hits_to_weigh` hits: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]."""
+        `hits_to_weigh` hits: positions, shape (L, 2) [m], and covariances xx, xy, yy, shape (L, 3) [m^2]. The
+        scan of a landmark is that of its reference pose, which may be a little earlier than the scan that
+        began it."""
         known = self.state.map_of(self.state.best)
         young = self.state.frame.scan_of(known.birth) >= scan
         rows = young & (known.hits >= self.parameters.hits_to_weigh)
         return known.mean[rows], known.covariance[rows]
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
+        """Return the state after one more odometry step: the motion since the last used scan, its covariance
+        and `since_update` grow. The state itself if the step adds nothing, see `accumulated`."""
         moved = accumulated(
             state.motion, state.motion_covariance, motion, state.recent.distrust, self.parameters
         )
@@ -317,8 +354,25 @@ class FastSlam:
         places: PlaceStates,
         rules: Rules,
     ) -> tuple[SlamState, ScanStatistics, Float, Int]:
-        """Return the state after a scan, the statistics of the scan, the weights, and the births of the
-        landmarks that each particle associates with the detections, shape (P, D)."""
+        """Update all particles by the detections of a scan; their arrays change in place.
+
+        Args:
+            state: State after the motion.
+            trees: Motion since the last used scan, by odometry or by trees.
+            centre: Detections in the base frame, shape (D, 2) [m]; D may be 0.
+            R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+            clear_range: Free distance by azimuth, shape (bins,) [m].
+            noise: Standard normal numbers, shape (P, 3).
+            measured: Pose that another source measured, if any.
+            doubted: Doubts about the odometry, for the running statistics.
+            places: States of the places in reach.
+            rules: Parameters.
+
+        Returns:
+            State after the scan, with the motion reset to zero; statistics of the scan; normalised weights,
+            shape (P,); and births of the landmarks that each particle associates with the detections, int64,
+            shape (P, D). A detection without landmark begins one, so each has a birth.
+        """
         found = len(centre)
         motion, covariance, recent = trees.motion, trees.covariance, state.recent
         if trees.slipped:
@@ -351,8 +405,9 @@ class FastSlam:
         return state, scan, weights, births
 
     def _places_in_reach(self, state: SlamState, centre: Float) -> PlaceStates:
-        """Return the states of the places whose landmarks the particles may associate with detections,
-        shape (D, 2) [m], after the motion of the state."""
+        """Return the states of the places whose landmarks any particle may associate with detections after
+        the motion of the state; an empty table if all of them are active. `centre` contains the detections in
+        the base frame, shape (D, 2) [m]."""
         x, y, _ = state.pose[state.best].tolist()
         apart = np.hypot(state.pose[:, 0] - x, state.pose[:, 1] - y).max()
         reach = self.parameters.view_range + self.parameters.distance_max + float(apart)
@@ -364,12 +419,13 @@ class FastSlam:
         self, state: SlamState, births: Int, centre: Float, R: Float, estimate: PoseEstimate, reach: float
     ) -> SlamState:
         """Return the state with the place of a scan, and with the known places that the scan confirms or
-        contradicts.
+        contradicts. Without detections, or without old places, no place is confirmed or contradicted.
 
         Args:
             state: State after the scan.
             births: Birth numbers of the landmarks of the detections in the best particle, shape (D,).
-            centre, R: The detections.
+            centre, R: Detections in the base frame, shape (D, 2) [m], and covariances xx, xy, yy, shape (D,
+                3) [m^2].
             estimate: Pose after the scan.
             reach: Distance of the farthest detection [m].
         """
@@ -388,12 +444,17 @@ class FastSlam:
         return replace(state, places=places)
 
     def _with_keyframe(self, state: SlamState, detections: Detections, birth: Int) -> SlamState:
-        """Return the state with the detections of this scan, and with a keyframe if the last one is far.
+        """Return the state with the detections of this scan, and with a keyframe if none exists or the last
+        one is at least `keyframe_distance` of driven path behind.
+
+        The detections of a scan are kept only if it is `keyframe_distance` / SCANS_MAX after the last kept
+        one.
 
         Args:
             state: State after the scan.
             detections: Detections of the scan.
-            birth: Birth number of the landmark of each detection, shape (D,).
+            birth: Birth number of the landmark of each detection, int64, shape (D,); rows with -1 are
+                omitted.
         """
         graph, scans, spacing = state.graph, state.since_keyframe, self.parameters.keyframe_distance
         # Scans from the same place share their errors.
@@ -416,8 +477,8 @@ class FastSlam:
         )
 
     def _keyframe(self, state: SlamState, scans: tuple[ScanDetections, ...], first_birth: int) -> Keyframe:
-        """Return the keyframe at the newest scan with the detections of scans since the last keyframe; see
-        Keyframe for `first_birth`."""
+        """Return the keyframe at the newest scan with the combined detections of `scans` since the last
+        keyframe, without any if `scans` is empty; see Keyframe for `first_birth`."""
         birth, centre, R = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
         if scans:
             weights = normalised(state.log_weight)
@@ -431,6 +492,16 @@ class FastSlam:
     def _by_trees(
         self, state: SlamState, centre: Float, R: Float, places: PlaceStates, rules: Rules
     ) -> TreeMotion:
+        """Return the motion since the last used scan by `against_slip`: that of the odometry, or that of the
+        trees where they contradict it.
+
+        Args:
+            state: State after the motion.
+            centre: Detections in the base frame, shape (D, 2) [m].
+            R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+            places: States of the places in reach.
+            rules: Parameters.
+        """
         return against_slip(
             state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
             state.recent.odometry_trust(noise_of(self.parameters)), centre, R, places, rules,
@@ -439,8 +510,16 @@ class FastSlam:
     def _shared(
         self, state: SlamState, motion: Float, covariance: Float, measured: PoseMeasurement | None
     ) -> SharedErrors:
-        """What is known after a motion and a measured pose of errors that all poses of its source share; the
-        particles' part of it is as it was."""
+        """Return the shared errors after a motion and a measured pose. The first measured pose with shared
+        errors begins them at the present estimate; the means and covariances of the particles are not updated
+        here.
+
+        Args:
+            state: State with the shared errors before the motion.
+            motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
+            covariance: Its covariance, shape (3, 3).
+            measured: The measured pose, if any.
+        """
         shared = state.shared.moved(motion, covariance)
         if measured is None or (measured.shared is None and not shared.begun):
             return shared
@@ -452,24 +531,34 @@ class FastSlam:
 
 
 def _at_scans(covariance: Float, graph: KeyframeGraph, scans: int) -> Float:
-    """Return the covariance of each scan's pose, shape (N, 3, 3): that of the keyframe before it."""
+    """Return the covariance of each scan's pose, shape (N, 3, 3): that of the last keyframe before or at the
+    scan, or of the first keyframe for earlier scans.
+
+    Args:
+        covariance: Covariance of each keyframe, shape (K, 3, 3), K > 0.
+        graph: Graph with these keyframes.
+        scans: Number of scans N.
+    """
     keyframe = np.searchsorted(graph.scans, np.arange(scans), side="right") - 1
     rows: Float = covariance[np.maximum(keyframe, 0)]
     return rows
 
 
 def _farthest(detections: Detections) -> float:
-    """Return the distance of the farthest detection [m], 0 without one."""
+    """Return the distance of the farthest detection from the base [m]; 0 without detections."""
     centre = detections.centre
     return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
 
 
 def _relative(estimate: PoseEstimate) -> Float:
+    """Return the covariance of an estimate with respect to the nearby landmarks, shape (3, 3): `relative`, or
+    `covariance` if that is None."""
     return estimate.covariance if estimate.relative is None else estimate.relative
 
 
 def rules_of(p: Slam) -> Rules:
-    """Return the parameters as the kernels take them."""
+    """Return the parameters that the compiled measurement update needs. `use_proposal` is False for the
+    method "fastslam1" only; `miss` is 1 / `misses_per_hit`."""
     return Rules(
         use_proposal=p.method != "fastslam1",
         gate=p.gate,
@@ -487,8 +576,19 @@ def rules_of(p: Slam) -> Rules:
 def _estimate(
     state: SlamState, weights: Float, p: Slam, reach: float
 ) -> tuple[PoseEstimate, FrameUncertainty, bool]:
-    """Return the pose, the uncertainty of the frame after it, and whether landmarks within `reach` [m]
-    determine it (always False where no other source measures poses)."""
+    """Return the pose, the uncertainty of the frame after it, and whether known landmarks within `reach`
+    determine it (always False before a measured pose with shared errors was used). The state is unchanged.
+
+    The pose is the weighted mean of the particles after the motion of the state. If the particles are apart
+    (`are_apart`), it is that of the best particle, and the covariance is enlarged by the square of the
+    difference to the mean.
+
+    Args:
+        state: State with the motion since the last used scan.
+        weights: Weights with sum 1, shape (P,).
+        p: Parameters.
+        reach: Maximum distance of landmarks that determine the pose [m]; 0 for a scan without detections.
+    """
     pose, mean, spread, n_eff = estimated(state.pose, weights, state.motion, state.motion_covariance)
     landmarks = state.map_of(state.best)
     known = landmarks

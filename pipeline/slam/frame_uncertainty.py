@@ -66,7 +66,8 @@ class FrameUncertainty:
 
         With landmarks of reference poses in reach, the result is `at_least(spread, C)`, where C is the mean
         of the covariances of their reference poses, transported to the pose and weighted by the numbers of
-        landmarks. Otherwise it is `spread` plus the transported `hidden`.
+        landmarks. Otherwise it is `spread` plus the transported `hidden`. Landmarks that precede all
+        reference poses do not count.
 
         Args:
             pose: x, y [m], yaw [rad], shape (3,).
@@ -113,7 +114,8 @@ class FrameUncertainty:
         return covariance, replace(self, hidden=covariance - spread)
 
     def with_reference(self, serial: int, scan: int, pose: Float, covariance: Float) -> FrameUncertainty:
-        """Return the state with a new reference pose, or unchanged if the last one is nearer than APART.
+        """Return the state with a new reference pose, or unchanged if x, y and yaw all differ from those of
+        the last one by less than APART.
 
         Args:
             serial: Birth number of the first landmark that this scan may begin.
@@ -156,7 +158,7 @@ class FrameUncertainty:
 
     def without_hidden(self) -> FrameUncertainty:
         """Return the state with `hidden` = 0: the particles were drawn with the complete covariance of the
-        pose."""
+        pose. All reference poses remain."""
         return replace(self, hidden=np.zeros((3, 3)))
 
 
@@ -201,7 +203,8 @@ def _with_frame(
     at: Float,
 ) -> tuple[Float, Float]:
     """Return the covariance and the new `hidden`, both of shape (3, 3); see `FrameUncertainty.with_pose`.
-    `place` holds the reference poses."""
+    `serial`, `place` and `covariance` are `serial`, `pose` and `covariance` of the reference poses, shapes
+    (M,), (M, 3) and (M, 3, 3); the other arguments are those of `with_pose` or attributes."""
     least, known = np.zeros((3, 3)), 0
     counts = np.zeros(len(serial), np.int64)
     for j in range(len(hits)):
@@ -239,6 +242,8 @@ def at_least(spread: Float, least: Float, noise: float = 0.0) -> Float:
     Args:
         spread, least: Covariances of x, y [m], yaw [rad], shape (3, 3).
         noise: Standard error of the ratio of their variances; 0 for exact covariances.
+    Raises:
+        LinAlgError: `spread` is not positive semidefinite.
     """
     # The regularisation grows with the spread: two distant particles spread along a line, and the rounding
     # error of the other directions is relative to that distance.

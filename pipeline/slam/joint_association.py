@@ -57,7 +57,7 @@ class JointSearch(NamedTuple):
 
 @compiled
 def search_for() -> JointSearch:
-    """Return work arrays for a search."""
+    """Return uninitialised work arrays for a search."""
     return JointSearch(
         np.empty(MOST, np.int64),
         np.empty(MOST, np.int64),
@@ -114,7 +114,9 @@ def choose_jointly(
     n: int,
     search: JointSearch,
 ) -> float:
-    """Find the most likely assignment; return its -2 log likelihood.
+    """Find the most likely assignment of the detections of n levels, and write it to `search.best` (-1 for a
+    detection without landmark); return its -2 log likelihood. After MOST_STEPS steps the best assignment so
+    far is the result; n = 0 gives 0.
 
     Args:
         pose: Pose by the odometry and the pairs that were accepted before.
@@ -122,7 +124,7 @@ def choose_jointly(
         gate2: Square of the maximum Mahalanobis distance.
         taken: Landmarks that are no choices, shape (L,); unchanged on return.
         n: Number of levels.
-        search: Work arrays with `detection`, `choices` and `landmark` of n levels; `best` is filled.
+        search: Work arrays with `detection`, `choices` and `landmark` of n levels.
     """
     _fill_bounds(pose, centre, R, covariance, gate2, n, search)
     least, steps, level = np.inf, 0, 0
@@ -173,19 +175,20 @@ def _accept(
     least: float,
     search: JointSearch,
 ) -> bool:
-    """Accept a choice of a level and write cost and pose of the next level; return False if the landmark is
-    taken, the pair is outside the gate, or the cost cannot fall below `least`.
+    """Accept a choice of a level: mark its landmark as taken and chosen, and write cost and pose of the next
+    level; return True. Return False, without a change, if the landmark is taken, the pair is outside the
+    gate, or the cost cannot fall below `least`.
 
     Args:
         level: Level of the search, which decides about one detection.
-        choice: Number of a landmark of this level; the number of landmarks means none.
+        choice: Row of `search.landmark[level]`; the number of its landmarks means none.
         centre, R, mean, covariance: See `innovation`.
-        hits: Hits of the landmarks.
+        hits: Hits of the landmarks, int32, shape (L,).
         gate2: Square of the gate.
-        hits_to_weigh: Least hits of a landmark that corrects the pose.
-        taken: Whether a landmark is taken; the chosen one is marked.
+        hits_to_weigh: Minimum hits of a landmark that corrects the pose.
+        taken: Whether a landmark is taken, shape (L,).
         least: Cost of the best assignment so far.
-        search: The search; the level after `level` is written.
+        search: The search.
     """
     pose = _read_pose(search.pose, level)
     if choice == search.choices[level]:
@@ -246,7 +249,8 @@ def _fill_bounds(
 @compiled_borrowing
 def _log_det_least(R0: float, R1: float, R2: float, covariance: Float, j: int) -> float:
     """Return a lower bound of log |C R C^T + Sigma_j| over all rotations C: |A + B|^(1/2) >= |A|^(1/2) +
-    |B|^(1/2) (Minkowski), where rotations do not change |A| and |B|."""
+    |B|^(1/2) (Minkowski), where rotations do not change |A| and |B|. R0, R1, R2 are xx, xy, yy of R;
+    `covariance` contains xx, xy, yy of each landmark, shape (L, 3), and j is a row of it."""
     Sigma = covariance[j, 0] * covariance[j, 2] - covariance[j, 1] * covariance[j, 1]
     both = np.sqrt(max(R0 * R2 - R1 * R1, 0.0)) + np.sqrt(max(Sigma, 0.0))
     return float(2.0 * np.log(both))

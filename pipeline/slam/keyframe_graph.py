@@ -89,11 +89,12 @@ def combined(scans: Sequence[ScanDetections | Keyframe], T_keyframe_base: Float)
     (bottom-k sampling; Broder 1997), near and far.
 
     Args:
-        scans: The scans.
-        T_keyframe_base: Pose of each scan with respect to the keyframe, shape (S, 3).
+        scans: The scans, at least one; they may have no detections.
+        T_keyframe_base: Pose of each scan with respect to the keyframe, x, y [m], yaw [rad], shape (S, 3).
 
     Returns:
-        Birth numbers, positions and covariances of the landmarks; see Keyframe.
+        Birth numbers, int64, shape (D,), in the order of the hash; positions in the frame of the keyframe,
+        shape (D, 2) [m]; and covariances xx, xy, yy, shape (D, 3) [m^2]; D is at most STEMS_MAX.
     """
     count = [len(s.birth) for s in scans]
     pose = np.repeat(T_keyframe_base, count, axis=0)
@@ -167,7 +168,7 @@ class KeyframeGraph:
 
     @property
     def scans(self) -> Int:
-        """Scan numbers of the keyframes, shape (K,)."""
+        """Scan numbers of the keyframes, int64, shape (K,), ascending."""
         return np.array([k.scan for k in self.keyframes], np.int64)
 
     @property
@@ -177,15 +178,17 @@ class KeyframeGraph:
 
     @property
     def nbytes(self) -> int:
-        """Size of all arrays."""
+        """Size of the poses and of the detections and covariances of the keyframes [bytes]; motions and loops
+        are not counted."""
         size = sum(
             k.birth.nbytes + k.centre.nbytes + k.R.nbytes + k.covariance.nbytes for k in self.keyframes
         )
         return size + self.pose.nbytes
 
     def with_keyframe(self, keyframe: Keyframe, pose: Float) -> KeyframeGraph:
-        """Return the graph with one more keyframe, at a pose by the filter, shape (3,). It replaces a
-        keyframe at the same scan."""
+        """Return the graph with one more keyframe, at a pose x, y [m], yaw [rad] by the filter, shape (3,).
+        It replaces the newest keyframe if that has the same scan. With more than KEYFRAMES_MAX keyframes the
+        result is thinned."""
         kept = len(self.keyframes) - (self.newest_scan == keyframe.scan)
         graph = replace(
             self,
@@ -196,10 +199,12 @@ class KeyframeGraph:
         return graph.thinned() if len(graph.keyframes) > KEYFRAMES_MAX else graph
 
     def with_loop(self, anchor: int, T_map_base: Pose2, covariance: Float) -> KeyframeGraph:
-        """Return the graph with a loop from an earlier keyframe to the newest one.
+        """Return the graph with a loop from an earlier keyframe to the newest one; unchanged with fewer than
+        two keyframes.
 
         Args:
-            anchor: Number of a scan near the place, at or after the earlier keyframe.
+            anchor: Number of a scan near the place. The loop begins at the last keyframe before or at it, or
+                at the first keyframe for an earlier scan.
             T_map_base: Pose of the newest keyframe, found by the trees around the anchor.
             covariance: Covariance of x, y [m], yaw [rad] of this pose, axes of the map, shape (3, 3).
         """
@@ -214,22 +219,30 @@ class KeyframeGraph:
         return replace(self, loops=(*self.loops, LoopEdge(scans, motion, C @ covariance @ C.T)))
 
     def first_birth_after(self, scan: int) -> int:
-        """Return the birth number of the first landmark that was begun at the next keyframe after a scan."""
+        """Return the `first_birth` of the first keyframe after a scan, or of the newest keyframe if none is
+        later.
+
+        Raises:
+            IndexError: The graph has no keyframe.
+        """
         row = int(np.searchsorted(self.scans, scan, side="right"))
         return self.keyframes[min(row, len(self.keyframes) - 1)].first_birth
 
     def solved_by(self, solution: Solution) -> KeyframeGraph:
-        """Return the graph at its solution."""
+        """Return the graph with the poses of its solution, no revisits, and `solved` at the present number of
+        keyframes."""
         return replace(self, pose=solution.pose, revisits=0, solved=len(self.keyframes))
 
     @property
     def is_due(self) -> bool:
-        """Whether revisits were added since the last solution, and the graph has grown by GROWTH."""
+        """Whether revisits were added since the last solution, and the graph has grown by the share GROWTH,
+        and by GROWTH_MIN keyframes at least."""
         grown = len(self.keyframes) - self.solved
         return self.revisits > 0 and grown >= max(GROWTH_MIN, GROWTH * len(self.keyframes))
 
     def renamed(self, birth: Int, name: Int) -> KeyframeGraph:
-        """Return the graph with other birth numbers for some landmarks, which are the same trees.
+        """Return the graph with other birth numbers for some landmarks, which are the same trees; unknown
+        birth numbers have no effect.
 
         Args:
             birth: Their birth numbers, int64, shape (N,), ascending.
@@ -286,7 +299,9 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(kept), pose=self.pose[rows], solved=solved)
 
     def solve(self, *, new_loop: bool = False) -> Solution | None:
-        """Return the minimum next to the present poses; None without convergence.
+        """Return the minimum next to the present poses. None with fewer than two keyframes, if the problem is
+        singular, or if no step decreases the cost. After ITERATIONS_MAX steps the best estimate so far is the
+        result. The graph is unchanged.
 
         Args:
             new_loop: Whether the last loop was just added. The Cauchy kernel has no slope far from the
@@ -304,7 +319,8 @@ class KeyframeGraph:
         return None if minimum is None else problem.solution(*minimum)
 
     def _is_revisit(self, keyframe: Keyframe) -> bool:
-        """Whether a keyframe shows at least two known stems for the first time in REVISIT_DISTANCE."""
+        """Return whether a keyframe shows at least two known stems for the first time in REVISIT_DISTANCE of
+        path; False while the path is shorter."""
         recent: list[Int] = []
         first_birth = -1
         for before in reversed(self.keyframes):
@@ -323,6 +339,8 @@ class _Problem:
     """A graph as arrays of K poses, L landmarks, E motions and loops, and M detections."""
 
     def __init__(self, graph: KeyframeGraph) -> None:
+        """Convert a graph with at least two keyframes. Stems with a single detection are omitted, and so are
+        motions with infinite covariance."""
         keyframes = graph.keyframes
         birth = np.concatenate([k.birth for k in keyframes])
         row = np.repeat(np.arange(len(keyframes)), [len(k.birth) for k in keyframes])
@@ -349,11 +367,16 @@ class _Problem:
         self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
 
     def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Sparse, Float] | None:
-        """Return poses, stems, normal matrix and weights of motions and loops at the minimum by
-        Levenberg-Marquardt; None without convergence.
+        """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
+        iteration ends without a test of convergence.
 
         Args:
             quadratic_loops: Number of loops at the end that have no Cauchy kernel.
+
+        Returns:
+            Poses, shape (K, 3), yaw wrapped; positions of the stems, shape (L, 2) [m]; normal matrix, sparse,
+            shape (3K + 2L, 3K + 2L); and weights of motions and loops, shape (E,). None if the normal matrix
+            is singular or the damping exceeds its limit.
         """
         x, l = self.pose.copy(), self._triangulated()  # noqa: E741
         cost, H, g, weight = self._linearised(x, l, quadratic_loops)
@@ -380,13 +403,24 @@ class _Problem:
 
     def solution(self, x: Float, l: Float, H: Sparse, weight: Float) -> Solution:  # noqa: E741
         """Return the record of a minimum. A diagonal block of the normal matrix H is the information of a
-        pose given all other unknowns."""
+        pose given all other unknowns.
+
+        Args:
+            x: Poses, shape (K, 3).
+            l: Stems, shape (L, 2) [m].
+            H: Normal matrix, sparse, shape (3K + 2L, 3K + 2L).
+            weight: Weights of motions and loops, shape (E,).
+
+        Raises:
+            LinAlgError: Nothing observes the newest pose.
+        """
         end = 3 * len(x)
         conditional = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
         return Solution(x, self.birth, l, self._marginals(H), conditional, weight[self.motions :])
 
     def _triangulated(self) -> Float:
-        """Return the mean position of each landmark by its detections, shape (L, 2) [m]."""
+        """Return the mean position of each landmark by its detections at the poses in `pose`, shape (L, 2)
+        [m]."""
         c, s = np.cos(self.pose[self.row, 2]), np.sin(self.pose[self.row, 2])
         x = self.pose[self.row, 0] + c * self.z[:, 0] - s * self.z[:, 1]
         y = self.pose[self.row, 1] + s * self.z[:, 0] + c * self.z[:, 1]
@@ -399,7 +433,17 @@ class _Problem:
         l: Float,  # noqa: E741
         quadratic_loops: int,
     ) -> tuple[float, Sparse, Float, Float]:
-        """Return robust cost, normal matrix, gradient, and weights of motions and loops at an estimate."""
+        """Return cost and linear system at an estimate.
+
+        Args:
+            x: Poses, shape (K, 3).
+            l: Stems, shape (L, 2) [m].
+            quadratic_loops: Number of loops at the end that have no Cauchy kernel.
+
+        Returns:
+            Robust cost; normal matrix, sparse, shape (3K + 2L, 3K + 2L); gradient, shape (3K + 2L,), poses
+            first; and weights of motions (1) and loops by their kernel, shape (E,).
+        """
         from scipy import sparse
 
         K, L, M, E = len(x), len(l), len(self.row), len(self.first)
@@ -458,6 +502,9 @@ class _Problem:
         return cost, (A.T @ A).tocsc(), A.T @ b, weight
 
     def _step(self, H: Sparse, g: Float, damping: float) -> Float | None:
+        """Return the Levenberg-Marquardt step for the normal matrix H and the gradient g, shape (3K + 2L,);
+        None if the system is singular or the step is not finite. `damping` is relative to the diagonal of H.
+        """
         step = self._factorised(H, damping)
         if step is None:
             return None
@@ -465,7 +512,8 @@ class _Problem:
         return out if np.isfinite(out).all() else None
 
     def _factorised(self, H: Sparse, damping: float) -> Sparse | None:
-        """Return LU factors of the damped normal matrix with the first pose fixed; None if it is singular."""
+        """Return LU factors of the normal matrix H plus `damping` times its diagonal, with the first pose
+        fixed; None if it is singular."""
         from scipy import sparse
         from scipy.sparse.linalg import splu
 
@@ -483,7 +531,9 @@ class _Problem:
             return None
 
     def _marginals(self, H: Sparse) -> Float:
-        """Return the covariance of each keyframe's pose, shape (K, 3, 3)."""
+        """Return the covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3). It is
+        computed from the normal matrix H for at most MARGINALS keyframes and interpolated linearly by row in
+        between."""
         K = len(self.pose)
         factors: Sparse = self._factorised(H, 0.0)
         chosen = np.unique(np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64))
@@ -500,17 +550,23 @@ class _Problem:
 
 
 def _root_information(covariance: Float) -> Float:
-    """Return W with W^T W = covariance^-1, shape (N, n, n)."""
+    """Return upper triangular matrices W with W^T W = covariance^-1, shape (N, n, n), for covariances of this
+    shape.
+
+    Raises:
+        LinAlgError: A covariance is not positive definite.
+    """
     if not len(covariance):
         return covariance
     return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
 
 
 def _weight(d2: Float) -> Float:
-    """Return the weights of squared errors by the Cauchy kernel."""
+    """Return the weights of squared errors [sigma^2] by the Cauchy kernel: 1 for 0, towards 0 for large
+    errors; same shape."""
     return 1.0 / (1.0 + d2 / CAUCHY**2)
 
 
 def _cost(d2: Float) -> Float:
-    """Return the Cauchy kernel of squared errors."""
+    """Return the cost of squared errors [sigma^2] by the Cauchy kernel; same shape."""
     return CAUCHY**2 * np.log1p(d2 / CAUCHY**2)

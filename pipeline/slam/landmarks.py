@@ -24,8 +24,8 @@ def kalman_update(
         j: Row of the landmark.
         z0, z1: Measured position [m].
         R0, R1, R2: Covariance xx, xy, yy of the measurement [m^2].
-        looks: Maximum number of independent views. Successive views of a trunk share their error, so that the
-            variances never fall below those of R divided by this number.
+        looks: Maximum number of independent views, > 0. Successive views of a trunk share their error, so
+            that the variances never fall below those of R divided by this number.
     """
     S0, S1, S2 = Sigma[j, 0], Sigma[j, 1], Sigma[j, 2]
     a, b, d = S0 + R0, S1 + R1, S2 + R2  # S = Sigma + R, H = I
@@ -56,8 +56,9 @@ def merge_duplicates(
 ) -> None:
     """Merge each landmark that was seen with those within the gate that were not seen, in place.
 
-    The lower birth number remains; the other row gets the score 0 and is removed later. Landmarks that are
-    both seen in this scan are never merged.
+    The merged position is the Kalman update of both, the hits are added, and the better score and the lower
+    birth number remain; the other row gets the score 0 and is removed later. Landmarks that are both seen in
+    this scan are never merged.
 
     Args:
         mean, covariance, hits, score, birth: Landmarks, see Maps.

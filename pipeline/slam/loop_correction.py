@@ -39,7 +39,9 @@ def corrected_path(path: Float, graph: KeyframeGraph, solution: Solution) -> Flo
     """Return the path with the keyframes of a solution, x, y [m], yaw [rad], shape (N, 3).
 
     Between two keyframes the path keeps its shape, and the difference at the second one is spread evenly.
-    Behind the last keyframe the path moves with it. `path` is the path before, with the same shape.
+    Scans before the first keyframe and after the last one move with it. A section without odometry (infinite
+    covariance) moves with the keyframe at its start. `path` is the path before, with the same shape; the
+    graph has at least one keyframe.
     """
     scans = graph.scans
     keyframe = np.maximum(np.searchsorted(scans, np.arange(len(path)), side="right") - 1, 0)
@@ -55,7 +57,8 @@ def corrected_landmarks(
 ) -> MapColumns:
     """Return the landmarks of one particle after a correction of the path.
 
-    A landmark of the graph is at its solution; another one moves with the keyframe that began it.
+    A landmark of the graph is at its solution; another one moves with the keyframe that began it. All
+    covariances turn with that keyframe. Hits, scores and births are unchanged.
 
     Args:
         known: Landmarks of the particle.
@@ -72,8 +75,15 @@ def corrected_landmarks(
 def _moved_rigidly(
     place: Float, birth: Int, graph: KeyframeGraph, solution: Solution, path: Float
 ) -> tuple[Float, Float]:
-    """Return positions, shape (L, 2) [m], each moved with the keyframe that began it, and their rotations,
-    shape (L,) [rad]."""
+    """Return positions, each moved with the keyframe that began it, shape (L, 2) [m], and their rotations,
+    shape (L,) [rad]. Landmarks from before the first keyframe move with the first one.
+
+    Args:
+        place: Positions of the landmarks, shape (L, 2) [m].
+        birth: Their birth numbers, int64, shape (L,).
+        graph, solution: Keyframes and their corrected poses.
+        path: Path before the correction, shape (N, 3).
+    """
     first = np.array([k.first_birth for k in graph.keyframes], np.int64)
     row = np.maximum(np.searchsorted(first, birth, side="right") - 1, 0)
     was, now = path[graph.scans][row], solution.pose[row]
@@ -84,8 +94,9 @@ def _moved_rigidly(
 
 
 def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
-    """Return pairs of landmarks at the same place, one begun before a loop and one after it: the birth
-    numbers of the later ones, ascending, and of the earlier ones, int64, shape (N,) each.
+    """Return pairs of landmarks within TWICE of each other, one begun before a loop and one after it, each
+    landmark in at most one pair (most likely pairs first): the birth numbers of the later ones, ascending,
+    and of the earlier ones, int64, shape (N,) each.
 
     Args:
         known: Landmarks of one particle after the correction.
@@ -102,9 +113,17 @@ def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
 
 
 def joined(known: MapColumns, birth: Int, name: Int) -> MapColumns:
-    """Return the landmarks without those of the birth numbers `birth`, whose hits go to those of the birth
-    numbers `name`; see `same_trees`. Both lists have one entry per pair; all births must exist. The better
-    score of a pair is kept."""
+    """Return the landmarks without those of the birth numbers `birth`; their hits are added to the landmarks
+    of the birth numbers `name`, which keep position and covariance and get the better score of the pair.
+
+    Args:
+        known: Landmarks of one particle.
+        birth: Landmarks that are removed, int64, shape (N,).
+        name: The remaining landmark of each pair, int64, shape (N,); see `same_trees`.
+
+    Raises:
+        KeyError: A birth number does not exist.
+    """
     hits, score = known.hits.copy(), known.score.copy()
     keep = np.ones(len(known.birth), np.bool_)
     row = {int(b): k for k, b in enumerate(known.birth)}
@@ -117,14 +136,15 @@ def joined(known: MapColumns, birth: Int, name: Int) -> MapColumns:
 
 
 def without_jumps(path: Float, motion: Float) -> tuple[Float, int]:
-    """Return the path with each jump replaced by the motion of the odometry, and the number of jumps.
+    """Return a copy of the path with each jump replaced by the motion of the odometry, and the number of
+    jumps; the path after a jump moves rigidly.
 
     A jump is a step of the path that differs from the odometry by more than JUMP or JUMP_TURN: a correction
     moved the pose, not the robot. A long step that the odometry reports is no jump, since scans may be lost.
 
     Args:
         path: x, y [m], yaw [rad], shape (N, 3).
-        motion: Motion by odometry from each scan to the next, shape (N, 3).
+        motion: Motion by odometry from the scan before to each scan, shape (N, 3); row 0 is ignored.
     """
     step = composed(inverse(path[:-1]), path[1:])
     apart = step - motion[1:]
@@ -139,8 +159,9 @@ def without_jumps(path: Float, motion: Float) -> tuple[Float, int]:
 
 
 def drift_of(path: Float, first: int, noise: Noise) -> Float:
-    """Return the covariance of the last pose relative to that of scan `first`, x, y [m], yaw [rad], shape
-    (3, 3), if only odometry connects the two. A heading error moves all later positions."""
+    """Return the covariance of the last pose relative to that of scan `first`, x, y [m], yaw [rad], shape (3,
+    3), if only odometry connects the two. A heading error moves all later positions. Zeros if `first` is the
+    last scan. `path` has the shape (N, 3)."""
     step = np.diff(path[first:], axis=0)
     distance = np.hypot(step[:, 0], step[:, 1])
     heading = noise.turn_distance**2 * distance + noise.turn**2 * np.abs(wrap_angle(step[:, 2]))

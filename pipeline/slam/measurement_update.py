@@ -34,7 +34,8 @@ def against_slip(
     rules: Rules,
 ) -> TreeMotion:
     """Return the motion by odometry, corrected with the map of the best particle, see `motion_by_trees`. With
-    fewer than FEWEST_PAIRS detections it is the odometry.
+    fewer than FEWEST_PAIRS detections it is the odometry. Landmarks of inactive places are not used. All
+    arguments are unchanged.
 
     Args:
         pose: Poses before the motion, shape (P, 3).
@@ -73,13 +74,14 @@ def use_scan(
     rules: Rules,
     measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, float, Int]:
-    """Update poses, log weights and maps of all particles in place.
+    """Update poses, log weights and maps of all particles in place; the greatest log weight is 0 then.
 
-    The arguments are those of `particle_update.observe`.
+    The arguments are those of `particle_update.observe`; there may be no detections.
 
     Returns:
-        Maps, grown where they had no space for new landmarks; normalised weights, shape (P,); both results of
-        `mean_statistics`; and births of the associated landmarks, int64, shape (P, D).
+        Maps, grown where they had no space for new landmarks (then the arrays of the argument are stale);
+        normalised weights, shape (P,); both results of `mean_statistics`; and births of the associated or new
+        landmarks, int64, shape (P, D).
     """
     found = centre.shape[0]
     reach = 0.0
@@ -109,7 +111,8 @@ def estimated(
     pose: Float, weights: Float, motion: Float, motion_covariance: Float
 ) -> tuple[Float, Float, Float, float]:
     """Return the poses after a motion, shape (P, 3), their mean and covariance (see `weighted_pose`), and the
-    effective number of particles."""
+    effective number of particles, 1 / sum of squared weights; see `weighted_pose` for the arguments, except
+    that `pose` contains the poses before the motion."""
     particles = moved_poses(pose, motion)
     mean, covariance = weighted_pose(particles, weights, motion, motion_covariance)
     return particles, mean, covariance, 1.0 / (weights * weights).sum()

@@ -123,7 +123,7 @@ def compounded(
     motion: Float, covariance: Float, x: float, y: float, yaw: float, noise: Float
 ) -> tuple[Float, Float]:
     """Return the composition of a motion and a step x, y [m], yaw [rad], and its covariance F P F^T + G Q
-    G^T.
+    G^T. The yaw of the result is in [-pi, pi); arguments are unchanged.
 
     F is the Jacobian by the motion and G the rotation of the step into the frame of the motion; P is
     `covariance` and Q is `noise`, both of shape (3, 3). See `compound`.
@@ -300,7 +300,8 @@ def correct_by_pose(mu: Float, P: Float, z: Float, R: Float) -> float:
 @compiled
 def inverted(S: Float) -> tuple[Float, float]:
     """Return the inverse of a symmetric positive definite matrix of shape (3, 3), and its determinant.
-    Cofactors are used because the library function takes seven seconds to compile."""
+    Cofactors are used because the library function takes seven seconds to compile. For a singular matrix the
+    determinant is 0 and the inverse contains inf or NaN."""
     inverse = np.empty((3, 3))
     for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
@@ -316,7 +317,8 @@ def inverted(S: Float) -> tuple[Float, float]:
 
 @compiled
 def moved_poses(pose: Float, motion: Float) -> Float:
-    """Return poses after one common motion, T_map_after = T_map_pose T_motion for each row, shape (P, 3).
+    """Return poses after one common motion, T_map_after = T_map_pose T_motion for each row, shape (P, 3),
+    with yaw in [-pi, pi).
 
     Args:
         pose: x, y [m], yaw [rad] of each pose, shape (P, 3).

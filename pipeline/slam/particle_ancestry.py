@@ -62,19 +62,21 @@ class Genealogy:
         return cls(settled, recent)
 
     def __len__(self) -> int:
+        """Return the number of scans."""
         return BLOCK * len(self.settled) + len(self.recent)
 
     @property
     def nbytes(self) -> int:
-        """Size of all arrays except the founders."""
+        """Size of all arrays except the founders [bytes]."""
         poses = sum(block.nbytes for block in self.settled) + sum(g.pose.nbytes for g in self.recent)
         return poses + sum(g.ancestors.nbytes for g in self.recent if g.ancestors is not None)
 
     def with_scan(self, pose: Float, ancestors: Int | None, leaf: int) -> Genealogy:
-        """Return the ancestry with one more scan.
+        """Return the ancestry with one more scan. When more than RECENT_POSES poses are kept, the oldest
+        BLOCK scans are reduced to the path of `leaf`.
 
         Args:
-            pose: Poses before resampling, shape (P, 3).
+            pose: Poses x, y [m], yaw [rad] before resampling, shape (P, 3); stored as float32.
             ancestors: Ancestor of each particle after resampling, shape (Q,), or None.
             leaf: The best particle after the scan; the distant past keeps its path.
         """
@@ -94,11 +96,12 @@ class Genealogy:
     @property
     def distinct_ancestors(self) -> int:
         """Number of distinct ancestors of the particles FOUNDED to 2 FOUNDED scans ago, or at the first scan
-        of a shorter run."""
+        of a shorter run. 0 before the first scan and after `of_path`."""
         return 0 if self.founders is None else int(np.count_nonzero(np.bincount(self.founders[1])))
 
     def redrawn(self, rows: Int) -> Genealogy:
-        """Return the ancestry of redrawn particles: particle k descends from particle rows[k]."""
+        """Return the ancestry of redrawn particles: particle k descends from particle rows[k]. `rows` is
+        int64, shape (Q,). The ancestry itself without recent scans."""
         if not self.recent:
             return self
         last = self.recent[-1]
@@ -107,7 +110,9 @@ class Genealogy:
         return Genealogy(self.settled, (*self.recent[:-1], Generation(last.pose, ancestors)), founders)
 
     def path(self, leaf: int) -> Float:
-        """Return the path of particle `leaf` of the newest scan, x, y [m], yaw [rad], shape (N, 3)."""
+        """Return the path of particle `leaf` of the newest scan, x, y [m], yaw [rad], shape (N, 3). The
+        oldest scans, which are settled, are those of the particle that was best when they were settled. Shape
+        (0, 3) without scans."""
         return np.concatenate([*self.settled, _walk(self.recent, leaf)])
 
     def mean_motion_from(self, scans: Int, weights: Float) -> Float:
@@ -143,7 +148,8 @@ def _founders_after(
     scans: int, founders: tuple[Int, Int] | None, particles: int, ancestors: Int | None
 ) -> tuple[Int, Int]:
     """Return the founders after one more scan (see Genealogy); `scans`: number of scans before it. `founders`
-    is None before the first scan, and `ancestors`, shape (P,), None without resampling."""
+    is None before the first scan, and `ancestors`, shape (P,), None without resampling. `particles` is their
+    number P."""
     newer, older = founders or (np.arange(particles),) * 2
     if scans % FOUNDED == 0:
         newer, older = np.arange(particles), newer
@@ -151,13 +157,16 @@ def _founders_after(
 
 
 def _mean(poses: Float, weights: Float) -> Float:
-    """Return the weighted mean of similar poses, shape (P, 3)."""
+    """Return the weighted mean of similar poses x, y [m], yaw [rad], shape (P, 3), as shape (3,). `weights`
+    have the sum 1, shape (P,); yaws are averaged as differences to the first one."""
     turn = wrap_angle(poses[:, 2] - poses[0, 2])
     yaw = float(wrap_angle(poses[0, 2] + weights @ turn))
     return np.array([*(weights @ poses[:, :2]), yaw])
 
 
 def _walk(generations: Sequence[Generation], leaf: int) -> Float:
+    """Return the pose x, y [m], yaw [rad] of particle `leaf` of the last generation and of its ancestors in
+    each generation before, oldest first, shape (len(generations), 3)."""
     rows = np.empty((len(generations), 3))
     for i in range(len(generations) - 1, -1, -1):
         ancestors = generations[i].ancestors

@@ -59,19 +59,20 @@ class MapColumns(NamedTuple):
     birth: Int
 
     def take(self, rows: Int | Bool) -> MapColumns:
-        """Return some of the landmarks."""
+        """Return copies of some landmarks, by row numbers or by a mask of shape (L,)."""
         return MapColumns(
             self.mean[rows], self.covariance[rows], self.hits[rows], self.score[rows], self.birth[rows]
         )
 
 
 def empty_maps(particles: int) -> Maps:
-    """Return maps without landmarks."""
+    """Return maps without landmarks for a number of particles, with an empty pool."""
     return _with_pool(np.full((particles, 1), -1, np.int32), np.zeros(particles, np.int32), 0)
 
 
 def shared_map(particles: int, columns: MapColumns) -> Maps:
-    """Return maps that all have the same landmarks, in shared blocks."""
+    """Return maps of a number of particles that all have the same landmarks, in shared blocks without free
+    rows. Columns of length 0 give maps without landmarks."""
     n = len(columns.hits)
     k = max(-(-n // ROOM), 1)
     maps = _with_pool(
@@ -89,7 +90,8 @@ def shared_map(particles: int, columns: MapColumns) -> Maps:
 
 
 def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
-    """Return maps with these blocks and an empty pool of a number of rows."""
+    """Return maps with these blocks and a pool of `rows` rows without landmarks: no owners, no free rows,
+    empty bounding boxes. `block` and `places` are as in Maps and are not copied."""
     nowhere = np.tile([np.inf, np.inf, -np.inf, -np.inf], (rows, 1))
     return Maps(
         block=block,
@@ -165,7 +167,7 @@ def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
 
 @compiled
 def _with_block(maps: Maps, block: Int32) -> Maps:
-    """Return the maps with another array of blocks."""
+    """Return the maps with another array of blocks. Both share all other arrays."""
     return Maps(
         block, maps.places, maps.mean, maps.covariance, maps.hits, maps.score, maps.birth, maps.box,
         maps.owners, maps.free, maps.free_count,
@@ -198,8 +200,8 @@ def taken(maps: Maps, rows: Int) -> Maps:
 
 
 def is_sound(maps: Maps, particles: int) -> bool:
-    """Return whether maps from a file are consistent: shapes, number of particles, indices and numbers of
-    owners."""
+    """Return whether maps from a file are consistent: shapes, number of particles, indices, numbers of owners
+    and free rows. Positions, covariances, hits and scores are not checked."""
     template = _with_pool(maps.block, maps.places, len(maps.owners))
     if any(getattr(maps, name).shape != getattr(template, name).shape for name in Maps._fields):
         return False
@@ -220,7 +222,8 @@ def is_sound(maps: Maps, particles: int) -> bool:
 
 @compiled
 def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
-    """Return copies of the landmarks of particle p: the columns of `MapColumns`."""
+    """Return copies of the landmarks of particle p: the columns of `MapColumns`. Unused places (hits 0) are
+    skipped; the order is that of the places."""
     places = maps.places[p]
     mean, covariance = np.empty((places, 2)), np.empty((places, 3))
     hits, score = np.empty(places, np.int32), np.empty(places, np.float32)
@@ -240,7 +243,8 @@ def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
 @compiled
 def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32, Int]:
     """Return the landmarks of particle p within `reach` [m] of x, y [m]: positions, shape (L, 2) [m];
-    covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, and birth numbers, int64, shape (L,)."""
+    covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, and birth numbers, int64, shape (L,). The
+    distance must be smaller than `reach`; the arrays are copies."""
     places = maps.places[p]
     mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
     birth = np.empty(places, np.int64)
@@ -310,7 +314,7 @@ def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: I
 
 @compiled_within
 def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: float) -> None:
-    """Extend the bounding box of row b of the pool by another box."""
+    """Extend the bounding box of row b of the pool by another box. In place."""
     maps.box[b, 0], maps.box[b, 1] = min(maps.box[b, 0], x_min), min(maps.box[b, 1], y_min)
     maps.box[b, 2], maps.box[b, 3] = max(maps.box[b, 2], x_max), max(maps.box[b, 3], y_max)
 
@@ -318,7 +322,8 @@ def widen(maps: Maps, b: int, x_min: float, y_min: float, x_max: float, y_max: f
 @compiled_within
 def own_block(maps: Maps, p: int, k: int) -> int:
     """Return the row of the pool of block k of particle p for writing. A shared or unused block gets a free
-    row first. The pool must have a free row."""
+    row first. The pool must have a free row. The maps change in place; the content of a shared block is
+    copied."""
     b = maps.block[p, k]
     if b >= 0 and maps.owners[b] == 1:
         return int(b)

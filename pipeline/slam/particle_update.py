@@ -82,7 +82,7 @@ class Near(NamedTuple):
 
 @compiled
 def near_for(landmarks: int) -> Near:
-    """Return work arrays for a number of landmarks."""
+    """Return uninitialised work arrays for this number of landmarks; the hash grid is empty."""
     n = landmarks
     return Near(
         np.empty(n, np.int32),
@@ -101,8 +101,16 @@ def near_for(landmarks: int) -> Near:
 
 @compiled
 def predict(pose: Float, motion: Float, covariance: Float, noise: Float, use_proposal: bool) -> Float:
-    """Return the poses after a motion, shape (P, 3); without `use_proposal` they are drawn from its
-    covariance, see `Rules`."""
+    """Return the poses after a motion, shape (P, 3). With `use_proposal` each pose is only moved; otherwise
+    it is drawn from the Gaussian about the moved pose.
+
+    Args:
+        pose: x, y [m], yaw [rad] of each particle, shape (P, 3); unchanged.
+        motion: Motion in the frame of each particle, shape (3,).
+        covariance: Covariance of `motion` in the same frame, shape (3, 3).
+        noise: Standard normal numbers, shape (P, 3); used only without `use_proposal`.
+        use_proposal: See `Rules`.
+    """
     P = np.empty((3, 3))
     mu = np.empty(3)
     moved = np.empty_like(pose)
@@ -144,13 +152,15 @@ def observe(
     mu: Float,
     P: Float,
 ) -> None:
-    """Update all particles in place.
+    """Update all particles with the detections of one scan: correct and draw poses, update, add, miss and
+    merge landmarks, and weigh. All results are written into the arguments.
 
     Args:
         pose: Poses before the motion, shape (P, 3); become the poses after the scan.
         moved: Poses after the motion, see `predict`.
-        log_weight: Log weights, shape (P,).
-        maps: Maps of the particles; the pool has the free rows that `blocks_in_reach` requires.
+        log_weight: Log weights, shape (P,); the log likelihood of the scan and of the measured pose is added.
+        maps: Maps of the particles, changed in place; the pool has the free rows that `blocks_in_reach`
+            requires.
         near_blocks, near_lengths: First two results of `blocks_in_reach`.
         motion, motion_covariance: Motion since the last used scan in the frame of each particle, shapes (3,)
             and (3, 3).
@@ -159,13 +169,15 @@ def observe(
         R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
         clear_range: Free range per direction [m], see `FastSlam.process`.
         reach: Distance beyond which landmarks are not used [m].
-        first_birth: Birth number of the first detection.
+        first_birth: Birth number of the first detection; a detection d without landmark begins one with the
+            birth `first_birth` + d.
         places: States of the places; landmarks of inactive places are not used, and those of uncertain ones
             are not updated.
         rules: Parameters.
         near, room: Work arrays for the landmarks in reach and for pairs.
-        statistics: Statistics of the scan by particle, shape (P, STATISTICS); filled.
-        measured: Pose measured by another source; its shared errors are updated.
+        statistics: Statistics of the scan by particle, shape (P, STATISTICS), zeros; filled.
+        measured: Pose measured by another source, `z` of length 0 for none; its shared errors are updated in
+            place.
         births: Birth of the landmark of each detection, int64, shape (P, D); filled.
         mu, P: Work arrays for a pose, shape (3,), and its covariance, shape (3, 3), zeros.
     """
@@ -220,9 +232,23 @@ def _gather(
     places: PlaceStates,
     near: Near,
 ) -> tuple[int, int]:
-    """Fill `near` with the active landmarks of particle p within `reach` [m] of the pose mu; return their
-    number and the number of unused rows of its blocks. Landmarks of uncertain places are marked as seen, so
-    that they are neither updated nor missed nor merged."""
+    """Copy the landmarks of particle p within `reach` of the pose into `near`, except those of inactive
+    places. Landmarks of uncertain places are marked as seen, so that they are neither updated nor missed nor
+    merged.
+
+    Args:
+        maps: Maps of the particles; unchanged.
+        p: Row of the particle.
+        near_blocks, blocks: Its blocks in reach, int32, shape (P, K), of which row p has this number of valid
+            entries.
+        mu: x, y [m], yaw [rad] of the particle, shape (3,).
+        reach: Distance [m].
+        places: States of the places.
+        near: Work arrays; filled from row 0.
+
+    Returns:
+        Number of landmarks in `near`, and number of unused places of these blocks in `near.free`.
+    """
     n, free = 0, 0
     count = maps.places[p]
     for i in range(blocks):
@@ -270,14 +296,25 @@ def _learn(
     first_birth: int,
     rules: Rules,
 ) -> int:
-    """Update the landmarks of particle p that were detected and append new ones; return the number of rows of
-    `near` then.
+    """Update the landmarks of particle p that were detected, mark them as seen, and append a new landmark for
+    each detection without one; return the number of rows of `near` then.
+
+    Landmarks that were marked as seen before (of uncertain places) are unchanged. A score grows by 1 up to
+    SCORE_MAX. A new landmark has one hit, the score 1 and the covariance of its detection.
 
     Args:
+        pose: Poses after the scan, shape (P, 3).
+        p: Row of the particle.
         c, s: Cosine and sine of the yaw of the particle.
+        maps: Maps; `places` of the particle grows where `near.free` has no place left.
+        near: Landmarks in reach; changed in place.
         known: Number of landmarks in `near`.
         free: Number of unused places in `near.free`.
         landmark_of: Row of `near` of each detection, -1 for none, int64, shape (D,).
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        first_birth: Birth number of the first detection.
+        rules: Parameters.
     """
     n = known
     for d in range(centre.shape[0]):
@@ -308,7 +345,9 @@ def _learn(
 
 @compiled_borrowing
 def _farthest_missed(clear_range: Float, view_range: float) -> float:
-    """Return the square of the distance beyond which no landmark can be missed in any direction [m^2]."""
+    """Return the square of the distance beyond which no landmark can be missed in any direction [m^2]: of the
+    smaller of `view_range` [m] and the largest free range less BEHIND; 0 if no direction is free.
+    `clear_range` has the shape (bins,) [m]."""
     free = 0.0
     for k in range(clear_range.shape[0]):
         if clear_range[k] - BEHIND > free:
@@ -329,13 +368,22 @@ def _miss(
     rules: Rules,
     statistics: Float,
 ) -> float:
-    """Decrease the score of the landmarks in free view that were not detected; return the number of
-    well-known ones among them.
+    """Decrease the score of the landmarks in free view that were not seen, by `rules.miss`; return the number
+    of well-known ones among them. Their hits, each at most MOST_HITS, are added to the column MISSED of row
+    p.
+
+    A landmark is in free view if it is nearer than the free range in its direction less BEHIND.
 
     Args:
+        pose: Poses after the scan, shape (P, 3).
+        p: Row of the particle.
         c, s: Cosine and sine of the yaw of the particle.
+        near: Landmarks in reach; `score` and `changed` are written.
         known: Number of landmarks known before the scan.
-        farthest: Result of `_farthest_missed`.
+        clear_range: Free range by azimuth in the base frame, shape (bins,) [m].
+        farthest: Result of `_farthest_missed` [m^2].
+        rules: Parameters.
+        statistics: Statistics by particle, shape (P, STATISTICS).
     """
     missed = 0.0
     if farthest == 0.0:
@@ -359,7 +407,15 @@ def _miss(
 
 @compiled_within
 def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
-    """Write changed landmarks back to the map; the place of a landmark without score becomes unused."""
+    """Write the changed rows of `near` to the map of particle p, in place; the place of a landmark whose
+    score is not positive becomes unused (hits 0).
+
+    Args:
+        maps: Maps; a block that other particles share is copied first, and bounding boxes are extended.
+        p: Row of the particle.
+        near: Landmarks; rows of one block are adjacent.
+        all_near: Number of rows of `near`.
+    """
     k, b = -1, 0
     x_min = y_min = np.inf
     x_max = y_max = -np.inf
@@ -391,7 +447,7 @@ def _write_back(maps: Maps, p: int, near: Near, all_near: int) -> None:
 @compiled_within
 def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
     """Write C covariance C^T into P, where C is the rotation about z by the angle with cosine c and sine s;
-    both matrices have the shape (3, 3)."""
+    both matrices have the shape (3, 3), order x, y, yaw, and must be different arrays."""
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     P[0, 0] = c * c * xx - 2.0 * c * s * xy + s * s * yy
     P[0, 1] = P[1, 0] = c * s * (xx - yy) + (c * c - s * s) * xy
@@ -405,8 +461,17 @@ def _turned_covariance(covariance: Float, c: float, s: float, P: Float) -> None:
 def _shift(
     x: float, y: float, yaw: float, c: float, s: float, motion: Float, mu: Float, statistics: Float, p: int
 ) -> None:
-    """Write the SHIFT columns of row p: deviation of the pose mu from the pose x, y, yaw plus the motion, in
-    the frame of that pose (c, s: cosine and sine of its yaw)."""
+    """Write the SHIFT columns of row p: how far the motion by SLAM deviates from the odometry, in the frame
+    of the pose before.
+
+    Args:
+        x, y, yaw: Pose before the motion [m, m, rad].
+        c, s: Cosine and sine of `yaw`.
+        motion: Motion by odometry, shape (3,).
+        mu: Corrected pose, shape (3,).
+        statistics: Statistics by particle, shape (P, STATISTICS).
+        p: Row of the particle.
+    """
     dx, dy = mu[0] - x, mu[1] - y
     statistics[p, SHIFT_X] = c * dx + s * dy - motion[0]
     statistics[p, SHIFT_Y] = c * dy - s * dx - motion[1]

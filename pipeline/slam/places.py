@@ -53,13 +53,14 @@ class Places:
     contradicted: bool = False
 
     def with_scan(self, distance: float, first_birth: int, birth: Int) -> Places:
-        """Return the places after a scan.
+        """Return the places after a scan, with a new place if the last one is PLACE or more behind.
+        `contradicted` becomes False.
 
         Args:
             distance: Distance driven [m].
             first_birth: Birth number of the first landmark that the scan may begin.
-            birth: Birth numbers of the landmarks that it shows, int64, shape (D,). A place that was not seen
-                for REVISIT_DISTANCE is not seen for certain by them; see `with_seen`.
+            birth: Birth numbers of the landmarks that the scan shows, int64, shape (D,). Their places become
+                seen, except those that were not seen for REVISIT_DISTANCE; see `with_seen`.
         """
         places = self
         if not len(self.birth) or distance - self.distance[-1] >= PLACE:
@@ -77,14 +78,19 @@ class Places:
         return replace(places, seen=seen, contradicted=False)
 
     def with_seen(self, distance: float, birth: Int) -> Places:
-        """Return the places after landmarks of the given birth numbers were seen for certain: their places
-        and those within REVISIT_DISTANCE of them along the path are active."""
+        """Return the places after landmarks were seen for certain: their places and those within
+        REVISIT_DISTANCE of them along the path are active and seen.
+
+        Args:
+            distance: Distance driven [m].
+            birth: Birth numbers of the landmarks, int64, shape (L,); may be empty.
+        """
         near = self._near(birth)
         return replace(self, seen=np.where(near, distance, self.seen), inactive=self.inactive & ~near)
 
     def with_contradiction(self, birth: Int) -> Places:
-        """Return the places after the detections contradicted landmarks of the given birth numbers: their
-        places are inactive."""
+        """Return the places after the detections contradicted landmarks of the given birth numbers, int64,
+        shape (L,): their places are inactive, and `contradicted` is True."""
         inactive = self.inactive.copy()
         row = self._row(birth)
         inactive[row[row >= 0]] = True
@@ -96,18 +102,20 @@ class Places:
         return old
 
     def of_old(self, birth: Int, distance: float) -> Bool:
-        """Return which landmarks belong to old places, shape (L,), by birth numbers of shape (L,)."""
+        """Return which landmarks belong to old places, shape (L,), by birth numbers of shape (L,). False for
+        landmarks that precede all places."""
         row = self._row(birth)
         return (row >= 0) & self.is_old(distance)[row] if len(self.birth) else row >= 0
 
     def last_seen(self, birth: Int) -> Float:
         """Return the distance driven at which the place of each landmark was last seen for certain [m], shape
-        (L,); infinite for landmarks that precede all places."""
+        (L,), by birth numbers, int64, shape (L,); infinite for landmarks that precede all places."""
         row = self._row(birth)
         return np.where(row < 0, np.inf, self.seen[row]) if len(self.birth) else np.full(len(birth), np.inf)
 
     def is_usable(self, birth: Int) -> Bool:
-        """Return which landmarks are not in inactive places, shape (L,), by birth numbers of shape (L,)."""
+        """Return which landmarks are not in inactive places, shape (L,), by birth numbers of shape (L,); True
+        for landmarks that precede all places."""
         row = self._row(birth)
         return (row < 0) | ~self.inactive[row] if len(self.birth) else row < 0
 
@@ -126,11 +134,14 @@ class Places:
         return PlaceStates(self.birth, state)
 
     def _row(self, birth: Int) -> Int:
-        """Return the place of each landmark, -1 for those that precede all places."""
+        """Return the row of the place of each landmark, int64, shape (L,), by birth numbers of this shape; -1
+        for those that precede all places."""
         return np.searchsorted(self.birth, birth, side="right") - 1
 
     def _near(self, birth: Int) -> Bool:
-        """Return which places are within REVISIT_DISTANCE along the path of those of some landmarks."""
+        """Return which places are within REVISIT_DISTANCE along the path of those of some landmarks, shape
+        (M,), by their birth numbers, int64, shape (L,); all False for an empty list or landmarks that precede
+        all places."""
         row = np.unique(self._row(birth))
         at = self.distance[row[row >= 0]]
         change = np.zeros(len(self.birth) + 1, np.int64)
@@ -154,7 +165,8 @@ class PlaceStates(NamedTuple):
 
 @compiled_within
 def state_of(birth: int, places: PlaceStates) -> int:
-    """Return the state of the place of a landmark; ACTIVE for landmarks that precede all places."""
+    """Return the state of the place of a landmark by its birth number; ACTIVE for landmarks that precede all
+    places, and with an empty table."""
     low, high = 0, places.state.shape[0]
     while low < high:
         middle = (low + high) // 2
@@ -170,7 +182,8 @@ def agreement(
     pose: Pose, centre: Float, R: Float, mean: Float, covariance: Float
 ) -> tuple[float, Bool, Bool]:
     """Return the log odds that detections show the given landmarks and not others, which landmarks agree with
-    a detection, and which have a detection within WINDOW, shape (L,).
+    a detection, and which have a detection within WINDOW, shape (L,). The log odds are 0 without a landmark
+    within WINDOW of a detection.
 
     A landmark agrees with one of the detections around it, which have the density rho, by chance with the
     probability p = 1 - exp(-rho A), where A is the area of the gate, and at the right place with AGREEING (or

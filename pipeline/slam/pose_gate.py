@@ -15,6 +15,7 @@ REJECTED = "a measured pose is rejected: it is too far from the estimated pose (
 
 def within_gate(T_map_base: Pose2, covariance: Float, motion: Motion, noise: Noise) -> bool:
     """Return whether a measured pose agrees with the prediction: y^T (P + R)^-1 y <= gate of the measurement.
+    The gate is a squared Mahalanobis distance.
 
     y is the difference to the predicted pose, P the covariance of the prediction and R that of the
     measurement. Without a measured pose, or with an infinite gate, the result is True.

@@ -9,7 +9,7 @@ from pipeline.types.records import Int
 
 
 def composed(a: Float, b: Float) -> Float:
-    """Return T_a_c = T_a_b T_b_c for each row, shape (N, 3).
+    """Return T_a_c = T_a_b T_b_c for each row, shape (N, 3), with wrapped yaw.
 
     Args:
         a: T_a_b as x, y [m], yaw [rad], shape (N, 3).

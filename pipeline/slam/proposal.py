@@ -38,7 +38,8 @@ def recognise(
     statistics: Float,
     p: int,
 ) -> float:
-    """Associate detections with landmarks one to one, correct the pose, and return the log likelihood.
+    """Associate detections with landmarks one to one, correct the pose, and return the log likelihood up to a
+    constant, in which each detection without well-known landmark counts like a pair at the gate.
 
     Pairs are accepted in the order of their likelihood, first those of detections with one likely landmark;
     each pair is tested with the pose that the pairs before it corrected. Ambiguous detections are decided
@@ -55,7 +56,8 @@ def recognise(
         gate: Maximum Mahalanobis distance [sigma].
         distance_max: Maximum distance [m].
         hits_to_weigh: Minimum hits of a landmark that affects pose and likelihood.
-        room: Work arrays; `landmark_of` is filled.
+        room: Work arrays; `landmark_of` is filled with the row of the landmark of each detection, -1 for
+            none.
         statistics: Statistics of the scan by particle; row p is filled, except MISSED and SHIFT.
         p: Row of the particle.
     """

@@ -10,11 +10,12 @@ WORD = 2**32  # seeds below it need one 32-bit word
 
 
 def draws(seed: int, index: int, particles: int) -> tuple[Float, float]:
-    """Return standard normal numbers, shape (P, 3), and one uniform number in [0, 1).
+    """Return standard normal numbers, shape (P, 3), and one uniform number in [0, 1); the same for equal
+    arguments.
 
     Args:
-        seed: Seed of the run.
-        index: Number of the scan.
+        seed: Seed of the run, >= 0.
+        index: Number of the scan, >= 0.
         particles: Number of particles P.
     """
     # An array of 32-bit words gives the same stream as the list and is converted faster.

@@ -11,7 +11,8 @@ from pipeline.types.records import Int
 
 @compiled
 def normalised(log_weight: Float) -> Float:
-    """Weights that sum to 1 from logarithms up to a constant, shape (P,)."""
+    """Return weights that sum to 1 from logarithms up to a constant, shape (P,), P > 0. NaN if all logarithms
+    are -inf; the argument is unchanged."""
     weights = np.empty(log_weight.shape[0])
     greatest, total = log_weight.max(), 0.0
     for p in range(log_weight.shape[0]):
@@ -24,14 +25,14 @@ def normalised(log_weight: Float) -> Float:
 
 @compiled
 def low_variance_ancestors(weights: Float, offset: float) -> Int:
-    """Which particle each one of the new generation comes from, shape (P,).
+    """Return the row of the ancestor of each particle of the new generation, int64, shape (P,).
 
-    A particle of weight w is drawn floor(P w) or ceil(P w) times. Survivors keep their own slot, so
-    that only their copies have to be written.
+    A particle of weight w is drawn floor(P w) or ceil(P w) times. Survivors keep their own slot, so that only
+    their copies have to be written: ancestors[k] == k for each particle k that is drawn.
 
     Args:
-        weights: shape (P,), sum 1.
-        offset: Uniform in [0, 1).
+        weights: Weights with sum 1, shape (P,).
+        offset: Uniform random number in [0, 1).
     """
     n = weights.shape[0]
     draws = np.zeros(n, np.int64)

@@ -65,8 +65,8 @@ def estimate_rigid_shift(
 
     Returns:
         Whether the shift is significant and enough pairs agree; whether it is significant with too few pairs
-        (SEVERAL); the pose x, y [m], yaw [rad] by the trees, shape (3,); and its covariance, shape (3, 3).
-        Without either, the pose is that of the odometry and the covariance has no meaning.
+        (SEVERAL); the pose x, y [m], yaw [rad] by the trees, shape (3,); and its covariance, shape (3, 3). If
+        both are False, pose and covariance have no meaning.
     """
     lever, off, variance, landmark = _pairs(pose, centre, R, known, spread)
     place, motion, N_inv = pose.copy(), np.zeros(3), np.zeros((3, 3))
@@ -110,8 +110,14 @@ def estimate_rigid_shift(
 @compiled
 def _expected(pose: Float, centre: Float, known: Float, votes: Bool) -> int:
     """Return the number of expected pairs: the smaller of the number of detections and the number of
-    landmarks in `votes` that are no farther from the pose than the farthest detection. `pose` is x, y, yaw;
-    `centre` (D, 2) [m] in the base frame, `known` (L, 2) [m] in the map."""
+    landmarks in `votes` that are no farther from the pose than the farthest detection.
+
+    Args:
+        pose: x, y [m], yaw [rad], shape (3,).
+        centre: Detections in the base frame, shape (D, 2) [m].
+        known: Landmarks in the frame of the map, shape (L, 2) [m].
+        votes: Landmarks that count, shape (L,).
+    """
     farthest, expected = 0.0, 0
     for d in range(centre.shape[0]):
         farthest = max(farthest, centre[d, 0] ** 2 + centre[d, 1] ** 2)
@@ -151,7 +157,8 @@ def _standing(
 def _pairs(
     pose: Float, centre: Float, R: Float, known: Float, spread: Float
 ) -> tuple[Float, Float, Float, Int]:
-    """Pair each landmark with the nearest detection, of the detections whose nearest landmark it is.
+    """Pair each landmark with the nearest detection, of the detections whose nearest landmark it is, up to
+    NEAR.
 
     Args:
         pose, centre, R, known, spread: See `estimate_rigid_shift`.
@@ -182,8 +189,13 @@ def _pairs(
 def _pair_arrays(
     pose: Float, c: float, s: float, centre: Float, R: Float, known: Float, spread: Float, owner: Int
 ) -> tuple[Float, Float, Float, Int]:
-    """Return the results of `_pairs`, for the detection of each landmark, `owner`, shape (L,), -1 for none; c
-    and s are cosine and sine of the yaw."""
+    """Return the results of `_pairs` for known pairs, in the order of the landmarks.
+
+    Args:
+        pose, centre, R, known, spread: See `estimate_rigid_shift`.
+        c, s: Cosine and sine of the yaw of `pose`.
+        owner: Detection of each landmark, -1 for none, int64, shape (L,).
+    """
     n = (owner >= 0).sum()
     lever, off, variance = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
     landmark, k = np.empty(n, np.int64), 0
@@ -204,7 +216,8 @@ def _pair_arrays(
 @compiled
 def _normal_equations(lever: Float, off: Float, variance: Float, kept: Bool) -> tuple[Float, Float]:
     """Return the normal equations N, b, shapes (3, 3) and (3,), of off = t + theta (-lever_y, lever_x) for
-    the unknowns t [m] and theta [rad], over the pairs in `kept`, weighted by 1 / variance."""
+    the unknowns t [m] and theta [rad], over the pairs in `kept`, weighted by 1 / variance; zeros without
+    pairs. See `_pairs` for the arguments; `kept` is bool, shape (K,)."""
     N, b = np.zeros((3, 3)), np.zeros(3)
     for k in range(lever.shape[0]):
         if not kept[k]:
@@ -226,16 +239,18 @@ def _normal_equations(lever: Float, off: Float, variance: Float, kept: Bool) -> 
 def _agreeing(
     lever: Float, off: Float, variance: Float, motion: Float, may: Bool, kept: Bool
 ) -> tuple[int, float]:
-    """Mark the pairs in `may` that agree with a motion, in `kept`, in place.
-
-    Returns:
-        Number of these pairs, and their sum of squared normalised deviations per degree of freedom.
+    """Mark the pairs in `may` that agree with a motion, in `kept`, in place. A pair agrees if its squared
+    normalised deviation is at most AGREE^2, or twice the mean of the pairs in `kept` before, if that is
+    larger.
 
     Args:
         lever, off, variance: Results of `_pairs`.
-        motion: x, y [m], yaw [rad].
-        may: Pairs that are considered.
-        kept: At least one of the pairs by which the motion was estimated must be true; overwritten.
+        motion: x, y [m], yaw [rad], shape (3,).
+        may: Pairs that are considered, shape (K,).
+        kept: Pairs by which the motion was estimated, shape (K,), at least one true; overwritten.
+
+    Returns:
+        Number of agreeing pairs, and their sum of squared normalised deviations per degree of freedom.
     """
     square, total, n = np.empty(lever.shape[0]), 0.0, 0
     for k in range(lever.shape[0]):

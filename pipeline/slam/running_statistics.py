@@ -105,7 +105,7 @@ def update_statistics(
     Args:
         recent: Statistics before the scan.
         scan: Statistics of the scan.
-        driven: Distance since the scan before [m].
+        driven: Distance since the last used scan [m], with 1 m per radian of turn.
         doubted: Doubts about the odometry at this scan.
     """
     expected, is_measured = scan.found + scan.missed, math.isfinite(scan.innovation)
@@ -133,7 +133,8 @@ def update_statistics(
 
 @compiled
 def distance_without_trees(alone: float, recognised: float, driven: float) -> float:
-    """Return the distance driven since two known trees were last recognised in one scan [m].
+    """Return the distance driven since two known trees were last recognised in one scan [m]: 0 after a scan
+    with FEWEST recognised trees.
 
     Args:
         alone: The distance before [m].
@@ -145,7 +146,7 @@ def distance_without_trees(alone: float, recognised: float, driven: float) -> fl
 
 @compiled
 def decayed_distrust(distrust: float) -> float:
-    """Return the distrust after one more scan: less by FADING, and 0 from 0.01 on."""
+    """Return the distrust, 0 to 1, after one more scan: 90 % of it, and 0 if it was at most 0.01."""
     return (1.0 - FADING) * distrust if distrust > 0.01 else 0.0
 
 

@@ -112,7 +112,8 @@ class SharedErrors:
         return replace(self, mean=mean, covariance=covariance)
 
     def moved(self, motion: Float, motion_covariance: Float) -> SharedErrors:
-        """Return the estimates after a motion by the odometry: the pose block of `joint` and `by_trees` grow.
+        """Return the estimates after a motion by the odometry: `at` moves, and the pose block of `joint` and
+        `by_trees` grow; unchanged before the first shared pose.
 
         Args:
             motion: x, y [m], yaw [rad] in the frame of the pose before, shape (3,).
@@ -133,14 +134,15 @@ class SharedErrors:
         return replace(self, joint=joint, at=at, by_trees=by_trees)
 
     def corrected(self, pose: Float, by_trees: Float | None) -> SharedErrors:
-        """Return the estimates with `at` at the estimated pose.
+        """Return the estimates with `at` at the estimated pose; unchanged before the first shared pose.
 
         Without this correction `at` would follow the odometry, turn away from the path, and rotate the
         covariances wrongly.
 
         Args:
             pose: Estimated pose, shape (3,).
-            by_trees: Covariance of the pose if landmarks determined it, shape (3, 3), else None.
+            by_trees: Covariance of the pose if landmarks determined it, shape (3, 3); None keeps the one
+                before.
         """
         if not self.begun:
             return self
@@ -148,7 +150,8 @@ class SharedErrors:
 
     def measured(self, pose: PoseMeasurement) -> SharedErrors:
         """Return the estimates after a measured pose: `joint` becomes P - K S K^T, with the gain K = P H^T
-        S^-1. The errors of the particles are updated in the kernels, see `update_shared_errors`."""
+        S^-1. The errors of the particles are updated in the kernels, see `update_shared_errors`. Unchanged
+        before the first shared pose. A pose without shared errors corrects only the pose block directly."""
         if not self.begun:
             return self
         H = np.zeros((POSE, len(self.joint)))
@@ -163,8 +166,8 @@ class SharedErrors:
     def without_shared_error(self, pose: PoseMeasurement, weights: Float) -> PoseMeasurement:
         """Return a measured pose minus the estimated shared error, H e, with the covariance R + H E H^T.
 
-        e and E are the mean and the covariance of the error over the particles. A pose without shared errors
-        is returned unchanged.
+        e and E are the mean and the covariance of the error over the particles. A pose without shared errors,
+        and each pose before the first shared one, is returned unchanged.
 
         Args:
             pose: The measured pose.
@@ -180,8 +183,9 @@ class SharedErrors:
         return replace(pose, T_map_base=type(pose.T_map_base)(*at), covariance=pose.own + H @ E @ H.T)
 
     def for_particles(self, pose: PoseMeasurement | None) -> MeasuredPose:
-        """Return a measured pose, or None, as the record for the kernels. Its mean and covariance are views,
-        which `update_shared_errors` changes in place."""
+        """Return a measured pose as the record for the kernels, `no_measured_pose()` for None. With shared
+        errors, its mean and covariance are views, which `update_shared_errors` changes in place; a pose
+        without shared errors has its whole covariance as `own` and no particles."""
         nothing = no_measured_pose()
         if pose is None:
             return nothing
@@ -195,14 +199,14 @@ class SharedErrors:
 @compiled
 def correct_by_measured(mu: Float, P: Float, measured: MeasuredPose, p: int) -> float:
     """Correct the pose of a particle by a measured pose (Kalman update), in place, and return its log
-    likelihood.
+    likelihood up to a constant.
 
     The shared error of the particle is subtracted from the measurement, and its covariance is added.
 
     Args:
         mu: x, y [m], yaw [rad], shape (3,); is corrected.
         P: Covariance of `mu`, shape (3, 3); is corrected.
-        measured: The measured pose.
+        measured: The measured pose, with `z` of shape (3,); unchanged.
         p: Row of the particle.
     """
     z, R = measured.z.copy(), measured.own.copy()

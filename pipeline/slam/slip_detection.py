@@ -82,9 +82,9 @@ def motion_by_trees(
 ) -> TreeMotion:
     """Return the motion since the last used scan, from trees where they contradict the odometry.
 
-    If neither the rigid shift nor the search finds a contradiction, the result is the odometry. If its
-    covariance was large (WIDE) and most detections match, the covariance is reduced to that of an undisturbed
-    odometry.
+    If neither the rigid shift nor the search finds a contradiction, or the search is ambiguous, the result is
+    the odometry with its covariance. If its covariance was large (WIDE) and most detections match, the
+    covariance is reduced to that of an undisturbed odometry.
 
     Args:
         before: x, y [m], yaw [rad] in the frame of the map at the last used scan, shape (3,).
@@ -183,7 +183,7 @@ def count_matches(
 
 @compiled
 def search_offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) -> tuple[int, bool, Float]:
-    """Search the pose with most matches between detections and landmarks, within SEARCH and TURNS.
+    """Search the pose with most matches between detections and landmarks, within SEARCH and TURNS of `pose`.
 
     Each pair of a detection and a landmark proposes a position for each heading. Positions whose grid cell of
     0.5 m has at least half of the votes of the best pose are counted exactly.
@@ -193,7 +193,7 @@ def search_offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) ->
 
     Returns:
         Number of matches; whether the pose is unambiguous (FEWEST, CONVINCING, MARGIN); and the pose x, y
-        [m], yaw [rad], shape (3,).
+        [m], yaw [rad], shape (3,), which is `pose` without any match.
     """
     found = centre.shape[0]
     best, second = 0, 0

@@ -65,8 +65,8 @@ class SlamState:
 
     @classmethod
     def at_origin(cls, particles: int) -> SlamState:
-        """Return the state of a new map: all particles at the origin, with zero log weights and without
-        landmarks."""
+        """Return the state of a new map: this number of particles at the origin (0, 0, 0), with zero log
+        weights and without landmarks."""
         return cls(
             pose=np.zeros((particles, 3)),
             log_weight=np.zeros(particles),
@@ -77,7 +77,8 @@ class SlamState:
 
     @classmethod
     def in_map(cls, pose: Float, landmarks: MapColumns) -> SlamState:
-        """Return a state in which all particles have the same known map.
+        """Return a state in which all particles have the same known map. The next detection gets a birth
+        number above all of theirs; path, graph and places are empty.
 
         Args:
             pose: Poses of the particles, shape (P, 3).
@@ -91,7 +92,7 @@ class SlamState:
         )
 
     def map_of(self, particle: int) -> MapColumns:
-        """Return a copy of the landmarks of one particle."""
+        """Return a copy of the landmarks of one particle. Removed landmarks are not among them."""
         return MapColumns(*map_of(self.maps, particle))
 
     def copy(self) -> SlamState:
@@ -101,8 +102,8 @@ class SlamState:
     def placed(self, pose: Float) -> SlamState:
         """Return a state with the particles at new poses, all with the map and the path of the best particle.
 
-        Weights, the motion since the last scan, running statistics (except `mapped`) and shared errors are
-        reset.
+        Weights, the motion since the last used scan, running statistics (except `mapped`), shared errors and
+        the hidden covariance of the frame are reset. The graph and the places remain.
 
         Args:
             pose: New poses, shape (P, 3); P may differ from the present number.

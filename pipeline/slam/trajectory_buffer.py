@@ -26,6 +26,7 @@ class TrajectoryBuffer:
         self._length = 0 if stamp_ns is None else len(stamp_ns)
 
     def __len__(self) -> int:
+        """Return the number of scans."""
         return self._length
 
     @property
@@ -55,16 +56,17 @@ class TrajectoryBuffer:
         self._length += 1
 
     def set_sigma(self, covariance: Float) -> None:
-        """Set the sigma of the last scan to sqrt((Cxx + Cyy) / 2), from the covariance C of x, y [m], yaw
-        [rad], shape (3, 3)."""
+        """Set the sigma of the last scan, which must exist, to sqrt((Cxx + Cyy) / 2), from the covariance C
+        of x, y [m], yaw [rad], shape (3, 3)."""
         self._sigma[self._length - 1] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
 
     def cut(self, length: int) -> None:
-        """Keep only the first `length` scans."""
+        """Keep only the first `length` scans; `length` is at most the present number."""
         self._length = length
 
     def columns(self, poses: Float) -> Path:
-        """Return the path with poses x, y [m], yaw [rad], shape (N, 3); its arrays are copies."""
+        """Return the times and sigmas of all N scans as a path with the poses x, y [m], yaw [rad], shape (N,
+        3); its arrays are copies."""
         n = self._length
         return Path(
             self._stamp[:n].copy(),
