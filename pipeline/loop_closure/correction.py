@@ -33,7 +33,7 @@ class Restart(Generic[S]):
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Text for the warnings of the scan."""
+        """Warnings of the scan: that the robot is lost."""
         return (LOST,)
 
 
@@ -53,7 +53,7 @@ class RelocalisedPose:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Text for the warnings of the scan."""
+        """Warnings of the scan: that the robot was located, with the number of stems."""
         return (_located(self.stems),)
 
 
@@ -71,7 +71,8 @@ class LoopClosure:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Text for the warnings of the scan."""
+        """Warnings of the scan: that a loop was closed; for a robot that was lost, that it was located and
+        that the path had drifted."""
         return (LOOP,) if self.stems is None else (_located(self.stems), DRIFT)
 
 
@@ -81,7 +82,7 @@ class Smoothing:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """No text: the correction is small."""
+        """Warnings of the scan: none, because the correction is small."""
         return ()
 
 
@@ -91,9 +92,10 @@ class SearchFailure:
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """Text for the warnings of the scan."""
+        """Warnings of the scan: that the robot was not found in the map."""
         return (NOT_FOUND,)
 
 
 def _located(stems: int) -> str:
+    """Return the warning that a lost robot was located by a number of stems."""
     return f"robot located in the map by {stems} stems"

@@ -76,21 +76,35 @@ class RunHistory:
 
 
 def is_due(index: int, sigma_xy: Float, contradicted: bool) -> bool:
-    """Return whether a search is due after a scan.
+    """Return whether a search is due after a scan: at each EVERY-th scan, if known places are contradicted or
+    the position was uncertain by more than UNSURE in one of the last RECENT scans.
 
-    A pose that was uncertain and is no longer may have been corrected by the wrong trees, so the search goes
-    on for RECENT scans.
+    A pose that was uncertain and is no longer may have been corrected by the wrong trees, so the search
+    continues for RECENT scans.
 
     Args:
         index: Number of the scan.
-        sigma_xy: Standard deviation of the position at each scan so far, shape (N,) [m].
+        sigma_xy: Standard deviation of the position at each scan so far, shape (N,) [m]; may be empty.
         contradicted: See RunHistory.
     """
     return index % EVERY == 0 and (contradicted or bool(sigma_xy[-RECENT:].max(initial=0.0) > UNSURE))
 
 
 def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
-    """Search for a loop that ends at the newest scan; None if there is none."""
+    """Search for a loop that ends at the newest scan.
+
+    Landmarks that were begun in the last LATELY metres and are within REACH of the robot are matched with
+    trees of at least LEAST_HITS observations that were first seen before and are within the possible drift,
+    at most FARTHEST.
+
+    Args:
+        run: Path and map with at least one scan; unchanged.
+        parameters: Parameters of the stage.
+
+    Returns:
+        The loop. None if the path is too short, either side has fewer than `stems_min` stems, the
+        constellation is not found (see `find_constellation`), or `loop_to` rejects the match.
+    """
     way = _way(run.path)
     lately = max(int(np.searchsorted(way, way[-1] - LATELY)), run.placed)
     if lately == 0:
@@ -127,12 +141,13 @@ def loop_to(
     run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
     """Return the loop from the scan at which known trees were left to the newest scan, at which they are
-    found again. None if they were seen until the map last changed, if the error is too small and no earlier
-    loop contradicts the map, or if it is larger than the drift of the path can be.
+    found again; its anchor is the nearest scan to the found pose, up to the one at which they were left. None
+    if they were seen until the map last changed, if the error is too small and no earlier loop contradicts
+    the map, or if it is larger than the drift of the path can be.
 
     Args:
-        run: Path and map.
-        numbers: Numbers of the trees that agree.
+        run: Path and map; unchanged.
+        numbers: Numbers of the trees that agree, int64, shape (K,); at least one exists in the map.
         T_map_base: Pose of the base by these trees.
         R: Covariance of this pose, shape (3, 3).
         last_mapped: Last scan that changed the map.
@@ -161,14 +176,20 @@ def loop_to(
 
 
 def _gap(T_map_base: Pose2, pose: Float) -> Float:
-    """Return the difference from a pose to T_map_base, x, y [m], yaw [rad], shape (3,)."""
+    """Return the difference T_map_base minus a pose x, y [m], yaw [rad], shape (3,), along the axes of the
+    map, with the yaw wrapped."""
     gap = T_map_base.as_array() - pose
     gap[2] = wrap_angle(gap[2])
     return gap
 
 
 def _is_beyond(gap: Float, covariance: Float) -> bool:
-    """Return whether a difference of poses is larger than DRIFT sigma of its covariance."""
+    """Return whether a difference of poses, shape (3,), is larger than DRIFT sigma of its covariance, shape
+    (3, 3).
+
+    Raises:
+        LinAlgError: The covariance is singular.
+    """
     return bool(gap @ np.linalg.solve(covariance, gap) > DRIFT**2)
 
 
@@ -192,11 +213,13 @@ def through(T_map_local: Pose2, covariance: Float, T_local_base: Pose2, own: Flo
 def _left(seen: Int, way: Float) -> int:
     """Return the scan at which the robot left a group of trees.
 
-    A drifted scan may have associated some of the trees wrongly since, so the result is the first time at
-    which at least a quarter of the trees was seen last.
+    A drifted scan may have associated some of the trees wrongly since, so the trees are grouped by the path
+    at which they were last seen (groups are GROUP_APART from each other), and the result is the median scan
+    of the first group with at least a quarter of the trees and LEAST_LEFT trees. Without such a group it is
+    that of the first group.
 
     Args:
-        seen: Scan in which each tree was seen last, shape (K,).
+        seen: Scan in which each tree was seen last, int64, shape (K,), K > 0.
         way: Distance driven at each scan, shape (N,) [m].
     """
     seen = np.sort(seen)
@@ -206,11 +229,14 @@ def _left(seen: Int, way: Float) -> int:
 
 
 def nearby(estimate: PoseEstimate) -> Float:
-    """Return the covariance of a pose with respect to the landmarks around, shape (3, 3)."""
+    """Return the covariance of a pose with respect to the landmarks around, shape (3, 3): `relative`, or
+    `covariance` where that is None."""
     return estimate.covariance if estimate.relative is None else estimate.relative
 
 
 def _way(path: Float) -> Float:
+    """Return the distance driven at each pose of a path, shape (N,) [m], 0 at the first one. `path` is x, y
+    [m], yaw, shape (N, 3)."""
     step = np.diff(path[:, :2], axis=0, prepend=path[:1, :2])
     way: Float = np.cumsum(np.hypot(step[:, 0], step[:, 1]))
     return way
@@ -218,6 +244,7 @@ def _way(path: Float) -> Float:
 
 def _stems(place: Float, covariance: Float) -> MapStems:
     """Return stems without diameters, which are unknown for distant trees. Their sigma is limited to SIGMA,
-    since the error that all positions share is what the match finds."""
+    since the error that all positions share is what the match finds. `place` has the shape (N, 2) [m],
+    `covariance` xx, xy, yy, shape (N, 3) [m^2]."""
     unknown = np.full(len(place), np.nan)
     return MapStems(place, np.minimum(worst_sigma(covariance), SIGMA), unknown, unknown)

@@ -49,7 +49,7 @@ class RelocaliserState(Generic[S]):
     since: int = 0
 
     def copy(self) -> RelocaliserState[S]:
-        """A copy that a search does not change."""
+        """Return a copy that a search does not change; the stored states of the mapper are shared."""
         return replace(self, local=None if self.local is None else self.local.copy())
 
 
@@ -67,16 +67,18 @@ class Relocaliser(Generic[S]):
     """Finds a lost robot in the map of a mapper whose states are of type S."""
 
     def __init__(self, seed: int) -> None:
+        """Create a relocaliser that is not searching and has no stored state. The seed of the local map is
+        derived from `seed`, the seed of the run."""
         self._seed = local_seed(seed)
         self.state: RelocaliserState[S] = RelocaliserState()
 
     @property
     def is_searching(self) -> bool:
-        """Whether the robot is lost."""
+        """Whether a search is going on because the robot is lost."""
         return self.state.local is not None
 
     def reset(self) -> None:
-        """End a search, and forget the stored states: the map returns to none of them."""
+        """End a search, and discard the stored states and motions, so that the map returns to none of them."""
         self.state = RelocaliserState()
 
     def needs_state(self, index: int) -> bool:
@@ -85,7 +87,14 @@ class Relocaliser(Generic[S]):
         return not self.state.kept or index % SPACING == 0
 
     def remember(self, index: int, motion: Motion, state: S | None) -> None:
-        """Store the motion to a scan, and the state of the mapper before it where one is given."""
+        """Store the motion to a scan, and the state of the mapper before it where one is given; see
+        `needs_state`. Only the last two states and the motions since the older one are kept.
+
+        Args:
+            index: Number of the scan.
+            motion: Motion from the scan before.
+            state: State of the mapper before the scan, or None.
+        """
         s = self.state
         if state is not None:
             kept = (*s.kept[-1:], state)
@@ -93,7 +102,21 @@ class Relocaliser(Generic[S]):
         self.state = replace(s, motions=(*s.motions, (index, motion)))
 
     def begin(self, index: int, detections: Detections, free: Float, parameters: Parameters) -> Restart[S]:
-        """Begin a search at a scan; the arguments are as in `search`."""
+        """Begin a search at a scan: start a local map with at most PARTICLES particles at the origin, and map
+        the detections in it. The stored states are discarded.
+
+        Args:
+            index: Number of the scan.
+            detections: Trees in the base frame.
+            free: Free distance by azimuth, shape (bins,) [m].
+            parameters: Parameters of all stages.
+
+        Returns:
+            The older stored state, to which the mapper must return, with the motions since then.
+
+        Raises:
+            IndexError: No state was stored by `remember`.
+        """
         s = self.state
         local = SlamState.at_origin(min(PARTICLES, parameters.slam.particles))
         self.state = RelocaliserState(local=local, since=s.motions[0][0])
@@ -109,16 +132,18 @@ class Relocaliser(Generic[S]):
         parameters: Parameters,
         run: detection.RunHistory,
     ) -> RelocalisedPose | LoopClosure | SearchFailure | None:
-        """Take a scan into the local map, and look for the local map among the trees of the map.
+        """Map a scan in the local map, and search the local map among the confirmed trees of the map at each
+        EVERY-th scan. The search continues until `reset`, after a decision as well.
 
         Args:
-            index, motion, detections, free: As `FastSlam.process` takes them.
+            index, motion, detections, free: See `FastSlam.process`; a measured pose of the motion is ignored.
             parameters: Parameters of all stages.
             run: The map and the path, with the pose by odometry at this scan.
 
         Returns:
-            The decision; None while the search goes on. A robot that the odometry can have led there was not
-            carried: that is a loop closure.
+            The decision: a loop closure if the odometry can have led to the found pose, otherwise a
+            relocalised pose; a failure after FARTHEST metres of search. None while the search continues, and
+            without a search.
         """
         if self.state.local is None:
             return None
@@ -143,6 +168,21 @@ class Relocaliser(Generic[S]):
         free: Float,
         parameters: Parameters,
     ) -> tuple[FastSlam, PoseEstimate]:
+        """Process a scan in the local map, and add its motion to the distance of the search; replaces
+        `state`.
+
+        Args:
+            local: State of the local map; its particles are kept in number.
+            index: Number of the scan.
+            motion: Motion from the scan before; a measured pose is ignored, because it is in the frame of the
+                map.
+            detections: Trees in the base frame.
+            free: Free distance by azimuth, shape (bins,) [m].
+            parameters: Parameters of all stages.
+
+        Returns:
+            The filter of the local map after the scan, and the pose in the local map.
+        """
         slam = FastSlam(parameters.slam.model_copy(update={"particles": len(local.pose)}), self._seed)
         slam.state = local
         # Measured poses are in the frame of the map, and not in that of the local one.
@@ -155,6 +195,15 @@ class Relocaliser(Generic[S]):
 def _match(
     slam: FastSlam, estimate: PoseEstimate, parameters: Parameters, run: detection.RunHistory
 ) -> LocalMapMatch | None:
+    """Search the local map among the confirmed trees of the map; None if it is not found, see
+    `find_constellation`.
+
+    Args:
+        slam: Filter of the local map.
+        estimate: Pose of the base in the local map.
+        parameters: Parameters of all stages.
+        run: The map.
+    """
     trees = run.trees
     match = find_constellation(
         _stems(slam, parameters), MapStems.of_trees(trees), parameters.relocalisation, hypotheses=HYPOTHESES
@@ -168,7 +217,8 @@ def _match(
 
 
 def _stems(slam: FastSlam, parameters: Parameters) -> MapStems:
-    """The landmarks of the local map that were seen more than once."""
+    """Return the landmarks of the best particle of the local map with at least `hits_to_weigh` hits, as stems
+    of unknown diameter."""
     landmarks = slam.state.map_of(slam.state.best)
     known = landmarks.hits >= parameters.slam.hits_to_weigh
     unknown = np.full(int(np.count_nonzero(known)), np.nan)
@@ -176,6 +226,7 @@ def _stems(slam: FastSlam, parameters: Parameters) -> MapStems:
 
 
 def local_seed(seed: int) -> int:
-    """The seed of the local map: independent of the seeds of all runs, also of those with a near seed."""
+    """Return the seed of the local map for the seed of a run, >= 0. It is independent of the seeds of all
+    runs, also of those with a near seed."""
     sequence = np.random.SeedSequence(seed, spawn_key=(LOCAL_MAP,))
     return int(sequence.generate_state(1)[0])

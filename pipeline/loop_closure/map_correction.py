@@ -27,11 +27,12 @@ class PathCorrection:
 
     @property
     def largest(self) -> float:
-        """Largest displacement of a scan [m]."""
+        """Largest displacement of a scan in x and y [m]; 0 without scans."""
         return float(np.hypot(*(self.after - self.before)[:, :2].T).max(initial=0.0))
 
     def followed_by(self, later: PathCorrection) -> PathCorrection:
-        """Return this correction and a later one as one."""
+        """Return this correction and a later one as one. The path of the later one begins with the scans of
+        this one, shape (M, 3), M >= N."""
         return PathCorrection(np.concatenate([self.before, later.before[len(self.before) :]]), later.after)
 
     def moved(self, place: Float, scan: Int) -> tuple[Float, Float]:
@@ -39,10 +40,11 @@ class PathCorrection:
 
         An object moves rigidly with the nearest pose of the path within NEAR of the scan that observed it:
         the pass of the path that observed it decides, and the nearest pose of it has the shortest lever.
+        Without scans nothing moves. The arguments are unchanged.
 
         Args:
             place: Positions before the correction, shape (N, 2) [m].
-            scan: int64, shape (N,): the scan that observed each object.
+            scan: int64, shape (N,): the scan that observed each object; the last scan for larger numbers.
         """
         if not len(self.before):
             return place.copy(), np.zeros(len(place))
@@ -66,7 +68,12 @@ class PathCorrection:
         return after[:, :2] + _rotated(place - before[:, :2], turn), turn
 
     def poses(self, pose: Float, scan: Int) -> Float:
-        """Return poses, shape (N, 3), moved with the scans that they belong to, int64, shape (N,)."""
+        """Return poses x, y [m], yaw [rad], shape (N, 3), moved rigidly with the scans that they belong to,
+        int64, shape (N,); yaws are wrapped.
+
+        Raises:
+            IndexError: A scan is not in the path.
+        """
         before, after = self.before[scan], self.after[scan]
         turn = after[:, 2] - before[:, 2]
         position = after[:, :2] + _rotated((pose - before)[:, :2], turn)
@@ -74,6 +81,6 @@ class PathCorrection:
 
 
 def _rotated(v: Float, angle: Float) -> Float:
-    """Return vectors, shape (N, 2), rotated by angles, shape (N,)."""
+    """Return vectors, shape (N, 2), rotated by angles [rad], shape (N,)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.column_stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1]])

@@ -10,12 +10,16 @@ from pipeline.jit import compiled
 
 @compiled
 def aligned(local: Float, reference: Float, weight: Float, n: int, out: Float) -> None:
-    """The pose T that makes the weighted sum of |reference - T local|^2 least (Horn 1987, in the plane).
+    """Write the pose T that minimises the weighted sum of |reference - T local|^2 into `out` (Horn 1987, in
+    the plane).
 
-    tan yaw = sum w (l x r) / sum w (l . r) of the points about their weighted means.
+    tan yaw = sum w (l x r) / sum w (l . r) of the points about their weighted means. One pair, or coincident
+    points, give the yaw 0; without pairs the result is NaN.
 
     Args:
-        local, reference: The first `n` rows are pairs, shape (M, 2) [m]; weight: shape (M,) [1/m^2].
+        local, reference: The first `n` rows are pairs, shape (M, 2) [m].
+        weight: Weights of the pairs, shape (M,) [1/m^2].
+        n: Number of pairs.
         out: Filled with x, y [m], yaw [rad], shape (3,).
     """
     total = lx = ly = rx = ry = 0.0
@@ -38,13 +42,18 @@ def aligned(local: Float, reference: Float, weight: Float, n: int, out: Float) -
 
 
 def alignment_covariance(pose: Pose2, local: Float, reference: Float, variance: Float) -> Float:
-    """Covariance of an aligned pose x, y, yaw, shape (3, 3): (sum J^T J / variance)^-1 at the solution.
+    """Return the covariance of an aligned pose x, y [m], yaw [rad], shape (3, 3): (sum J^T J / variance)^-1
+    at the solution.
 
-    Where the residuals are larger than the variances say, it grows by their ratio; it never shrinks.
+    Where the residuals are larger than their variances, it grows by their ratio; it never shrinks.
 
     Args:
         pose: T_reference_local.
-        local, reference: Pairs, shape (M, 2) [m], M >= 2; variance: of each difference, shape (M,) [m^2].
+        local, reference: Pairs, shape (M, 2) [m], M >= 2, not all at one position.
+        variance: Variance per axis of each difference, shape (M,) [m^2].
+
+    Raises:
+        LinAlgError: The pairs do not determine the pose.
     """
     arm = local @ pose.rotation().T
     J = np.zeros((len(arm), 2, 3))

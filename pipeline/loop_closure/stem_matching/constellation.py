@@ -64,7 +64,8 @@ class Match:
 def find_constellation(
     local: MapStems, reference: MapStems, parameters: Relocalisation, *, hypotheses: int = 300_000
 ) -> Match:
-    """Return the pose of local stems in a reference map, without an initial pose.
+    """Return the pose of local stems in a reference map, without an initial pose, or the reason of a refusal.
+    Stems whose position or sigma is not finite are ignored; either side may be empty.
 
     Args:
         local: Stems in their own frame, for example of the map since the robot was lost.
@@ -100,7 +101,8 @@ class _Candidate:
     found: int
 
     def is_same(self, other: _Candidate) -> bool:
-        """Return whether more than half of the pairs are those of another candidate."""
+        """Return whether more than half of the pairs are those of another candidate. Both have the same local
+        stems."""
         return 2 * int(np.count_nonzero((self.of >= 0) & (self.of == other.of))) > self.found
 
 
@@ -108,6 +110,13 @@ class _Search:
     """One search. The local stems are centred at their mean, which decouples rotation and translation."""
 
     def __init__(self, local: MapStems, reference: MapStems, parameters: Relocalisation, most: int) -> None:
+        """Prepare a search.
+
+        Args:
+            local, reference: Usable stems of the constellation and of the map.
+            parameters: Parameters of the stage.
+            most: Number of hypotheses after which no further pair of local stems is tried.
+        """
         self.reason: Refusal = "too few stems"
         self._p = parameters
         self._mean: Float = local.position.mean(axis=0) if len(local) else np.zeros(2)
@@ -138,7 +147,9 @@ class _Search:
         return best, next((c for c in refined[1:] if not c.is_same(best)), None)
 
     def checked(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
-        """Return the pose, its covariance, the logarithm of the false alarms, and the reason of a refusal."""
+        """Return the pose T_reference_local, its covariance, shape (3, 3), the decimal logarithm of the false
+        alarms, and the reason of a refusal (None for none). `second` is the number of pairs of the second
+        best pose, 0 without one."""
         local, reference = self._local, self._reference
         at = np.flatnonzero(best.of >= 0)
         about_mean = Pose2(*(float(v) for v in best.pose))
@@ -157,6 +168,16 @@ class _Search:
     def _refusal(
         self, found: int, second: int, chance: float, inside: int, covariance: Float
     ) -> Refusal | None:
+        """Return the reason of a refusal; None if the pose is accepted. The first condition that fails
+        decides.
+
+        Args:
+            found: Number of pairs of the best pose.
+            second: Number of pairs of the second best pose.
+            chance: Decimal logarithm of the false alarms.
+            inside: Number of local stems with a stem of the map within WINDOW.
+            covariance: Covariance of the pose at the mean of the local stems, shape (3, 3).
+        """
         if found < self._p.stems_min:
             return "too few stems"
         if chance > np.log10(FALSE_ALARMS):
@@ -171,7 +192,8 @@ class _Search:
         return None
 
     def _refined(self, pose: Float) -> _Candidate:
-        """Return a pose after pairing and alignment in turns until the pairs do not change."""
+        """Return a pose x, y [m], yaw [rad], shape (3,), after pairing and alignment in turns until the pairs
+        do not change, there are fewer than two, or ROUNDS are over. The argument is unchanged."""
         local, reference = self._local, self._reference
         pose = pose.copy()
         of, before = np.full(len(local), -1, np.int64), np.full(len(local), -2, np.int64)
@@ -192,17 +214,21 @@ class _Search:
 
     @staticmethod
     def _columns(stems: MapStems) -> tuple[Float, Float, Float, Float]:
+        """Return positions, sigmas, diameters and their sigmas of stems, in the order in which the kernels
+        expect them."""
         return stems.position, stems.sigma, stems.dbh, stems.dbh_sigma
 
 
 def _evenly(base: Int32) -> Int32:
-    """Return at most BASE_PAIRS pairs, in an order in which each first part covers all lengths evenly."""
+    """Return at most BASE_PAIRS of the pairs, which are sorted by length, int32, shape (B, 2), in an order in
+    which each first part covers all lengths evenly."""
     rows = np.linspace(0, len(base) - 1, min(len(base), BASE_PAIRS)).astype(np.int64)
     return base[rows[np.argsort(np.arange(len(rows)) * GOLDEN % 1.0, kind="stable")]]
 
 
 def _log10_false_alarms(tests: int, trials: int, hits: int, p: float) -> float:
-    """Return log10 of tests * P(Binomial(trials, p) >= hits)."""
+    """Return log10 of tests * P(Binomial(trials, p) >= hits), where the probability is at least 1e-300;
+    `tests` and `trials` count as at least 1."""
     from scipy.stats import binom
 
     tail = float(binom.logsf(hits - 1, max(trials, 1), p)) / np.log(10.0)

@@ -20,8 +20,13 @@ DBH_SLACK = 0.05  # m; difference of diameters by another height, season or inst
 
 @compiled
 def pairs_within(position: Float, shortest: float, longest: float, most: int) -> tuple[Int32, Float]:
-    """Return the pairs of stems with a distance between two bounds, sorted by distance: rows (K, 2) and
-    lengths (K,) [m]. Of more than `most` pairs the longest are omitted.
+    """Return the pairs of stems with a distance in [shortest, longest), sorted by distance: rows, int32,
+    shape (K, 2), and lengths, shape (K,) [m].
+
+    Args:
+        position: Stems, shape (N, 2) [m].
+        shortest, longest: Bounds of the distance [m].
+        most: Maximum number of pairs. Of more pairs the longest are omitted, in whole bins of length.
     """
     order = np.argsort(position[:, 0], kind="mergesort")
     bins = np.zeros(BINS, np.int64)
@@ -44,7 +49,17 @@ def _walk_pairs(
     bins: Int, taken: int, row: Int32, length: Float,
 ) -> None:  # fmt: skip
     """Count the pairs by bins of their length, and write those of the first `taken` bins as far as there is
-    room."""
+    room.
+
+    Args:
+        position: Stems, shape (N, 2) [m].
+        order: Rows of the stems by ascending x.
+        shortest, longest: Bounds of the distance [m].
+        bins: Number of pairs per bin, shape (BINS,); increased.
+        taken: Number of bins whose pairs are written.
+        row, length: Filled with rows, int32, shape (K, 2), and lengths, shape (K,) [m], in the order of
+            `order`.
+    """
     n = 0
     for a in range(order.shape[0]):
         i = order[a]
@@ -65,8 +80,9 @@ def _walk_pairs(
 
 @compiled
 def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
-    """Return a grid over the stems: its low corner and cell size, the first stem of each cell, and the next
-    stem in the same cell of each stem; -1 without one."""
+    """Return a grid over stems, shape (N, 2) [m], N > 0: low corner x, y and cell size, shape (3,) [m]; first
+    stem of each cell, int32, shape (W, H); and next stem in the same cell of each stem, int32, shape (N,); -1
+    without one. The cell is doubled from `cell` [m] until at most MOST_CELLS are needed."""
     grid = np.empty(3)
     grid[0], grid[1], grid[2] = position[:, 0].min(), position[:, 1].min(), cell
     width = np.floor((position[:, 0].max() - grid[0]) / grid[2]) + 1.0
@@ -89,7 +105,15 @@ def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
 def nearest(
     x: float, y: float, reach: float, position: Float, grid: Float, first: Int32, following: Int32
 ) -> tuple[int, float]:
-    """Return row and squared distance of the nearest stem within reach, at most one cell; else row -1."""
+    """Return row and squared distance [m^2] of the nearest stem nearer than a reach; the row -1 without one,
+    where the distance has no meaning.
+
+    Args:
+        x, y: Position [m].
+        reach: Maximum distance [m], at most one cell.
+        position: Stems, shape (N, 2) [m].
+        grid, first, following: See `cells_of`.
+    """
     best, best2 = -1, reach * reach
     fa, fb = np.floor((x - grid[0]) / grid[2]), np.floor((y - grid[1]) / grid[2])
     if not (-2.0 < fa < first.shape[0] + 1.0 and -2.0 < fb < first.shape[1] + 1.0):
@@ -108,7 +132,9 @@ def nearest(
 
 @compiled
 def alike(dbh: float, sigma: float, other: float, other_sigma: float) -> bool:
-    """Return whether two diameters may be of the same stem; an unknown diameter fits any other."""
+    """Return whether two diameters [m] may be of the same stem: their difference is at most three sigma, with
+    DBH_SLACK added. An unknown diameter (NaN or not positive) fits any other; an unknown sigma counts as 0.
+    """
     if not (dbh > 0.0 and other > 0.0):
         return True
     slack = DBH_SLACK * DBH_SLACK + (sigma * sigma if sigma > 0.0 else 0.0)
@@ -126,18 +152,20 @@ def search(
     """Align each base pair with all pairs of the map of equal length, and count the stems that agree.
 
     Args:
-        local: Local stems, shape (L, 2) [m], relative to their mean.
-        base: Pairs of their rows, shape (B, 2).
-        reference: Stems of the map, shape (N, 2) [m].
+        local, local_sigma, local_dbh, local_dbh_sigma: Local stems, shape (L, 2) [m], relative to their mean,
+            and their other columns, shape (L,), see `MapStems`.
+        base: Pairs of local rows, int32, shape (B, 2).
+        reference, sigma, dbh, dbh_sigma: Stems of the map, likewise, N > 0.
         pair, length: Pairs of the map, see `pairs_within`.
         slack: Standard deviation of the deformation of a map within a constellation [m].
         reach: Largest distance of two stems that agree [m], at most one cell of the grid.
         least: Hypotheses with fewer stems in agreement are dropped.
         most: Number of hypotheses after which no further base pair is tried.
+        grid, first, following: Grid of the map, see `cells_of`.
 
     Returns:
-        The best distinct poses x, y, yaw, shape (K, 3), the number of stems that agree in each, (K,), and the
-        number of hypotheses.
+        The best distinct poses x, y [m], yaw [rad], shape (K, 3), at most KEPT, in no particular order; the
+        number of stems that agree in each, int64, shape (K,); and the number of hypotheses.
     """
     pose = np.empty((KEPT, 3))
     agree = np.zeros(KEPT, np.int64)
@@ -198,7 +226,17 @@ def search(
 def _keep(
     pose: Float, agree: Int, kept: int, x: float, y: float, yaw: float, found: int, reach: float
 ) -> int:
-    """Store a hypothesis unless a better one has the same pose; returns the number of stored ones."""
+    """Store a hypothesis, unless a stored one with at least as many stems has the same pose, or KEPT better
+    ones are stored; return the number of stored ones.
+
+    Args:
+        pose, agree: Stored poses, shape (KEPT, 3), and their numbers of stems, shape (KEPT,); changed in
+            place.
+        kept: Number of stored hypotheses.
+        x, y, yaw: Pose of the hypothesis [m, m, rad].
+        found: Number of stems that agree.
+        reach: Poses within half of it [m] and within 0.05 rad are the same.
+    """
     worst = 0
     for k in range(kept):
         dx, dy = pose[k, 0] - x, pose[k, 1] - y
@@ -228,8 +266,17 @@ def partners(
     grid: Float, first: Int32, following: Int32,
     slack: float, reach: float, of: Int,
 ) -> int:  # fmt: skip
-    """Fill `of` with the row of the map for each local stem within three sigma, one to one, -1 without one;
-    returns the number of pairs."""
+    """Pair each local stem with the nearest stem of the map within three sigma, one to one; return the number
+    of pairs. Of local stems with the same stem of the map, the nearest one gets it and the others none.
+
+    Args:
+        pose: x, y [m], yaw [rad] of the local frame in the map, shape (3,).
+        local, local_sigma, local_dbh, local_dbh_sigma, reference, sigma, dbh, dbh_sigma: See `search`.
+        grid, first, following: Grid of the map, see `cells_of`.
+        slack: Standard deviation of the deformation of the map [m].
+        reach: Maximum distance [m].
+        of: Filled with the row of the map of each local stem, -1 for none, int64, shape (L,).
+    """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     distance2 = np.full(local.shape[0], np.inf)
     owner = np.full(reference.shape[0], -1, np.int64)
@@ -257,7 +304,13 @@ def partners(
 @compiled
 def crowding(pose: Float, local: Float, reference: Float, window: float) -> tuple[float, int]:
     """Return the mean density of the map around the aligned local stems [1/m^2], and the number of local
-    stems with a stem of the map within the window."""
+    stems with a stem of the map within the window.
+
+    Args:
+        pose: x, y [m], yaw [rad] of the local frame in the map, shape (3,).
+        local, reference: Stems, shapes (L, 2) and (N, 2) [m], L > 0.
+        window: Radius [m].
+    """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     total, inside = 0, 0
     for m in range(local.shape[0]):

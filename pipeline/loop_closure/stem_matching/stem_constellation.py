@@ -27,18 +27,19 @@ class MapStems:
     dbh_sigma: Float
 
     def __len__(self) -> int:
+        """Return the number of stems."""
         return len(self.position)
 
     @classmethod
     def at(cls, position: Float, sigma: float = 0.05) -> MapStems:
-        """Return stems of unknown diameter at positions of shape (N, 2) [m]."""
+        """Return stems of unknown diameter at positions of shape (N, 2) [m], all with the same sigma [m]."""
         n = len(position)
         unknown = np.full(n, np.nan)
         return cls(np.asarray(position, np.float64).reshape(n, 2), np.full(n, sigma), unknown, unknown)
 
     @classmethod
     def of_trees(cls, trees: Trees) -> MapStems:
-        """Return the confirmed trees of a map."""
+        """Return the confirmed trees of a map. Their order is kept."""
         kept = trees.confirmed
         unknown = np.isnan(trees.dbh[kept])
         return cls(
@@ -49,12 +50,12 @@ class MapStems:
         )
 
     def usable(self) -> Bool:
-        """Return which stems have a finite position and sigma, shape (N,)."""
+        """Return which stems have a finite position and a finite sigma that is not negative, shape (N,)."""
         finite: Bool = np.isfinite(self.position).all(axis=1) & np.isfinite(self.sigma) & (self.sigma >= 0.0)
         return finite
 
     def take(self, rows: Int | Bool) -> MapStems:
-        """Return the stems of some rows."""
+        """Return the stems of some rows, by row numbers or by a mask of shape (N,)."""
         return MapStems(self.position[rows], self.sigma[rows], self.dbh[rows], self.dbh_sigma[rows])
 
 
