@@ -33,6 +33,10 @@ def follow(
 ) -> Bool:
     """Assign the tracks to the landmarks of the present map, in place.
 
+    A track keeps its landmark if that exists. Otherwise it gets a free landmark at its position
+    (`associate`); if the landmark there has a track, both are joined. A track without any of these gets the
+    landmark NO_LANDMARK.
+
     Args:
         rows: Tracks; landmark, score and, for joined tracks, all columns are changed.
         scan: Pose of the robot.
@@ -45,6 +49,7 @@ def follow(
 
     Returns:
         Which tracks remain, shape (T,): those with a landmark, and trees by the class of their voxel column.
+        The caller removes the others.
     """
     T, L = rows.number.shape[0], birth.shape[0]
     order = np.argsort(birth)
@@ -123,7 +128,7 @@ def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
         radius: Distance below which two tracks are one tree [m].
 
     Returns:
-        Which tracks remain, shape (T,).
+        Which tracks remain, shape (T,); the caller removes the others.
     """
     kept = np.ones(rows.number.shape[0], np.bool_)
     for k in range(seen.shape[0]):
@@ -160,8 +165,8 @@ def are_separate(position: Float, x: Float, radius: float) -> Bool:
 @compiled_borrowing
 def _fill_spread(rows: Rows, scan: ScanPose, spread: Float) -> None:
     """Write the covariance xx, xy, yy of each track relative to the landmarks into `spread`, shape (T, 3)
-    [m^2]: P without the part that track and landmarks share, plus that of the pose relative to the
-    landmarks."""
+    [m^2] with the present pose `scan`: P without the part that track and landmarks share, plus that of the
+    pose relative to the landmarks."""
     x, P, shared = rows.x, rows.P, rows.shared
     for t in range(spread.shape[0]):
         xx, xy, yy = by_pose(x[t, 0] - scan.pose[0], x[t, 1] - scan.pose[1], scan.relative)

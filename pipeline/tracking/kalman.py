@@ -19,7 +19,7 @@ H = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]])
 
 @compiled
 def transition(dt: float) -> Float:
-    """Return the transition matrix F of constant velocity over dt [s], shape (4, 4)."""
+    """Return the transition matrix F of [x, y, vx, vy] of constant velocity over dt [s], shape (4, 4)."""
     F = np.eye(4)
     F[0, 2] = F[1, 3] = dt
     return F
@@ -27,8 +27,8 @@ def transition(dt: float) -> Float:
 
 @compiled
 def process_noise(dt: float, acceleration_sigma: float) -> Float:
-    """Return the process noise Q of a white acceleration over dt, shape (4, 4) (Bar-Shalom, Li, Kirubarajan
-    2001, eq. 6.3.2-4).
+    """Return the process noise Q of [x, y, vx, vy] by a white acceleration over dt, shape (4, 4) (Bar-Shalom,
+    Li, Kirubarajan 2001, eq. 6.3.2-4).
 
     Args:
         dt: Time step [s].
@@ -73,6 +73,7 @@ def _update_rows(
     K: Float,
     M: Float,
 ) -> None:
+    """Do the work of `update_rows` in place; K and M are work arrays of the shapes (4, 2) and (4, 4)."""
     for k in range(rows.shape[0]):
         row = rows[k]
         _predict(x[row], P[row], dt[k], acceleration_sigma)
@@ -129,7 +130,7 @@ def correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
 def _update_rows_filterpy(
     x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
 ) -> None:
-    """Do the same as `update_rows` with filterpy."""
+    """Predict and correct in place like `update_rows`, with filterpy; the results agree up to rounding."""
     from filterpy.kalman import predict, update
 
     for k, row in enumerate(rows):

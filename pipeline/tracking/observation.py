@@ -39,7 +39,8 @@ def add_observations(
     arc: Float,
     above_breast: Float,
 ) -> None:
-    """Add the detections of one scan to the columns of their tracks, in place.
+    """Add the detections of one scan to the columns of their tracks, in place: hits, sums of eccentricities
+    and radii, and observed sides. NaN in eccentricity or radius adds nothing to its sum.
 
     A radius is weighted by its variance and by the square of its distance. The errors that a fit does not
     know, such as the width of a beam, grow with the distance and are the same in every scan, so a hundred
@@ -71,6 +72,7 @@ def _add(
     arc: Float,
     above_breast: Float,
 ) -> None:
+    """Do the work of `add_observations` in place."""
     for d in range(rows.shape[0]):
         t = rows[d]
         tracks.hits[t] += 1
@@ -112,7 +114,8 @@ def widest_view(radius: float, distance: float) -> float:
 
 @compiled_borrowing
 def seen_sides(from_bearing: float, arc: float) -> np.int64:
-    """Return the bits of the sectors around a trunk that a view shows as a whole.
+    """Return the bits of the sectors around a trunk that a view shows as a whole. Bit k is the sector from 10
+    k to 10 (k + 1) degrees; a sector that the view shows in part does not count.
 
     Args:
         from_bearing: Direction from the trunk to the sensor, frame of the map [rad].
@@ -166,6 +169,7 @@ def _fill_figures(
     mean: Float,
     confirmed: Bool,
 ) -> None:
+    """Fill the results of `table_figures`; `mean` contains NaN before."""
     for t in range(tracks.sides.shape[0]):
         coverage[t] = sides_of(tracks.sides[t]) * WIDTH
         dbh[t], dbh_sigma[t] = diameter(tracks, t, coverage[t], limits)
@@ -176,7 +180,7 @@ def _fill_figures(
 
 @compiled_borrowing
 def sides_of(bits: int) -> int:
-    """Return the number of observed sectors, the number of set bits."""
+    """Return the number of observed sectors: the number of set bits of a mask without sign."""
     seen = 0
     while bits:
         bits &= bits - 1  # clears the lowest bit

@@ -60,6 +60,7 @@ def _split(
     P2: Float,
     room: Float,
 ) -> None:
+    """Do the work of `split` in place: P2 contains R before; `room` is a work array, shape (3, 2, 2)."""
     own, P1, S = room[0], room[1], room[2]
     for d in range(rows.shape[0]):
         t = rows[d]
@@ -80,15 +81,15 @@ def _split(
 
 @compiled_borrowing
 def _share(shared: Float, P1: Float, S: Float, w: float, B: Float) -> None:
-    """Replace the shared part of a tree, shape (2, 2), by that after the update, in place: (I - K) P_shared /
-    w (I - K)^T + K B / (1 - w) K^T, with K = P1 S^-1.
+    """Replace `shared`, the shared part of a tree, by that after the update, in place: (I - K) P_shared / w
+    (I - K)^T + K B / (1 - w) K^T, with K = P1 S^-1.
 
     Args:
         shared: Shared part of the covariance of the tree.
         P1: Covariance of the tree, with its shared part divided by w.
         S: Covariance of the innovation.
         w: Weight of the shared part, above 0 and below 1.
-        B: Shared part of the measurement.
+        B: Shared part of the measurement. All matrices have the shape (2, 2) [m^2].
     """
     det = S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0]
     k00, k01 = (

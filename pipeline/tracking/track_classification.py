@@ -49,19 +49,20 @@ def classify(
     range_max: float,
     hits_to_confirm: int,
 ) -> Int:
-    """Give the tracks the classes of the columns at their positions.
+    """Assign the classes of the columns to the tracks at their positions; see `confirm_round`,
+    `_take_classes` and `_assign_trees`, which are applied in this order.
 
     Args:
         tracks: The tracks, changed in place.
         scan: Pose of the robot.
         axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
-        votes: Shares of the votes, shape (C, 6).
+        votes: Shares of the votes in the order of CLASSES, shape (C, 6).
         verdict: Classes by votes and rules, shape (C,), changed in place by `confirm_round`.
         tree_share, range_max: See `Classification`.
         hits_to_confirm: See `Tracking`.
 
     Returns:
-        Rows of the tree columns without a track, where new tracks begin.
+        Rows of the tree columns without a track, int64, where the caller begins new tracks.
     """
     columns = verdict.shape[0]
     cells, scale = cells_for(columns), per_metre(NEIGHBOUR)
@@ -128,15 +129,20 @@ def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
 
 
 def tree_columns(columns: Columns) -> Int:
-    """Return the rows of the columns of class tree, those with most votes for tree first. Of columns within
-    ONE_TREE of each other, only the first remains."""
+    """Return the rows of the columns of class tree, int64, those with most votes for tree first. Of columns
+    within ONE_TREE of each other, only the first remains."""
     return _best_first(columns.axis, columns.share, columns.verdict)
 
 
 @compiled
 def _best_first(axis: Float, votes: Float, verdict: Int32) -> Int:
-    """Return the same as `tree_columns`, from axes (x, y first), votes (tree first) and classes of the
-    columns."""
+    """Return the same as `tree_columns`.
+
+    Args:
+        axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
+        votes: Shares of the votes, tree first, shape (C, 6).
+        verdict: Classes of the columns, shape (C,).
+    """
     rows, fewest, n = np.empty(verdict.shape[0], np.int64), np.empty(verdict.shape[0]), 0
     for c in range(verdict.shape[0]):
         if verdict[c] == TREE:
@@ -233,7 +239,8 @@ def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
     on.
 
     The limit is the observed time, at least GLIMPSE_NS and at most DUE_NS. A track that has been unobserved
-    for FORMER_NS or longer belongs to an earlier pass of the robot and is not rejected.
+    for FORMER_NS or longer belongs to an earlier pass of the robot and is not rejected. The arguments are the
+    times of the first and the last observation and of the present scan [ns].
     """
     unseen = now_ns - last_ns
     return min(max(last_ns - first_ns, GLIMPSE_NS), DUE_NS) < unseen < FORMER_NS
@@ -242,7 +249,7 @@ def _is_out_of_sight(first_ns: int, last_ns: int, now_ns: int) -> bool:
 @compiled
 def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
-    to the axis.
+    to the axis. Several columns may be assigned to one stem.
 
     Columns are assigned in their order, first those with a detected track. Each takes the track within REACH
     that is most likely (see `_likeliest`) and not assigned yet. The class of a column depends on its
@@ -312,7 +319,9 @@ def _stem_beside(tracks: Rows, cells: Cells, scale: float, x: float, y: float, f
 
 @compiled_within
 def _may_be_stem(verdict: int) -> bool:
-    """Return whether a track of a class can be the stem of a tree column beside it; see `_stem_beside`."""
+    """Return whether a track of a class can be the stem of a tree column near it: without class (negative),
+    tree, or a class by votes with AT_ROUND below 1. Classes that are not by votes (moving, too few voxels)
+    cannot."""
     if verdict < 0 or verdict == TREE:
         return True
     for k in range(_KINDS.shape[0]):

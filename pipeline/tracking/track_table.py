@@ -119,7 +119,7 @@ class TrackTable:
         shared: Float,
         velocity_sigma: float,
     ) -> TrackTable:
-        """Return new tracks without observations.
+        """Return K new tracks without observations (hits 0), landmark and class, with consecutive numbers.
 
         Args:
             number: Number of the first one.
@@ -139,6 +139,7 @@ class TrackTable:
         return t
 
     def __len__(self) -> int:
+        """Return the number of tracks."""
         return len(self.number)
 
     def copy(self) -> TrackTable:
@@ -146,17 +147,17 @@ class TrackTable:
         return TrackTable(*(getattr(self, f.name).copy() for f in fields(self)))
 
     def take(self, rows: Bool) -> TrackTable:
-        """Return the rows where the mask is true."""
+        """Return copies of the rows where the mask, shape (T,), is true."""
         return TrackTable(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def extended(self, more: TrackTable) -> TrackTable:
-        """Return these rows, followed by others."""
+        """Return these rows, followed by others, as copies. The caller keeps the numbers ascending."""
         return TrackTable(
             *(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self))
         )
 
     def as_rows(self) -> Rows:
-        """Return the same columns for compiled code."""
+        """Return the same arrays for compiled code, without copies: kernels change this table in place."""
         return Rows(*(getattr(self, f.name) for f in fields(self)))
 
 

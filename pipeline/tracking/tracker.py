@@ -35,6 +35,7 @@ class Tracker:
     """
 
     def __init__(self, parameters: Tracking) -> None:
+        """Create a tracker without trees; the first tree gets the number 1."""
         self.parameters = parameters
         self.next_number = 1
         self.tracks = TrackTable.empty()
@@ -49,12 +50,15 @@ class Tracker:
         landmarks: Landmarks,
         heights: Float | None = None,
     ) -> None:
-        """Update the trees with the detections of one scan.
+        """Update the trees with the detections of one scan, in place: assign them to the landmarks, remove
+        those without landmark and voxel column, filter and describe those that are detected, begin a tree at
+        each new landmark farther than `proximity_radius` from all trees, and join trees nearer than that to a
+        detected one.
 
         Args:
-            stamp_ns: Time of the scan.
-            estimate: Pose by SLAM (Eq. 9), with the landmark of each detection.
-            detections: Detections in the base frame.
+            stamp_ns: Time of the scan, not before the last one.
+            estimate: Pose by SLAM (Eq. 9), with the landmark of each detection (-1 for none).
+            detections: Detections in the base frame; may be empty.
             landmarks: Landmarks of SLAM after the scan.
             heights: Mean height above the ground of each detection, shape (D,) [m], NaN where unknown; None
                 where all are unknown.
@@ -94,13 +98,15 @@ class Tracker:
     def correct(
         self, correction: PathCorrection, stamps_ns: Int, estimate: PoseEstimate, landmarks: Landmarks
     ) -> None:
-        """Move the trees with a corrected path, and those with a landmark to its corrected position.
+        """Move the trees in place with a corrected path, and those with a landmark to its corrected position.
+        Trees without a landmark within LOOP_DISTANCE and without a tree column are removed.
 
-        Trees that share a landmark afterwards are joined. The covariances are rotated with the path.
+        Trees that share a landmark afterwards are joined. Velocities and covariances are rotated with the
+        path.
 
         Args:
             correction: The correction of the path.
-            stamps_ns: Time of each scan of the path.
+            stamps_ns: Time of each scan of the path [ns], int64, shape (N,).
             estimate: Pose after the correction.
             landmarks: Landmarks after the correction.
         """
@@ -122,7 +128,8 @@ class Tracker:
         self._follow(self._scan.stamp_ns, estimate, landmarks, np.inf, LOOP_DISTANCE)
 
     def classify(self, stamp_ns: int, columns: Columns, parameters: Classification) -> Columns:
-        """Classify the trees by the voxel columns, and begin a tree at each tree column without one.
+        """Classify the trees by the voxel columns, in place, and begin a tree without detections and landmark
+        at each tree column without one. The pose is that of the last scan of `process` or `correct`.
 
         Args:
             stamp_ns: Time of the scan.
@@ -130,7 +137,7 @@ class Tracker:
             parameters: Parameters of the classification.
 
         Returns:
-            The columns, of which those that `confirm_round` changes are trees.
+            The columns, of which those that `confirm_round` changes are trees; the argument is unchanged.
         """
         verdict = columns.verdict.copy()
         scan = self._scan._replace(stamp_ns=stamp_ns)
@@ -147,7 +154,8 @@ class Tracker:
         return replace(columns, verdict=verdict)
 
     def classify_new(self, columns: Columns) -> None:
-        """Classify trees that have no class yet by columns that `classify` returned."""
+        """Classify detected trees that have no class yet by columns that `classify` returned, in place; see
+        `track_classification.classify_new`."""
         classify_new(self.tracks.as_rows(), columns.axis, columns.verdict)
 
     def trees(self) -> Trees:
@@ -174,8 +182,8 @@ class Tracker:
     def _follow(
         self, stamp_ns: int, estimate: PoseEstimate, landmarks: Landmarks, gate: float, distance_max: float
     ) -> ScanPose:
-        """Assign the trees to the landmarks, remove trees without landmark and column, and return the pose of
-        the robot.
+        """Assign the trees to the landmarks, remove trees without landmark and tree column, and return the
+        pose of the robot, which is stored as that of the last scan.
 
         Args:
             stamp_ns: Time of the scan [ns].
@@ -194,7 +202,8 @@ class Tracker:
         return self._scan
 
     def _restart(self, rows: Int, position: Float, own: Float, landmarks: Landmarks) -> None:
-        """Restart the filters of trees at their landmarks where their detections are beyond the gate.
+        """Restart the filters of trees at their landmarks, in place, where their detections are beyond the
+        gate; the velocity is kept.
 
         That happens when SLAM corrects its map, or when another particle with another map is the best one.
 
