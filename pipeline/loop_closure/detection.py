@@ -50,7 +50,7 @@ class RunHistory:
         begun_since: Returns the landmarks that were begun at a scan or later, see FastSlam.begun_since.
         estimate: Pose at the newest scan.
         noise: Noise of the odometry.
-        motion: x, y [m], yaw [rad] by odometry from each scan to the next, shape (N, 3).
+        motion: x, y [m], yaw [rad] by odometry from the scan before to each scan, shape (N, 3).
         placed: Scan at which the pose was last set from outside; the path begins there.
         closed: Scan at which the last loop was closed; the path before it has no drift left.
         contradicted: Whether the newest scan shows trees where known places have others; see

@@ -78,7 +78,7 @@ class Relocaliser(Generic[S]):
         return self.state.local is not None
 
     def reset(self) -> None:
-        """End a search, and discard the stored states and motions, so that the map returns to none of them."""
+        """End a search, and discard the stored states and motions: the map returns to none of them."""
         self.state = RelocaliserState()
 
     def needs_state(self, index: int) -> bool:
