@@ -53,6 +53,7 @@ class OdometryBuffer:
     """
 
     def __init__(self) -> None:
+        """Create an empty buffer."""
         self._readings: deque[Reading] = deque()
         self._T_odom_jumped = Pose2()
         self.standing_since: tuple[int, Pose2] | None = None
@@ -63,7 +64,10 @@ class OdometryBuffer:
         return self._readings[-1] if self._readings else None
 
     def add(self, odometry: Odometry) -> Jump | None:
-        """Add a finite reading that is later than the last one; return its jump, None when there is none."""
+        """Add a finite reading that is later than the last one; return its jump, None if there is none.
+
+        A step faster than JUMP_SPEED or JUMP_TURN (over at least 0.1 s) is a jump: the reading gets the pose
+        of the one before, and later readings continue from there."""
         raw, jump = odometry.T_odom_base.planar(), None
         pose = self._T_odom_jumped @ raw
         if self._readings:
@@ -81,6 +85,7 @@ class OdometryBuffer:
         return jump
 
     def _watch_standing(self, reading: Reading) -> None:
+        """Set `standing_since` to a reading if it has moved from there by STANDSTILL or more."""
         if self.standing_since is not None:
             away = self.standing_since[1].inverse() @ reading.pose
             if np.hypot(away.x, away.y) < STANDSTILL[0] and abs(away.yaw) < STANDSTILL[1]:
@@ -88,20 +93,27 @@ class OdometryBuffer:
         self.standing_since = (reading.stamp_ns, reading.pose)
 
     def forget(self, needed_ns: int) -> None:
-        """Drop readings that no scan from time `needed_ns` on needs."""
+        """Remove the readings that are more than KEEP_NS before a time [ns]; at least two readings remain,
+        and the last one before that limit."""
         while len(self._readings) > 2 and self._readings[1].stamp_ns < needed_ns - KEEP_NS:
             self._readings.popleft()
 
     def pose_at(self, stamp_ns: int) -> Pose2:
         """Return T_odom_base at a time [ns]: interpolated, or that of the nearest reading outside of their
-        range. There must be a reading."""
+        range. Raises IndexError without a reading."""
         before, after = self._around(stamp_ns)
         span = after.stamp_ns - before.stamp_ns
         fraction = (stamp_ns - before.stamp_ns) / span if span > 0 else 1.0
         return interpolate(before.pose, after.pose, min(max(fraction, 0.0), 1.0))
 
     def motion_at(self, stamp_ns: int) -> Moving:
-        """Return the motion of the base at a time [ns]. There must be a reading."""
+        """Return the motion of the base at a time [ns]: pose and tilt interpolated, velocity constant between
+        two readings. Outside of the readings pose and tilt are those of the nearest one, with the velocity of
+        the nearest two. With a single reading the velocity is 0.
+
+        Raises:
+            IndexError: There is no reading.
+        """
         before, after = self._around(stamp_ns)
         span = (after.stamp_ns - before.stamp_ns) * 1e-9
         if span <= 0.0:
@@ -137,7 +149,7 @@ def _tilt_between(before: Reading, after: Reading, fraction: float) -> Tilt | No
 
 
 def _tilt(T_odom_base: Pose3) -> Tilt | None:
-    """Return roll and pitch of a pose; None for odometry in the plane."""
+    """Return roll and pitch of a pose [rad]; None if both are 0, as for odometry in the plane."""
     roll, pitch, _ = T_odom_base.euler()
     return None if roll == 0.0 and pitch == 0.0 else (roll, pitch)
 
@@ -154,11 +166,14 @@ class PoseBuffer:
     separately, because the odometry cannot predict them."""
 
     def __init__(self) -> None:
+        """Create an empty buffer, which keeps at most MOST positions and MOST poses."""
         self._places: deque[PoseMeasurement] = deque(maxlen=MOST)
         self._poses: deque[PoseMeasurement] = deque(maxlen=MOST)
 
     def add(self, pose: PoseMeasurement) -> bool:
-        """Add a valid pose; return False, and drop it, when it is not later than the last one of its kind."""
+        """Add a valid pose and return True; return False, and ignore it, if it is not later than the last one
+        of its kind (position, with a yaw variance of NO_HEADING or more, or pose). The oldest one of more
+        than MOST is removed."""
         kept = self._places if pose.covariance[2, 2] >= NO_HEADING else self._poses
         if kept and pose.stamp_ns <= kept[-1].stamp_ns:
             return False
@@ -168,15 +183,16 @@ class PoseBuffer:
     def at(
         self, stamp_ns: int, T_odom_base: Pose2 | None, odometry_at: Callable[[int], Pose2] | None
     ) -> PoseMeasurement | None:
-        """Return the pose measurement for a scan, None when there is none.
+        """Return the pose measurement for a scan, None if there is none.
 
-        A position must be from the same time as the scan. A pose is predicted to the time of the scan by the
-        odometry, and is used once.
+        A position within SAME_TIME_NS of the scan is returned as it is. Otherwise the latest pose up to the
+        scan is predicted to it by the odometry, if it is at most CARRIED_NS older; without odometry it must
+        be within SAME_TIME_NS. That pose and earlier ones are removed.
 
         Args:
-            stamp_ns: Stamp of the scan.
-            T_odom_base: Odometry at the stamp, None when unknown.
-            odometry_at: Returns T_odom_base at an earlier time, None without odometry.
+            stamp_ns: Time of the scan [ns].
+            T_odom_base: Odometry at the scan, None if unknown.
+            odometry_at: Returns T_odom_base at an earlier time [ns]; None without odometry.
         """
         near = min(self._places, key=lambda pose: abs(pose.stamp_ns - stamp_ns), default=None)
         if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS:
@@ -192,7 +208,8 @@ class PoseBuffer:
 
 
 def _carried(pose: PoseMeasurement, step: Pose2, stamp_ns: int) -> PoseMeasurement:
-    """Return a pose measurement predicted to a later time: P' = F P F^T + Q.
+    """Return a pose measurement predicted to a later time: P' = F P F^T + Q; Q has the sigma CARRIED times
+    the distance and the turn of the step.
 
     Args:
         pose: The measurement.

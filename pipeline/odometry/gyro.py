@@ -39,6 +39,7 @@ class Gyro:
     """Gyroscope readings of the last seconds, and the estimate of the bias."""
 
     def __init__(self) -> None:
+        """Create an estimator without readings, with the bias 0, which is not proven."""
         self._readings: deque[tuple[int, float]] = deque()
         self._block: list[float] = []
         self._blocks, self._bias, self._scatter = 0, 0.0, 0.0
@@ -47,7 +48,8 @@ class Gyro:
         self._proven = False
 
     def add(self, imu: Imu, tilt: tuple[float, float], *, standing: bool, needed_ns: int) -> None:
-        """Add a reading that is later than the last one.
+        """Add a finite reading that is later than the last one, as turn rate about the vertical; remove
+        readings that are no longer needed, and estimate the bias while the robot stands still.
 
         Args:
             imu: The reading.
@@ -66,11 +68,14 @@ class Gyro:
         self._learn_bias(rate, standing=standing)
 
     def forget_since(self, stamp_ns: int) -> None:
-        """Drop the readings from a time on, whose stamps were wrong."""
+        """Remove the readings from a time [ns] on, whose stamps were wrong."""
         while self._readings and self._readings[-1][0] >= stamp_ns:
             self._readings.pop()
 
     def _learn_bias(self, rate: float, *, standing: bool) -> None:
+        """Add a turn rate [rad/s] to the estimate of the bias. After BLOCK rates in a row at standstill,
+        their mean counts if their scatter and mean are within STILL_SIGMA and STILL_MOST; a rate in motion
+        discards the block."""
         if not standing:
             self._block.clear()
             return
@@ -127,7 +132,8 @@ class Gyro:
         return self._bias
 
     def turn(self, from_ns: int, to_ns: int) -> Turn | None:
-        """Return the turn between two times [ns]; None if readings are missing."""
+        """Return the turn between two times [ns] less the bias, with its sigma. None if readings are missing
+        for more than GAP_NS or are constant, or if the times are not in order."""
         angle = self._integral(from_ns, to_ns)
         if angle is None:
             return None
@@ -141,16 +147,20 @@ class Gyro:
         return Turn(angle, math.sqrt(variance))
 
     def rate(self, stamp_ns: int) -> float | None:
-        """Return the turn rate at a time [rad/s], None when readings are missing."""
+        """Return the turn rate at a time [ns] less the bias [rad/s]: the mean of the readings within
+        AROUND_NS. None without such a reading, or if the readings are constant."""
         near = [rate for _, rate in self._between(stamp_ns - AROUND_NS, stamp_ns + AROUND_NS)]
         return None if not near or self._is_dead else float(np.mean(near)) - self._bias
 
     @property
     def _is_dead(self) -> bool:
-        """Whether the readings are constant."""
+        """Whether the last DEAD readings (or all, of fewer) are equal; True with a single reading that
+        repeats the one before."""
         return self._same >= min(DEAD, max(len(self._readings) - 1, 1))
 
     def _between(self, from_ns: int, to_ns: int) -> list[tuple[int, float]]:
+        """Return the readings, time [ns] and rate [rad/s], between two times [ns], both included, in the
+        order of time."""
         found = []
         for reading in reversed(self._readings):
             if reading[0] < from_ns:
@@ -160,8 +170,8 @@ class Gyro:
         return found[::-1]
 
     def _integral(self, from_ns: int, to_ns: int) -> float | None:
-        """Return the turn between two times [ns], integrated by trapezoids [rad]; outside of the readings the
-        rate is constant. None if readings are missing."""
+        """Return the turn between two times [ns], integrated by trapezoids [rad]; up to GAP_NS outside of the
+        readings the rate is constant. None if readings are missing or constant."""
         inside = self._between(from_ns - GAP_NS, to_ns + GAP_NS)
         if self._is_dead or not inside or to_ns <= from_ns:
             return None
@@ -185,12 +195,12 @@ def fused(
     Args:
         step: Step by the wheels.
         sigma: Standard deviation of its turn [rad].
-        slack: Additional standard deviations, see `records.Step`.
+        slack: Additional standard deviations of position [m] and heading [rad], see `Step`.
         turn: Turn by the gyroscope.
 
     Returns:
-        The step, the standard deviation of its turn [rad], the remaining slack, and the reason why the wheels
-        are not trusted, "" when they are.
+        The step, the standard deviation of its turn [rad], the remaining slack (heading 0), and the message
+        why the wheels are not trusted, "" if they are.
     """
     of_wheels, of_gyro = sigma**2 + slack[1] ** 2, turn.sigma**2
     gap = float(wrap_angle(turn.angle - step.yaw))
@@ -202,5 +212,7 @@ def fused(
 
 
 def _turned(step: Pose2, by: float) -> Pose2:
+    """Return a step whose yaw is changed by an angle [rad], with its translation rotated by half of the
+    angle; the yaw is wrapped."""
     c, s = math.cos(0.5 * by), math.sin(0.5 * by)
     return Pose2(c * step.x - s * step.y, s * step.x + c * step.y, float(wrap_angle(step.yaw + by)))

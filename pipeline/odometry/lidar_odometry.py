@@ -53,6 +53,7 @@ class LidarOdometry:
     """
 
     def __init__(self, T_base_lidar: Pose3) -> None:
+        """Create an estimator without a map; imports KISS-ICP."""
         self._T_base_lidar = T_base_lidar
         self._matcher = _matcher()
         self._known: dict[int, Pose3 | None] = {}
@@ -63,10 +64,12 @@ class LidarOdometry:
         self.losses: dict[str, int] = {}
 
     def end(self) -> None:
-        """Do nothing."""
+        """Do nothing; nothing is counted at the end."""
 
     def add(self, record: Record) -> Iterator[Record]:
-        """Yield the records that replace one: odometry of the wheels is consumed, a scan follows its pose."""
+        """Yield the records that replace one record: nothing for odometry, which is stored as the initial
+        guess; the pose (if it is known) and the scan for a scan of points; the record itself for all others.
+        The scan is registered when the iterator is consumed."""
         if isinstance(record, Odometry):
             self._wheels = record
             return
@@ -77,6 +80,9 @@ class LidarOdometry:
         yield record
 
     def _pose_of(self, scan: Scan) -> Pose3 | None:
+        """Return T_odom_base of a scan: the known one for a time that was registered before, else by
+        registration. None for a new scan that is not later than the newest one, and where `_match` has none.
+        """
         if scan.stamp_ns in self._known:
             return self._known[scan.stamp_ns]
         if self._newest_ns is not None and scan.stamp_ns <= self._newest_ns:
@@ -86,6 +92,9 @@ class LidarOdometry:
         return pose
 
     def _match(self, scan: Scan) -> Pose3 | None:
+        """Register a scan to the map, add it to the map, and return T_odom_base. None, counted in `losses`,
+        with fewer than FEWEST useful points. If the registration is not finite, the initial guess is the
+        pose; this is counted too."""
         points, offset_ns = self._useful(scan)
         if len(points) < FEWEST:
             count_loss(self.losses, "scans with too few points for LiDAR odometry")
@@ -157,7 +166,8 @@ def undistorted(points: Float, offset_s: Float | None, delta: Float, span_ns: in
 
 
 def _matcher() -> Matcher:
-    """Return KISS-ICP with one thread, because more threads change the order of sums and so the result."""
+    """Return KISS-ICP with an empty map and one thread, because more threads change the order of sums and so
+    the result."""
     from kiss_icp.config import KISSConfig
     from kiss_icp.config.config import AdaptiveThresholdConfig, DataConfig, MappingConfig, RegistrationConfig
     from kiss_icp.kiss_icp import KissICP

@@ -24,10 +24,10 @@ class OdometryEstimator(Protocol):
     losses: dict[str, int]
 
     def add(self, record: Record) -> Iterator[Record]:
-        """Yield the records that replace one record."""
+        """Yield the records that replace one record; may yield none."""
 
     def end(self) -> None:
-        """Finish after the last record of a complete reading."""
+        """Finish after the last record of a complete reading; may add to `losses`."""
 
 
 class OdometryOverride:
@@ -43,37 +43,42 @@ class OdometryOverride:
     """
 
     def __init__(self, source: Source, motion: OdometryEstimator, digest: str = "") -> None:
+        """Wrap a source; nothing is read."""
         self.source, self._motion = source, motion
         self._digest = digest
 
     @property
     def description(self) -> SourceDescription:
-        """Description of the source, with odometry."""
+        """Description of the source, with odometry, and with "+" and the digest of the file appended to its
+        digest if there is one."""
         known = self.source.description
         digest = f"{known.digest}+{self._digest}" if self._digest else known.digest
         return replace(known, has_odometry=True, digest=digest)
 
     @property
     def losses(self) -> dict[str, int]:
-        """Records left out, by reason."""
+        """Number of records that the source left out and of scans without a pose, by reason; a new
+        dictionary."""
         total = dict(self.source.losses)
         for reason, count in self._motion.losses.items():
             count_loss(total, reason, count)
         return total
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of time."""
+        """Yield the records of the source in the order of time, from `start_ns` on, each replaced by the
+        estimator. After the last record of a reading from the beginning (`start_ns` None) the estimator is
+        finished."""
         for record in self.source.records(start_ns):
             yield from self._motion.add(record)
         if start_ns is None:
             self._motion.end()
 
     def pass_on(self, record: Record) -> Iterator[Record]:
-        """Yield the records that replace one record of the source, when the caller reads it (live)."""
+        """Yield the records that replace one record of a live source, whose records the caller reads itself."""
         return self._motion.add(record)
 
     def truth(self) -> Truth | None:
-        """Return the ground truth of the source."""
+        """Return the ground truth of the source; None without one."""
         return self.source.truth()
 
     def close(self) -> None:
@@ -105,6 +110,7 @@ class FileOdometry:
     """
 
     def __init__(self, path: Path, T_base_lidar: Pose3) -> None:
+        """Read the file of poses."""
         try:
             self._times, self._poses = read_any_poses(path)
         except (TextError, OSError) as error:
@@ -119,7 +125,9 @@ class FileOdometry:
         self.losses: dict[str, int] = {}
 
     def add(self, record: Record) -> Iterator[Record]:
-        """Yield the records that replace one: other odometry is dropped, a scan follows its pose."""
+        """Yield the records that replace one record: nothing for odometry; the pose of the base (if the file
+        has one) and the scan for a scan; the record itself for all others. A scan that is read again gets the
+        same row."""
         if isinstance(record, Odometry):
             return
         if isinstance(record, Scan):
@@ -129,11 +137,14 @@ class FileOdometry:
         yield record
 
     def end(self) -> None:
-        """Count rows without a scan, or scans without a row."""
+        """Set `losses` to the number of rows without a scan, or of scans without a row. Empty for rows with
+        times."""
         left = 0 if self._times is not None else len(self._poses) - len(self._row_of)
         self.losses = {reason: n for reason, n in ((TOO_MANY, left), (TOO_FEW, -left)) if n > 0}
 
     def _pose_of(self, stamp_ns: int) -> Pose3 | None:
+        """Return the pose of the LiDAR at a scan [ns], T_odom_lidar; None for a scan after the last row, or
+        far from all rows with times (see `pose_at`)."""
         if self._times is not None:
             return pose_at(self._times, self._poses, stamp_ns)
         row = self._row_of.setdefault(stamp_ns, len(self._row_of))

@@ -48,17 +48,19 @@ def steps(
     losses: Counter[str] | None = None,
     after: SynchroniserState | None = None,
 ) -> Iterator[Step]:
-    """Yield a step for each scan: the scan with the odometry interpolated to its time, the tilt, and more.
+    """Yield a step for each scan: the scan with odometry and tilt interpolated to its time, the measured
+    pose, and the turn by the gyroscope.
 
-    A scan waits for the first odometry at or after its stamp, until more than five scans wait; then the last
+    A scan waits for the first odometry at or after its stamp, until more than WAIT scans wait; then the last
     pose is used. A scan that is not later than the last one is left out, counted in `losses`, and reported in
-    the warnings of the next step.
+    the warnings of the next step. Without any odometry the step has no pose.
 
     Args:
-        records: In the order of arrival.
-        odometry: "static" ignores odometry: the robot does not move.
+        records: Records in the order of arrival.
+        odometry: "static" ignores odometry, so that no step has a pose and no scan waits; the other choices
+            use it.
         first_index: Number of the first step.
-        losses: Counts what was left out, by reason.
+        losses: Counter of what was left out, by reason, increased in place; None for none.
         after: State of the estimates at a step of an earlier reading; the records begin shortly before it.
     """
     counted = Counter[str]() if losses is None else losses
@@ -82,6 +84,7 @@ class Synchroniser:
     def __init__(
         self, *, use_odometry: bool, index: int, losses: Counter[str], after: SynchroniserState | None = None
     ) -> None:
+        """Create a synchroniser without records."""
         self._losses = losses
         self._use_odometry = use_odometry
         self._index = index
@@ -103,7 +106,8 @@ class Synchroniser:
         self._warnings: list[str] = []
 
     def add(self, record: Record) -> None:
-        """Add a record of any kind."""
+        """Add a record of any kind. A record that cannot be used (see the reasons in `losses`) is counted and
+        reported in the next step; a notice becomes a warning of the next step; other kinds are ignored."""
         match record:
             case Scan():
                 self._add_scan(record)
@@ -117,6 +121,7 @@ class Synchroniser:
                 self._warn(record.text)
 
     def _add_scan(self, scan: Scan) -> None:
+        """Append a scan to the waiting ones; one that is not later than the last one is left out."""
         if self._last_stamp is not None and scan.stamp_ns <= self._last_stamp:
             self._leave_out("scans that were not later than the one before")
             return
@@ -124,6 +129,8 @@ class Synchroniser:
         self._scans.append(scan)
 
     def _add_odometry(self, odometry: Odometry) -> None:
+        """Add a reading of the odometry. Without finite numbers, or not later than the last one, it is left
+        out; without `use_odometry` it is ignored. A jump is reported and makes the odometry doubtful."""
         T = odometry.T_odom_base
         if not (np.all(np.isfinite(T.t)) and np.all(np.isfinite(T.R))):
             self._leave_out("odometry readings without finite numbers")
@@ -136,6 +143,8 @@ class Synchroniser:
             self._odometry.forget(self._needed_ns(odometry.stamp_ns))
 
     def _report_jump(self, jump: Jump) -> None:
+        """Add a warning about a jump of the odometry, and make the motion to the next step doubtful by
+        JUMP_SLACK."""
         self._warn(
             f"the odometry jumped by {jump.distance:.1f} m and {np.degrees(jump.turn):.0f} degrees; "
             "the jump is not used as motion"
@@ -143,16 +152,22 @@ class Synchroniser:
         self._suspect("the odometry jumped", JUMP_SLACK)
 
     def _add_pose(self, pose: PoseMeasurement) -> None:
+        """Add a measured pose; an unsound one (`PoseMeasurement.is_sound`), or one that is not later than the
+        last one of its kind, is left out."""
         if not pose.is_sound():
             self._leave_out("measured poses without finite numbers or a positive definite covariance")
         elif not self._measured.add(pose):
             self._leave_out("measured poses that were not later than the one before")
 
     def _suspect(self, why: str, slack: tuple[float, float]) -> None:
+        """Set the message of doubt of the next step (the last one wins), and add the sigmas of position [m]
+        and heading [rad] to its slack as independent errors."""
         self._doubt = why
         self._slack = (float(np.hypot(self._slack[0], slack[0])), float(np.hypot(self._slack[1], slack[1])))
 
     def _add_imu(self, imu: Imu) -> None:
+        """Add a reading of the IMU: its turn rate, and its orientation if that is known. One that is not
+        later than the last one is left out, unless earlier ones were ahead of their time (`_was_ahead`)."""
         if (
             self._turned_ns is not None
             and imu.stamp_ns <= self._turned_ns
@@ -171,10 +186,11 @@ class Synchroniser:
             self._imu.popleft()
 
     def _was_ahead(self, stamp_ns: int) -> bool:
-        """Drop the last IMU readings when their stamps were ahead of the time; return whether they were.
+        """Return whether the last IMU readings were ahead of their time, and remove them then, with a
+        warning.
 
-        They were ahead when the new reading is earlier by more than the order of messages can explain, and is
-        nearer to the other records.
+        They were ahead if the new reading, at `stamp_ns`, is AHEAD_NS or more before the last one, and is
+        nearer to the newest scan or odometry. False without a scan or odometry.
         """
         last = self._turned_ns
         newest = self._odometry.newest
@@ -190,6 +206,9 @@ class Synchroniser:
         return True
 
     def _add_turn_rate(self, imu: Imu) -> None:
+        """Add the turn rate of an IMU reading to the gyroscope. It is ignored if it is not finite, and left
+        out if it exceeds FASTEST. The bias is estimated only while the odometry is recent and at rest for
+        more than SETTLES_NS."""
         if not np.all(np.isfinite(imu.angular_velocity)):
             return
         if np.abs(imu.angular_velocity).max() > FASTEST:
@@ -206,7 +225,8 @@ class Synchroniser:
         self._gyro.add(imu, self._gyro_tilt[1:], standing=still, needed_ns=oldest)
 
     def _needed_ns(self, now_ns: int) -> int:
-        """Return the time from which readings are still needed: the stamp of the oldest waiting scan."""
+        """Return the time from which readings are still needed [ns]: the stamp of the oldest waiting scan,
+        `now_ns` without one."""
         return self._scans[0].stamp_ns if self._scans else now_ns
 
     def ready(self, *, end: bool = False) -> Iterator[Step]:
@@ -215,12 +235,16 @@ class Synchroniser:
             yield self._join(self._scans.popleft())
 
     def _is_ready(self, scan: Scan) -> bool:
+        """Return whether a waiting scan can be joined: its odometry has arrived, more than WAIT scans wait,
+        or odometry is not used."""
         if len(self._scans) > WAIT:
             return True
         newest = self._odometry.newest
         return not self._use_odometry if newest is None else newest.stamp_ns >= scan.stamp_ns
 
     def _join(self, scan: Scan) -> Step:
+        """Return the step of a scan, with the warnings and doubts since the last step, which are reset. With
+        a state `after`, the estimates of the first step at or after it are replaced by that state."""
         if self._stepped_ns is None and self._after is not None and self._after.stamp_ns < scan.stamp_ns:
             self._stepped_ns = self._after.stamp_ns
         self._report_pause(scan.stamp_ns)
@@ -260,8 +284,8 @@ class Synchroniser:
         return step
 
     def _turn_to(self, stamp_ns: int, pose: Pose2 | None) -> Turn | None:
-        """Return the turn since the last step by the gyroscope, and compare it with the odometry if that is
-        reliable.
+        """Return the turn since the last step by the gyroscope, None if unknown; it is compared with the
+        odometry (`Gyro.compare`) if neither is missing and the odometry is not doubted.
 
         Args:
             stamp_ns: Time of the scan [ns].
@@ -275,8 +299,11 @@ class Synchroniser:
 
     def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:
         """Return pose, velocity in the base frame (x, y [m/s], yaw [rad/s]), and tilt by the odometry at a
-        time [ns]. After the end of the odometry the last pose is returned without motion and tilt, and None
-        as pose before it begins."""
+        time [ns].
+
+        More than STALE_NS after the last reading the last pose is returned, without motion and tilt; without
+        any reading the pose is None. Both add a warning and a doubt (`_bridge`), except for None without
+        `use_odometry`."""
         newest = self._odometry.newest
         if newest is None:
             if self._use_odometry:
@@ -288,14 +315,15 @@ class Synchroniser:
         return self._odometry.motion_at(stamp_ns)
 
     def _report_pause(self, stamp_ns: int) -> None:
-        """Add a warning after a long time without a scan, and flag the odometry as unreliable."""
+        """Add a warning and a doubt without sigmas if more than PAUSE_NS have passed since the last step."""
         seconds = 0.0 if self._stepped_ns is None else (stamp_ns - self._stepped_ns) * 1e-9
         if seconds * 1e9 > PAUSE_NS:
             self._warn(f"no scan for {seconds:.0f} s: the pose is known only by the odometry")
             self._suspect(f"no scan for {seconds:.0f} s", (0.0, 0.0))
 
     def _bridge(self, stamp_ns: int) -> None:
-        """Add the uncertainty of an unknown motion since the last scan."""
+        """Add a warning, a doubt and the uncertainty of an unknown motion since the last step, up to
+        WALK_MOST; zero before the first step."""
         self._warn(NO_ODOMETRY)
         since = self._stepped_ns if self._stepped_ns is not None else stamp_ns
         seconds = (stamp_ns - since) * 1e-9
@@ -305,6 +333,8 @@ class Synchroniser:
         )
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
+        """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None without one, and,
+        with a warning, if it is more than STALE_NS away."""
         if not self._imu:
             return None
         nearest = min(self._imu, key=lambda imu: abs(imu.stamp_ns - stamp_ns))
@@ -314,16 +344,19 @@ class Synchroniser:
         return _tilt_of(nearest)
 
     def _leave_out(self, reason: str) -> None:
+        """Count a record that is left out for a reason, and add a warning."""
         self._losses[reason] += 1
         self._warn(f"left out: {reason}")
 
     def _warn(self, text: str) -> None:
+        """Add a warning to the next step, unless it has the same one."""
         if text not in self._warnings:
             self._warnings.append(text)
 
 
 def _tilt_of(imu: Imu) -> tuple[float, float] | None:
-    """Return roll and pitch by the orientation of a reading, None without one."""
+    """Return roll and pitch [rad] by the orientation of a reading; None without one, or if it is not finite
+    or not a valid quaternion."""
     if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
         return None
     try:
