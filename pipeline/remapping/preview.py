@@ -55,6 +55,7 @@ class ClusterTable:
     """
 
     def __init__(self) -> None:
+        """Create a table without scans."""
         self._columns = {
             name: np.zeros((FIRST_ROWS, *shape), kind) for name, (kind, shape) in JUDGED_COLUMNS.items()
         }
@@ -63,16 +64,18 @@ class ClusterTable:
         self._lost: list[bool] = []
 
     def __len__(self) -> int:
+        """Return the number of scans."""
         return len(self.start) - 1
 
     def put(self, index: int, clusters: Clusters, offset: Float, *, lost: bool = False) -> None:
-        """Store the clusters of a scan. Those of later scans are removed. A scan beyond the next is ignored.
+        """Store the clusters of a scan. Those of this and later scans are removed first. A scan beyond the
+        next one is ignored.
 
         Args:
             index: Number of the scan.
-            clusters: Its clusters.
-            offset: Sensor in the base frame, shape (3,) [m].
-            lost: Whether the robot was lost, so that the pose is of no use.
+            clusters: Its clusters; copied.
+            offset: Position of the sensor in the base frame, shape (3,) [m].
+            lost: Whether the robot was lost, so that the pose is unusable.
         """
         if index > len(self):
             return
@@ -89,12 +92,16 @@ class ClusterTable:
         self._lost.append(lost)
 
     def record(self, frame: Frame) -> None:
-        """Store the clusters of a mapped scan."""
+        """Store the clusters of a mapped scan, see `put`; the robot counts as lost if its health is "lost"."""
         lost = frame.estimate.health.state == "lost"
         self.put(frame.index, frame.clusters, frame.sensor_offset, lost=lost)
 
     def of(self, scans: Sequence[int]) -> ClusterTable:
-        """The table of some scans, in their order."""
+        """Return the table of some scans, in the given order, as a copy.
+
+        Raises:
+            IndexError: A scan is not in the table.
+        """
         rows = [np.arange(self.start[k], self.start[k + 1]) for k in scans]
         part = ClusterTable()
         part.start = np.cumsum([0, *map(len, rows)]).tolist()
@@ -104,7 +111,7 @@ class ClusterTable:
         return part
 
     def verdicts(self, parameters: Detection) -> Int:
-        """Verdict of each cluster, shape (K,)."""
+        """Return the verdict of each cluster by these parameters, see `Verdict`, int64, shape (K,)."""
         rows = self.start[-1]
         columns: dict[str, Any] = {name: column[:rows] for name, column in self._columns.items()}
         unused = np.zeros(rows)
@@ -121,7 +128,9 @@ class ClusterTable:
         return verdict
 
     def places(self, path: Float, p: Parameters) -> tuple[Float, Int]:
-        """Where clusters that are trees lie together: x, y in the map, shape (T, 2) [m], and how many, (T,).
+        """Group the clusters that are trees by their position in the map: return the mean positions, shape
+        (T, 2) [m], and the numbers of clusters, int64, shape (T,). Scans of a lost robot are omitted; at most
+        MOST_PLACES groups are returned.
 
         Args:
             path: x, y [m], yaw [rad] of the base at each scan of the table, shape (N, 3).
@@ -138,19 +147,22 @@ class Sample:
     """Every n-th scan of a run with its points. Where the sample is too large, n doubles."""
 
     def __init__(self) -> None:
+        """Create an empty sample that keeps every scan."""
         self._steps: dict[int, Step] = {}
         self._spacing = 1
 
     def __len__(self) -> int:
+        """Return the number of scans."""
         return len(self._steps)
 
     @property
     def nbytes(self) -> int:
-        """Size of the points."""
+        """Size of the points [bytes]."""
         return sum(step.scan.points.nbytes for step in self._steps.values())
 
     def offer(self, step: Step) -> None:
-        """Keep a scan if it is due."""
+        """Keep a scan if its number is a multiple of the spacing. While more than SAMPLE_SCANS scans or
+        SAMPLE_BYTES are kept, the spacing doubles, and scans between are removed; one scan always remains."""
         if step.index % self._spacing:
             return
         self._steps[step.index] = step
@@ -164,12 +176,14 @@ class Sample:
         scans: int,
         segment_all: Callable[[Segment, list[Step]], Iterable[SegmentedScan]] = map,
     ) -> dict[int, SegmentedScan]:
-        """The segmented scans of the sample among the first ones, by their numbers, ascending.
+        """Return the segmented scans of the sample with numbers below `scans`, by number, ascending; may be
+        empty.
 
         Args:
             segment: Segments one scan.
-            scans: Number of the first scans.
-            segment_all: Segments a list of scans: in turn, or several at once.
+            scans: Number of scans of the run that are considered.
+            segment_all: Segments a list of scans and returns the results in the same order, one by one or
+                several at once.
         """
         numbers = [n for n in sorted(self._steps) if n < scans]
         return dict(zip(numbers, segment_all(segment, [self._steps[n] for n in numbers]), strict=True))
@@ -192,7 +206,7 @@ class KnownMap:
     columns: Columns | None
 
     def needs_sample(self, parameters: Parameters) -> bool:
-        """Whether the parameters change the clusters."""
+        """Return whether the parameters change the clusters: whether a stage of the segmentation differs."""
         before = self.parameters
         return any(getattr(before, stage) != getattr(parameters, stage) for stage in SEGMENTATION_STAGES)
 
@@ -200,16 +214,19 @@ class KnownMap:
 def preview_trees(
     known: KnownMap, parameters: Parameters, sample: Mapping[int, SegmentedScan] | None = None
 ) -> Trees | None:
-    """Where trees would stand with other parameters, without diameters; their numbers mean nothing.
+    """Return the trees that a rerun with other parameters would approximately give, without diameters,
+    covariances and times (NaN or 0). All are confirmed, and their numbers (from 1) are unrelated to those of
+    the run.
 
     Args:
-        known: The run as it is mapped.
+        known: The run as it is mapped; unchanged.
         parameters: The other parameters.
         sample: Some scans as these parameters segment them, by their numbers, ascending. Needed where
             `KnownMap.needs_sample`.
 
     Returns:
-        The trees; None where the parameters classify columns in another way, or a sample is missing.
+        The trees. None if no scan is known, if the parameters classify columns in another way (apart from
+        `tree_share`), or if a needed sample is missing or empty.
     """
     path = np.stack([known.path.x, known.path.y, known.path.yaw], axis=1)
     scans = min(len(path), len(known.clusters))
@@ -234,13 +251,15 @@ class _Places(NamedTuple):
 
 
 def _classifies_alike(before: Parameters, now: Parameters) -> bool:
-    """Whether both classify the same columns with the same votes."""
+    """Return whether both classify the same columns with the same votes: whether the classification differs
+    at most in `tree_share`."""
     a, b = (p.classification.model_dump(exclude=TREE_SHARE) for p in (before, now))
     return bool(a == b)
 
 
 def _has_same_columns(before: Parameters, now: Parameters) -> bool:
-    """Whether both integrate the same points into the columns."""
+    """Return whether both integrate the same points into the columns: the stages COLUMN_STAGES differ at most
+    in the voxel size."""
     a, b = (
         [getattr(p, stage).model_dump(exclude=NOT_OF_COLUMNS) for stage in COLUMN_STAGES]
         for p in (before, now)
@@ -249,6 +268,7 @@ def _has_same_columns(before: Parameters, now: Parameters) -> bool:
 
 
 def _reach(p: Parameters) -> float:
+    """Return the distance up to which clusters belong to one tree [m]."""
     return max(p.tracking.proximity_radius, min(p.slam.distance_max, REACH))
 
 
@@ -263,7 +283,15 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
 
 
 def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:
-    """The trees of all scans: where a voxel column is, it decides; elsewhere the number of clusters."""
+    """Return the trees of all scans. At a voxel column its class decides; elsewhere, trees have at least
+    `hits_to_confirm` clusters.
+
+    Args:
+        known: The run, for its columns.
+        table: Clusters of N scans.
+        path: x, y [m], yaw [rad] of the base at these scans, shape (N, 3).
+        p: Parameters of verdicts, tracking and classification.
+    """
     place, hits = table.places(path, p)
     confirmed = hits >= p.tracking.hits_to_confirm
     columns = _columns(known, p)
@@ -287,11 +315,19 @@ def _with_sample(
     p: Parameters,
     sample: Mapping[int, SegmentedScan],
 ) -> _Places:
-    """The trees as a sample of scans changes them.
+    """Return the trees as a sample of scans changes them.
 
-    A tree that is found less often in the sample gets fewer hits, and what is found only now is a new tree.
-    A voxel column does not depend on clusters, so its tree stays; where the columns change too, it stays as
-    long as the sample finds it.
+    A tree that is found less often in the sample gets fewer hits, and is removed below `hits_to_confirm`; one
+    with fewer than LEAST_HITS finds before is unchanged. What is found LEAST_HITS times and only now is a new
+    tree. The tree of a voxel column remains; where the columns change too, it remains if the sample finds it.
+
+    Args:
+        before: Trees of all scans with the segmentation of the run.
+        known: The run.
+        table: Clusters of all scans.
+        path: x, y [m], yaw [rad] of the base at each scan, shape (N, 3).
+        p: The other parameters.
+        sample: Segmented scans by number; numbers beyond the table are ignored.
     """
     scans = [k for k in sample if k < len(table)]
     part, fresh = table.of(scans), ClusterTable()
@@ -322,12 +358,15 @@ def _with_sample(
 
 
 def _sums(row: Int, hits: Int, rows: int) -> Int:
-    """Sum of the hits of each row; row -1 is left out."""
+    """Return the sum of the hits by row, int64, shape (rows,); entries with the row -1 are omitted. `row` and
+    `hits` have the same shape."""
     valid = row >= 0
     return np.bincount(row[valid], hits[valid], rows).astype(np.int64)
 
 
 def _trees(known: _Places) -> Trees:
+    """Return places as confirmed trees with the numbers 1 to T; diameters and covariances are NaN, times,
+    velocities and coverage 0."""
     place, hits, n = known.place, known.hits, len(known.place)
     unknown, none = np.full(n, np.nan), np.zeros(n, np.int64)
     return Trees(
@@ -350,15 +389,17 @@ def _trees(known: _Places) -> Trees:
 def _grouped(
     centre: Float, tree: Bool, start: Int, pose: Float, reach: float, most: int
 ) -> tuple[Float, Int]:
-    """Mean of the clusters within reach of the first one of each place, shape (T, 2), and their number, (T,).
+    """Group the clusters that are trees: each one joins the nearest place within reach, or begins a place.
+    Return the mean position of each place, shape (T, 2) [m], and its number of clusters, int64, shape (T,).
 
     Args:
-        centre: Level sensor frame, shape (K, 2) [m].
+        centre: Positions in the level sensor frame, shape (K, 2) [m].
         tree: Which of them are trees, shape (K,).
-        start: First row of each scan, shape (N + 1,).
-        pose: x, y [m], yaw [rad] of the base in the map, then x, y of the sensor in the base frame, (N, 5).
+        start: First row of each scan, then K, int64, shape (N + 1,).
+        pose: x, y [m], yaw [rad] of the base in the map, then x, y of the sensor in the base frame, shape (N,
+            5).
         reach: Distance [m].
-        most: Number of places at most.
+        most: Maximum number of places; clusters that would begin further ones are omitted.
     """
     place, hits, n = np.empty((most, 2)), np.zeros(most, np.int64), 0
     cells, scale = cells_for(most), per_metre(reach)

@@ -17,7 +17,7 @@ SegmentSteps = Callable[[Segment, Iterator[Step]], Iterator[tuple[Step, Segmente
 
 
 def segment_in_turn(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Step, SegmentedScan]]:
-    """Each step with its segmented scan, in order."""
+    """Yield each step with its segmented scan, in order; each is segmented when it is consumed."""
     return ((step, segment(step)) for step in steps)
 
 
@@ -42,6 +42,7 @@ class Rerun:
         reread: Reread | None = None,
         segment_steps: SegmentSteps = segment_in_turn,
     ) -> None:
+        """Prepare a rerun; nothing is read."""
         self.mapper = mapper
         self.done = 0
         self.was_read = False
@@ -49,10 +50,12 @@ class Rerun:
         self._segmented: Iterator[tuple[Step, SegmentedScan]] | None = None
 
     def map_next(self) -> Frame:
-        """Map the next scan. The frame has no points where the scan comes from the cache.
+        """Map the next scan, from the cache or else from the source, and return its frame. A scan from the
+        cache has no points in the frame; one from the source is added to the cache.
 
         Raises:
-            StemmapError: The scan is not in the cache and cannot be read again.
+            StemmapError: The scan is not in the cache and cannot be read again, for example after the last
+                scan.
         """
         step, scan = self._cache.read(self.done) or self._read_again(self.done)
         frame = self.mapper.process(step, scan)
@@ -60,15 +63,22 @@ class Rerun:
         return frame
 
     def go_back(self, scans: int, state: MapperState) -> None:
-        """Return to an earlier state of the mapper, which holds so many scans."""
+        """Return to an earlier state of the mapper, taken after `scans` scans. The source is read again from
+        its beginning where it is needed."""
         self.mapper.restore(state)
         self.done, self._segmented = scans, None
 
     def close(self) -> None:
-        """Stop reading the source."""
+        """Stop reading the source. The cache stays open."""
         self._segmented = None
 
     def _read_again(self, index: int) -> tuple[Step, SegmentedScan]:
+        """Return a step and its segmented scan from the source, and add it to the cache. Reading continues
+        after the last scan read; scans before `index` are skipped.
+
+        Raises:
+            StemmapError: The run is live, or the source has no such scan.
+        """
         if self._reread is None:
             raise StemmapError(
                 "the scans of a live run cannot be read again, and these parameters need their points",

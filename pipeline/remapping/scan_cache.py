@@ -57,7 +57,8 @@ class _PackedColumnInput:
 
     @classmethod
     def of(cls, given: ColumnInput) -> _PackedColumnInput:
-        """Pack the points that can be integrated into columns; their z is not used and not stored."""
+        """Return the packed points that can be integrated into columns, with heights in (0, HIGHEST); their z
+        is not used and not stored."""
         low = (given.height > 0.0) & (given.height < HIGHEST)
         places = np.stack([given.points[low, 0], given.points[low, 1], given.height[low]])
         steps = np.rint(places * np.float32(1.0 / POINT)).astype(np.int32)
@@ -82,10 +83,11 @@ class _PackedScan:
 
 
 def pack(step: Step, scan: SegmentedScan) -> bytes:
-    """Pack a step and its segmented scan; of the points only those of the column input are kept.
+    """Return a step and its segmented scan as a compressed block. Of the points only those of the column
+    input are kept; clearance and the state of the synchroniser are omitted.
 
     Raises:
-        TooLargeError: The block is larger than `unpack` accepts.
+        TooLargeError: The block is larger than `unpack` accepts, LARGEST bytes before compression.
     """
     no_points: Float32 = np.zeros((0, 3), np.float32)
     lean = replace(
@@ -105,10 +107,11 @@ def pack(step: Step, scan: SegmentedScan) -> bytes:
 
 
 def unpack(block: bytes | bytearray) -> tuple[Step, SegmentedScan]:
-    """Return what `pack` was given, without the raw points.
+    """Return the step and the segmented scan that `pack` was given, without what it omits; z of the column
+    points is 0. Sizes are checked before memory is taken.
 
     Raises:
-        ValueError: The block is damaged.
+        ValueError: The block is damaged. A damaged block can also raise KeyError, TypeError or RuntimeError.
     """
     try:
         if not 0 <= zstandard.frame_content_size(block) <= LARGEST:
@@ -141,7 +144,8 @@ _File = Any  # binary, with seek, write and readinto; its class depends on the o
 
 
 def segmentation_key(parameters: Parameters) -> bytes:
-    """Sixteen bytes that differ where `pipeline.front_end.segment` may give another result."""
+    """Return sixteen bytes that differ where `pipeline.front_end.segment` may give another result; obstacle
+    parameters do not count."""
     values = {
         **{stage: getattr(parameters, stage).model_dump() for stage in SEGMENTATION_STAGES},
         "classification": parameters.classification.model_dump(include=set(SEGMENTATION_CLASSIFICATION)),
@@ -166,6 +170,8 @@ class ScanCache:
     def __init__(
         self, file: _File, header: bytes, folder: Path | None = None, most: int = MOST_BYTES
     ) -> None:
+        """Open the cache and find its scans. A file with another header is emptied; one that is cut or
+        damaged is cut after the last valid row, with a `notice`. Errors of the disk appear in `refusal`."""
         self._file: _File = file
         self._folder, self._most = folder, most
         self._rows: dict[int, tuple[int, Any]] = {}  # by scan: position of its block, and its row
@@ -181,19 +187,22 @@ class ScanCache:
             self.refusal = f"no scan is cached: {error.strerror or error}"
 
     def __len__(self) -> int:
+        """Return the number of stored scans."""
         return len(self._rows)
 
     @property
     def nbytes(self) -> int:
-        """Size of the file."""
+        """Size of the file [bytes]."""
         return self._end
 
     def has_all(self, scans: int) -> bool:
-        """Whether all of the first scans are stored."""
+        """Return whether the scans 0 to `scans` - 1 are all stored."""
         return len(self._rows) >= scans and all(index in self._rows for index in range(scans))
 
     def put(self, step: Step, scan: SegmentedScan) -> None:
-        """Store a scan unless it is stored already. Where there is no room, `refusal` says so."""
+        """Store a scan at the end of the file, unless its number is stored already or the cache is closed. If
+        the block, the file or the disk is full, or writing fails, it is not stored and `refusal` contains the
+        reason; nothing is raised."""
         if self._file is None or step.index in self._rows:
             return
         try:
@@ -217,13 +226,14 @@ class ScanCache:
         self._end += ROW.itemsize + len(block)
 
     def read(self, index: int, stamp_ns: int | None = None) -> tuple[Step, SegmentedScan] | None:
-        """A scan without its raw points; None where it is not stored.
+        """Return a scan without its raw points. None if it is not stored, the cache is closed, or its time
+        differs.
+
+        A damaged scan is removed from the index, so that it can be stored again; `notice` reports it.
 
         Args:
             index: Number of the scan.
-            stamp_ns: Time that it must have; None accepts any.
-
-        A damaged scan is forgotten, so that it is stored again; `notice` says so.
+            stamp_ns: Time that it must have [ns]; None accepts any.
         """
         if index not in self._rows or self._file is None:
             return None
@@ -240,12 +250,18 @@ class ScanCache:
         return (step, scan) if stamp_ns in (None, step.scan.stamp_ns) else None
 
     def close(self) -> None:
-        """Close the file. A file without a name is deleted."""
+        """Close the file; a file without a name is deleted. Later calls of `put` and `read` do nothing."""
         if self._file is not None:
             self._file.close()
             self._file = None
 
     def _open(self, header: bytes) -> None:
+        """Read the rows of the file, without their blocks. A file without this header is emptied; the part
+        after the last valid row is cut off.
+
+        Raises:
+            OSError: The disk refuses.
+        """
         size = self._file.seek(0, os.SEEK_END)
         start = bytearray(len(header))
         if size < len(header) or _read(self._file, 0, start) < 0 or start != header:
@@ -266,7 +282,8 @@ class ScanCache:
             self._file.truncate(self._end)
 
     def _refuse(self, index: int, why: str) -> None:
-        """Report the first scan that is not stored; later ones may be smaller and fit."""
+        """Set `refusal` to the first scan that is not stored and the reason; later ones may be smaller and
+        fit."""
         self.refusal = self.refusal or f"scan {index} and possibly later scans are not cached: {why}"
 
 
@@ -281,11 +298,13 @@ class ScanCaches:
     """
 
     def __init__(self, folder: Path | None = None, source: str = "", most: int = MOST_BYTES) -> None:
+        """Create the collection; no file is opened."""
         self._folder, self._source, self._most = folder, source, most
         self._open: OrderedDict[bytes, ScanCache] = OrderedDict()
 
     def of(self, parameters: Parameters) -> ScanCache:
-        """The cache for scans that are segmented with these parameters."""
+        """Return the cache for scans that are segmented with these parameters, opened where necessary. The
+        least recently used of more than MOST_OPEN caches is closed."""
         key = segmentation_key(parameters)
         if key not in self._open:
             while len(self._open) >= MOST_OPEN:
@@ -295,12 +314,14 @@ class ScanCaches:
         return self._open[key]
 
     def close(self) -> None:
-        """Close all files."""
+        """Close all caches."""
         for each in self._open.values():
             each.close()
         self._open.clear()
 
     def _opened(self, key: bytes) -> ScanCache:
+        """Return the cache of a segmentation key: in a named file if source and folder are known and no other
+        process has it, otherwise in a file without a name."""
         identity = hashlib.sha256(self._source.encode() + key + _code_digest()).digest()
         header = MAGIC + identity
         file: _File = None
@@ -313,15 +334,17 @@ class ScanCaches:
 
 
 def free_space(folder: Path | None) -> int:
-    """Free bytes on the disk of a folder."""
+    """Return the number of free bytes on the disk of a folder; that of temporary files for None or a missing
+    folder."""
     return shutil.disk_usage(folder if folder is not None and folder.is_dir() else gettempdir()).free
 
 
 def _named_file(folder: Path, identity: bytes) -> _File:
-    """The file of this identity, held by this process.
+    """Return the open file of an identity (32 bytes), which this process locks. Creates the folder and the
+    file, and removes old files of the folder, see `_make_room`.
 
     Raises:
-        OSError: The disk refuses, or another process has it.
+        OSError: The disk refuses, or another process has the file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / (identity[:16].hex() + SUFFIX)
@@ -337,7 +360,8 @@ def _named_file(folder: Path, identity: bytes) -> _File:
 
 
 def _unnamed_file(folder: Path | None) -> _File:
-    """A file without a name in the folder, or where the system has room; None where neither is possible."""
+    """Return an open file without a name in the folder, or else in the folder of the system; None if neither
+    is possible."""
     for place in (folder, None):
         with contextlib.suppress(OSError):
             return TemporaryFile(dir=place, buffering=0)
@@ -345,7 +369,8 @@ def _unnamed_file(folder: Path | None) -> _File:
 
 
 def _make_room(folder: Path, keep: Path) -> None:
-    """Delete the files that were opened longest ago, where all together are too large."""
+    """Delete the cache files that were opened longest ago until all together have at most MOST_IN_FOLDER
+    bytes, except `keep` and files that a process has locked."""
     sizes: list[tuple[float, int, Path]] = []
     for path in folder.glob(f"*{SUFFIX}"):
         with contextlib.suppress(OSError):
@@ -362,7 +387,8 @@ def _make_room(folder: Path, keep: Path) -> None:
 
 @cache
 def _code_digest() -> bytes:
-    """Digest of all sources of the pipeline: any of them may change what is found in a scan."""
+    """Return the digest (32 bytes) of all sources of the pipeline, because any of them may change the
+    segmentation."""
     folder = Path(pipeline.__file__).parent
     state = hashlib.sha256()
     for path in sorted(folder.rglob("*.py")):
@@ -372,11 +398,16 @@ def _code_digest() -> bytes:
 
 
 def _checksum(row: Any) -> int:  # noqa: ANN401 - of ROW
-    """Checksum of a row without its last field, which holds it."""
+    """Return the CRC-32 of a row (ROW) without its last field, which contains it."""
     return zlib.crc32(row.tobytes()[:-4])
 
 
 def _write(file: _File, at: int, block: bytes) -> None:
+    """Write a block completely at a position of the file [bytes].
+
+    Raises:
+        OSError: The disk refuses.
+    """
     file.seek(at)
     view = memoryview(block)
     while view:
@@ -384,7 +415,11 @@ def _write(file: _File, at: int, block: bytes) -> None:
 
 
 def _read(file: _File, at: int, into: bytearray) -> int:
-    """Fill the block; returns its checksum, -1 where the file ends before."""
+    """Fill a block from a position of the file [bytes]; return its CRC-32, -1 if the file ends before.
+
+    Raises:
+        OSError: The disk refuses.
+    """
     file.seek(at)
     view = memoryview(into)
     while view:
