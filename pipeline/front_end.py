@@ -62,10 +62,12 @@ class SegmentedScan:
 
     Attributes:
         clusters: Clusters without verdicts.
-        heights: Mean height of each cluster above the ground, shape (K,) [m]; None without ground.
+        heights: Mean height of each cluster above the ground, shape (K,) [m]; None if no ground is in view.
         free: Free range by direction (see `pipeline.detection.free_space`).
-        column_input: Input of the voxel columns; None for scans that do not update them or show no ground.
-        terrain: Ground that updates the terrain map; None for scans that do not update it, or without ground.
+        column_input: Input of the voxel columns; None for scans that do not update them, or if the parameter
+            `ground.method` is "none".
+        terrain: Ground that updates the terrain map; None for scans that do not update it, or if the parameter
+            `ground.method` is "none".
         clearance: Free space in the path of the robot; None if obstacle detection is off.
     """
 
@@ -98,8 +100,8 @@ class DetectionResult(NamedTuple):
 
 
 def updates_columns(index: int, every: int) -> bool:
-    """Return whether scan `index` updates the voxel columns: each of the first FIRST_SCANS, then one of
-    `every`."""
+    """Return whether scan `index` updates the voxel columns: each of the first FIRST_SCANS, then each
+    multiple of `every` (>= 1)."""
     return index < FIRST_SCANS or index % every == 0
 
 
@@ -112,10 +114,12 @@ def updates_terrain(index: int, every: int) -> bool:
 def segment(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, timer: StageTimer = no_timer
 ) -> SegmentedScan:
-    """Return a scan filtered and segmented into ground and clusters.
+    """Return a scan filtered and segmented into ground and clusters. It may have no points; without ground in
+    view, heights are None and a warning is added.
 
     Args:
-        step: The scan: points of a LiDAR, or stems that another program has detected.
+        step: The scan: points of a LiDAR, or stems that another program has detected, each of which becomes a
+            cluster.
         sensor: The LiDAR.
         T_base_lidar: Pose of the LiDAR on the robot.
         parameters: Parameters of all stages.
@@ -127,7 +131,8 @@ def segment(
 
 
 def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_timer) -> DetectionResult:
-    """Return the verdicts on the clusters of a scan, and the clusters that are trees as detections.
+    """Return the verdicts on the clusters of a scan, and the clusters that are trees as detections. The scan
+    is unchanged.
 
     Args:
         scan: The segmented scan.
@@ -214,7 +219,16 @@ def _column_input(
     sensor_offset: Float,
     sensor: Sensor,
 ) -> ColumnInput | None:
-    """Return the input of the voxel columns, see ColumnInput; None without terrain."""
+    """Return the input of the voxel columns, see ColumnInput; None without heights or terrain.
+
+    Args:
+        raw: All points in the level sensor frame, float32, shape (N, 3) [m].
+        boxed: Points in the box, float32, shape (M, 3) [m].
+        height: Their heights above the ground, float32, shape (M,) [m], or None.
+        terrain: Ground of the scan, or None.
+        sensor_offset: Position of the sensor in the base frame, shape (3,) [m].
+        sensor: The LiDAR.
+    """
     if height is None or terrain is None:
         return None
     steepest = steepest_by_direction(raw, sensor_offset, sensor.rings > 0)
@@ -228,7 +242,8 @@ def _column_input(
 
 
 def _returns(step: Step, raw: Float32) -> dict[str, int]:
-    """Return the numbers of returns: all, without a value, and outside of the range limits."""
+    """Return the numbers of returns: all with a value, those without a value, and those outside of the range
+    limits, which are missing in `raw`."""
     returns = len(step.scan.points)
     return {
         "returns": returns,
@@ -240,8 +255,8 @@ def _returns(step: Step, raw: Float32) -> dict[str, int]:
 def _segment_stems(
     step: Step, stems: Stems, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
-    """Return the segmented scan of stems that another program detected: each stem is a cluster of one point;
-    see `segment`."""
+    """Return the segmented scan of stems that another program detected: each stem is a cluster of one point,
+    without ground, column input and clearance; see `segment`."""
     with timer("acquisition"):
         places, sensor_offset, clusters = external_clusters(step, stems, T_base_lidar, p.acquisition)
 

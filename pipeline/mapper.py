@@ -113,6 +113,7 @@ class Mapper:
         timer: StageTimer = no_timer,
         forests: ForestOf = package_alone,
     ) -> None:
+        """Create a mapper with an empty map."""
         self._parameters = parameters
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
@@ -131,12 +132,13 @@ class Mapper:
         self._delayed: PathCorrection | None = None
 
     def process(self, step: Step, scan: SegmentedScan | None = None) -> Frame:
-        """Map one scan.
+        """Map one scan: update path, trees, voxel columns and terrain, correct the map where a loop is closed
+        or a lost robot is found, and return the results. A lost robot maps nothing.
 
         Args:
-            step: The scan with its odometry.
+            step: The scan with its odometry; numbers increase by 1 from 0.
             scan: Result of `segment` for this step where it is known already; of the step's own scan only the
-                time is used then.
+                time is used then. None segments the scan.
         """
         p, timer, stamp_ns = self._parameters, self._timer, step.scan.stamp_ns
 
@@ -170,11 +172,13 @@ class Mapper:
         return self._frame(step, scan, found, estimate, notices, correction, closure)
 
     def segment(self, step: Step) -> SegmentedScan:
-        """Filter a scan and find its ground and clusters. The map stays as it is."""
+        """Return a scan filtered and segmented into ground and clusters by the present parameters. The map is
+        unchanged."""
         return segment(step, self._sensor, self._T_base_lidar, self._parameters, self._timer)
 
     def segmenter(self) -> Callable[[Step], SegmentedScan]:
-        """`segment` with the present parameters, without a timer: another thread may call it."""
+        """Return `segment` with the present parameters, without a timer, so that another thread can call it.
+        Later changes of the parameters have no effect on it."""
         return partial(
             segment, sensor=self._sensor, T_base_lidar=self._T_base_lidar, parameters=self._parameters
         )
@@ -195,22 +199,22 @@ class Mapper:
 
     @property
     def path(self) -> Path:
-        """The path so far, one row per scan: that of the particle which explains the scans best now. A new
-        scan may therefore change earlier rows."""
+        """The path of the best particle so far, one row per scan. A new scan may change earlier rows. The
+        arrays are copies."""
         return self._path.columns(self._slam.path())
 
     @property
     def height_map(self) -> HeightMap:
-        """The terrain map of all scans so far."""
+        """The terrain map so far."""
         return self._terrain.record()
 
     @property
     def motion(self) -> Float:
-        """x, y [m], yaw [rad] by odometry from each scan to the next, shape (N, 3)."""
+        """x, y [m], yaw [rad] by odometry from the scan before to each scan, shape (N, 3); a copy."""
         return self._path.motion.copy()
 
     def snapshot(self) -> MapperState:
-        """All state, copied; parameters are not part of it."""
+        """Return a copy of all state except the parameters; later scans do not change it."""
         return MapperState(
             self._slam.state.copy(),
             self._columns.snapshot(),
@@ -227,7 +231,8 @@ class Mapper:
         )
 
     def restore(self, state: MapperState) -> None:
-        """Return to an earlier snapshot of this mapper. The snapshot itself stays unchanged."""
+        """Return to an earlier snapshot of this mapper: its path is the beginning of the present one.
+        Parameters stay; the snapshot is unchanged."""
         self._restore_map(state)
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
@@ -236,19 +241,20 @@ class Mapper:
         self._relocaliser.state = state.recovery.copy()
 
     def load(self, state: MapperState, stamp_ns: Int, sigma_xy: Float, motion: Float) -> None:
-        """Go on from a snapshot of another mapper.
+        """Replace the state by a snapshot of another mapper, from which the run continues.
 
         Args:
-            state: The snapshot.
-            stamp_ns: Time of each scan of its path.
-            sigma_xy: Standard deviation of each position [m].
+            state: The snapshot; unchanged.
+            stamp_ns: Time of each scan of its path [ns], int64, shape (N,); copied.
+            sigma_xy: Standard deviation of each position [m], shape (N,).
             motion: Motion by odometry to each scan, shape (N, 3).
         """
         self._path = TrajectoryBuffer(stamp_ns, sigma_xy, motion)
         self.restore(state)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
-        """Set the pose of the base before scan `index`. The odometry starts again there.
+        """Set the pose of the base before scan `index`, see `FastSlam.place`. The next scan has no motion by
+        odometry, and loops do not begin before it.
 
         Args:
             index: Number of the next scan.
@@ -262,14 +268,17 @@ class Mapper:
     # --- stages ---------------------------------------------------------------------------------------
 
     def _predict_motion(self, step: Step) -> tuple[Motion, tuple[str, ...]]:
-        """The motion since the last scan with its uncertainty, by odometry and gyroscope, and warnings. A
-        scan without odometry has no motion."""
+        """Return the motion since the last scan with its uncertainty, by odometry and gyroscope, and
+        warnings. A scan without odometry, and the first one with it, has no motion. Stores the odometry pose
+        of the scan."""
         before, now = self._odometry, step.T_odom_base
         self._odometry = before if now is None else now
         driven = Pose2() if before is None or now is None else before.inverse() @ now
         return self._gated(self._with_gyro(step, driven))
 
     def _with_gyro(self, step: Step, driven: Pose2) -> Motion:
+        """Return the motion of a step with the odometry `driven`, fused with the turn by the gyroscope;
+        unchanged if the turn or the odometry is unknown or the parameter `acquisition.gyro` is off."""
         motion = Motion(driven, step.slack, step.doubt, step.measured)
         if step.turn is None or step.T_odom_base is None or not self._parameters.acquisition.gyro:
             return motion
@@ -279,7 +288,8 @@ class Mapper:
         return motion._replace(step=turned, slack=slack, doubt=step.doubt or doubt, turn_sigma=turn_sigma)
 
     def _gated(self, motion: Motion) -> tuple[Motion, tuple[str, ...]]:
-        """The motion without a measured pose that fails its gate, and the warning about it."""
+        """Return the motion without a measured pose that fails its gate, and the warning about it; unchanged,
+        without warning, if there is no measured pose, the pose passes, or no pose was estimated before."""
         if self._last is None or motion.measured is None:
             return motion, ()
         expected = motion._replace(measured=self._slam.without_shared_error(motion.measured))
@@ -290,7 +300,15 @@ class Mapper:
     def _update_slam(
         self, index: int, motion: Motion, found: DetectionResult, scan: SegmentedScan
     ) -> PoseEstimate:
-        """Sample, associate, weigh and resample the particles. A lost robot follows its odometry."""
+        """Sample, associate, weigh and resample the particles; return the pose. During the search of a lost
+        robot no detections are used, so that the pose follows the odometry.
+
+        Args:
+            index: Number of the scan.
+            motion: Motion since the last scan.
+            found: Detections of the scan.
+            scan: The segmented scan, for its free ranges.
+        """
         if self._relocaliser.is_searching:
             return self._slam.process(index, motion, no_detections(), NOTHING_FREE)
         return self._slam.process(index, motion, found.detections, scan.free)
@@ -298,7 +316,15 @@ class Mapper:
     def _update_trees(
         self, stamp_ns: int, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate
     ) -> None:
-        """Update the Kalman filters. The scan that finds a lost robot again has no data association."""
+        """Update the Kalman filters of the trees, and classify new ones by the present columns. The scan that
+        finds a lost robot again has no data association, and updates no filter.
+
+        Args:
+            stamp_ns: Time of the scan [ns].
+            scan: The segmented scan.
+            found: Detections of the scan.
+            estimate: Pose with the landmark of each detection.
+        """
         tracker = self._tracker
         with self._timer("tracking"):
             if len(estimate.landmark_of) == len(found.detections.cluster):
@@ -308,7 +334,8 @@ class Mapper:
                 tracker.classify_new(self._columns.columns)
 
     def _update_columns(self, step: Step, scan: SegmentedScan, estimate: PoseEstimate) -> None:
-        """Integrate the scan into the voxel columns, and classify columns and trees."""
+        """Integrate the scan into the voxel columns at the estimated pose, and classify columns and trees. A
+        scan without column input only settles the columns."""
         given = scan.column_input
         if given is None:
             self._settle_columns()
@@ -328,6 +355,8 @@ class Mapper:
                 self._columns.settle()
 
     def _update_terrain(self, scan: SegmentedScan, estimate: PoseEstimate) -> None:
+        """Add the terrain of the scan to the terrain map at the estimated pose; nothing for a scan without
+        terrain."""
         if scan.terrain is not None:
             with self._timer("height map"):
                 self._terrain.add(scan.terrain, estimate.T_map_base, scan.sensor_offset)
@@ -354,11 +383,12 @@ class Mapper:
         scan: SegmentedScan,
         estimate: PoseEstimate,
     ) -> Correction | None:
-        """Begin a search if the robot is lost, or continue the search.
+        """Begin a search if the robot is lost (`FastSlam.is_lost`), or continue the search. The map is
+        unchanged; see `_apply`.
 
         Returns:
-            Pose or loop with which the search ended, its failure, or None while nothing changes and if the
-            parameter `relocalisation.method` is "none".
+            The restart with which a search begins; the pose, the loop or the failure with which it ends; None
+            while nothing changes and if the parameter `relocalisation.method` is "none".
         """
         p, relocaliser = self._parameters, self._relocaliser
         if p.relocalisation.method == "none":
@@ -384,6 +414,7 @@ class Mapper:
         return Smoothing() if self._slam.is_smoothing_due else None
 
     def _history(self, estimate: PoseEstimate) -> detection.RunHistory:
+        """Return path and map for the search of loops, with the pose at the newest scan."""
         return detection.RunHistory(
             self._path.stamp_ns, self._slam.path(), self._tracker.trees(), self._slam.begun_since, estimate,
             noise_of(self._parameters.slam), self._path.motion, self._placed, self._closed,
@@ -393,11 +424,16 @@ class Mapper:
     def _apply(
         self, index: int, correction: Correction | None, estimate: PoseEstimate
     ) -> tuple[PoseEstimate, Correction | None]:
-        """Correct SLAM, trees, columns and terrain.
+        """Correct SLAM, trees, columns and terrain by a decision, and end a search that is over.
+
+        Args:
+            index: Number of the scan.
+            correction: The decision; None changes nothing.
+            estimate: Pose before the correction.
 
         Returns:
-            The corrected pose, and the correction that was applied: a loop that the graph contradicts changes
-            nothing, but a lost robot is located by it.
+            The corrected pose, and the correction that was applied. A loop that the graph contradicts changes
+            nothing (None), unless the robot was lost; then it is located by it.
         """
         slam = self._slam
         match correction:
@@ -432,7 +468,9 @@ class Mapper:
         return estimate, correction
 
     def _correct_map(self, correction: PathCorrection | None, before: PoseEstimate) -> bool:
-        """Move trees, columns and terrain with the path; returns whether there is a correction."""
+        """Move trees, columns and terrain with the path; return whether there is a correction. Columns and
+        terrain are moved only when all corrections since then displace a scan by CORRECTION_MIN or more.
+        `before` is the pose before the correction."""
         if correction is None:
             return False
         estimate = self._slam.estimate(before)
@@ -445,7 +483,8 @@ class Mapper:
         return True
 
     def _restore_map(self, before: MapperState) -> None:
-        """Return to the map of an earlier state; path, odometry and the numbers of trees go on."""
+        """Return to SLAM, columns, terrain and trees of an earlier state, which is unchanged; path, odometry
+        and the numbers of trees continue."""
         self._slam.state = before.slam.copy()
         self._columns.restore(before.gathering)
         self._terrain.state = before.ground
@@ -463,6 +502,17 @@ class Mapper:
         notices: tuple[str, ...],
         *corrections: Correction | None,
     ) -> Frame:
+        """Return the results of a scan: its points, clusters and detections, the pose, and the present trees,
+        columns and terrain.
+
+        Args:
+            step: The scan.
+            scan: The segmented scan.
+            found: Its clusters with verdicts, and its detections.
+            estimate: Pose after all corrections.
+            notices: Warnings of the motion.
+            corrections: Corrections that were applied, whose messages become warnings; None for none.
+        """
         terrain, p = self._terrain.state, self._parameters
         base_z = (terrain.sensor_z or 0.0) - float(scan.sensor_offset[2]) if terrain.scans else 0.0
         messages = [text for c in corrections if c is not None for text in c.messages]
