@@ -9,7 +9,8 @@ from pipeline.types.records import Int, Trees, TruthTrees
 
 
 def match(found: Float, truth: Float, distance_max: float) -> Int:
-    """Return the row of `truth` that is assigned to each row of `found`, -1 for none, shape (N,).
+    """Return the row of `truth` that is assigned to each row of `found`, -1 for none, int64, shape (N,).
+    Positions that are not finite have no partner; either side may be empty.
 
     The assignment has the maximum number of pairs within `distance_max`, and among such assignments the
     minimum sum of distances (Kuhn 1955, solved by scipy).
@@ -39,8 +40,8 @@ def match(found: Float, truth: Float, distance_max: float) -> Int:
 
 
 def _near(found: Float, truth: Float, distance_max: float) -> tuple[Int, Int]:
-    """Return rows of `found` and of `truth` for all pairs within `distance_max` [m]. A position that is not
-    finite has no pair."""
+    """Return rows of `found` and of `truth` for all pairs within `distance_max` [m], int64, shape (K,) each.
+    A position that is not finite has no pair."""
     from scipy.spatial import cKDTree
 
     mine, others = (np.flatnonzero(np.isfinite(each).all(axis=1)) for each in (found, truth))
@@ -78,7 +79,7 @@ def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: 
 
 def matched_rows(trees: Trees, truth: TruthTrees, distance_max: float) -> tuple[Int, Int]:
     """Return the rows of the matched mapped trees in `trees`, and of the real trees in `truth` that they are
-    assigned to.
+    assigned to, int64, shape (K,) each. Pairs with another object of the ground truth are omitted.
 
     Args:
         trees: The map; confirmed trees are matched.

@@ -25,7 +25,7 @@ class Rate:
 
     @property
     def rate(self) -> float | None:
-        """count / of; None if the total is 0."""
+        """count / of, 0 to 1; None if the total is 0."""
         return self.count / self.of if self.of else None
 
 
@@ -75,7 +75,8 @@ class MapScores:
 
 
 def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Float | None = None) -> MapScores:
-    """Return the scores of the confirmed trees.
+    """Return the scores of the confirmed trees. Trees and objects beyond the reach of the path do not count;
+    a mapped tree that is matched counts if its partner is within reach.
 
     Args:
         trees: The map.
@@ -142,10 +143,10 @@ class PairErrors:
 
 
 def pair_distances(position: Float) -> Float:
-    """Return the distances between all pairs of N positions (Fig. 6), shape (N, N) [m].
+    """Return the distances between all pairs of N positions (Fig. 6), shape (N, N) [m], 0 on the diagonal.
 
     Args:
-        position: shape (N, 2) [m].
+        position: Positions, shape (N, 2) [m].
     """
     difference = position[:, None, :] - position[None, :, :]
     distances: Float = np.hypot(difference[..., 0], difference[..., 1])
@@ -153,7 +154,8 @@ def pair_distances(position: Float) -> Float:
 
 
 def pair_errors(found: Float, truth: Float) -> PairErrors:
-    """Return the errors of the distances between N mapped trees.
+    """Return the errors of the distances between N mapped trees. Pairs at the same place in the ground truth
+    have the error 0.
 
     Distances do not depend on the frame, so the two maps need no alignment.
 
@@ -172,10 +174,11 @@ def pair_errors(found: Float, truth: Float) -> PairErrors:
 
 
 def _within(position: Float, path: Float | None, reach: float) -> Bool:
-    """Return which positions are at most `reach` from the path, shape (N,); all are without a path.
+    """Return which positions are at most `reach` from a position of the path, shape (N,): all if the path is
+    None, none if it is empty.
 
     Args:
-        position: shape (N, 2) [m].
+        position: Positions, shape (N, 2) [m].
         path: Positions of the robot, shape (M, 2) [m], or None.
         reach: Maximum distance [m].
     """
@@ -191,18 +194,22 @@ def _within(position: Float, path: Float | None, reach: float) -> Bool:
 
 
 def _count(mask: Bool) -> int:
+    """Return the number of true elements."""
     return int(np.count_nonzero(mask))
 
 
 def _none(value: float) -> float | None:
+    """Return a number, or None if it is not finite."""
     return float(value) if np.isfinite(value) else None
 
 
 def _harmonic(a: float | None, b: float | None) -> float | None:
+    """Return the harmonic mean of two shares; 0 if both are 0, None if one is None."""
     if a is None or b is None:
         return None
     return 2.0 * a * b / (a + b) if a + b > 0.0 else 0.0
 
 
 def _rms(error: Float) -> float | None:
+    """Return the root mean square of errors, shape (N,); None without any."""
     return float(np.sqrt((error**2).mean())) if len(error) else None

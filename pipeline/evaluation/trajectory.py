@@ -30,7 +30,8 @@ class PathError:
 
 
 def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> PathError | None:
-    """Return the error of a path, or None if fewer than three true positions are within its time.
+    """Return the error of a path, or None if it has fewer than two poses or fewer than three true positions
+    are within its time. The path is interpolated linearly at the times of the true positions.
 
     Args:
         path: In the frame of the map.
@@ -61,7 +62,7 @@ def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> Pa
 
 def fit_rigid(a: Float, b: Float) -> Pose2:
     """Return the pose T_b_a that minimises sum |b - T_b_a a|^2 over N pairs of points (Umeyama 1991, without
-    scale).
+    scale), N > 0; the yaw is 0 for coincident points.
 
     Args:
         a, b: Points in the two frames, shape (N, 2) [m] each.
@@ -74,6 +75,14 @@ def fit_rigid(a: Float, b: Float) -> Pose2:
 
 
 def _at(wanted_ns: Int, stamp_ns: Int, value: Float) -> Float:
+    """Return values interpolated linearly at other times, shape (K,); outside of the times the first or last
+    value.
+
+    Args:
+        wanted_ns: Times [ns], int64, shape (K,).
+        stamp_ns: Times of the values, ascending [ns], int64, shape (N,), N > 0.
+        value: Values, shape (N,).
+    """
     start = stamp_ns[0]  # int64 nanoseconds since the epoch do not fit a float; differences do
     result: Float = np.interp((wanted_ns - start) * 1e-9, (stamp_ns - start) * 1e-9, value)
     return result
