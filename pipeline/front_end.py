@@ -66,8 +66,8 @@ class SegmentedScan:
         free: Free range by direction (see `pipeline.detection.free_space`).
         column_input: Input of the voxel columns; None for scans that do not update them, or if the parameter
             `ground.method` is "none".
-        terrain: Ground that updates the terrain map; None for scans that do not update it, or if the parameter
-            `ground.method` is "none".
+        terrain: Ground that updates the terrain map; None for scans that do not update it, or if the
+            parameter `ground.method` is "none".
         clearance: Free space in the path of the robot; None if obstacle detection is off.
     """
 

@@ -74,7 +74,7 @@ class OdometryOverride:
             self._motion.end()
 
     def pass_on(self, record: Record) -> Iterator[Record]:
-        """Yield the records that replace one record of a live source, whose records the caller reads itself."""
+        """Yield the records that replace one record of a live source; its records are read by the caller."""
         return self._motion.add(record)
 
     def truth(self) -> Truth | None:

@@ -92,7 +92,8 @@ class ClusterTable:
         self._lost.append(lost)
 
     def record(self, frame: Frame) -> None:
-        """Store the clusters of a mapped scan, see `put`; the robot counts as lost if its health is "lost"."""
+        """Store the clusters of a mapped scan, see `put`. The robot counts as lost if its health is
+        "lost"."""
         lost = frame.estimate.health.state == "lost"
         self.put(frame.index, frame.clusters, frame.sensor_offset, lost=lost)
 
