@@ -21,7 +21,8 @@ UNFINISHED = ".unfinished-"
 
 @contextmanager
 def write_beside(path: Path) -> Iterator[Path]:
-    """Write a temporary file and move it to its path when it is complete.
+    """Write a temporary file and move it to its path when it is complete. An existing file at the path is
+    replaced.
 
     Yields a path in the same folder; write and close that file. At the end of the block it is flushed to the
     disk and replaces `path` in one step; if the block raises, it is removed and `path` does not change.
@@ -48,14 +49,23 @@ def write_beside(path: Path) -> Iterator[Path]:
 
 
 def hold(file: IO[Any]) -> None:
-    """Lock an open file until it is closed or the process ends. Other processes see the lock with
-    `is_held`."""
+    """Lock an open file until it is closed or the process ends. Other processes see the lock with `is_held`.
+    On Windows, which locks open files itself, nothing is done.
+
+    Raises:
+        OSError: Another process has locked it (BlockingIOError), or the disk does not support locks.
+    """
     if sys.platform != "win32":  # Windows locks open files
         fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_held(path: Path) -> bool:
-    """Return whether a process has locked a file, see `hold`."""
+    """Return whether another process has locked a file, see `hold`. False if it does not exist, and always on
+    Windows.
+
+    Raises:
+        OSError: The file cannot be opened, or the disk does not support locks.
+    """
     if sys.platform != "win32":
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
             try:

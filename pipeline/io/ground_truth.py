@@ -34,22 +34,23 @@ _KIND = ("class", "kind", "type")
 def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
     """Read a table of trees.
 
-    Positions are x and y (or easting and northing) in metres, or azimuth in degrees from north (y),
-    clockwise, with a distance in metres. The class of a row is one of KINDS; without such a column all rows
-    are trees.
+    Diameters are in metres in the result, NaN where they are unknown, 0 or negative. Positions are x and y
+    (or easting and northing) in metres, or azimuth in degrees from north (y), clockwise, with a distance in
+    metres. The class of a row is one of KINDS; without such a column all rows are trees.
 
     Args:
         path: A CSV with a header line; commas, semicolons or tabs.
-        dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit.
+        dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit; None refuses such a column.
 
     Raises:
-        SourceError: It is not such a table; the message names line and column.
+        SourceError: It cannot be read, is larger than 8 MB, is not such a table, or a coordinate is beyond
+            COORDINATE_LIMIT; the message names line and column.
     """
     return parse_truth_trees(_text_of(path), where=str(path), dbh_unit=dbh_unit)
 
 
 def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> TruthTrees:
-    """Parse the text of a table, see `read_truth_trees`.
+    """Parse the text of a table, see `read_truth_trees`. A header without rows gives no trees.
 
     Args:
         text: The text.
@@ -70,21 +71,48 @@ def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> 
 
 class _Table:
     def __init__(self, where: str, lines: list[int], rows: list[list[str]], column: dict[str, int]) -> None:
+        """Store the parts of a table.
+
+        Args:
+            where: Name of the table in errors.
+            lines: Line number of each row in the file.
+            rows: Cells of each row, without the header.
+            column: Index of each column by its name in lower case.
+        """
         self.where, self.lines, self.rows, self.column = where, lines, rows, column
 
     def find(self, names: Iterable[str]) -> str | None:
+        """Return the first of some names that is a column; None if none is."""
         return next((name for name in names if name in self.column), None)
 
     def text(self, name: str) -> list[str]:
+        """Return the stripped cells of a column, "" where a row is too short.
+
+        Raises:
+            KeyError: There is no such column.
+        """
         k = self.column[name]
         return [row[k].strip() if k < len(row) else "" for row in self.rows]
 
     def numbers(self, name: str, *, required: bool) -> Float:
+        """Return the numbers of a column, shape (N,). Without `required`, empty cells, "nan" and "na" give
+        NaN.
+
+        Raises:
+            SourceError: A cell is not a number, or is beyond COORDINATE_LIMIT.
+        """
         return np.array(
             [self._number(text, name, k, required) for k, text in enumerate(self.text(name))], np.float64
         )
 
     def _number(self, text: str, name: str, row: int, required: bool) -> float:
+        """Return the number of one cell, see `numbers`.
+
+        Args:
+            text: The cell.
+            name, row: Name of the column and index of the row, for errors.
+            required: Whether an unknown number is an error.
+        """
         if text == "" and not required:
             return math.nan
         try:
@@ -103,6 +131,11 @@ class _Table:
 
 
 def _text_of(path: Path) -> str:
+    """Return the text of a table of trees, without a byte order mark.
+
+    Raises:
+        SourceError: It cannot be read, is larger than 8 MB, or is not UTF-8.
+    """
     try:
         if path.stat().st_size > LARGEST_FILE:
             raise SourceError("the table of trees is larger than 8 MB", where=str(path))
@@ -114,7 +147,8 @@ def _text_of(path: Path) -> str:
 
 
 def _rows_of(text: str, where: str) -> tuple[list[int], list[list[str]]]:
-    """Return the line number and the cells of every row that is not empty.
+    """Return the line number and the cells of every row that is not empty, the header first; two empty lists
+    for an empty text. The delimiter is the most frequent one of comma, semicolon and tab in the first line.
 
     Raises:
         SourceError: The text is no CSV.
@@ -130,6 +164,11 @@ def _rows_of(text: str, where: str) -> tuple[list[int], list[list[str]]]:
 
 
 def _positions(table: _Table) -> tuple[Float, ...]:
+    """Return x and y of each row, shape (N,) [m], from columns of coordinates or of azimuth and distance.
+
+    Raises:
+        SourceError: The table has neither, or a cell is not a number.
+    """
     x, y = table.find(_X), table.find(_Y)
     if x is not None and y is not None:
         return table.numbers(x, required=True), table.numbers(y, required=True)
@@ -155,7 +194,7 @@ def _diameters(table: _Table, dbh_unit: str | None) -> Float:
         dbh_unit: Unit of a column whose name does not state it: "m", "cm" or "mm".
 
     Raises:
-        SourceError: The unit is unknown.
+        SourceError: The unit is unknown, or a cell is not a number.
     """
     name = table.find((*_DBH, *_DBH_OF_UNKNOWN_UNIT))
     if name is None:
@@ -169,6 +208,12 @@ def _diameters(table: _Table, dbh_unit: str | None) -> Float:
 
 
 def _kinds(table: _Table) -> tuple[str, ...]:
+    """Return the class of each row in lower case; "tree" for an empty cell, and for all rows without a column
+    of classes.
+
+    Raises:
+        SourceError: A class is not one of KINDS.
+    """
     name = table.find(_KIND)
     if name is None:
         return ("tree",) * len(table.rows)
@@ -229,6 +274,7 @@ class _TruthFile(msgspec.Struct, frozen=True):
 
 def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
     """Return the ground truth in the map frame, and the sensor (None if it is not named), of an attachment.
+    Trees and path of the result are None if they are missing; the path is sorted by time.
 
     Args:
         content: JSON of `truth_json`.
@@ -251,11 +297,13 @@ def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
 
 
 def _trees(columns: _Trees) -> TruthTrees:
+    """Return columns of a file as trees; unknown diameters become NaN."""
     dbh = [np.nan if diameter is None else diameter for diameter in columns.dbh]
     return TruthTrees(np.array(columns.x), np.array(columns.y), np.array(dbh, float), tuple(columns.kind))
 
 
 def _path(columns: _Path) -> TruthPath:
+    """Return columns of a file as the true path, sorted by time, in the frame of the map."""
     stamp_ns = np.array(columns.stamp_ns, dtype=np.int64)
     order = np.argsort(stamp_ns, kind="stable")
     x, y, yaw = (np.array(column, dtype=np.float64)[order] for column in (columns.x, columns.y, columns.yaw))
@@ -269,7 +317,7 @@ def truth_json(sensor: Sensor, truth: Truth | None) -> bytes:
 
     Args:
         sensor: The LiDAR.
-        truth: Ground truth, or None.
+        truth: Ground truth; None, or missing parts of it, are left out.
     """
     content: dict[str, Any] = {"version": 1, "sensor": asdict(sensor)}
     if truth is not None and truth.trees is not None:

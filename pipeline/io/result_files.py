@@ -55,8 +55,8 @@ DETECTION_COLUMNS = (
 
 
 def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
-    """Return the confirmed trees as rows of TREE_COLUMNS; seconds count from `start_ns`, and a stamp below 0
-    is unknown."""
+    """Return the confirmed trees as rows of TREE_COLUMNS; unknown values are empty. Seconds count from
+    `start_ns` [ns]; a stamp below 0 is unknown."""
     return [
         [
             str(trees.number[k]),
@@ -93,7 +93,7 @@ def path_rows(path: Path, start_ns: int) -> list[list[str]]:
 
 
 def terrain_text(ground: HeightMap) -> str:
-    """Return the text of terrain.csv."""
+    """Return the text of terrain.csv: a header and the rows of `terrain_rows`."""
     return csv_text(TERRAIN_COLUMNS, terrain_rows(ground))
 
 
@@ -120,8 +120,8 @@ def seen_text(area: SeenArea) -> str:
 
 
 def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
-    """Return the clusters of a scan with their verdicts, in the frame of the map, as rows of
-    DETECTION_COLUMNS.
+    """Return all clusters of a scan with their verdicts, in the frame of the map, as rows of
+    DETECTION_COLUMNS; unknown values are empty.
 
     Args:
         frame: Results of the scan.
@@ -159,7 +159,8 @@ def geojson(
     frame: Mapping[str, str] | None = None,
     lon_lat: Float | None = None,
 ) -> str:
-    """Return the confirmed trees as a FeatureCollection.
+    """Return the text of a GeoJSON FeatureCollection with the confirmed trees; unknown values are null.
+    Positions must be finite.
 
     RFC 7946 requires WGS84; a map without georeference has a member `coordinateFrame`.
 
@@ -196,7 +197,8 @@ def geojson(
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a header and rows, separated by commas and line feeds."""
+    """Return the text of a header and rows, separated by commas and line feeds; cells are quoted where
+    necessary."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
@@ -217,6 +219,8 @@ class RunFiles:
     """
 
     def __init__(self, folder: FilePath, earlier: FilePath | None = None) -> None:
+        """Create the folder and, in it, a hidden folder for incomplete files, with the detections of the
+        earlier run or a header."""
         self._folder = folder
         self._made_folder = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
@@ -232,12 +236,12 @@ class RunFiles:
             hold(self._detections)
 
     def add(self, frame: Frame, start_ns: int) -> None:
-        """Write the clusters of a scan; seconds count from `start_ns`."""
+        """Write the clusters of a scan to the detections; seconds count from `start_ns` [ns]."""
         writer = csv.writer(self._detections, lineterminator="\n")
         writer.writerows(detection_rows(frame, start_ns))
 
     def add_rows(self, rows: Iterable[Sequence[str]]) -> None:
-        """Write rows of DETECTION_COLUMNS."""
+        """Write rows of DETECTION_COLUMNS to the detections."""
         csv.writer(self._detections, lineterminator="\n").writerows(rows)
 
     def finish(
@@ -249,12 +253,18 @@ class RunFiles:
         state: bytes | None,
         further: Mapping[str, str] | None = None,
     ) -> None:
-        """Write the other files and move all files to their names.
+        """Write the other files and move all files to their names, `run.json` last. Files `seen.csv`,
+        `georeference.json` and (without a new state) `state.zip` of an earlier run are removed.
 
         Args:
-            trees, path, start_ns, run: Results.
+            trees, path: The map; confirmed trees are written.
+            start_ns: Time from which the seconds count [ns].
+            run: Content of run.json; numbers are finite.
             state: State for a continuation; None without.
             further: Texts of additional files, or of files to replace, by name.
+
+        Raises:
+            OSError: The disk refuses.
         """
         self._detections.close()
         texts = {
@@ -279,7 +289,12 @@ class RunFiles:
         self._staging.rmdir()
 
     def abandon(self) -> None:
-        """Remove the incomplete files; those of an earlier run do not change."""
+        """Remove the incomplete files, and the folder if this object created it; files of an earlier run do
+        not change.
+
+        Raises:
+            OSError: The created folder contains other files.
+        """
         self._detections.close()
         for file in self._staging.iterdir():
             file.unlink()
@@ -289,6 +304,7 @@ class RunFiles:
 
 
 def _seconds(stamp_ns: int, start_ns: int) -> float:
+    """Return the time from `start_ns` to a stamp [s]; NaN for a stamp below 0, which is unknown."""
     return (int(stamp_ns) - start_ns) * 1e-9 if stamp_ns >= 0 else math.nan
 
 

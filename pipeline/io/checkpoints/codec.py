@@ -45,11 +45,14 @@ class _Blob:
     """Bytes of arrays, each at a multiple of eight bytes; see `encode` for `planes`."""
 
     def __init__(self, planes: bool) -> None:
+        """Begin an empty block; see `encode` for `planes`."""
         self.parts: list[bytes] = []
         self.length = 0
         self._planes = planes
 
     def add(self, array: np.ndarray[Any, Any]) -> dict[str, Any]:
+        """Append the bytes of an array, and return its description for JSON: type (little-endian), shape and
+        position [bytes]."""
         data = np.ascontiguousarray(array)
         at = self.length
         raw = (
@@ -63,12 +66,15 @@ class _Blob:
 
 
 def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: ANN401 - any record
-    """Return a record as JSON and the bytes of its arrays.
+    """Return a record as JSON values (not text) and the bytes of its arrays. Numbers that are not finite
+    become texts; fields with NOT_SAVED are omitted.
 
     Args:
         record: A record of arrays, numbers, texts, tuples and other records.
         planes: Whether the first bytes of all numbers of an array come first, then the second ones, and so
             on, which compresses better.
+    Raises:
+        TypeError: A value has another type.
     """
     blob = _Blob(planes)
     tree = _encoded(record, blob)
@@ -76,6 +82,7 @@ def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: 
 
 
 def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
+    """Return a value as JSON values, with its arrays added to `blob`; see `encode`."""
     if isinstance(value, np.ndarray):
         return blob.add(value)
     if is_dataclass(value) and not isinstance(value, type):
@@ -94,7 +101,8 @@ def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
 
 
 def decode(kind: type[R], tree: Any, blob: bytes, *, planes: bool = False) -> R:  # noqa: ANN401
-    """Return the record that `encode` encoded.
+    """Return the record that `encode` encoded. Fields with NOT_SAVED get their defaults, and missing fields
+    with ADDED the value of an earlier version. Arrays are copies.
 
     Args:
         kind: Type of the record.
@@ -117,6 +125,17 @@ class _Block(NamedTuple):
 
 
 def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
+    """Return the value of a JSON value by its declared type.
+
+    Args:
+        kind: Declared type, possibly generic.
+        tree: JSON value.
+        blob: Bytes of the arrays.
+        name: Name of the value in errors.
+
+    Raises:
+        ValueError: The value has another type.
+    """
     origin, of = _origin_and_args(kind)
     if origin is np.ndarray:
         return _array(get_args(of[1])[0], tree, blob, name)
@@ -147,6 +166,11 @@ def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN
 
 
 def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
+    """Return a dataclass of type `kind` from a table of its saved fields; see `decode` for missing fields.
+
+    Raises:
+        ValueError: `tree` is not a table, or has other fields.
+    """
     wanted = _saved(kind)
     if not isinstance(tree, dict):
         raise ValueError(f"{name} does not have the fields of this version")
@@ -167,6 +191,11 @@ def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN4
 
 
 def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return a tuple of the declared types `of` from a list; (T, Ellipsis) allows any length.
+
+    Raises:
+        ValueError: `tree` is not a list, or has another length.
+    """
     if not isinstance(tree, list):
         raise ValueError(f"{name} is not a list")
     if len(of) == 2 and of[1] is Ellipsis:
@@ -177,6 +206,12 @@ def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any
 
 
 def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
+    """Return a number, truth value or text of type `kind`. An integer is accepted as float if it has fewer
+    than 64 bits, and "nan", "inf" and "-inf" are.
+
+    Raises:
+        ValueError: The value has another type.
+    """
     if kind is float and isinstance(tree, str) and tree in ("nan", "inf", "-inf"):
         return float(tree)
     if isinstance(tree, int) and not isinstance(tree, bool) and abs(tree) < 1 << 63 and kind in (int, float):
@@ -189,6 +224,11 @@ def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
 
 
 def _array(scalar: Any, tree: Any, blob: _Block, name: str) -> np.ndarray[Any, Any]:  # noqa: ANN401
+    """Return a copy of an array with elements of type `scalar` by its description, see `_Blob.add`.
+
+    Raises:
+        ValueError: It has another type, no valid shape (1 to 8 dimensions), or is not inside of the block.
+    """
     dtype = np.dtype(scalar)
     if not isinstance(tree, dict) or tree.get("dtype") != dtype.newbyteorder("<").str:
         raise ValueError(f"{name} is not an array of {dtype}")
@@ -235,7 +275,8 @@ def write_archive(tree: Any, blob: bytes) -> bytes:  # noqa: ANN401 - any JSON
 
 
 def read_archive(data: bytes, where: str) -> tuple[Any, bytes]:
-    """Return the JSON and the arrays of an archive; sizes are checked before memory is allocated.
+    """Return the JSON values and the bytes of the arrays of an archive; sizes are checked before memory is
+    allocated.
 
     Args:
         data: Bytes of the archive, see `write_archive`.
@@ -265,6 +306,13 @@ def damaged(where: str, why: str) -> StemmapError:
 
 
 def _entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
+    """Return the bytes of a file in an archive.
+
+    Raises:
+        KeyError: There is no such file.
+        ValueError: It is compressed in another way, declares more than `largest` bytes or an implausible
+            ratio, or has another size than declared.
+    """
     entry = archive.getinfo(name)
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{name} is compressed in another way")

@@ -47,13 +47,16 @@ class MergedMap:
 def merge_maps(
     a: SavedMap, b: SavedMap, T_a_b: Pose2, covariance: Float, stamp_shift_ns: int, parameters: Parameters
 ) -> MergedMap:
-    """Merge map b into map a.
+    """Merge map b into map a; both are unchanged. Trees of both at one place (`associate`) become one with
+    the number in a; other trees of b get new numbers. The run continues at the end of b, in the frame of a,
+    without graph and places.
 
     Args:
         a, b: The maps.
         T_a_b: Pose of the frame of b in that of a.
-        covariance: Its covariance, shape (3, 3).
-        stamp_shift_ns: Added to the times of b, which must then be after those of a.
+        covariance: Its covariance of x, y [m], yaw [rad], shape (3, 3).
+        stamp_shift_ns: Added to the times of b [ns], which must then be after those of a; this is not
+            checked.
         parameters: Parameters of all stages.
     """
     moved = _moved_tracks(b.tracks, T_a_b, covariance, stamp_shift_ns)
@@ -101,11 +104,20 @@ def merge_maps(
 
 
 def _flat(P: Float) -> Float:
+    """Return xx, xy, yy, shape (N, 3), of covariances, shape (N, 2 or more, 2 or more)."""
     flat: Float = P[:, [0, 0, 1], [0, 1, 1]]
     return flat
 
 
 def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int) -> TrackTable:
+    """Return a copy of tracks in another frame, at later times.
+
+    Args:
+        tracks: The tracks.
+        T: Pose of their frame in the new one.
+        covariance: Covariance of T, shape (3, 3); it is added to that of the positions, as a shared part.
+        shift_ns: Added to all times [ns].
+    """
     moved = tracks.copy()
     C = np.kron(np.eye(2), T.rotation())
     moved.x[:] = tracks.x @ C.T
@@ -123,6 +135,8 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
 
 
 def _moved_path(b: SavedMap, T: Pose2) -> Float:
+    """Return the path of a map in another frame, x, y [m], yaw [rad], shape (N, 3); T is the pose of its
+    frame in the new one."""
     poses = b.slam.genealogy.path(b.slam.best)
     return np.column_stack([T.apply(poses[:, :2]), wrap_angle(poses[:, 2] + T.yaw)])
 
@@ -194,7 +208,7 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameUnce
 
 def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int) -> PackedVoxelMap:
     """Return the voxels of a with the means of those of b, each added as often as it was seen in b, up to
-    MOST_RETURNS. No tile of the result is due for classification.
+    MOST_RETURNS. No tile of the result is due for classification; a and b are unchanged.
 
     Args:
         a, b: Voxel maps.
@@ -213,8 +227,8 @@ def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int
 
 
 def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
-    """Return the columns of a, and those of b at positions where a has none; T is the pose of the frame of b
-    in the frame of a."""
+    """Return the columns of a, and those of b that are more than SAME_COLUMN from all of a, moved into the
+    frame of a; T is the pose of the frame of b in the frame of a."""
     axis = b.axis.copy()
     axis[:, :2] = T.apply(b.axis[:, :2])
     axis[:, 2:4] = b.axis[:, 2:4] @ T.rotation().T
@@ -226,6 +240,8 @@ def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
 
 
 def _apart(place: Float, other: Float) -> Bool:
+    """Return which positions, shape (N, 2) [m], are more than SAME_COLUMN from all other ones, shape (M, 2);
+    all if either is empty."""
     from scipy.spatial import cKDTree
 
     if not len(place) or not len(other):

@@ -57,7 +57,7 @@ class SavedMap:
 
     @classmethod
     def of(cls, mapper: Mapper) -> SavedMap:
-        """Return the state of a mapper."""
+        """Return the state of a mapper as a copy, without the states to which a lost robot could return."""
         state, path = mapper.snapshot(), mapper.path
         slam, lost = state.slam, state.recovery
         return cls(
@@ -106,6 +106,11 @@ class SavedMap:
         )  # fmt: skip
 
     def _recovery(self, scans: int) -> RelocaliserState[MapperState]:
+        """Return the state of the relocaliser: that of the saved search, or an empty one.
+
+        Raises:
+            ValueError: The search does not fit a path of this number of scans.
+        """
         if self.search is None:
             return RelocaliserState()
         local, driven, since = self.search.local, self.search.driven, self.search.since
@@ -115,13 +120,19 @@ class SavedMap:
         return RelocaliserState(local=local, driven=driven, since=since)
 
     def trees(self, parameters: Parameters) -> Trees:
-        """Return the trees of the map, with the confirmation and diameters that the parameters give."""
+        """Return the trees of the map, confirmed or not, with the confirmation and diameters by the
+        parameters of tracking."""
         tracker = Tracker(parameters.tracking)
         tracker.tracks, tracker.next_number = self.tracks, self.next_number
         return tracker.trees()
 
 
 def _check_slam(slam: SlamState) -> None:
+    """Check shapes, indices and finiteness of a state of SLAM from a file.
+
+    Raises:
+        ValueError: Its parts contradict each other.
+    """
     P = len(slam.pose)
     template = SlamState.at_origin(max(P, 1))
     for f in fields(SlamState):
@@ -149,6 +160,11 @@ def _check_slam(slam: SlamState) -> None:
 
 
 def _check_frame(frame: FrameUncertainty, scans: int) -> None:
+    """Check shapes, order and finiteness of the reference poses of a path with this number of scans.
+
+    Raises:
+        ValueError: They do not fit.
+    """
     marks, template = len(frame.serial), FrameUncertainty()
     for f in fields(FrameUncertainty):
         column, wanted = getattr(frame, f.name), getattr(template, f.name)
@@ -162,6 +178,12 @@ def _check_frame(frame: FrameUncertainty, scans: int) -> None:
 
 
 def _check_graph(slam: SlamState, scans: int) -> None:
+    """Check the keyframe graph of a state with this number of scans: order, shapes, finite numbers, and
+    covariances that are positive definite or (of motions) infinite.
+
+    Raises:
+        ValueError: It does not fit.
+    """
     graph, K = slam.graph, len(slam.graph.keyframes)
     if graph.pose.shape != (K, 3) or K > KEYFRAMES_MAX or not 0 <= graph.solved <= K:
         raise ValueError("the keyframes have no poses")
@@ -196,6 +218,11 @@ def _check_graph(slam: SlamState, scans: int) -> None:
 
 
 def _check_places(places: Places) -> None:
+    """Check shapes, order and finiteness of the places.
+
+    Raises:
+        ValueError: They do not fit.
+    """
     M = len(places.birth)
     if not places.birth.shape == places.distance.shape == places.seen.shape == places.inactive.shape == (M,):
         raise ValueError("the places of the path have another shape")
@@ -215,6 +242,7 @@ def _check_finite(*columns: Float) -> None:
 
 
 def _within(rows: Int, size: int) -> bool:
+    """Return whether rows have one dimension and are all in [0, size)."""
     return rows.ndim == 1 and bool(np.all((rows >= 0) & (rows < size)))
 
 

@@ -19,12 +19,13 @@ _LIVE = ("udp", "tcp", "ros2")
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:
-    """Open a run to be read.
+    """Open a run to be read; close it after use.
 
     Args:
         uri: A simulated scenario ("sim:stand"), a file or a folder. The format is detected by the contents
             first, then by the name.
-        options: Choices of the user.
+        options: Choices of the user; None for the defaults.
+        UsageError: The scheme of the URI is unknown.
 
     Raises:
         SourceError: It does not exist, has an unknown format, or is damaged.
@@ -63,6 +64,12 @@ def _no_such_file(uri: str) -> SourceError:
 
 
 def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
+    """Open a source by the scheme of its URI: "sim" or "file".
+
+    Raises:
+        SourceError: The scheme is that of a live robot, or the source cannot be opened.
+        UsageError: The scheme is unknown.
+    """
     if scheme == "sim":
         from pipeline.io.readers.simulated import open_simulated
 
@@ -81,6 +88,12 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
 
 
 def _find_opener(path: Path, uri: str) -> Opener:
+    """Return the opener for a path. `uri` is the path as the user wrote it, for errors.
+
+    Raises:
+        SourceError: It does not exist, is empty, is neither a file nor a folder, or has an unknown format.
+        OSError: It cannot be read.
+    """
     if "\0" in uri or not path.exists():
         raise _no_such_file(uri)
     if path.is_dir():
@@ -115,10 +128,11 @@ Opener = Callable[[str, Path, SourceOptions], Source]
 
 
 def _opener(module: str, function: str) -> Opener:
-    """Return a function that imports `module` of this package and calls its `function` when a file is
-    opened."""
+    """Return an opener that imports `module` of this package and calls its `function` when a file is opened,
+    so that formats which are not used are not imported."""
 
     def opened(uri: str, path: Path, options: SourceOptions) -> Source:
+        """Open a source, see `Opener`."""
         found: Opener = getattr(import_module(f"pipeline.io.readers.{module}"), function)
         return found(uri, path, options)
 
@@ -203,18 +217,21 @@ def expected_format(path: Path) -> Format | None:
 
 
 def recordings_in(folder: Path) -> list[str]:
-    """Return the names of the files in a folder that are runs or clouds by their suffixes."""
+    """Return the sorted names of the files in a folder (not in folders in it) that are runs or clouds by
+    their suffixes."""
     return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
 
 
 def named(names: list[str]) -> str:
-    """Return the first few names as text for a message."""
+    """Return the first five names as text for a message, with the number of the others; "" without names."""
     more = len(names) - _MOST_NAMED
     return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def folder_opener(folder: Path) -> Opener | None:
-    """Return the opener of a folder, None when nothing in it can be read."""
+    """Return the opener of a folder by the names of the files in it, and of `velodyne/*.bin`; None if nothing
+    in it can be read. Where several formats fit, the order is TreeManager, ROS recording, KITTI, other point
+    files."""
     names = {path.name for path in folder.iterdir() if path.is_file()}
     if any(name.startswith("TreeManagerState_") for name in names):
         return _tree_manager

@@ -148,6 +148,7 @@ class FileSource:
     _description: SourceDescription
 
     def __init__(self) -> None:
+        """Begin without losses."""
         self._damage: dict[str, int] = {}
         self._losses: dict[str, int] = {}
 
@@ -158,7 +159,7 @@ class FileSource:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Records left out on opening and in the latest reading, by reason."""
+        """Number of records left out on opening and in the latest reading, by reason; a new dictionary."""
         total = dict(self._damage)
         for reason, number in self._losses.items():
             count_loss(total, reason, number)
@@ -173,7 +174,7 @@ class FileSource:
 
 
 def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:
-    """Add a number of left-out records to the losses of one reason."""
+    """Add a number of left-out records to the losses of one reason, in place."""
     losses[reason] = losses.get(reason, 0) + number
 
 

@@ -42,7 +42,8 @@ class Camera:
     T_base_camera: Pose3
 
     def project(self, points: Float) -> tuple[Float, Float]:
-        """Return the pixels, shape (N, 2), and the depths, shape (N,) [m], of points.
+        """Return the pixels x, y, shape (N, 2), and the depths, shape (N,) [m], of points. Pixels may be
+        outside of the picture; for a depth of 0 or less they have no meaning (inf or NaN at 0).
 
         Args:
             points: Points in the base frame, shape (N, 3) [m].
@@ -76,7 +77,8 @@ class Picture:
 def find_camera(
     container: Container, decoder: MessageDecoder, tree: TransformTree, base: str, topic: str
 ) -> tuple[Camera | None, str]:
-    """Return the camera of a topic by its CameraInfo and the transforms, or None and the reason.
+    """Return the camera of a topic and "", or None and the reason. Of the CameraInfo topics, the one with the
+    most similar name is used, and of its first 20 messages the first valid one.
 
     Args:
         container, decoder: The recording and the decoder of its messages.
@@ -110,7 +112,8 @@ def find_camera(
 
 
 def shared_parts(first: str, second: str) -> int:
-    """Return the number of leading parts between slashes that two topic names share."""
+    """Return the number of leading parts between slashes that two topic names share; 99 if one begins with
+    all parts of the other."""
     parts = zip(first.split("/"), second.split("/"), strict=False)
     return next((k for k, (a, b) in enumerate(parts) if a != b), 99)
 
@@ -118,7 +121,8 @@ def shared_parts(first: str, second: str) -> int:
 def picture_of(
     message: Message, channels: Mapping[int, Channel], decoder: MessageDecoder, stamp_ns: int
 ) -> Picture | None:
-    """Return the picture in a message; None if its sizes contradict each other or are too large.
+    """Return the picture in a message; None if it cannot be decoded, or its sizes contradict each other or
+    exceed BYTES_LIMIT or PIXEL_LIMIT.
 
     Args:
         message: Image or CompressedImage.
@@ -176,22 +180,23 @@ class PictureSource(Protocol):
         """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time, None when none is within `within_ns` of it."""
+        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it."""
 
     def picture_stamps(self) -> list[int]:
         """Return the times of the pictures that are available, ascending [ns]."""
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `picture_stamps`, each once."""
+        """Yield the pictures of some of `picture_stamps` that can be decoded, each once."""
 
 
 def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
-    """Return the time of a picture of a live run [ns]: its stamp, or its arrival when the clock was set.
+    """Return the time of a picture of a live run [ns]: its stamp, or its arrival plus `offset_ns` if the
+    stamp is missing, 0, or of another clock (_OTHER_CLOCK_NS).
 
     Args:
         stamp_ns: Stamp in its message, None without one.
-        log_ns: Time of arrival.
-        offset_ns: Stamp minus arrival of the first scan of the run.
+        log_ns: Time of arrival [ns].
+        offset_ns: Stamp minus arrival of the first scan of the run [ns].
     """
     if stamp_ns and abs(stamp_ns - log_ns - offset_ns) < _OTHER_CLOCK_NS:
         return stamp_ns
@@ -212,20 +217,23 @@ class MessageSource(FileSource):
     _offset_ns: int  # time minus time of recording, roughly
 
     def __init__(self, container: Container) -> None:
+        """Begin with the damage of the recording as losses."""
         super().__init__()
         self._container = container
         self._damage = container.damage
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a picture [ns] by the stamp in its message, None when it is impossible."""
+        """Return the time of a picture [ns] by the stamp in its message (None without one), or None if it is
+        impossible. Subclasses implement it."""
         raise NotImplementedError
 
     def picture_stamps(self) -> list[int]:
-        """Return the times of the pictures, ascending [ns]."""
+        """Return the times of the pictures, ascending [ns]; reads all pictures of the recording."""
         return sorted(stamp_ns for stamp_ns, _ in self._taken(None))
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `picture_stamps`, each once."""
+        """Yield the pictures of some of `picture_stamps` in the order of recording, each once; those that
+        cannot be decoded are omitted."""
         left = set(wanted_ns)
         for stamp_ns, message in self._taken(None) if left else ():
             if stamp_ns in left:
@@ -235,7 +243,8 @@ class MessageSource(FileSource):
                     yield picture
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it."""
+        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it or it cannot be
+        decoded."""
         # First only a short interval is read: pictures of a fast camera can be a megabyte each.
         best = self._nearest(stamp_ns, min(within_ns, SAME_TIME_NS)) or self._nearest(stamp_ns, within_ns)
         return None if best is None else self._picture(best[1], best[0])
@@ -245,6 +254,7 @@ class MessageSource(FileSource):
         self._container.close()
 
     def _picture(self, message: Message, stamp_ns: int) -> Picture | None:
+        """Return the picture in a message with this time [ns]; None if it cannot be decoded."""
         return picture_of(message, self._picture_channels, self._decoder, stamp_ns)
 
     def _nearest(self, stamp_ns: int, within_ns: int) -> tuple[int, Message] | None:
@@ -261,7 +271,8 @@ class MessageSource(FileSource):
         return best
 
     def _taken(self, from_log_ns: int | None) -> Iterator[tuple[int, Message]]:
-        """Yield the pictures with their times in the order of recording."""
+        """Yield the times [ns] and messages of the pictures in the order of recording, from a time of
+        recording on [ns] (None: all); those without a possible time are omitted."""
         channels = self._picture_channels
         for message in self._container.messages(channels, from_log_ns, {}) if channels else ():
             stamp_ns = self._time_of(header_stamp(channels[message.channel], message.payload), message)

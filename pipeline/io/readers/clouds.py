@@ -31,7 +31,8 @@ _REMEDY = "Copy the file again, or export it again"
 
 
 def is_cloud(uri: str) -> bool:
-    """Return whether a file is a whole cloud by its first bytes or its name; a .pcd file is a scan."""
+    """Return whether a file is a whole cloud by its first bytes or its name; a .pcd file is a scan. False for
+    a file that cannot be read."""
     try:
         path = Path(uri).expanduser()
         with path.open("rb") as file:
@@ -72,7 +73,8 @@ def is_place(xyz: Float) -> NDArray[np.bool_]:
 
 
 def offset_for(middle: Float) -> Float:
-    """Return the offset of a cloud by a position in it, shape (3,) [m].
+    """Return the offset of a cloud by a position in it, shape (3,) [m]: per axis 0 up to 1000 m, beyond that
+    rounded to 100 m.
 
     The offset has whole hundreds of metres, so 32 bits hold the rest of the coordinates without loss.
     """
@@ -97,13 +99,21 @@ class CloudFile:
     description: CloudDescription
 
     def __init__(self, uri: str, path: Path) -> None:
+        """Open the file and read its description and its first points."""
         self._uri, self._path = uri, path
         self.losses: dict[str, int] = {}
         with self._one_error():
             self.description = self._describe()
 
     def parts(self) -> Iterator[Float32]:
-        """Yield all points part by part, shape (N, 3)."""
+        """Yield all points part by part, relative to `description.offset`, float32, shape (N, 3) [m]; parts
+        may be empty. `losses` is reset; points without coordinates, and those missing after a damage, are
+        counted in it.
+
+        Raises:
+            SourceError: The file is damaged before its first point.
+            OSError: It cannot be read.
+        """
         self.losses = {}
         read = 0
         try:
@@ -124,11 +134,12 @@ class CloudFile:
             count_loss(self.losses, MISSING, self.description.points - read)
 
     def _describe(self) -> CloudDescription:
-        """Return the description."""
+        """Return the description. Subclasses implement it."""
         raise NotImplementedError
 
     def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the positions part by part, shape (N, 3) [m], each with the number of points read for it."""
+        """Yield the positions part by part, shape (N, 3) [m], in the frame of the file, each with the number
+        of points read for it. Subclasses implement it."""
         raise NotImplementedError
 
     def _described(self, kind: str, points: int, **known: Any) -> CloudDescription:  # noqa: ANN401
@@ -149,7 +160,8 @@ class CloudFile:
 
     @contextmanager
     def _one_error(self) -> Iterator[None]:
-        """Turn whatever a library raises for a damaged file into a SourceError."""
+        """Turn whatever a library raises for a damaged file into a SourceError; SourceError and OSError pass
+        unchanged."""
         try:
             yield
         except (SourceError, OSError):
@@ -171,11 +183,13 @@ class TableCloud(CloudFile):
     name = "point"
 
     def _describe(self) -> CloudDescription:
+        """Return the description by the header of the table, which is kept open for reading."""
         self._table = table = open_table(self._path)
         attributes = tuple(name for name in table.names if name not in ("x", "y", "z"))
         return self._described(table.kind, table.points, crs="", attributes=attributes)
 
     def _read(self) -> Iterator[tuple[int, Float]]:
+        """Yield the coordinates of all rows, valid or not."""
         for columns in self._table.parts():
             with np.errstate(over="ignore", invalid="ignore"):
                 xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
@@ -201,6 +215,7 @@ class LasCloud(CloudFile):
     name = "LAS"
 
     def _describe(self) -> CloudDescription:
+        """Return the description by the header, which is checked before laspy reads it."""
         points, self._there, compressed, version = _check_las(self._path, self._uri)
         with _open_las(self._path) as reader:
             header = reader.header
@@ -214,6 +229,8 @@ class LasCloud(CloudFile):
         )
 
     def _read(self) -> Iterator[tuple[int, Float]]:
+        """Yield the coordinates of the points before any damage. Withheld points are omitted and counted in
+        `losses`."""
         read = 0
         with _open_las(self._path) as reader:
             scales, offsets = reader.header.scales.copy(), reader.header.offsets.copy()
@@ -229,6 +246,7 @@ class LasCloud(CloudFile):
 
 
 def _open_las(path: Path) -> laspy.LasReader:
+    """Return a laspy reader that decompresses in this thread."""
     import laspy
 
     # One decoder in this thread: results do not depend on the number of cores.
@@ -370,7 +388,8 @@ def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
 
 
 def _crs_of(header: laspy.LasHeader) -> str:
-    """Return the coordinate reference system of the header, "" when there is none."""
+    """Return the coordinate reference system of the header: WKT, or "EPSG:" with the number of the projected
+    or else geographic system; "" without one."""
     for record in header.vlrs:
         if record.record_id == 2112:
             wkt = str(getattr(record, "string", "")).strip("\0 \n")
@@ -404,6 +423,7 @@ class E57Cloud(CloudFile):
     name = "E57"
 
     def _describe(self) -> CloudDescription:
+        """Return the description by the headers of the stations."""
         with closing(self._open()) as file:
             stations = int(file.scan_count)
             if stations > MOST_STATIONS:
@@ -415,6 +435,7 @@ class E57Cloud(CloudFile):
         return self._described(kind, sum(points), crs="")
 
     def _read(self) -> Iterator[tuple[int, Float]]:
+        """Yield the points of all stations in the frame of the file."""
         with closing(self._open()) as file:
             for station in range(int(file.scan_count)):
                 for xyz in self._station(file, station):
@@ -444,6 +465,11 @@ class E57Cloud(CloudFile):
                 yield xyz
 
     def _open(self) -> Any:  # noqa: ANN401
+        """Return the file opened by pye57.
+
+        Raises:
+            SourceError: pye57 is not installed.
+        """
         try:
             from pye57 import E57
         except ImportError:
@@ -462,6 +488,8 @@ def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401
 
 
 def _cartesian(columns: dict[str, Float], axes: tuple[str, ...]) -> Float:
+    """Return positions, shape (N, 3) [m], from the three columns `axes`: Cartesian, or range [m], azimuth and
+    elevation [rad]."""
     first, second, third = (columns[name] for name in axes)
     if axes == _CARTESIAN:
         return np.stack([first, second, third], axis=1)

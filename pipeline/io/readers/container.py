@@ -87,8 +87,8 @@ class Container:
     clock_steps: int = 0
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return a time [ns] from which a few messages of some channels are left to read, the last ones of
-        the recording.
+        """Return a time of recording [ns] from which a few messages of some channels are left to read, the
+        last ones of the recording; 0 if there are none.
 
         Args:
             numbers: Numbers of the channels.
@@ -98,12 +98,13 @@ class Container:
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield messages in the order of recording. Parts that cannot be read are left out.
+        """Yield messages in the order of recording. Parts that cannot be read are left out; a payload that
+        cannot be unpacked is b"".
 
         Args:
             numbers: Numbers of the channels that are read.
-            start_ns: Time of the first message [ns]; None for all.
-            losses: Counts the parts that are left out, by reason.
+            start_ns: Earlier times of recording [ns] are left out; None for none.
+            losses: Counts the parts that are left out, by reason; changed in place.
         """
         raise NotImplementedError
 
@@ -121,7 +122,8 @@ class Container:
 
 
 def ros2_type_name(name: str) -> str:
-    """Spell a message type as ROS 2 does: "sensor_msgs/Imu" becomes "sensor_msgs/msg/Imu"."""
+    """Return a message type in the spelling of ROS 2: "sensor_msgs/Imu" becomes "sensor_msgs/msg/Imu"; names
+    with other than two parts keep them."""
     parts = [part for part in name.split("/") if part]
     return "/".join([parts[0], "msg", parts[1]]) if len(parts) == 2 else "/".join(parts)
 
@@ -188,8 +190,8 @@ def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
 
 
 def plain(message: Message) -> Message:
-    """Return a message of a ROS 2 recorder without its own compression; its payload is b"" if it is
-    damaged."""
+    """Return a message of a ROS 2 recorder without its own compression (zstd): up to BLOCK_LIMIT bytes of
+    payload, b"" if it is damaged. Other messages are returned as they are."""
     if message.payload[:4] != _ZSTD_MAGIC:
         return message
     try:
@@ -238,6 +240,7 @@ class ChunkedFile(Container):
     """
 
     def __init__(self, path: Path) -> None:
+        """Open the file and read its index; chunks without valid counts are unpacked."""
         self.damage = {}
         self._path = path
         self._known: dict[int, Channel] = {}
@@ -267,7 +270,7 @@ class ChunkedFile(Container):
         self.channels = [replace(self._known[number], count=total[number]) for number in sorted(self._known)]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the start of the last chunk with messages of some channels [ns]."""
+        """Return the start of the last chunk with messages of some channels [ns]; 0 without one."""
         last = max(self._needed(frozenset(numbers), None), key=attrgetter("end_ns"), default=None)
         return 0 if last is None else last.start_ns
 
@@ -323,6 +326,11 @@ class ChunkedFile(Container):
     # --- shared ---
 
     def _read(self, offset: int, size: int) -> bytes:
+        """Return `size` bytes from a position, fewer at the end of the file.
+
+        Raises:
+            SourceError: The disk refuses.
+        """
         try:
             self._file.seek(offset)
             return self._file.read(size)
@@ -330,6 +338,8 @@ class ChunkedFile(Container):
             raise damaged(f"cannot read on: {error.strerror}", self._path) from error
 
     def _needed(self, wanted: frozenset[int], start_ns: int | None) -> Iterable[Chunk]:
+        """Return the chunks with messages of some channels that do not end before a time [ns] (None: all), in
+        the order of the file."""
         for chunk in self._chunks:
             if start_ns is not None and chunk.end_ns < start_ns:
                 continue
@@ -337,7 +347,7 @@ class ChunkedFile(Container):
                 yield chunk
 
     def _bytes_of(self, chunk: Chunk) -> bytes:
-        """Return the unpacked bytes of a chunk.
+        """Return the unpacked bytes of a chunk; the last one is kept in memory.
 
         Raises:
             BrokenChunkError: It is damaged.
@@ -352,10 +362,11 @@ class ChunkedFile(Container):
         return self._unpacked[1]
 
     def _contents(self, chunk: Chunk, *, define: bool) -> Iterator[Message]:
-        """Yield the messages of a chunk.
+        """Yield the messages of a chunk, at most MOST_IN_CHUNK; with `define`, channels that it defines are
+        added.
 
         Raises:
-            BrokenChunkError: It is damaged.
+            BrokenChunkError: It is damaged, or has more messages; those before the damage were yielded.
         """
         try:
             shifts, shift_ns = deque(chunk.shifts), 0
@@ -420,7 +431,8 @@ class ChunkedFile(Container):
 
     def _survey(self, chunk: Chunk) -> Chunk:
         """Return a chunk with the number and times of its messages, which are counted by unpacking it.
-        Channels that it defines are added."""
+        Channels that it defines are added. Of a damaged chunk the messages before the damage count, and the
+        damage is counted."""
         counts = Counter[int]()
         first_ns, last_ns = 2**64, -1
         try:

@@ -52,6 +52,11 @@ class MessageList(Container):
     """Messages in memory as a container."""
 
     def __init__(self, kind: str, channels: Sequence[Channel], messages: Sequence[Message]) -> None:
+        """Count the messages by channel; the messages are not copied.
+
+        Raises:
+            KeyError: A message is of another channel.
+        """
         self.kind, self.damage = kind, {}
         self._messages = messages
         counts = {channel.number: 0 for channel in channels}
@@ -60,7 +65,7 @@ class MessageList(Container):
         self.channels = [replace(channel, count=counts[channel.number]) for channel in channels]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of the last message [ns], see `Container.tail_ns`."""
+        """Return the time of the last message of some channels [ns], 0 without one."""
         return max((m.log_ns for m in self._messages if m.channel in numbers), default=0)
 
     def messages(
@@ -91,6 +96,7 @@ class ArrivalReader:
     """
 
     def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
+        """Create a reader that has seen no message."""
         self._uri, self._kind, self._channels, self._options = uri, kind, channels, options
         self._scans = {c.number for c in channels if c.msgtype in TYPES_BY_ROLE["scan"]}
         self._fixed = {c.number for c in channels if is_fixed(c.topic)}
@@ -121,7 +127,7 @@ class ArrivalReader:
         returned; then the stored ones follow at once.
 
         Raises:
-            SourceError: There are scans, and none can be read.
+            SourceError: There are scans, and none could be read in five attempts of OPENING_NS.
         """
         if self._source is not None:
             return self._records_of(self._source, message)
@@ -139,7 +145,8 @@ class ArrivalReader:
         return self._open(message.log_ns)
 
     def finish(self) -> list[Record]:
-        """Return the records of the messages that still wait for the description, at the end of the input.
+        """Return the records of the messages that still wait for the description, at the end of the input; []
+        if it is known already, or no scan arrived.
 
         Raises:
             SourceError: There are scans, and none can be read.
@@ -156,6 +163,12 @@ class ArrivalReader:
         self._opening[:half] = old[-half // 2 :]
 
     def _open(self, now_ns: int) -> list[Record]:
+        """Describe the source by the waiting messages; return their records. If no scan can be read, wait for
+        another OPENING_NS from `now_ns` on and return [].
+
+        Raises:
+            SourceError: That failed _TRIES times.
+        """
         heard = MessageList(self._kind, self._channels, self._opening)
         try:
             self._source = RosSource(self._uri, heard, [], self._options, live=True)
@@ -171,6 +184,8 @@ class ArrivalReader:
         return [record for message in opening for record in self._records_of(self._source, message)]
 
     def _records_of(self, source: RosSource, message: Message) -> list[Record]:
+        """Return the records of a message, after notices of the source with the time of the first record (0
+        without one)."""
         records = list(source.records_of(message, self.losses, self.from_ns))
         if source.notices:
             stamp_ns = records[0].stamp_ns if records else 0
@@ -195,6 +210,7 @@ class LiveCamera:
     """
 
     def __init__(self, channels: Sequence[Channel], fixed: Sequence[Channel]) -> None:
+        """Create a camera without pictures."""
         self._pictures_of = channels[0]
         self._channels = {channel.number: channel for channel in (*channels, *fixed)}
         self._numbers = {channel.number for channel in channels}
@@ -206,7 +222,8 @@ class LiveCamera:
         self._found: tuple[str, Camera | None, str] | None = None
 
     def add(self, message: Message) -> bool:
-        """Process a message of any channel; return whether only the camera uses it."""
+        """Process a message of any channel: store pictures (the last MOST_PICTURES, MOST_BYTES), the
+        CameraInfo and fixed transforms. Return whether only the camera uses it."""
         number = message.channel
         if number not in self._numbers:
             if number in self._channels and len(self._fixed) < _MOST_FIXED:
@@ -222,7 +239,8 @@ class LiveCamera:
         return True
 
     def camera(self, base: str) -> tuple[Camera | None, str]:
-        """Return the camera with its pose on the robot, or None and the reason why it is unknown.
+        """Return the camera with its pose on the robot, or None and the reason why it is unknown. The result
+        is kept until CameraInfo, transforms or base change.
 
         Args:
             base: Name of the base frame.
@@ -234,12 +252,13 @@ class LiveCamera:
         return self._found[1:]
 
     def near(self, stamp_ns: int, offset_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture in memory that is nearest to a time, None when it is farther than `within_ns`.
+        """Return the picture in memory that is nearest to a time; None if it is farther than `within_ns`,
+        cannot be decoded, or there is none.
 
         Args:
-            stamp_ns: The time.
-            offset_ns: Stamp minus arrival of the first scan of the run.
-            within_ns: Largest time difference.
+            stamp_ns: The time [ns].
+            offset_ns: Stamp minus arrival of the first scan of the run [ns].
+            within_ns: Maximum time difference [ns].
         """
         times = [(time_beside(stamp, m.log_ns, offset_ns), k) for k, (stamp, m) in enumerate(self._held)]
         taken_ns, k = min(times, key=lambda each: abs(each[0] - stamp_ns), default=(0, -1))
@@ -253,6 +272,7 @@ class LiveCamera:
         return self._info is None or info.payload[head:] != self._info.payload[head:]
 
     def _keep_fixed(self, message: Message) -> None:
+        """Store a message of fixed transforms unless it is stored or larger than _LARGEST_TOLD."""
         known = {each.payload for each in self._fixed}
         if len(message.payload) <= _LARGEST_TOLD and message.payload not in known:
             self._fixed.append(message)
@@ -345,6 +365,7 @@ class LiveRecording(MessageSource):
     def __init__(
         self, uri: str, container: Container, run: LiveRunHeader, paths: list[Path], options: SourceOptions
     ) -> None:
+        """Read the recording up to its description, and the notes of the recorder."""
         super().__init__(container)
         self._uri, self._run = uri, run
         self._options = replace(options, topics={"scan": run.topics[0], **options.topics})
@@ -387,6 +408,7 @@ class LiveRecording(MessageSource):
         return self._found_camera
 
     def _reader(self) -> ArrivalReader:
+        """Return a new reader of the messages of the robot."""
         return ArrivalReader(self._uri, KIND, self._channels, self._options)
 
     def _opened_reader(self) -> ArrivalReader:
@@ -446,7 +468,8 @@ class LiveRecording(MessageSource):
         return self._notes(PARAMETERS, Revision)
 
     def _read_skipped(self) -> dict[int, set[int]]:
-        """Return the log times of the messages that the live run did not map, by channel."""
+        """Return the log times [ns] of the messages that the live run did not map, by channel; at most
+        _MOST_SKIPPED are read, later notes are ignored."""
         skipped: dict[int, set[int]] = {c.number: set() for c in self._channels}
         numbers = {c.topic: c.number for c in self._channels}
         total = 0
@@ -460,7 +483,8 @@ class LiveRecording(MessageSource):
         return {number: times for number, times in skipped.items() if times}
 
     def _notes(self, topic: str, kind: type[T]) -> Iterator[T]:
-        """Yield the JSON values of a channel of the recorder; damaged ones are counted."""
+        """Yield the JSON values of a topic of the recorder as `kind`; damaged ones are counted in the losses.
+        Reading ends after _MOST_NOTES and at a note longer than _LIMIT."""
         numbers = [c.number for c in self._container.channels if c.topic == topic]
         types: Any = standard_types("cdr")
         for count, message in enumerate(self._container.messages(numbers, None, {})):

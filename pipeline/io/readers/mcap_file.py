@@ -98,6 +98,12 @@ class McapFile(ChunkedFile):
     # --- index -------------------------------------------------------------------------------------
 
     def _read_index(self, end: int) -> None:
+        """Read the records from the start of the file. If they end before the end of the data, use the
+        summary for later chunks and count the bytes in between as damage.
+
+        Raises:
+            SourceError: The file is no MCAP file.
+        """
         self._schemas: dict[int, records.Schema] = {}
         self._definitions: dict[int, records.Channel] = {}
         self._further: list[tuple[int, int, int]] = []  # opcode, position and length of other records
@@ -120,7 +126,8 @@ class McapFile(ChunkedFile):
             count_loss(self.damage, what, max((read or end) - at, 1))
 
     def _read_summary(self, after: int) -> int:
-        """Add the chunks behind a damaged record by the summary; return where they begin, 0 for none."""
+        """Add the channels of the summary and the chunks after a position [bytes]; return where these chunks
+        begin, 0 without a summary or chunk."""
         try:
             with self._path.open("rb") as file:
                 summary = SeekingReader(file, record_size_limit=BLOCK_LIMIT).get_summary()
@@ -184,6 +191,11 @@ class McapFile(ChunkedFile):
                 self._further.append((opcode, body, length))
 
     def _define(self, opcode: int, record: bytes) -> None:
+        """Add the type or channel in a record; `opcode` is SCHEMA or CHANNEL.
+
+        Raises:
+            DAMAGE: The record is damaged.
+        """
         stream = ReadDataStream(io.BytesIO(record))
         if opcode == Opcode.SCHEMA:
             schema = records.Schema.read(stream)
@@ -192,6 +204,8 @@ class McapFile(ChunkedFile):
             self._add_channel(records.Channel.read(stream))
 
     def _add_channel(self, channel: records.Channel) -> None:
+        """Add a channel; without a known schema its type and definition are "". An earlier one of this number
+        is replaced."""
         schema = self._schemas.get(channel.schema_id) or records.Schema(0, b"", "", "")
         text = schema.data[:DEFINITION_LIMIT].decode(errors="replace")
         self._definitions[channel.id] = channel
@@ -201,7 +215,8 @@ class McapFile(ChunkedFile):
         )  # fmt: skip
 
     def _add_loose(self, start: int, end: int) -> None:
-        """Add a message between two positions outside of chunks to a run, which is an uncompressed chunk."""
+        """Add a message between two positions [bytes] outside of chunks to a run, which is an uncompressed
+        chunk of up to about LOOSE_RUN bytes."""
         last = self._chunks[-1] if self._chunks else None
         is_run = last is not None and last.offset + last.length == start and last.counts is None
         if last is not None and is_run and not last.crc and last.length == last.size < LOOSE_RUN:
@@ -211,7 +226,7 @@ class McapFile(ChunkedFile):
             self._chunks.append(Chunk(start, end - start, 0, 0, "", end - start, 0, None))
 
     def _count(self, number: int, size: int) -> None:
-        """Store the number of messages of a channel in the chunk before.
+        """Store the number of messages of a channel in the chunk before; nothing without one.
 
         Args:
             number: Number of the channel.
@@ -225,6 +240,7 @@ class McapFile(ChunkedFile):
     # --- chunks ------------------------------------------------------------------------------------
 
     def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
+        """Yield the messages of an unpacked chunk, see `ChunkedFile._parse`."""
         view, at = memoryview(raw), 0
         while at < len(raw):
             opcode, length = RECORD.unpack_from(raw, at)

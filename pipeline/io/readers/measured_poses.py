@@ -56,7 +56,8 @@ class RigidFit:
 
     def shared(self, x: float, y: float, sigma: float, yaw_sigma: float, heading_sigma: float = 0.0) -> Float:
         """Return the factor L of the covariance L L^T of (x, y, yaw) that all positions share, shape (3, 4);
-        see PoseMeasurement.
+        see PoseMeasurement. Its columns are the shift along x and y, the rotation about `centre`, and the
+        heading.
 
         Args:
             x, y: Position in the map [m].
@@ -80,8 +81,8 @@ def interpolated(at_ns: Int, stamp_ns: Sequence[int], path: Float) -> Float:
 
     Args:
         at_ns: Times [ns], shape (K,).
-        stamp_ns: Times of the path, ascending [ns], length N.
-        path: shape (N, C).
+        stamp_ns: Times of the path, ascending [ns], length N > 0.
+        path: Columns of the path, shape (N, C).
     """
     times = (np.asarray(stamp_ns, dtype=np.int64) - int(stamp_ns[0])).astype(np.float64)
     at = (at_ns - int(stamp_ns[0])).astype(np.float64)
@@ -112,7 +113,9 @@ def fit_rigid(
         what, unknown: For messages: name of the positions, and what a short path does not determine.
 
     Returns:
-        The fit, or None and the reason why there is none.
+        The fit and "", or None and the reason why there is none: fewer than FEWEST positions within the time
+        of the odometry, a path shorter than `shortest` or than three sigmas, or too large residuals (WORST).
+        Positions that are not finite are ignored.
     """
     if len(positions) < FEWEST or len(stamp_ns) < 2:
         return None, f"{len(positions)} {what} are too few"
@@ -206,13 +209,14 @@ class Plane:
     """
 
     def __init__(self, latitude: float, longitude: float) -> None:
+        """Prepare the projection; imports pyproj."""
         from pyproj import Transformer
 
         local = f"+proj=aeqd +lat_0={latitude!r} +lon_0={longitude!r} +datum=WGS84 +units=m"
         self._transform = Transformer.from_crs("EPSG:4326", local, always_xy=True).transform
 
     def place(self, fix: Fix) -> tuple[float, float]:
-        """Return east and north of the origin [m]."""
+        """Return east and north of a fix from the origin [m]."""
         east, north = self._transform(fix.longitude, fix.latitude)
         return float(east), float(north)
 
@@ -246,8 +250,8 @@ class GnssFrame:
         )
 
     def measurement(self, fix: Fix) -> PoseMeasurement:
-        """Return a fix as measurement of the position of the base in the map, with the errors of the fix and
-        of the plane."""
+        """Return a fix as measurement of the position of the base in the map, with the errors of the fix, the
+        lever and the plane. Its heading is unknown: yaw 0 with the variance NO_HEADING."""
         T = self.fit.T_map_other
         c, s = math.cos(T.yaw), math.sin(T.yaw)
         east, north = self.plane.place(fix)
@@ -266,13 +270,13 @@ def align_fixes(
     """Fit the pose of the GNSS plane in the map.
 
     Args:
-        fixes: In the order of time.
+        fixes: Fixes in the order of time; the first one is the origin of the plane.
         stamp_ns: Times of the odometry, ascending, shape (N,).
         path: Positions of the base by odometry in the map frame [m], shape (N, 2) or with more columns.
         lever: Distance of the antenna from the base [m].
 
     Returns:
-        The frame, or None and the reason why there is none.
+        The frame and "", or None and the reason why there is none, see `fit_rigid`.
     """
     if not fixes:
         return None, "0 fixes are too few"
@@ -330,7 +334,8 @@ class OtherPose:
         covariance: Sequence[float],
         T_child_base: Pose3 | None = None,
     ) -> OtherPose:
-        """Return a pose from the fields of its message.
+        """Return a pose from the fields of its message, in the plane; the variances BEST are added to its
+        covariance.
 
         Args:
             stamp_ns: Time [ns].
@@ -339,7 +344,7 @@ class OtherPose:
             T_child_base: Pose of the base in the frame of the message; None for the base itself.
 
         Raises:
-            NoPoseError: The covariance in the plane is not finite or not positive definite.
+            NoPoseError: The covariance in the plane is not finite, not symmetric or not positive definite.
         """
         planar = np.array(covariance, dtype=np.float64).reshape(6, 6)[np.ix_(_ROWS, _ROWS)]
         if not (np.abs(planar) < 1e12).all():
@@ -383,7 +388,8 @@ class OtherFrame:
         )
 
     def measurement(self, pose: OtherPose) -> PoseMeasurement | None:
-        """Return the pose in the map with the errors of the pose and of the frame; None until poses count."""
+        """Return the pose in the map with the errors of the pose and of the frame; None for poses up to
+        `from_ns`, which do not count. Without `turn` the heading is unknown (variance NO_HEADING)."""
         if pose.stamp_ns <= self.from_ns:
             return None
         T, rate = self.fit.T_map_other, max(self.fit.rate_hz, 1.0)
@@ -413,7 +419,8 @@ def align_poses(
         path: Poses of the base by odometry in the map frame: x, y [m], yaw [rad], shape (N, 3).
 
     Returns:
-        The frame, or None and the reason why there is none.
+        The frame and "", or None and the reason why there is none, see `fit_rigid`. Headings that differ from
+        those of the odometry by more than SCATTER (RMS) are not used.
     """
     at_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
     other = np.array([pose.T_other_base.as_array() for pose in poses]).reshape(-1, 3)
@@ -512,6 +519,7 @@ class FrameAlignment:
         *,
         early: bool,
     ) -> None:
+        """Begin without readings."""
         self._decoder, self.kind, self.readings, self._odometry = decoder, kind, readings, odometry
         self._start_ns, self._early = start_ns, early
         self._found: list[Any] = []
@@ -523,7 +531,8 @@ class FrameAlignment:
         self.refused = ""
 
     def add(self, stamped: Stamped[Message | Odometry]) -> Any:  # noqa: ANN401 - GnssFrame or OtherFrame
-        """Process the next message or odometry. Return the frame once it is known, else None."""
+        """Process the next message or odometry. Return the frame (GnssFrame or OtherFrame) once it is known,
+        else None; if it can never be known, `refused` is set. Messages of other channels are ignored."""
         content = stamped.content
         if isinstance(content, Odometry):
             self._add_odometry(content)
@@ -536,7 +545,7 @@ class FrameAlignment:
         return None
 
     def finish(self) -> tuple[Any, str]:
-        """Fit the frame to all readings; return it, or None and the reason why it is unknown."""
+        """Fit the frame to all readings; return it and "", or None and the reason why it is unknown."""
         if self._origin is None:
             return None, "no odometry can be read"
         found, why = self._fit(self._origin[1])
@@ -545,6 +554,8 @@ class FrameAlignment:
         return found, why
 
     def _add_odometry(self, odometry: Odometry) -> None:
+        """Add a pose to the path, unless it is less than _APART_NS after the last one. The pose nearest to
+        the first scan becomes the origin of the map."""
         off_ns = abs(odometry.stamp_ns - self._start_ns)
         if self._origin is None or off_ns < abs(self._origin[0] - self._start_ns):
             self._origin = (odometry.stamp_ns, odometry.T_odom_base)
@@ -552,6 +563,9 @@ class FrameAlignment:
             self._path.append((odometry.stamp_ns, odometry.T_odom_base))
 
     def _add_reading(self, message: Message, stamp_ns: int) -> Any:  # noqa: ANN401
+        """Decode and store a reading; return the frame if it is known now, else None. Damaged readings, those
+        without a position and those less than _APART_NS after the last one are left out. `refused` is set
+        after _HOPELESS damaged readings without a usable one, and with more than _MOST_READINGS."""
         try:
             with np.errstate(all="ignore"):
                 reading, self._frame = self.kind.read(message, stamp_ns)
@@ -568,6 +582,9 @@ class FrameAlignment:
         return None if self._origin is None or self.refused else self._try_fit(self._origin[1])
 
     def _try_fit(self, origin: Pose3) -> Any:  # noqa: ANN401
+        """Return the frame if the robot is far enough from its start for the next fit, and the fit is good;
+        else None. The last fit, at `kind.longest`, is returned in any case or sets `refused`. `origin` is
+        T_odom_start at the first scan."""
         away = float(np.hypot(*(self._path[-1][1].t - self._path[0][1].t)[:2]))
         if away < self._try_at:
             return None
@@ -579,6 +596,8 @@ class FrameAlignment:
         return found if found is not None and found.yaw_sigma <= NORTH_SIGMA else None
 
     def _fit(self, T_odom_start: Pose3) -> tuple[Any, str]:
+        """Return the frame by all readings so far and "", or None and the reason. `T_odom_start` is the pose
+        of the base at the origin of the map."""
         start = T_odom_start.planar().inverse()
         path = np.array([(start @ pose.planar()).as_array() for _, pose in self._path])
         linked = self._decoder.place_of(self._frame)
@@ -609,6 +628,7 @@ class FrameAlignments:
         odometry: frozenset[int],
         times_of: TimesOf,
     ) -> None:
+        """Choose the readings by the topics that are read; nothing is aligned."""
         self._container, self._decoder, self._odometry = container, decoder, odometry
         self._times_of = times_of
         kinds = (
@@ -625,8 +645,9 @@ class FrameAlignments:
         self.notices: list[str] = []
 
     def begin(self, description: SourceDescription, *, live: bool) -> SourceDescription:
-        """Align the frames of a recording, or prepare the alignment for a live run. Return the description
-        with how the readings are used.
+        """Align the frames of a recording, or prepare the alignment for a live run. Frames that are found are
+        passed to the decoder. Return the description with how the readings are used, or with a warning why
+        they are not.
 
         Args:
             description: Description of the source.
@@ -662,7 +683,9 @@ class FrameAlignments:
         return description
 
     def add(self, stamped: Stamped[Message | Odometry]) -> None:
-        """Process the next message or odometry of a live run, before it is decoded to a record."""
+        """Process the next message or odometry of a live run, before it is decoded to a record. A frame that
+        becomes known is passed to the decoder; this, or the reason why readings are not used, is added to
+        `notices`."""
         for alignment in tuple(self._open):
             kind, found = alignment.kind, alignment.add(stamped)
             if found is not None:
@@ -676,6 +699,8 @@ class FrameAlignments:
             self._open.remove(alignment)
 
     def _align_recording(self, alignment: FrameAlignment) -> tuple[Any, str]:
+        """Return the frame by the first _MOST_READINGS messages of a recording and "", or None and the
+        reason."""
         messages = self._container.messages(alignment.readings | self._odometry, None, {})
         for message in islice(messages, _MOST_READINGS):
             for stamped in self._times_of(message, {}):

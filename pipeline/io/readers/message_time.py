@@ -32,7 +32,8 @@ T_co = TypeVar("T_co", covariant=True)
 
 
 def header_stamp(channel: Channel, payload: bytes) -> int | None:
-    """Return the stamp [ns] of a message that begins with a std_msgs/Header, None when it has none."""
+    """Return the stamp [ns] of a message that begins with a std_msgs/Header; None if the payload is too short
+    or the stamp is impossible. A stamp of zero is 0. The result has no meaning for other types."""
     if len(payload) < 12:
         return None
     if channel.encoding == "ros1":
@@ -57,6 +58,8 @@ class Clock:
     """
 
     def __init__(self, offsets_ns: list[int | None]) -> None:
+        """Choose the clock: stamps are used if all topics have one and their offsets differ by 10 s at
+        most."""
         known = [offset for offset in offsets_ns if offset is not None]
         self.by_stamp = (
             bool(known) and len(known) == len(offsets_ns) and max(known) - min(known) <= _SAME_CLOCK_NS
@@ -102,13 +105,17 @@ class ClockStepFilter(Clock):
     """
 
     def __init__(self, offsets_ns: list[int | None], notices: list[str] | None = None) -> None:
+        """Choose the clock as `Clock` does."""
         super().__init__(offsets_ns)
         self.notices: list[str] = [] if notices is None else notices
         self._channels: dict[int, _ChannelClock] = {}
         self._steps: list[int] = []
 
     def time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a message [ns], None when its stamp is impossible."""
+        """Return the time of a message [ns], with the steps of the clock removed; call it in the order of
+        arrival. A stamp that is missing or zero is replaced by the time of arrival plus the known offset.
+        None if such a message, or one with another clock, is the first of its channel. A step adds a notice.
+        """
         if not self.by_stamp:
             return message.log_ns
         known = self._channels.get(message.channel)
@@ -144,6 +151,9 @@ class ClockStepFilter(Clock):
         return _ChannelClock(offset_ns, stamp_ns, nearest.shift_ns, nearest.steps)
 
     def _step(self, channel: _ChannelClock, offset_ns: int) -> None:
+        """Correct the stamps of a channel by a step, whose size is that of a step which another channel has
+        shown, or is measured here and adds a notice. `offset_ns` is stamp minus arrival after the step [ns].
+        """
         size_ns = offset_ns - channel.offset_ns
         if channel.steps < len(self._steps) and abs(self._steps[channel.steps] - size_ns) < SAME_STEP_NS:
             size_ns = self._steps[channel.steps]
@@ -166,11 +176,12 @@ class Stamped(Generic[T_co]):
 
 
 def by_stamp(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -> Iterator[Stamped[T]]:
-    """Yield contents sorted by time. Contents that arrive more than WINDOW_NS late are left out.
+    """Yield contents sorted by time, then by rank. Contents that arrive more than WINDOW_NS late, and those
+    earlier than the last one yielded, are left out. At most _HELD_LIMIT contents wait.
 
     Args:
         arrivals: Contents in the order of arrival.
-        losses: Counts contents that are left out.
+        losses: Counts contents that are left out; changed in place.
     """
     heap: list[tuple[int, int, int, Stamped[T]]] = []
     newest = last = -(2**63)

@@ -67,7 +67,7 @@ class PointTable:
 
 
 def open_table(path: Path) -> PointTable:
-    """Open a file by its contents and read its header.
+    """Return the table of a file, whose format is found by its contents; only the header is read.
 
     Raises:
         ScanFileError: It has none of these formats, contradicts itself, or has no x, y and z.
@@ -92,7 +92,7 @@ def read_columns(path: Path, losses: dict[str, int], *, limit: int = POINT_LIMIT
 
     Args:
         path: A PLY, NumPy or PCD file.
-        losses: Counts the points that the header promises and the file does not hold.
+        losses: Counts the points that the header promises and the file does not hold; changed in place.
         limit: A file that promises more points is refused before they are read.
 
     Raises:
@@ -190,13 +190,16 @@ class _Stream:
 
 
 def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) -> PointTable:
-    """Return the table of streams with the same points.
+    """Return the table of streams with the same points. Its parts end at the first damage; damage before the
+    first point raises ScanFileError.
 
     Args:
         path: The file.
         kind: Name of the format.
         points: Number of points by the header.
         streams: Records of the points; several streams have different columns.
+    Raises:
+        ScanFileError: x, y or z is missing, sizes are too large, or the file ends before its first point.
     """
     usable = _usable([name for stream in streams for name in stream.dtype.names or ()])
     for stream in streams:
@@ -205,6 +208,7 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
             raise ScanFileError("it ends before its first point")
 
     def parts() -> Iterator[Columns]:
+        """Yield the points in parts, see PointTable."""
         read = 0
         try:
             with ExitStack() as stack:
@@ -223,7 +227,8 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
 def _text_table(
     path: Path, kind: str, points: int, dtype: np.dtype[Any], start: int, skipped: int = 0
 ) -> PointTable:
-    """Return the table of lines of text.
+    """Return the table of lines of text. Damaged lines are left out of its parts; without any valid line
+    ScanFileError is raised.
 
     Args:
         path: The file.
@@ -232,6 +237,8 @@ def _text_table(
         dtype: Types of the numbers of a point; a field of several values has its count as shape.
         start: First byte after the header.
         skipped: Number of lines before the points.
+    Raises:
+        ScanFileError: x, y or z is missing, sizes are too large, or the file is too short.
     """
     usable = _usable(list(dtype.names or ()))
     _check_size(points, dtype.itemsize)
@@ -242,6 +249,7 @@ def _text_table(
         raise ScanFileError("it ends before its first point")
 
     def parts() -> Iterator[Columns]:
+        """Yield the points in parts, see PointTable."""
         with path.open("rb") as file:
             file.seek(start)
             for _ in range(skipped):
@@ -258,7 +266,8 @@ def _text_table(
 
 
 def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
-    """Return numbers of a text file; integers by the header are clipped to the range of their type."""
+    """Return numbers of a text file, shape (N,), as the type of the header: floating numbers unchanged as
+    float64; integers truncated and clipped to the range of the type, NaN as 0."""
     if dtype.kind == "f":
         return numbers
     bounds = np.iinfo(dtype)
@@ -273,6 +282,12 @@ _PCD_TYPES |= {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size 
 
 
 def _open_pcd(path: Path, head: bytes) -> PointTable:
+    """Return the table of a PCD file with these first bytes.
+
+    Raises:
+        ScanFileError: The header is damaged, lacks x, y or z, or promises too many points.
+        OSError: It cannot be read.
+    """
     dtype, points, data, start = _pcd_header(head)
     kind = f"PCD {data}"
     if data == "ascii":
@@ -348,6 +363,11 @@ def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int]:
 
 
 def _whole_number(word: str) -> int:
+    """Return a decimal number of up to 18 digits.
+
+    Raises:
+        ValueError: The word is not such a number.
+    """
     if not word.isdecimal() or len(word) > 18:
         raise ValueError(word[:20])
     return int(word)
@@ -423,6 +443,12 @@ _PlyElement = tuple[str, int, list[tuple[str, str]]]
 
 
 def _open_ply(path: Path, head: bytes) -> PointTable:
+    """Return the table of the vertices of a PLY file with these first bytes.
+
+    Raises:
+        ScanFileError: The header is damaged, has no vertices with x, y and z, or lists precede the vertices.
+        OSError: It cannot be read.
+    """
     order, elements, start = _ply_header(head)
     place = next((k for k, e in enumerate(elements) if e[0] in ("vertex", "point", "points")), None)
     if place is None:
@@ -531,7 +557,8 @@ class _NumpyArray:
         return [_Stream(self.start, np.dtype([(name, self.dtype) for name in names]), self.room, self.member)]
 
     def column(self, name: str, number: int = 0) -> _Stream:
-        """Return a column whose numbers are stored one after the other."""
+        """Return the stream of the column with this index, whose numbers are stored one after the other,
+        under a name."""
         start = self.start + number * self.shape[0] * self.dtype.itemsize
         return _Stream(start, np.dtype([(name, self.dtype)]), self.room, self.member)
 
@@ -600,4 +627,5 @@ def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
 
 
 def _is_number(dtype: np.dtype[Any]) -> bool:
+    """Return whether a type is a real number of up to 8 bytes."""
     return dtype.kind in "fiu" and dtype.itemsize <= 8 and not dtype.shape

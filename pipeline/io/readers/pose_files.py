@@ -81,10 +81,12 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
 
 
 def seconds_ns(text: str) -> int:
-    """Return decimal seconds as integer nanoseconds, exactly.
+    """Return decimal seconds as integer nanoseconds: exactly for plain digits (further decimals are cut off),
+    otherwise rounded to a float.
 
     Raises:
         ValueError: The text is not a number, or the number is too large.
+        OverflowError: The number is infinite.
     """
     whole, dot, fraction = text.partition(".")
     plain = whole.isascii() and whole.isdigit() and (not dot or (fraction.isascii() and fraction.isdigit()))
@@ -99,10 +101,10 @@ def seconds_ns(text: str) -> int:
 
 
 def read_times(path: Path) -> Int:
-    """Read times [ns], one per row, in seconds or as dates with times of day.
+    """Read times [ns], int64, shape (N,), one per row, in seconds or as dates with times of day (UTC).
 
     Raises:
-        TextError: It has another format, or its times go back.
+        TextError: It has another format, no rows, or its times go back; equal times are accepted.
         OSError: It cannot be read.
     """
     try:
@@ -115,11 +117,22 @@ def read_times(path: Path) -> Int:
 
 
 def _check_positions(positions: Float) -> None:
+    """Check positions [m].
+
+    Raises:
+        TextError: A position is beyond COORDINATE_LIMIT or NaN.
+    """
     if not (np.abs(positions) < COORDINATE_LIMIT).all():
         raise TextError(f"it has positions beyond {COORDINATE_LIMIT:.0e} m")
 
 
 def _text(path: Path) -> str:
+    """Return the text of a file.
+
+    Raises:
+        TextError: It is longer than TEXT_LIMIT, or is not UTF-8.
+        OSError: It cannot be read.
+    """
     if path.stat().st_size > TEXT_LIMIT:
         raise TextError(f"it is longer than {TEXT_LIMIT >> 20} MB")
     try:
@@ -144,6 +157,11 @@ def read_table(path: Path, columns: int) -> Float:
 
 
 def _table(lines: list[list[str]], columns: int) -> Float:
+    """Return words as finite numbers below 1e10, shape (rows, columns).
+
+    Raises:
+        TextError: There are no rows, a row has another length, or a word is not such a number.
+    """
     if not lines or any(len(line) != columns for line in lines):
         raise TextError(f"its rows do not have {columns} numbers")
     try:
@@ -171,7 +189,7 @@ def _date(line: str) -> int:
 
 
 def _calibration(path: Path) -> Pose3 | None:
-    """Return `T_camera_lidar` of the calib.txt of KITTI, None when there is none."""
+    """Return `T_camera_lidar` of the calib.txt of KITTI; None if there is none or it cannot be used."""
     try:
         rows = [line.split() for line in _text(path).split("\n") if line.startswith("Tr:")]
         matrix = np.array([float(word) for word in rows[0][1:]]).reshape(3, 4)
@@ -189,6 +207,7 @@ def _moves_along_z(R: Float, t: Float) -> bool:
 
 
 def _nearest_rotation(matrix: Float) -> Float:
+    """Return the rotation matrix nearest to a matrix, shape (3, 3) (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(matrix)
     R: Float = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
     return R
@@ -199,12 +218,13 @@ _FAR_NS = 1_000_000_000
 
 
 def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
-    """Interpolate the pose at a time; the nearest row applies outside of their range, None far from it.
+    """Return the pose interpolated at a time. Outside of the times the nearest pose applies; None if the time
+    is more than _FAR_NS from the rows before and after it.
 
     Args:
         times: Times of the poses, ascending [ns], shape (N,), N >= 1.
         poses: Poses, N of them.
-        stamp_ns: The time.
+        stamp_ns: The time [ns].
     """
     after = int(np.searchsorted(times, stamp_ns))
     before = max(after - 1, 0)
@@ -262,7 +282,7 @@ def parse_numbers(text: bytes) -> Float:
 
 
 def parse_table(text: bytes, columns: int) -> tuple[Float, int]:
-    """Parse lines of numbers separated by blanks.
+    """Parse lines of numbers separated by blanks; a text without lines gives shape (0, columns).
 
     Empty lines are skipped. A line with another number of words, or with a word that is not a number, is
     damaged and left out; "nan" is a number.
@@ -310,6 +330,7 @@ def read_rows(file: IO[bytes], columns: int, lines: int) -> Iterator[Float]:
 
 
 def _numbers(words: list[bytes]) -> list[float] | None:
+    """Return words as numbers; None if one is not a number."""
     try:
         return [float(word) for word in words]
     except ValueError:

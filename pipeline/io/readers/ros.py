@@ -58,6 +58,8 @@ class RosSource(MessageSource):
     def __init__(
         self, uri: str, container: Container, paths: list[Path], options: SourceOptions, *, live: bool = False
     ) -> None:
+        """Open the source: choose topics and clock, read transforms and the first scan, and align measured
+        poses."""
         super().__init__(container)
         self._uri = uri
         self._channels = {channel.number: channel for channel in container.channels}
@@ -92,7 +94,8 @@ class RosSource(MessageSource):
             self._clock = ClockStepFilter(offsets_ns, self.notices)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of time; messages before `start_ns` are not decoded."""
+        """Yield records in the order of time; messages before `start_ns` [ns] are not decoded. Messages that
+        cannot be used, or come too late, are counted in `losses`."""
         losses: dict[str, int] = {}
         self._losses = losses
         for stamped in by_stamp(self._arrivals(start_ns, losses), losses):
@@ -101,7 +104,8 @@ class RosSource(MessageSource):
     def records_of(
         self, message: Message, losses: dict[str, int], from_ns: int | None = None
     ) -> Iterator[Record]:
-        """Yield the records of one message.
+        """Yield the records of one message of a live run; none for a channel that is not read. Call it in the
+        order of arrival.
 
         Args:
             message: The message.
@@ -150,7 +154,7 @@ class RosSource(MessageSource):
     # --- reading ---------------------------------------------------------------------------------
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a message [ns], None when its stamp is impossible."""
+        """Return the time of a message [ns] by the clock of the source, None if its stamp is impossible."""
         return self._clock.time_of(stamp_ns, message)
 
     def _arrivals(
@@ -170,12 +174,15 @@ class RosSource(MessageSource):
                     yield arrival
 
     def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
-        """Yield the contents of a message with their times."""
+        """Yield the contents of a message with their times: the message itself, or the odometry in a message
+        of moving transforms. Impossible times are counted in `losses`."""
         if message.channel in self._moving:
             return self._transforms(message, losses)
         return self._stamped(message, losses)
 
     def _decoded(self, stamped: Stamped[Message | Odometry], losses: dict[str, int]) -> Iterator[Record]:
+        """Yield the record of a message, none if it cannot be used (counted in `losses`). Rings of scans are
+        numbered from below."""
         if isinstance(stamped.content, Odometry):
             yield stamped.content
             return
@@ -186,6 +193,8 @@ class RosSource(MessageSource):
             yield record
 
     def _stamped(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message]]:
+        """Yield a message with its time, scans after other messages of the same time; nothing, counted in
+        `losses`, if its time is impossible."""
         time_ns = self._clock.time_of(header_stamp(self._channels[message.channel], message.payload), message)
         if time_ns is None:
             count_loss(losses, "messages with an impossible time stamp")
@@ -193,7 +202,8 @@ class RosSource(MessageSource):
             yield Stamped(time_ns, int(message.channel in self._topics.numbers("scan")), message)
 
     def _transforms(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
-        """Yield odometry that is recorded as a moving transform."""
+        """Yield the odometry in a message of moving transforms, with its time; transforms between other
+        frames are ignored, impossible times are counted in `losses`."""
         for stamp_ns, parent, child, pose in self._extrinsics.decode(message):
             if (parent, child) == self._extrinsics.odometry_link:
                 time_ns = self._clock.time_of(stamp_ns, message)
@@ -242,6 +252,8 @@ class RosSource(MessageSource):
         )
 
     def _scan_arrivals(self, log_start: int | None) -> Iterator[Stamped[Message]]:
+        """Yield the messages of the scan topic with their times, from a time of recording on [ns] (None:
+        all)."""
         for message in self._container.messages(self._topics.numbers("scan"), log_start, {}):
             yield from self._stamped(message, {})
 
@@ -256,10 +268,13 @@ class RosSource(MessageSource):
         return bool(stamps) and all(stamps[-_LAST:])
 
     def _last_stamp(self) -> int | None:
+        """Return the time of the last scan [ns]; None if no message near the end has a possible time."""
         tail_ns = self._container.tail_ns(self._topics.numbers("scan"))
         return max((arrival.stamp_ns for arrival in self._scan_arrivals(tail_ns)), default=None)
 
     def _read_truth(self) -> tuple[Truth | None, Sensor | None]:
+        """Return the attached ground truth and sensor, None for each that is missing. A damaged attachment
+        becomes a warning."""
         try:
             content = self._container.attachment(ATTACHMENT, SIZE_LIMIT)
             return (None, None) if content is None else read_truth(content, self._uri)
@@ -280,6 +295,15 @@ class RosSource(MessageSource):
     def _describe(
         self, first: Scan, frame: str, sensor: Sensor, digest: str, options: SourceOptions
     ) -> SourceDescription:
+        """Return the description of the source, and set the base frame.
+
+        Args:
+            first: First scan.
+            frame: Name of its frame.
+            sensor: The LiDAR.
+            digest: Digest of the files.
+            options: Extrinsics chosen by the user; without them, those of the transforms, else identity.
+        """
         chosen = self._topics.chosen
         self._records.base = base = self._extrinsics.base_frame(self._odometry_base())
         has_odometry = "odometry" in chosen or bool(self._moving)

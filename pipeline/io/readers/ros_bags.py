@@ -47,6 +47,7 @@ class Db3File(Container):
     kind = "ROS 2 bag (db3)"
 
     def __init__(self, path: Path) -> None:
+        """Open the database and read the index of all messages."""
         self._path = path
         self.damage = {}
         # `immutable` keeps SQLite from writing a journal, which fails on a read-only disk.
@@ -90,6 +91,7 @@ class Db3File(Container):
         self._database.close()
 
     def _payload(self, row: int) -> bytes | None:
+        """Return the bytes of the message in a row of the table; None if they cannot be read."""
         try:
             found = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
         except (sqlite3.Error, MemoryError):
@@ -128,6 +130,7 @@ class Db3File(Container):
         return table[:, 0], table[:, 1], table[:, 2]
 
     def _read_channels(self) -> list[Channel]:
+        """Return the channels by number, with their numbers of messages."""
         definitions = self._definitions()
         channels = []
         for number, topic, msgtype, encoding in self._database.execute(
@@ -140,7 +143,8 @@ class Db3File(Container):
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
-        """Return the format and text of message definitions by type, stored since ROS 2 Iron."""
+        """Return the format and text of message definitions by type, stored since ROS 2 Iron; empty without
+        them, or if they cannot be read."""
         query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
         if "message_definitions" not in self._tables:
             return {}
@@ -176,7 +180,8 @@ _STRIDE = 1 << 40
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """Return the .mcap and .db3 files of a folder in the order of their names.
+    """Return the .mcap and .db3 files of a folder in the order of the numbers at the end of their names; may
+    be empty.
 
     Raises:
         SourceError: The files themselves are compressed, or there are several without metadata.yaml.
@@ -216,6 +221,8 @@ class BagFolder(Container):
     """
 
     def __init__(self, files: list[Path]) -> None:
+        """Open all files; one that cannot be read is counted in `damage`. Channels of the n-th file (from 0)
+        are numbered from n times _STRIDE."""
         self.damage = {}
         self._parts: list[Container] = []
         for path in files:
@@ -262,10 +269,12 @@ class BagFolder(Container):
 
 
 def _own(numbers: Collection[int], index: int) -> list[int]:
+    """Return the numbers of the channels of one file, as numbered in that file."""
     return [number - _STRIDE * index for number in numbers if number // _STRIDE == index]
 
 
 def _renumbered(messages: Iterator[Message], index: int) -> Iterator[Message]:
+    """Return the messages of the file with this index, with the numbers of its channels in the folder."""
     if index == 0:
         return messages
     return (replace(message, channel=message.channel + _STRIDE * index) for message in messages)
@@ -288,6 +297,11 @@ class BagFile(ChunkedFile):
     kind = "ROS 1 bag"
 
     def _read_index(self, end: int) -> None:
+        """Read the headers of all records from the start of the file up to a cut; damage is counted.
+
+        Raises:
+            SourceError: It is not a bag of version 2.0, or is encrypted.
+        """
         if self._read(0, len(MAGIC)) != MAGIC:
             raise damaged("not a ROS 1 bag of version 2.0", self._path)
         at, strange = len(MAGIC), 0
@@ -310,6 +324,18 @@ class BagFile(ChunkedFile):
             count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
 
     def _take(self, header: Header, body: int, length: int) -> None:
+        """Store the contents of a record: a connection, a chunk, or the counts of a chunk; other kinds are
+        ignored.
+
+        Args:
+            header: Fields of its header.
+            body: Position of its contents in the file.
+            length: Length of its contents [bytes].
+
+        Raises:
+            SourceError: The bag is encrypted.
+            DAMAGE: The record is damaged.
+        """
         opcode = header[b"op"][0] if header[b"op"] else 0
         if opcode == BAG_HEADER and header.get(b"encryptor"):
             raise damaged("the bag is encrypted", self._path)
@@ -323,6 +349,11 @@ class BagFile(ChunkedFile):
             self._count(LENGTH.unpack(header[b"conn"])[0], self._read(body, length))
 
     def _define(self, header: Header, content: bytes) -> None:
+        """Add the channel of a connection, by the header and the contents of its record.
+
+        Raises:
+            DAMAGE: A field is missing or damaged.
+        """
         fields = _fields(content)
         (number,) = LENGTH.unpack(header[b"conn"])
         topic = header.get(b"topic", fields.get(b"topic", b"")).decode()
@@ -349,6 +380,7 @@ class BagFile(ChunkedFile):
         self._chunks[-1] = replace(chunk, start_ns=first, end_ns=last, counts=counts)
 
     def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
+        """Yield the messages of an unpacked chunk, see `ChunkedFile._parse`."""
         at = 0
         while at < len(raw):
             (header_size,) = LENGTH.unpack_from(raw, at)

@@ -69,6 +69,7 @@ class MessageDecoder:
     """
 
     def __init__(self, channels: Iterable[Channel]) -> None:
+        """Check the definitions of the types that are read; other channels are ignored."""
         self._stores: dict[str, Typestore] = {}
         self.refused: list[str] = []
         for channel in channels:
@@ -76,7 +77,8 @@ class MessageDecoder:
                 self._adopt(channel)
 
     def decode(self, channel: Channel, payload: bytes) -> Any:  # noqa: ANN401
-        """Decode one message; `rosbags.typesys.stores.ros2_jazzy` declares the fields.
+        """Return one message decoded as the type of its channel; `rosbags.typesys.stores.ros2_jazzy` declares
+        the fields.
 
         Raises:
             Exception: Of many kinds, when the bytes do not match the type. Callers count a loss.
@@ -87,6 +89,8 @@ class MessageDecoder:
         return store.deserialize_cdr(payload, channel.msgtype)
 
     def _store(self, channel: Channel) -> Typestore:
+        """Return the types by which messages of a channel are decoded: those of the recording where they are
+        used, else the standard ones."""
         own = self._stores.get(channel.msgtype)
         if own is not None:
             return own
@@ -95,7 +99,8 @@ class MessageDecoder:
         return self._stores[channel.encoding]
 
     def _adopt(self, channel: Channel) -> None:
-        """Use the definition of a type in the recording when it differs from the standard one."""
+        """Use the definition of a type in the recording where it differs from the standard one. The topic of
+        an invalid one is added to `refused`, and the standard one is used."""
         standard = self._store(channel)
         try:
             found = _parse(channel)
@@ -123,6 +128,11 @@ def standard_types(encoding: str) -> Typestore:
 
 
 def _parse(channel: Channel) -> dict[str, Fields]:
+    """Return the types in the definition of a channel, by name.
+
+    Raises:
+        ValueError: The definition is too long. A damaged one raises exceptions of many kinds.
+    """
     if len(channel.definition) > _DEFINITION_LIMIT:
         raise ValueError("the definition is too long")
     if channel.definition_format == "ros2idl":

@@ -87,6 +87,12 @@ def _table(cloud: ros2.sensor_msgs__msg__PointCloud2) -> NDArray[np.void]:
 
 
 def _dtype(cloud: ros2.sensor_msgs__msg__PointCloud2, step: int) -> np.dtype[np.void]:
+    """Return the type of a point of `step` bytes: the fields that are read, by name, the first one of each
+    name.
+
+    Raises:
+        LayoutError: A field is outside of the point, or x, y or z is missing or not a floating number.
+    """
     order = ">" if cloud.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for field in cloud.fields:
@@ -156,6 +162,7 @@ class RecordDecoder:
     """
 
     def __init__(self, channels: Mapping[int, Channel], decoder: MessageDecoder, tree: TransformTree) -> None:
+        """Create a decoder without a base frame and frames of measured poses."""
         self._channels, self._decoder, self._tree = channels, decoder, tree
         self._packets = PacketDecoder()
         self.base = ""
@@ -168,7 +175,8 @@ class RecordDecoder:
         Args:
             message: The message.
             stamp_ns: Its time [ns].
-            losses: Counts messages that cannot be used.
+            losses: Counts messages that cannot be used; changed in place. A measured pose whose frame is not
+                known yet is not counted.
         """
         channel = self._channels[message.channel]
         try:
@@ -259,10 +267,16 @@ class RecordDecoder:
         return OtherPose.of(stamp_ns, at, [float(number) for number in covariance], linked), frame
 
     def place_of(self, frame: str) -> Pose3 | None:
-        """Return the pose of a frame on the robot, None when no fixed transform leads to it."""
+        """Return the pose of a frame on the robot, T_base_frame; None if no fixed transforms link it to the
+        base."""
         return self._tree.find(self.base, frame)
 
     def _gnss_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
+        """Return the measurement of a fix; None if the frame of GNSS is unknown, and, counted, without a fix.
+
+        Raises:
+            Exception: Of many kinds, when the message is damaged.
+        """
         frame = self.frames.get("gnss")
         if not isinstance(frame, GnssFrame):
             return None
@@ -273,6 +287,12 @@ class RecordDecoder:
         return frame.measurement(fix)
 
     def _other_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
+        """Return the measurement of a pose of another SLAM; None if its covariance is invalid (counted), its
+        frame is unknown, or it does not count yet.
+
+        Raises:
+            Exception: Of many kinds, when the message is damaged.
+        """
         try:
             pose, _ = self.other_pose(message, stamp_ns)
         except NoPoseError as error:
@@ -282,6 +302,11 @@ class RecordDecoder:
         return frame.measurement(pose) if isinstance(frame, OtherFrame) else None
 
     def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
+        """Return the odometry in a message, with this time [ns].
+
+        Raises:
+            ValueError: The pose is not finite or its quaternion is zero.
+        """
         pose = self.message(message).pose.pose
         return Odometry(stamp_ns, pose_of(pose.position, pose.orientation))
 
@@ -308,4 +333,5 @@ class RecordDecoder:
 
 
 def _time_ns(stamp: ros2.builtin_interfaces__msg__Time) -> int:
+    """Return a ROS time [ns]."""
     return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)

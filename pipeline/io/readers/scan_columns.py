@@ -26,14 +26,15 @@ def clean_scan(
     offset_ns: NDArray[np.generic] | None = None,
     dropped: int = 0,
 ) -> Scan:
-    """Return a scan without invalid returns: rows that are not finite, beyond 10 km, or at the origin.
+    """Return a scan without invalid returns: rows that are not finite, with a coordinate beyond RANGE_LIMIT,
+    or at the origin (all coordinates up to NEAR_LIMIT).
 
     Args:
         stamp_ns: Time of the scan [ns].
-        points: shape (N, 3) [m].
-        reflectance: shape (N,), or None.
+        points: Points in the sensor frame, shape (N, 3) [m].
+        reflectance: Reflectances, shape (N,), or None; numbers that are not finite are replaced.
         ring: Ring numbers, shape (N,), or None.
-        offset_ns: Times of the points after the stamp, shape (N,), or None.
+        offset_ns: Times of the points after the stamp [ns], shape (N,), or None.
         dropped: Number of returns that were left out before; the rows left out here are added.
     """
     with np.errstate(invalid="ignore", over="ignore"):
@@ -47,6 +48,7 @@ def clean_scan(
         xyz = xyz[keep]
 
     def column(values: NDArray[np.generic] | None) -> NDArray[np.generic] | None:
+        """Return the remaining rows of a column; None for None."""
         return values if values is None or not refused else values[keep]
 
     return Scan(
@@ -60,6 +62,7 @@ def clean_scan(
 
 
 def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
+    """Return a column as float32, with NaN as 0 and infinite numbers limited; None for None."""
     if values is None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -68,6 +71,7 @@ def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
 
 
 def _as_int(values: NDArray[np.generic] | None) -> Int32 | None:
+    """Return a column as int32; None for None."""
     return None if values is None else np.ascontiguousarray(values, dtype=np.int32)
 
 
@@ -91,7 +95,8 @@ def first_of(
 
 
 def is_ring(ring: NDArray[np.generic]) -> bool:
-    """Return whether a column has ring numbers: integers from 0 to below RING_LIMIT."""
+    """Return whether a column has ring numbers: an integer type with numbers from 0 to below RING_LIMIT.
+    False for an empty column."""
     if ring.dtype.kind not in "iu" or not len(ring):
         return False
     return int(ring.min()) >= 0 and int(ring.max()) < RING_LIMIT
@@ -101,7 +106,8 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
     """Return the times of points relative to the stamp [ns], shape (N,), or None when they are impossible.
 
     Integers are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit
-    inferred from their size. Times farther than 2 s from the stamp are impossible.
+    inferred from their size. If one time is farther than 2 s from the stamp, all are impossible; so is an
+    empty column. A floating number that is not finite counts as 0.
     """
     if not len(time):
         return None
@@ -134,7 +140,8 @@ def _unit(largest: float) -> float | None:
 
 
 def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
-    """Return a scan of the columns of a table, which are found by their usual names.
+    """Return a scan of the columns of a table, which are found by their usual names, without invalid returns
+    (`clean_scan`). Ring numbers and times that are impossible are left out as a whole.
 
     Args:
         stamp_ns: Time of the scan [ns].
@@ -161,7 +168,8 @@ VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.
 def sensor_of(scan: Scan) -> Sensor:
     """Infer the sensor from a scan: number of rings, their step in elevation, and the step in azimuth.
 
-    Without a ring column only a VLP-16 is recognised, by its elevations; else `rings` is 0.
+    Without a ring column only a VLP-16 is recognised, by its elevations; else `rings` is 0, as it is with
+    fewer than 100 points.
     """
     if len(scan.points) < 100:
         return Sensor(range_sigma=0.03)
@@ -198,7 +206,8 @@ def _in_steps_of_vlp_16(scan: Scan) -> bool:
 
 
 def rings_descend(scan: Scan) -> bool:
-    """Return whether ring 0 has the highest elevation, as some drivers number rings."""
+    """Return whether ring 0 has the highest elevation, as some drivers number rings. False without ring
+    numbers or with fewer than two rings."""
     elevation = _elevations(scan) if scan.ring is not None and len(scan.points) else np.zeros(0)
     elevation = elevation[np.isfinite(elevation)]
     return len(elevation) >= 2 and float(np.median(np.diff(elevation))) < 0.0
@@ -218,7 +227,8 @@ def _elevations(scan: Scan) -> Float:
 
 
 def _azimuth_step(scan: Scan) -> float:
-    """Return the median angle between neighbouring returns of a ring [rad], 0 when it is unknown."""
+    """Return the median angle between neighbouring returns of a ring [rad], 0 if it is unknown. The scan has
+    ring numbers."""
     steps = []
     ring = np.asarray(scan.ring)
     azimuth = np.arctan2(scan.points[:, 1].astype(np.float64), scan.points[:, 0].astype(np.float64))

@@ -71,6 +71,8 @@ class ScanFolder(FileSource):
     """
 
     def __init__(self, uri: str, path: Path, form: ScanFormat, options: SourceOptions) -> None:
+        """Find the scan files, read the files of times and poses, and load the first scan that can be
+        read."""
         super().__init__()
         self._form = form
         self._warnings: list[str] = []
@@ -107,7 +109,8 @@ class ScanFolder(FileSource):
         )
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield odometry and scans from `start_ns` on; earlier files are not opened."""
+        """Yield odometry (if there are poses) and scans from `start_ns` [ns] on; earlier files are not
+        opened. Files that cannot be read, and scans without points, are counted in `losses`."""
         self._losses = losses = dict[str, int]()
         begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
         for index in range(begin, len(self._files)):
@@ -126,6 +129,11 @@ class ScanFolder(FileSource):
                 count_loss(losses, "scans without points")
 
     def _first_scan(self, uri: str) -> Scan:
+        """Return the first scan with points among the first _TRIES files, at the time 0.
+
+        Raises:
+            SourceError: None of them has points.
+        """
         reason = ""
         for file in self._files[:_TRIES]:
             try:
@@ -158,6 +166,13 @@ class ScanFolder(FileSource):
                 self._warnings.append(f"{path.name} is not used: {error}")
 
     def _read_stamps(self, places: list[Path], numbers: Int) -> Int:
+        """Return the time of each scan [ns], int64, shape (N,): by a file of times, by the names, or else
+        STEP_NS apart by the numbers. A file of times that is used is added to the files of the digest.
+
+        Args:
+            places: Folders that are searched.
+            numbers: Number in the name of each scan file.
+        """
         for path, times in self._read_texts(places, TIMES, read_times):
             rows = self._rows(path.name, len(times), numbers)
             if rows is not None:
@@ -169,6 +184,9 @@ class ScanFolder(FileSource):
         return numbers * STEP_NS if in_names is None else in_names
 
     def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3 | None] | None:
+        """Return the pose of each scan (None for scans without one) by the first file of poses that fits;
+        None without one. Times of its rows replace those of scans without times. Arguments as in
+        `_read_stamps`."""
         for path, (times, poses) in self._read_texts(places, POSES, read_any_poses):
             found = self._fitting(path.name, times, poses, numbers)
             if found is not None:
@@ -179,7 +197,8 @@ class ScanFolder(FileSource):
     def _fitting(
         self, name: str, times: Int | None, poses: list[Pose3], numbers: Int
     ) -> list[Pose3 | None] | None:
-        """Return the pose of each scan, or None if the rows of a file do not belong to the scans.
+        """Return the pose of each scan, or None, with a warning, if the rows of a file do not belong to the
+        scans. Times of the rows become those of scans without times.
 
         Args:
             name: Name of the file.
@@ -219,6 +238,8 @@ class ScanFolder(FileSource):
 
 
 def _scan_files(path: Path, suffix: str) -> list[Path]:
+    """Return the files with a suffix in a folder, or in its folder `velodyne` if it has none itself, by
+    number or time; only `path` if that is a file. May be empty."""
     if path.is_file():
         return [path]
     folder = path
@@ -291,7 +312,7 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
     Args:
         path: The file.
         stamp_ns: Time of the scan [ns].
-        losses: Counts what is left out.
+        losses: Counts what is left out; changed in place.
 
     Raises:
         ScanFileError: It is too large, or most of its rows are no positions.
@@ -347,7 +368,8 @@ def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 
 def _kitti_sensor(scan: Scan) -> Sensor:
-    """Return an HDL-64 when the scan looks like one: all around, dense, and from -25 to +3 degrees."""
+    """Return an HDL-64 when the scan looks like one: all around, dense, and from -25 to +3 degrees; otherwise
+    what `sensor_of` infers. The scan has points."""
     points = scan.points.astype(np.float64)
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     low, high = np.percentile(elevation, [0.5, 99.5])

@@ -30,6 +30,15 @@ class SimulatedSource(FileSource):
         kind: str = "simulated run",
         warnings: tuple[str, ...] = (),
     ) -> None:
+        """Describe a simulated run; nothing is simulated.
+
+        Args:
+            uri: As the user wrote it.
+            run: The run.
+            knows_trees: Whether the ground truth has trees.
+            kind: Name of the format.
+            warnings: Messages for the user.
+        """
         super().__init__()
         self.run = run
         self._knows_trees = knows_trees
@@ -55,7 +64,7 @@ class SimulatedSource(FileSource):
         continue to the end of the last sweep, so that every sweep can be undistorted.
 
         Args:
-            start_ns: Time of the first record, None for all.
+            start_ns: Earlier times [ns] are left out; None for none.
             every: Only every n-th scan is simulated.
         """
         period = self.run.lidar.period_ns
@@ -69,7 +78,7 @@ class SimulatedSource(FileSource):
                 yield self.run.sweep(tick // per_scan).scan
 
     def truth(self) -> Truth:
-        """Return the trees and other objects, and the true path."""
+        """Return the trees and other objects (None if they are unknown), and the true path."""
         trees = self.run.true_trees() if self._knows_trees else None
         return Truth(trees=trees, path=self.run.true_path())
 
@@ -97,6 +106,8 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
         uri: As the user wrote it.
         request: Scenario and options of the URI.
         options: Choices of the user.
+    Raises:
+        SourceError: The cloud or the ground truth cannot be read, or the cloud has no path for a robot.
     """
     from pipeline.io.ground_truth import read_truth_trees
     from pipeline.io.readers.clouds import open_cloud

@@ -66,7 +66,7 @@ class Topics:
     every: tuple[Topic, ...]
 
     def numbers(self, role: str) -> frozenset[int]:
-        """Return the numbers of the channels that are read in a role."""
+        """Return the numbers of the channels that are read in a role; empty without a topic."""
         topic = self.chosen.get(role)
         return frozenset() if topic is None else topic.numbers
 
@@ -91,7 +91,7 @@ class Topics:
 
 
 def is_fixed(topic: str) -> bool:
-    """Return whether a topic of transforms has the fixed ones."""
+    """Return whether a topic of transforms has the fixed ones: whether its name ends with "tf_static"."""
     return topic.endswith("tf_static")
 
 
@@ -100,13 +100,14 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
 
     Args:
         channels: Channels of the recording.
-        wanted: Topic by role ("scan", "odometry", "imu", "pose") chosen by the user; others are found by
-            type.
+        wanted: Topic by role ("scan", "odometry", "imu", "gnss", "pose", "camera") chosen by the user; other
+            roles get the topic of their type with most messages, except "pose", which is read only if it is
+            chosen.
         where: Name of the recording in errors.
 
     Raises:
-        SourceError: There is no topic with scans, or a topic chosen by the user does not exist or has no type
-            for its role. The message lists the topics.
+        SourceError: There is no topic with scans, a role is unknown, or a topic chosen by the user does not
+            exist or has no type for its role. The message lists the topics.
     """
     topics = _group(channels)
     unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())
@@ -126,6 +127,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
 
 
 def _role_of(topic: Topic) -> str:
+    """Return the first role that the type of a topic fits, "" without one."""
     return next((role for role, types in TYPES_BY_ROLE.items() if topic.msgtype in types), "")
 
 
@@ -163,6 +165,8 @@ def _why_not(topic: Topic, chosen: Topic | None) -> str:
 
 
 def _group(channels: Iterable[Channel]) -> list[Topic]:
+    """Return the topics of channels, sorted by name and type. Channels in another serialization than CDR or
+    ROS 1 get a type name that fits no role."""
     groups: dict[tuple[str, str], list[Channel]] = {}
     for channel in channels:
         if channel.encoding in _READABLE:
@@ -177,6 +181,19 @@ def _group(channels: Iterable[Channel]) -> list[Topic]:
 
 
 def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Topic | None:
+    """Return the topic of a role; None if there is none with messages. A planar laser is chosen only without
+    another scan topic.
+
+    Args:
+        topics: Topics that may have the role.
+        role: The role.
+        name: Topic chosen by the user, which may have no messages; None for none. Without one the role "pose"
+            has no topic.
+        where: Name of the recording in errors.
+
+    Raises:
+        SourceError: The topic chosen by the user does not exist or has another type.
+    """
     types = TYPES_BY_ROLE[role]
     fitting = [topic for topic in topics if topic.msgtype in types and (name is None or topic.name == name)]
     if name is not None and not fitting:
@@ -198,6 +215,7 @@ def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Top
 
 
 def _listing(topics: list[Topic]) -> str:
+    """Return the first 30 topics with types and numbers of messages as text for an error."""
     if not topics:
         return "it has no topics"
     shown = [f"{topic.name[:80]} [{topic.msgtype[:80]}, {topic.count}]" for topic in topics[:30]]

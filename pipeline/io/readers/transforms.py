@@ -22,6 +22,7 @@ class TransformTree:
     """Fixed transforms between frames; frames are compared without a leading slash."""
 
     def __init__(self) -> None:
+        """Create a tree without transforms."""
         self._links: dict[str, dict[str, Pose3]] = {}
 
     def add(self, parent: str, child: str, T_parent_child: Pose3) -> None:
@@ -35,7 +36,8 @@ class TransformTree:
         return frame in self._links
 
     def find(self, target: str, source: str) -> Pose3 | None:
-        """Return `T_target_source` along the fewest links, None when the frames are not linked."""
+        """Return `T_target_source` along the fewest links; None if the frames are not linked. The identity
+        for equal names, known or not."""
         reached = {target: Pose3.identity()}
         border = [target]
         while border and source not in reached:
@@ -50,7 +52,7 @@ class TransformTree:
 
 
 def frame_name(name: object) -> str:
-    """Return the name of a frame without the leading slash of some ROS 1 messages."""
+    """Return the name of a frame as text without leading slashes, which some ROS 1 messages have."""
     return str(name).lstrip("/")
 
 
@@ -58,10 +60,10 @@ def pose_of(
     position: ros2.geometry_msgs__msg__Point | ros2.geometry_msgs__msg__Vector3,
     orientation: ros2.geometry_msgs__msg__Quaternion,
 ) -> Pose3:
-    """Make a Pose3 of the position and the quaternion of a message.
+    """Return the pose with the position [m] and the quaternion of a message.
 
     Raises:
-        ValueError: A number is not finite or the quaternion is zero.
+        ValueError: A number is not finite, a position is beyond FARTHEST, or the quaternion is zero.
     """
     place = [position.x, position.y, position.z]
     if not all(abs(axis) < FARTHEST for axis in place):
@@ -70,7 +72,8 @@ def pose_of(
 
 
 def is_odometry_link(parent: str, child: str) -> bool:
-    """Return whether a transform is odometry: from a frame named odom to a frame named base."""
+    """Return whether a transform is odometry: the last part of the parent's name begins with "odom", that of
+    the child with "base"."""
     return parent.split("/")[-1].startswith("odom") and child.split("/")[-1].startswith("base")
 
 
@@ -92,6 +95,7 @@ class Extrinsics:
     """
 
     def __init__(self, container: Container, decoder: MessageDecoder) -> None:
+        """Begin without transforms; nothing is read."""
         self._container = container
         self._decoder = decoder
         self._channels: dict[int, Channel] = {c.number: c for c in container.channels}
@@ -99,14 +103,21 @@ class Extrinsics:
         self.odometry_link: tuple[str, str] | None = None
 
     def read(self, fixed: frozenset[int], moving: frozenset[int]) -> None:
-        """Read the transforms of some channels; messages that cannot be decoded are skipped here."""
+        """Add the transforms of the first messages of some channels to `tree`, and set `odometry_link`.
+        Moving channels contribute only transforms that do not change; fixed ones replace them. Damaged
+        messages are ignored.
+
+        Args:
+            fixed, moving: Numbers of the channels of fixed and of moving transforms.
+        """
         for (parent, child), pose in self._links(moving, MOVING_MESSAGES, steady=True).items():
             self.tree.add(parent, child, pose)
         for (parent, child), pose in self._links(fixed, FIXED_MESSAGES, steady=False).items():
             self.tree.add(parent, child, pose)
 
     def base_frame(self, by_odometry: str) -> str:
-        """Return the base frame: that of the odometry, else a frame with a usual name, else ""."""
+        """Return the base frame: `by_odometry` if it is not "", else the child of the moving transform of the
+        odometry, else a frame with a usual name, else ""."""
         if by_odometry:
             return by_odometry
         if self.odometry_link is not None:
@@ -140,7 +151,7 @@ class Extrinsics:
         }
 
     def decode(self, message: Message) -> list[Link]:
-        """Decode the finite transforms of a message; [] when it is damaged."""
+        """Return the finite transforms of a message, in its order; [] if it is damaged."""
         try:
             decoded: ros2.tf2_msgs__msg__TFMessage = self._decoder.decode(
                 self._channels[message.channel], message.payload
@@ -152,6 +163,7 @@ class Extrinsics:
 
 
 def _link(stamped: ros2.geometry_msgs__msg__TransformStamped) -> Link | None:
+    """Return a transform with its time and frames; None if it is not finite."""
     try:
         pose = pose_of(stamped.transform.translation, stamped.transform.rotation)
     except ValueError:

@@ -49,7 +49,12 @@ def state_text(rows: Iterable[Sequence[float | bool]]) -> str:
 
 
 def trajectory_text(stamp_ns: Int, poses: Iterable[Pose3]) -> str:
-    """Return the text of the file of poses; times in nanoseconds, shape (N,)."""
+    """Return the text of the file of poses, one row per pose, with times [ns], int64, shape (N,).
+
+    Args:
+    Raises:
+        ValueError: There are not as many poses as times.
+    """
     lines = []
     for stamp, pose in zip(stamp_ns.tolist(), poses, strict=True):
         w, x, y, z = pose.quaternion().tolist()
@@ -95,6 +100,12 @@ def write_tree_manager(folder: Path, path: MapPath, trees: Trees, reach: float) 
 
 
 def _write(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
+    """Write the files of a mapped run into an existing folder; return the number of confirmed trees that are
+    in no frame. Arguments as in `write_tree_manager`.
+
+    Raises:
+        OSError: The disk refuses.
+    """
     poses = [Pose2(x, y, yaw) for x, y, yaw in zip(path.x, path.y, path.yaw, strict=True)]
     known = np.flatnonzero(trees.confirmed)
     position, first_ns = trees.position[known], trees.first_seen_ns[known]
@@ -112,12 +123,15 @@ def _write(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
 
 
 def _row(trees: Trees, k: int, place: Float) -> list[float | bool]:
+    """Return the row of tree k in a frame, in the order of COLUMNS; `place` is its position in the frame,
+    shape (2,) [m]. The stem is vertical at height 0."""
     dbh, upright = float(trees.dbh[k]), np.eye(3).ravel().tolist()
     fit = [dbh, dbh, 1.0, math.isfinite(dbh), int(trees.observations[k])]
     return [*upright, float(place[0]), float(place[1]), 0.0, *fit]
 
 
 def _field(value: float | bool) -> str:
+    """Return a value as text: "True" or "False", a number with nine digits, or "" if it is not finite."""
     if isinstance(value, bool):
         return str(value)
     return f"{value:.9g}" if math.isfinite(value) else ""
@@ -147,6 +161,7 @@ class TreeManagerSource(FileSource):
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
+        """Read the trajectory and the first frame, and check the sizes of all files."""
         super().__init__()
         numbered = sorted(
             (int(match.group(1)), file) for file in path.iterdir() if (match := NAME.fullmatch(file.name))
@@ -179,7 +194,8 @@ class TreeManagerSource(FileSource):
         )
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield odometry and scans from `start_ns` on; earlier files are not opened."""
+        """Yield odometry for each row of the trajectory, and scans, from `start_ns` [ns] on; earlier files
+        are not opened. Files and rows that cannot be read are counted in `losses`."""
         self._losses = losses = dict[str, int]()
         file_of = dict(zip(self._row.tolist(), self._files, strict=True))
         begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
@@ -242,6 +258,7 @@ def _read_frame(file: Path, uri: str) -> tuple[Float, dict[str, int], int]:
 
 
 def _too_large(file: Path, uri: str) -> SourceError:
+    """Return the error for a file that is larger than CSV_LIMIT."""
     what = f"{file.name} is larger than {CSV_LIMIT >> 20} MB"
     return SourceError(what, where=uri, remedy="It is not a frame of stems.")
 
@@ -281,7 +298,12 @@ def _numbers(body: bytes, columns: int) -> tuple[Float, int]:
 
 
 def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
-    """Read stamps [ns], ascending, and poses."""
+    """Return the times [ns], int64, shape (N,), ascending, and the poses of the sensor in a file.
+
+    Raises:
+        SourceError: The file is missing, damaged, or its times do not ascend.
+        OSError: It cannot be read.
+    """
     remedy = "It needs a row `time x y z qx qy qz qw` for each TreeManagerState file."
     try:
         table = read_table(file, 8)
@@ -297,12 +319,15 @@ def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
 
 
 def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:
-    """Return the row of the trajectory for each file, and warnings.
+    """Return the row of the trajectory for each file, int64, and warnings: the number of the file, or its
+    index if there are as many rows as files.
 
     Args:
         number: Frame number of each file, ascending.
         count: Number of rows of the trajectory.
         uri: The source, for errors.
+    Raises:
+        SourceError: Neither fits.
     """
     files = len(number)
     if int(number[-1]) < count and len(np.unique(number)) == files:

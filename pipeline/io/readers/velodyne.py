@@ -29,6 +29,14 @@ VLP_32 = 0x23
 
 
 def _sensor(name: str, rings: int, ring_step: float, range_max: float) -> Sensor:
+    """Return a sensor with an azimuth step of 0.2 degrees and a range sigma of 0.03 m.
+
+    Args:
+        name: Name.
+        rings: Number of rings.
+        ring_step: Step in elevation [degrees].
+        range_max: Maximum range [m].
+    """
     return Sensor(name, rings, float(np.radians(ring_step)), float(np.radians(0.2)), 0.03, range_max)
 
 
@@ -63,6 +71,7 @@ class Rotation:
     """Finds the packets of one sensor with which a sweep begins: after a full rotation, or after a pause."""
 
     def __init__(self) -> None:
+        """Begin before the first packet."""
         self._azimuth: int | None = None
         self._stamp_ns = self._turned = 0
 
@@ -88,14 +97,17 @@ class PacketDecoder:
     """Decodes the packets of one sensor, one sweep at a time."""
 
     def __init__(self) -> None:
+        """Begin without decoders; each product number gets its own."""
         self._decoders: dict[int, velodyne_decoder.ScanDecoder] = {}
 
     def decode(self, stamp_ns: int, stamps_ns: Sequence[int], packets: Sequence[bytes]) -> Scan:
-        """Decode the packets of one sweep; each must pass `is_data_packet`.
+        """Return the scan of the packets of one sweep, which may have no points; each packet must pass
+        `is_data_packet`, and all are of one sensor.
 
         Args:
-            stamp_ns: Stamp of the scan.
-            stamps_ns: Time of arrival of each packet; point times are relative to the last one.
+            stamp_ns: Stamp of the scan [ns].
+            stamps_ns: Time of arrival of each packet [ns]. The times of the points are derived from the last
+                one and limited to 2 s about the stamp.
             packets: In the order of time.
 
         Raises:
@@ -120,6 +132,13 @@ class PacketDecoder:
         return self._decoders[product]
 
     def _scan(self, stamp_ns: int, late: int, table: NDArray[np.void]) -> Scan:
+        """Return the scan of a decoded table.
+
+        Args:
+            stamp_ns: Stamp of the scan [ns].
+            late: Time of arrival of the last packet after the stamp [ns].
+            table: Columns x, y, z [m], intensity, ring and time [s] relative to the last packet.
+        """
         points = np.stack([table["x"], table["y"], table["z"]], axis=1)
         with np.errstate(invalid="ignore"):
             offset = np.clip(np.nan_to_num(table["time"].astype(np.float64)) * 1e9 + late, -2e9, 2e9)
@@ -162,7 +181,7 @@ class Packets:
     sender: Int
 
     def only(self, keep: Bool) -> Packets:
-        """Return the packets of some rows."""
+        """Return the packets of the rows where a mask, shape (N,), is true."""
         return Packets(
             self.offset[keep], self.stamp_ns[keep], self.azimuth[keep], self.product[keep], self.sender[keep]
         )
@@ -182,6 +201,7 @@ class PcapSource(FileSource):
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
+        """Index the packets of the file and group them to sweeps."""
         super().__init__()
         self._path = path
         packets, self._damage = find_packets(path)
@@ -206,7 +226,13 @@ class PcapSource(FileSource):
         )
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield the scans from `start_ns` on; earlier packets are not decoded."""
+        """Yield the scans from `start_ns` [ns] on; earlier packets are not decoded. Scans without points, or
+        that cannot be decoded, are counted in `losses`.
+
+        Args:
+        Raises:
+            SourceError: The file cannot be read any more.
+        """
         self._losses = losses = dict[str, int]()
         decoder = PacketDecoder()
         begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
@@ -272,6 +298,8 @@ class PcapSource(FileSource):
         return self._keep(packets, ahead, "packets that came before their predecessor")
 
     def _keep(self, packets: Packets, keep: Bool, reason: str) -> Packets:
+        """Return the packets where a mask, shape (N,), is true; the others are counted in the losses under a
+        reason."""
         refused = len(keep) - int(np.count_nonzero(keep))
         if refused:
             count_loss(self._damage, reason, refused)
@@ -279,7 +307,8 @@ class PcapSource(FileSource):
 
 
 def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
-    """Find the data packets of a capture; count other packets to the LiDAR's port by reason.
+    """Return the data packets of a capture, and the numbers of other packets to the LiDAR's port and of cut
+    bytes, by reason. Reading ends at a damaged length.
 
     Raises:
         SourceError: The file is not a capture that can be read.

@@ -95,10 +95,11 @@ class VictoriaParkSource(FileSource):
 
     Raises:
         SourceError: It is a different zip, damaged, or too large when unpacked.
-        OSError: The file cannot be read.
+        OSError: The file becomes unreadable after it was unpacked.
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
+        """Read the whole zip; scans are made in `records`."""
         super().__init__()
         members = _unpack(path, uri)
         self._scan_ns, self._ranges = self._read_laser(members["laser.txt"], uri)
@@ -121,22 +122,26 @@ class VictoriaParkSource(FileSource):
         )
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield odometry and scans in the order of time, from `start_ns` on."""
+        """Return the odometry and the scans in the order of time, from `start_ns` [ns] on. Scans without
+        points are counted in `losses`."""
         self._losses = losses = dict[str, int]()
         streams: list[Iterator[Record]] = [self._odometry(start_ns), self._scans(start_ns, losses)]
         return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 
     def truth(self) -> Truth | None:
-        """Path by GPS, None when the zip has none."""
+        """Return the path by GPS, without yaw and in another frame than the map; None if the zip has none."""
         return None if self._gps is None else Truth(path=self._gps)
 
     def _odometry(self, start_ns: int | None) -> Iterator[Record]:
+        """Yield the odometry from a time on [ns] (None: all)."""
         begin = 0 if start_ns is None else int(np.searchsorted(self._odometry_ns, start_ns))
         for index in range(begin, len(self._odometry_ns)):
             x, y, yaw = self._poses[index].tolist()
             yield Odometry(int(self._odometry_ns[index]), Pose3.from_euler([x, y, 0.0], 0.0, 0.0, yaw))
 
     def _scans(self, start_ns: int | None, losses: dict[str, int]) -> Iterator[Record]:
+        """Yield the scans with points from a time on [ns] (None: all); those without are counted in
+        `losses`."""
         begin = 0 if start_ns is None else int(np.searchsorted(self._scan_ns, start_ns))
         for index in range(begin, len(self._scan_ns)):
             scan = self._scan(index)
@@ -146,6 +151,8 @@ class VictoriaParkSource(FileSource):
                 count_loss(losses, "scans without points")
 
     def _scan(self, index: int) -> Scan:
+        """Return the scan with this index, of the beams with a range between 0 and RANGE_MAX; it may have no
+        points."""
         ranges = self._ranges[index]
         with np.errstate(invalid="ignore"):
             seen = (ranges > 0.0) & (ranges < RANGE_MAX)
@@ -153,6 +160,12 @@ class VictoriaParkSource(FileSource):
         return clean_scan(int(self._scan_ns[index]), points, dropped=int(BEAMS - np.count_nonzero(seen)))
 
     def _read_laser(self, text: bytes, uri: str) -> tuple[Int, NDArray[np.float32]]:
+        """Return times [ns], int64, shape (N,), and ranges [m], shape (N, BEAMS). Scans with impossible
+        times, and an incomplete one at the end, are counted as damage.
+
+        Raises:
+            SourceError: There is no valid scan.
+        """
         numbers = parse_numbers(text)  # the real file has all scans in one line
         whole = len(numbers) // (BEAMS + 1) * (BEAMS + 1)
         if whole < len(numbers):
@@ -188,6 +201,8 @@ class VictoriaParkSource(FileSource):
         return stamp_ns, poses
 
     def _read_gps(self, text: bytes) -> TruthPath | None:
+        """Return the path by GPS, x east, y north [m], without yaw; None without valid rows. Other rows are
+        counted as damage."""
         table = self._ascending(self._rows(text, "GPS.txt"), "GPS rows with impossible times")
         near = (np.abs(table[:, 1:]) < COORDINATE_LIMIT).all(axis=1)
         if not near.all():
@@ -208,7 +223,7 @@ class VictoriaParkSource(FileSource):
         return table
 
     def _ascending(self, table: Float, reason: str) -> Float:
-        """Return the rows with finite numbers whose times do not go back.
+        """Return the rows with finite numbers whose times are in [0, _LONGEST_S) and do not go back.
 
         Args:
             table: Rows with the time in the first column.
@@ -228,7 +243,8 @@ def _unpack(path: Path, uri: str) -> dict[str, bytes]:
     folder of the zip. Sizes are checked before unpacking.
 
     Raises:
-        SourceError: The zip is damaged, has no LASER.txt or no DRS.txt, or a file in it is too large.
+        SourceError: The zip cannot be read or is damaged, has no LASER.txt or no DRS.txt, or a file in it is
+            too large.
     """
     wanted = {"laser.txt", "drs.txt", "gps.txt"}
     try:
@@ -253,4 +269,5 @@ def _unpack(path: Path, uri: str) -> dict[str, bytes]:
 
 
 def _nanoseconds(seconds: Float) -> Int:
+    """Return seconds as nanoseconds, rounded, int64 of the same shape."""
     return np.rint(seconds * 1e9).astype(np.int64)

@@ -54,7 +54,8 @@ _FOREVER = "{sec: 9223372036, nsec: 854775807}"
 
 
 def offered_qos_profiles(latched: bool) -> str:
-    """Return the profile of a topic as YAML; `latched` keeps the last message for late subscribers."""
+    """Return the quality-of-service profile of a topic as YAML; `latched` keeps the last message for late
+    subscribers, otherwise the last ten are kept for present ones."""
     return (
         f"- history: {_KEEP_LAST}\n"
         f"  depth: {1 if latched else 10}\n"
@@ -85,6 +86,7 @@ class _RosWriter:
     """
 
     def __init__(self, stream: Stream | BinaryIO, chunk_size: int, attachment: str, content: bytes) -> None:
+        """Write the head of the file: attachment and metadata."""
         self._writer = Writer(stream, chunk_size=chunk_size, compression=CompressionType.LZ4)
         # The default contains the version of the library, so the bytes would change with its releases.
         self._writer.start(profile="ros2", library="stemmap")
@@ -95,7 +97,7 @@ class _RosWriter:
         self._sequence = Counter[int]()
 
     def finish(self) -> None:
-        """Write the index.
+        """Write the last chunk and the index; the stream stays open.
 
         Raises:
             OSError: The disk refuses.
@@ -103,16 +105,29 @@ class _RosWriter:
         self._writer.finish()
 
     def _schema(self, kind: str) -> int:
+        """Return the number of a message type in the file, which is defined at the first call."""
         if kind not in self._schemas:
             text = messages.definition(kind).encode()
             self._schemas[kind] = int(self._writer.register_schema(kind, "ros2msg", text))
         return self._schemas[kind]
 
     def _channel(self, topic: str, kind: str, latched: bool = False) -> int:
+        """Return the number of a new channel in the file.
+
+        Args:
+            topic: Topic.
+            kind: Message type, e.g. "sensor_msgs/msg/Imu".
+            latched: Whether late subscribers get the last message; topics of fixed transforms always are.
+        """
         profiles = {"offered_qos_profiles": offered_qos_profiles(latched or is_fixed(topic))}
         return int(self._writer.register_channel(topic, "cdr", self._schema(kind), profiles))
 
     def _write(self, channel: int, stamp_ns: int, payload: bytes) -> None:
+        """Append a message in CDR to a channel, with one time [ns] for log and publication.
+
+        Raises:
+            OSError: The disk refuses.
+        """
         self._writer.add_message(channel, stamp_ns, payload, stamp_ns, self._sequence[channel])
         self._sequence[channel] += 1
 
@@ -137,10 +152,10 @@ def write_recording(
         sensor: Sensor, stored with the ground truth.
         T_base_lidar: Extrinsics of the LiDAR.
         truth: Ground truth, attached as `stemmap_truth.json`.
-        camera: Camera of the pictures among the records.
+        camera: Camera of the pictures among the records; without it pictures are left out.
 
     Returns:
-        Number of messages.
+        Number of messages. Records of other kinds than scan, odometry, IMU and picture are left out.
 
     Raises:
         StemmapError: ROS cannot represent a time, or writing fails.
@@ -157,6 +172,7 @@ class _Run(_RosWriter):
     """The recording of a whole run."""
 
     def __init__(self, stream: BinaryIO, truth: bytes, T_base_lidar: Pose3, camera: Camera | None) -> None:
+        """Define all types and topics; `truth` is the content of the attachment."""
         super().__init__(stream, CHUNK_SIZE, ATTACHMENT, truth)
         self._T_base_lidar: Pose3 | None = T_base_lidar
         self._camera = camera
@@ -171,7 +187,13 @@ class _Run(_RosWriter):
         return self._sequence.total()
 
     def add(self, record: Record | Picture) -> None:
-        """Write a record; the extrinsics of the LiDAR come before the first one."""
+        """Write a record as one or two messages; nothing for other kinds, and for a picture without a camera.
+        Extrinsics are written before the first record, with its time.
+
+        Raises:
+            StemmapError: ROS cannot represent the time.
+            OSError: The disk refuses.
+        """
         stamp = record.stamp_ns
         if self._T_base_lidar is not None:
             mounting = messages.transform(stamp, messages.BASE, messages.LIDAR, self._T_base_lidar)
@@ -195,6 +217,7 @@ class _Run(_RosWriter):
             self._encode("/imu/data", stamp, messages.imu(record))
 
     def _encode(self, topic: str, stamp_ns: int, message: messages.Message) -> None:
+        """Append a message object to a topic at a time [ns]."""
         self._write(self._channels[topic], stamp_ns, messages.encode(message))
 
 
@@ -214,6 +237,7 @@ class LiveWriter(_RosWriter):
     def __init__(
         self, stream: Stream, channels: Sequence[Channel], header: Mapping[str, Any], robot: str
     ) -> None:
+        """Write the head of the file and define the channels of robot and outputs."""
         content = json.dumps({"version": VERSION, **header}).encode()
         super().__init__(stream, LIVE_CHUNK_SIZE, NAME, content)
         self._numbers = {c.number: self._channel(c.topic, c.msgtype) for c in channels}
@@ -227,18 +251,21 @@ class LiveWriter(_RosWriter):
         self._last_ns = 0
 
     def add(self, message: Message) -> None:
-        """Write a message of the robot.
+        """Write a message of the robot at its time of arrival.
 
         Raises:
+            KeyError: Its channel is not one of `channels`.
             OSError: The disk refuses.
         """
         self._last_ns = message.log_ns
         self._write(self._numbers[message.channel], self._last_ns, message.payload)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Write results of the mapping, at the time of the last message of the robot.
+        """Write results of the mapping (CDR by topic of `outputs.TYPES`), at the time of the last message of
+        the robot, 0 before it.
 
         Raises:
+            KeyError: A topic is unknown.
             OSError: The disk refuses.
         """
         for topic, payload in messages_by_topic.items():
@@ -267,7 +294,7 @@ class LiveWriter(_RosWriter):
         self._write(self._skipped, self._last_ns, messages.text(json.dumps(times_by_topic)))
 
     def flush(self) -> None:
-        """End the present chunk, so that the system has all messages.
+        """Write the present chunk to the stream, so that a crash of this process loses no message.
 
         Raises:
             OSError: The disk refuses.

@@ -37,7 +37,7 @@ Message = Any  # rosbags makes its message classes at run time
 
 @cache
 def store() -> Typestore:
-    """Return the definitions of ROS 2 with those of vision_msgs 4."""
+    """Return the type definitions of ROS 2 with those of vision_msgs 4; the same object at each call."""
     types = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _VISION.items():
         types.register({name: get_types_from_msg(text, name)[name]})
@@ -45,7 +45,12 @@ def store() -> Typestore:
 
 
 def make(name: str, /, **fields: Any) -> Message:  # noqa: ANN401
-    """Return a message of a type, e.g. "std_msgs/Header", with its fields."""
+    """Return a message of a type, e.g. "std_msgs/Header", with all its fields.
+
+    Raises:
+        KeyError: The type is unknown.
+        TypeError: A field is missing or unknown.
+    """
     package, short = name.split("/")
     return store().types[f"{package}/msg/{short}"](**fields)
 
@@ -56,7 +61,8 @@ def encode(message: Message) -> bytes:
 
 
 def definition(type_name: str) -> str:
-    """Return the definition of a type with those of all types in it, as in `ros2msg` schemas."""
+    """Return the definition of a type, e.g. "sensor_msgs/msg/Imu", with those of all types in it, as in
+    `ros2msg` schemas."""
     return str(store().generate_msgdef(type_name, ros_version=2)[0])
 
 
@@ -84,13 +90,13 @@ def vector(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Message:
 
 
 def quaternion(wxyz: NDArray[np.float64]) -> Message:
-    """Return a geometry_msgs/Quaternion."""
+    """Return a geometry_msgs/Quaternion of w, x, y, z, shape (4,)."""
     w, x, y, z = (float(value) for value in wxyz)
     return make("geometry_msgs/Quaternion", x=x, y=y, z=z, w=w)
 
 
 def pose(t: NDArray[np.float64], wxyz: NDArray[np.float64]) -> Message:
-    """Return a geometry_msgs/Pose of a position (3,) and a quaternion (4,)."""
+    """Return a geometry_msgs/Pose of a position [m], shape (3,), and a quaternion w, x, y, z, shape (4,)."""
     x, y, z = (float(value) for value in t)
     point = make("geometry_msgs/Point", x=x, y=y, z=z)
     return make("geometry_msgs/Pose", position=point, orientation=quaternion(wxyz))
@@ -154,13 +160,14 @@ def point_cloud(scan: Scan) -> Message:
 
 
 def odometry(record: Odometry) -> Message:
-    """Return a nav_msgs/Odometry: the pose of base_link in odom."""
+    """Return a nav_msgs/Odometry: the pose of base_link in odom. Covariances and twist are zero."""
     T = record.T_odom_base
     return odometry_of(header(record.stamp_ns, ODOM), BASE, pose(T.t, T.quaternion()), np.zeros(36))
 
 
 def imu(record: Imu) -> Message:
-    """Return a sensor_msgs/Imu in base_link; without an orientation its covariance begins with -1."""
+    """Return a sensor_msgs/Imu in base_link; without an orientation its covariance begins with -1 and the
+    orientation is the identity. Other covariances are zero."""
     unknown = np.zeros(9)
     if record.orientation is None:
         unknown[0] = -1.0

@@ -52,9 +52,10 @@ def scan_messages(frame: Frame) -> dict[str, bytes]:
 
 
 def way_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]:
-    """Return the clearance by topic, in CDR; empty when obstacles are not detected.
+    """Return the clearance and its zone by topic, in CDR; empty for None, when obstacles are not detected.
 
-    By REP 117 a range is infinite without an obstacle; it is NaN where the sensor has no view.
+    By REP 117 a range is infinite without an obstacle; it is NaN where the sensor has no view. A time [ns]
+    that ROS cannot represent is limited.
     """
     if clearance is None:
         return {}
@@ -73,7 +74,7 @@ def way_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]
 
 
 def pose_messages(frame: Frame) -> dict[str, bytes]:
-    """Return the pose at a scan by topic, in CDR."""
+    """Return the pose at a scan by topic, in CDR: with and without its covariance."""
     T, covariance = frame.estimate.T_map_base, np.zeros((6, 6))
     rows = np.array([0, 1, 5])  # x, y and yaw of x, y, z, roll, pitch, yaw
     covariance[np.ix_(rows, rows)] = frame.estimate.covariance
@@ -83,13 +84,14 @@ def pose_messages(frame: Frame) -> dict[str, bytes]:
 
 
 def map_messages(frame: Frame, path: Path) -> dict[str, bytes]:
-    """Return path and trees at a scan by topic, in CDR."""
+    """Return path (at most MOST_POSES poses) and confirmed trees at a scan by topic, in CDR."""
     head = _header(frame.stamp_ns)
     return {PATH: encode(_path(path, head)), **tree_messages(frame.trees, head)}
 
 
 def tree_messages(trees: Trees, head: Any) -> dict[str, bytes]:  # noqa: ANN401
-    """Return the confirmed trees by topic, in CDR: markers and detections.
+    """Return the confirmed trees by topic, in CDR: markers, of which the first deletes all earlier ones, and
+    detections.
 
     Args:
         trees: The map.
@@ -106,6 +108,8 @@ def tree_messages(trees: Trees, head: Any) -> dict[str, bytes]:  # noqa: ANN401
 
 
 def _path(path: Path, head: Any) -> Any:  # noqa: ANN401
+    """Return a nav_msgs/Path with at most MOST_POSES poses, evenly thinned, the last one included; empty for
+    an empty path."""
     step = max(1, -(-len(path.x) // MOST_POSES))
     # Counted from the end, so that the pose of the robot is always included.
     rows = range((len(path.x) - 1) % step, len(path.x), step) if len(path.x) else range(0)
@@ -121,6 +125,8 @@ def _path(path: Path, head: Any) -> Any:  # noqa: ANN401
 
 
 def _markers(trees: Trees, row: int, head: Any) -> list[Any]:  # noqa: ANN401
+    """Return two visualization_msgs/Marker of the tree in a row: its stem, STEM_WIDTH wide if the diameter is
+    unknown, and its number and diameter as text."""
     x, y = (float(value) for value in trees.position[row])
     dbh, number = float(trees.dbh[row]), int(trees.number[row])
     width = dbh if np.isfinite(dbh) else STEM_WIDTH
@@ -145,6 +151,18 @@ def _marker(
     text: str = "",
     action: int = _ADD,
 ) -> Any:  # noqa: ANN401
+    """Return a visualization_msgs/Marker in the frame of the header.
+
+    Args:
+        head: Header.
+        number: Id, unique among markers of one kind.
+        kind: Shape, e.g. _CYLINDER.
+        x, y, z: Centre [m].
+        scale: Size along x, y, z [m].
+        colour: Red, green, blue, alpha, 0 to 1.
+        text: Text of a text marker.
+        action: _ADD or _DELETE_ALL.
+    """
     red, green, blue, alpha = colour
     return make(
         "visualization_msgs/Marker",
@@ -171,6 +189,7 @@ def _marker(
 
 
 def _detection(trees: Trees, row: int, head: Any) -> Any:  # noqa: ANN401
+    """Return a vision_msgs/Detection3D of the tree in a row; an unknown diameter has the width 0."""
     x, y = (float(value) for value in trees.position[row])
     covariance = np.zeros((6, 6))
     covariance[:2, :2] = trees.covariance[row]
@@ -192,8 +211,10 @@ def _detection(trees: Trees, row: int, head: Any) -> Any:  # noqa: ANN401
 
 
 def _header(stamp_ns: int, frame_id: str = MAP) -> Any:  # noqa: ANN401
+    """Return a header with a time [ns], limited to what ROS can represent."""
     return header(min(max(stamp_ns, 0), _LATEST_NS), frame_id)
 
 
 def _pose(T: Pose2, z: float = 0.0) -> Any:  # noqa: ANN401
+    """Return a geometry_msgs/Pose of a planar pose at a height z [m]."""
     return pose(np.array([T.x, T.y, z]), np.array([np.cos(T.yaw / 2), 0.0, 0.0, np.sin(T.yaw / 2)]))
