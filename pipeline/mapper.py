@@ -187,7 +187,8 @@ class Mapper:
 
     @property
     def parameters(self) -> Parameters:
-        """Parameters in force; new ones apply from the next scan onwards."""
+        """Parameters in force. New ones that are set apply from the next scan onwards; if their forest does
+        not exist, setting raises StemmapError and changes nothing."""
         return self._parameters
 
     @parameters.setter
@@ -349,7 +350,8 @@ class Mapper:
             )
 
     def _settle_columns(self) -> None:
-        """Finish what the last update of the columns left to the scan after it."""
+        """Finish what the last update of the columns left to the scan after it; nothing if the columns are
+        settled."""
         if self._columns.is_unsettled:
             with self._timer("gathering"):
                 self._columns.settle()

@@ -77,7 +77,11 @@ def is_held(path: Path) -> bool:
 
 def _to_disk(path: Path) -> None:
     """Wait until a file or folder is written to the disk, so that after a power cut either the old or the new
-    file exists."""
+    file exists. Nothing for folders on Windows.
+
+    Raises:
+        OSError: The disk refuses.
+    """
     if path.is_dir() and os.name == "nt":
         return  # Windows cannot open folders
     descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)

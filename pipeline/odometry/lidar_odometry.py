@@ -126,7 +126,7 @@ class LidarOdometry:
 
     def _expected(self, velocity: Float, span_ns: int) -> Float:
         """Return the predicted step since the last scan in the sensor frame, shape (4, 4): by the wheels,
-        else the last step, or no motion after a pause.
+        else the last step, or no motion after a pause (PAUSE_NS).
 
         Args:
             velocity: Last step in the sensor frame, shape (4, 4).
@@ -148,7 +148,8 @@ class LidarOdometry:
 
 
 def undistorted(points: Float, offset_s: Float | None, delta: Float, span_ns: int) -> Float:
-    """Transform points to the stamp of the scan with constant velocity: p' = p + (w x p + v) dt.
+    """Return points transformed to the stamp of the scan with constant velocity, p' = p + (w x p + v) dt,
+    shape (N, 3).
 
     The linearisation is exact to a centimetre for the turns of a robot within one sweep.
 

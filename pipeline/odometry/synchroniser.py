@@ -230,7 +230,8 @@ class Synchroniser:
         return self._scans[0].stamp_ns if self._scans else now_ns
 
     def ready(self, *, end: bool = False) -> Iterator[Step]:
-        """Yield the steps whose odometry has arrived; with `end`, all remaining steps."""
+        """Yield the steps of waiting scans in the order of time, as far as their odometry has arrived
+        (`_is_ready`); with `end`, all remaining steps."""
         while self._scans and (end or self._is_ready(self._scans[0])):
             yield self._join(self._scans.popleft())
 

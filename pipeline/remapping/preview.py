@@ -274,8 +274,8 @@ def _reach(p: Parameters) -> float:
 
 
 def _columns(known: KnownMap, p: Parameters) -> Columns | None:
-    """Return the voxel columns with the verdicts of other parameters; None without columns or if the
-    parameter `classification.method` is "none"."""
+    """Return the voxel columns with the verdicts of other parameters, as a copy; None without columns or if
+    the parameter `classification.method` is "none"."""
     if known.columns is None or p.classification.method == "none":
         return None
     from dataclasses import replace

@@ -242,6 +242,7 @@ def at_least(spread: Float, least: Float, noise: float = 0.0) -> Float:
     Args:
         spread, least: Covariances of x, y [m], yaw [rad], shape (3, 3).
         noise: Standard error of the ratio of their variances; 0 for exact covariances.
+
     Raises:
         LinAlgError: `spread` is not positive semidefinite.
     """

@@ -273,7 +273,8 @@ class KeyframeGraph:
 
     def thinned(self) -> KeyframeGraph:
         """Return the graph without every second keyframe. Motions are compounded, and the next keyframe takes
-        the detections at the present relative pose. The ends of loops and the newest keyframe stay."""
+        the detections at the present relative pose. The ends of loops and the newest keyframe stay. A motion
+        over a keyframe without odometry has infinite covariance."""
         ends = {scan for loop in self.loops for scan in loop.scans} | {self.newest_scan}
         rows, kept = list[int](), list[Keyframe]()
         motion, covariance = np.zeros(3), np.zeros((3, 3))

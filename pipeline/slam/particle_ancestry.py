@@ -52,7 +52,8 @@ class Genealogy:
 
     @classmethod
     def of_path(cls, path: Float, particles: int) -> Genealogy:
-        """Return an ancestry in which all particles have the same path, x, y [m], yaw [rad], shape (N, 3)."""
+        """Return an ancestry in which all particles have the same path, x, y [m], yaw [rad], shape (N, 3),
+        and no founders."""
         blocks = len(path) // BLOCK
         settled = tuple(path[BLOCK * k : BLOCK * (k + 1)].copy() for k in range(blocks))
         recent = tuple(
@@ -117,7 +118,7 @@ class Genealogy:
 
     def mean_motion_from(self, scans: Int, weights: Float) -> Float:
         """Return the poses of the base at some scans relative to its pose at the newest scan, as means over
-        the particles, x, y [m], yaw [rad], shape (S, 3).
+        the particles, x, y [m], yaw [rad], shape (S, 3). Settled scans have the pose of one particle.
 
         A single particle would add the noise of its random numbers (Rao-Blackwell).
 

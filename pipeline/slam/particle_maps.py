@@ -111,7 +111,8 @@ def _with_pool(block: Int32, places: Int32, rows: int) -> Maps:
 @compiled
 def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
     """Return the maps with space for a number of further landmarks per particle and at least a number of free
-    rows in the pool. The result shares arrays with `maps` where there was enough space."""
+    rows in the pool. The result shares arrays with `maps` where there was enough space; `places` is always
+    shared."""
     particles, k = maps.block.shape
     places = landmarks
     for p in range(particles):

@@ -89,7 +89,7 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
 
 
 def is_lost(recent: RunningStatistics) -> bool:
-    """Return whether too small a share of the known trees is found where they should be visible, or whether
-    nearly all of them were missed in STRANGE_LOST scans in a row. Before any tree is well known the result is
-    False."""
+    """Return whether less than FOUND_LOST of the known trees (running mean) are found where they should be
+    visible, or whether nearly all of them were missed in STRANGE_LOST scans in a row. Before any tree is well
+    known the result is False."""
     return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)

@@ -76,7 +76,7 @@ def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float)
     Args:
         statistics: Statistics by particle, shape (P, STATISTICS).
         weights: Weights with sum 1, shape (P,).
-        motion_covariance: Covariance of the odometry since the scan before, shape (3, 3).
+        motion_covariance: Covariance of the odometry since the last used scan, shape (3, 3).
     """
     mean = np.zeros(STATISTICS)
     for p in range(statistics.shape[0]):

@@ -46,7 +46,7 @@ class MeasuredPose(NamedTuple):
 
 
 def no_measured_pose() -> MeasuredPose:
-    """Return the record for a scan without a measured pose."""
+    """Return the record for a scan without a measured pose: `z` of length 0, zeros, and no particles."""
     return MeasuredPose(
         np.zeros(0),
         np.zeros((3, 3)),
@@ -104,7 +104,7 @@ class SharedErrors:
 
     def drawn(self, rows: Int) -> SharedErrors:
         """Return the estimates of resampled particles: those of the given rows, int64, shape (P,). The arrays
-        are independent copies."""
+        are independent copies; the estimates themselves before the first shared pose."""
         if not self.begun:
             return self
         # Indexing with brackets gives another memory layout, for which the kernels would be compiled again.

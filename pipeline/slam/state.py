@@ -96,7 +96,8 @@ class SlamState:
         return MapColumns(*map_of(self.maps, particle))
 
     def copy(self) -> SlamState:
-        """Return an independent copy, without unused capacity."""
+        """Return an independent copy, without unused capacity. Immutable parts (ancestry, graph, places,
+        statistics) are shared."""
         return self._drawn(np.arange(len(self.pose)))
 
     def placed(self, pose: Float) -> SlamState:
@@ -125,7 +126,7 @@ class SlamState:
 
     def with_particles(self, particles: int) -> SlamState:
         """Return the state resampled to another number of particles, systematically by their weights with the
-        offset 1/2; the state itself if the number is unchanged."""
+        offset 1/2, with equal weights; the state itself if the number is unchanged."""
         if particles == len(self.pose):
             return self
         weights = normalised(self.log_weight)
@@ -139,7 +140,9 @@ class SlamState:
         )
 
     def _drawn(self, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> SlamState:
-        """Return the state with the particles of the given rows, int64, shape (P,); rows may repeat."""
+        """Return the state with copies of the poses, weights, maps and shared errors of the given rows,
+        int64, shape (P,), which may repeat. The ancestry and the row `best` remain those of the state; the
+        caller redraws them."""
         return replace(
             self,
             pose=self.pose[rows],

@@ -159,7 +159,8 @@ class Tracker:
         classify_new(self.tracks.as_rows(), columns.axis, columns.verdict)
 
     def trees(self) -> Trees:
-        """Return the attributes of all trees, confirmed or not (Table 2); the columns are copies."""
+        """Return the attributes of all trees, confirmed or not (Table 2), by number; the columns are copies.
+        SHARED_COVARIANCE is added to the covariances. Diameters are NaN where they are unknown."""
         t, p = self.tracks, self.parameters
         limits = FigureLimits(p.hits_to_confirm, np.radians(p.dbh_arc_min), p.out_of_round, p.taper_sigma)
         coverage, dbh, dbh_sigma, eccentricity, confirmed = table_figures(t.as_rows(), limits)

@@ -73,6 +73,7 @@ def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: 
         record: A record of arrays, numbers, texts, tuples and other records.
         planes: Whether the first bytes of all numbers of an array come first, then the second ones, and so
             on, which compresses better.
+
     Raises:
         TypeError: A value has another type.
     """

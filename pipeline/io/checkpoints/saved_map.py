@@ -77,7 +77,7 @@ class SavedMap:
         )
 
     def state(self) -> MapperState:
-        """Return the state for a mapper.
+        """Return the state for a mapper, checked; it shares arrays with this record.
 
         Raises:
             ValueError: Its parts, which come from a file, contradict each other.

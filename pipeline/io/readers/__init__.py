@@ -25,10 +25,10 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         uri: A simulated scenario ("sim:stand"), a file or a folder. The format is detected by the contents
             first, then by the name.
         options: Choices of the user; None for the defaults.
-        UsageError: The scheme of the URI is unknown.
 
     Raises:
         SourceError: It does not exist, has an unknown format, or is damaged.
+        UsageError: The scheme of the URI is unknown.
     """
     chosen = options or SourceOptions()
     scheme = _SCHEME.match(uri)
@@ -196,10 +196,11 @@ READABLE = "Supported formats: " + ", ".join(
 
 
 def file_format(path: Path, head: bytes) -> Format | None:
-    """Return the format of a file, None if it is unknown.
+    """Return the format of a file, None if it is unknown. The first bytes decide; the suffix decides for .npz
+    and for formats without magic bytes.
 
     Args:
-        path: The file; its name decides for formats without magic bytes.
+        path: The file; it is not opened.
         head: Its first bytes.
     """
     if path.suffix.lower() == ".npz":  # a .zip by its contents

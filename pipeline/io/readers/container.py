@@ -304,7 +304,8 @@ class ChunkedFile(Container):
     # --- for the formats ---
 
     def _read_index(self, end: int) -> None:
-        """Read the headers of the records: chunks, channels, attachments.
+        """Read the headers of the records (chunks, channels, attachments) into `_chunks` and `_known`.
+        Subclasses implement it.
 
         Args:
             end: Length of the file.
@@ -315,7 +316,8 @@ class ChunkedFile(Container):
         raise NotImplementedError
 
     def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
-        """Yield the messages of an unpacked chunk; with `define`, keep the channels that it defines.
+        """Yield the messages of an unpacked chunk; with `define`, add the channels that it defines to
+        `_known`. Subclasses implement it.
 
         Raises:
             BrokenChunkError: The rest cannot be read.

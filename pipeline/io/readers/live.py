@@ -157,7 +157,8 @@ class ArrivalReader:
         return self._open(self._first_ns)
 
     def _forget_oldest(self) -> None:
-        """Drop the older half of the waiting messages, except scans and fixed transforms."""
+        """Remove the older half of the waiting messages, except scans and fixed transforms, of which the
+        newest remain in at most half of that space."""
         half, kept = len(self._opening) // 2, self._fixed | self._scans
         old = [message for message in self._opening[:half] if message.channel in kept]
         self._opening[:half] = old[-half // 2 :]

@@ -169,7 +169,7 @@ class _Stream:
         Args:
             path: The file.
             points: Number of points by the header. If the file has fewer, only whole records are yielded.
-            stack: Closes the file.
+            stack: Closes the file, when the caller closes the stack.
         """
         file: IO[bytes]
         if self.member is None:
@@ -198,6 +198,7 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
         kind: Name of the format.
         points: Number of points by the header.
         streams: Records of the points; several streams have different columns.
+
     Raises:
         ScanFileError: x, y or z is missing, sizes are too large, or the file ends before its first point.
     """
@@ -237,6 +238,7 @@ def _text_table(
         dtype: Types of the numbers of a point; a field of several values has its count as shape.
         start: First byte after the header.
         skipped: Number of lines before the points.
+
     Raises:
         ScanFileError: x, y or z is missing, sizes are too large, or the file is too short.
     """

@@ -315,7 +315,7 @@ def read_rows(file: IO[bytes], columns: int, lines: int) -> Iterator[Float]:
     Args:
         file: Open at the beginning of the first line.
         columns: Numbers per line.
-        lines: How many lines are read, including damaged ones.
+        lines: Maximum number of lines that are not empty, including damaged ones.
     """
     left = lines
     while left > 0:

@@ -123,7 +123,9 @@ class RosSource(MessageSource):
         return self._truth
 
     def fixes(self) -> list[Fix]:
-        """Return the GNSS fixes of the recording, in its order; damaged messages are left out."""
+        """Return all GNSS fixes of the recording with their times by the clock of the source, in the order of
+        recording. Messages that are damaged, have no fix or an impossible time are left out; [] without a
+        GNSS topic."""
         found = []
         for message in self._container.messages(self._topics.numbers("gnss"), None, {}):
             for stamped in self._stamped(message, {}):

@@ -51,7 +51,8 @@ def decode_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2, stamp_ns: int) -> Sc
 
     The time of a point is read from a field named t, time, timestamp, time_offset or offset_time: integers
     are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit inferred from
-    their size. Times farther than 2 s from the stamp are not used.
+    their size. If one time is farther than 2 s from the stamp, no times are used. Points that are not valid
+    returns are left out, see `clean_scan`.
 
     Raises:
         LayoutError: Width, height, steps, fields and length of the data do not fit together.
@@ -315,7 +316,7 @@ class RecordDecoder:
         is None if the message has none.
 
         Raises:
-            ValueError: A rate is not finite.
+            ValueError: A rate or an acceleration is not finite.
         """
         decoded: ros2.sensor_msgs__msg__Imu = self.message(message)
         linked = self._tree.find(self.base, frame_name(decoded.header.frame_id))

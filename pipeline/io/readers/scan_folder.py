@@ -220,7 +220,8 @@ class ScanFolder(FileSource):
         return [poses[row] for row in rows.tolist()]
 
     def _rows(self, name: str, count: int, numbers: Int) -> Int | None:
-        """Return the row of each scan in a text file, None (with a warning) if the rows do not fit.
+        """Return the row of each scan in a text file: the number of the scan if there are enough rows, else
+        its index if there are as many rows as scans; None (with a warning) if neither fits.
 
         Args:
             name: Name of the file.

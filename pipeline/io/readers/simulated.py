@@ -106,6 +106,7 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
         uri: As the user wrote it.
         request: Scenario and options of the URI.
         options: Choices of the user.
+
     Raises:
         SourceError: The cloud or the ground truth cannot be read, or the cloud has no path for a robot.
     """

@@ -126,12 +126,14 @@ class Extrinsics:
         return next((name for name in usual if self.tree.knows(name)), "")
 
     def _links(self, numbers: frozenset[int], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
-        """Return the transforms of the first messages by parent and child.
+        """Return the transforms of the first messages by parent and child, each with its first pose. With
+        `steady`, set `odometry_link` to the first transform that is odometry, and leave out transforms that
+        change or begin at a world frame (_WORLD).
 
         Args:
             numbers: Numbers of channels with transforms.
             limit: Number of messages that are read.
-            steady: Whether transforms that change are left out.
+            steady: Whether the channels have moving transforms.
         """
         seen: dict[tuple[str, str], Pose3] = {}
         moved: set[tuple[str, str]] = set()

@@ -51,7 +51,6 @@ def state_text(rows: Iterable[Sequence[float | bool]]) -> str:
 def trajectory_text(stamp_ns: Int, poses: Iterable[Pose3]) -> str:
     """Return the text of the file of poses, one row per pose, with times [ns], int64, shape (N,).
 
-    Args:
     Raises:
         ValueError: There are not as many poses as times.
     """
@@ -326,6 +325,7 @@ def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:
         number: Frame number of each file, ascending.
         count: Number of rows of the trajectory.
         uri: The source, for errors.
+
     Raises:
         SourceError: Neither fits.
     """

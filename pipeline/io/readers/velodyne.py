@@ -229,7 +229,6 @@ class PcapSource(FileSource):
         """Yield the scans from `start_ns` [ns] on; earlier packets are not decoded. Scans without points, or
         that cannot be decoded, are counted in `losses`.
 
-        Args:
         Raises:
             SourceError: The file cannot be read any more.
         """
@@ -254,7 +253,8 @@ class PcapSource(FileSource):
         self._file.close()
 
     def _read(self, rows: range) -> list[bytes]:
-        """Return the packets of one sweep, PACKET_BYTES each.
+        """Return the packets of one sweep, PACKET_BYTES each; fewer bytes if the file was shortened since it
+        was opened.
 
         Args:
             rows: Rows of the packets; not empty.

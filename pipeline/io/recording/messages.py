@@ -125,7 +125,7 @@ def point_cloud(scan: Scan) -> Message:
     """Return a sensor_msgs/PointCloud2 in the layout of the Velodyne driver: x, y, z, intensity, ring, time.
 
     `time` [s after the stamp] is a float32, as in the driver, and too coarse for nanoseconds; so `t` (int32)
-    follows it, which is `offset_ns`. Columns that the scan does not have are left out.
+    follows it, which is `offset_ns`. Columns that the scan does not have are left out. The frame is LIDAR.
     """
     columns: list[tuple[str, str, int, NDArray[Any]]] = [
         (name, "<f4", _FLOAT32, scan.points[:, axis]) for axis, name in enumerate("xyz")
