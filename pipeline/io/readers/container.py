@@ -365,7 +365,7 @@ class ChunkedFile(Container):
 
     def _contents(self, chunk: Chunk, *, define: bool) -> Iterator[Message]:
         """Yield the messages of a chunk, at most MOST_IN_CHUNK; with `define`, channels that it defines are
-        added.
+        added. Times of recording include the shifts of the chunk.
 
         Raises:
             BrokenChunkError: It is damaged, or has more messages; those before the damage were yielded.
@@ -382,8 +382,9 @@ class ChunkedFile(Container):
             raise BrokenChunkError from error
 
     def _shift_after_steps(self) -> None:
-        """Shift the times of chunks behind steps of the recorder's clock. Only chunks that begin earlier than
-        others before them are unpacked."""
+        """Shift the times of chunks behind steps back of the recorder's clock, in place, and count the steps
+        in `clock_steps`, up to MOST_STEPS. Only chunks that begin earlier than others before them, and their
+        predecessors, are unpacked."""
         shift_ns, newest_ns = 0, 0
         before: Chunk | None = None
         for place, chunk in enumerate(self._chunks):
@@ -403,11 +404,18 @@ class ChunkedFile(Container):
             newest_ns = max(newest_ns, shifted.end_ns)
 
     def _after_step(self, chunk: Chunk, before: Chunk | None) -> Chunk:
-        """Return a chunk with a further shift from each message on that is earlier than one of its channel
-        before; unchanged if there is none, as in files that are sorted by topic."""
+        """Return a chunk with a further shift from each message on that is STEP_BACK_NS or more earlier than
+        one of its channel before; its times then continue behind all messages before. Unchanged if there is
+        no such message, as in files that are sorted by topic.
+
+        Args:
+            chunk: The chunk.
+            before: The chunk with messages before it, None for the first one.
+        """
         newest, pause_ns = dict[int, int](), dict[int, int]()
 
         def note(channel: int, time_ns: int) -> None:
+            """Store the newest time of a channel [ns] and the pause before it; an earlier time is ignored."""
             if time_ns > newest.get(channel, -1):
                 pause_ns[channel] = time_ns - newest.get(channel, time_ns)
                 newest[channel] = time_ns

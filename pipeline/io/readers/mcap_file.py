@@ -69,7 +69,8 @@ class McapFile(ChunkedFile):
 
     def whole_records(self) -> Iterator[records.McapRecord]:
         """Yield all definitions, attachments, metadata and messages that can be read; other chunks and
-        records are counted in `damage`."""
+        records are counted in `damage`. Attachments with a wrong checksum are among these. Chunks are yielded
+        in the order of the file, with the times that they have there."""
         yield from self._schemas.values()
         yield from self._definitions.values()
         for opcode, offset, length in self._further:

@@ -67,9 +67,9 @@ class Clock:
         self.offset_ns = known[0] if self.by_stamp else 0
 
     def time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a message [ns], None when it has none.
-
-        The time of recording replaces a stamp that is impossible or behind a step of the clock.
+        """Return the time of a message [ns]: its stamp, or its time of recording plus `offset_ns` if stamps
+        are not used, or the stamp is missing or does not fit (`is_stepped`). None if that is not in [0,
+        2^63).
         """
         time_ns = stamp_ns
         if not self.by_stamp or time_ns is None or self.is_stepped(time_ns, message):
@@ -77,7 +77,8 @@ class Clock:
         return time_ns if 0 <= time_ns < 2**63 else None
 
     def is_stepped(self, stamp_ns: int, message: Message) -> bool:
-        """Return whether the stamp of a message [ns] does not fit to its time of recording."""
+        """Return whether the stamp of a message [ns] differs from its time of recording by more than
+        STAMP_LIMIT_NS after the offset of the clocks: it is damaged, or a clock was set."""
         return abs(stamp_ns - message.log_ns - self.offset_ns) > STAMP_LIMIT_NS
 
 

@@ -260,7 +260,8 @@ class RosSource(MessageSource):
             yield from self._stamped(message, {})
 
     def _is_clock_set(self) -> bool:
-        """Return whether no stamp of the last few scans fits to their times of recording."""
+        """Return whether no stamp of the last _LAST scans fits to their times of recording
+        (`Clock.is_stepped`); False without stamps."""
         numbers = self._topics.numbers("scan")
         stamps = [
             self._clock.is_stepped(stamp_ns, message)

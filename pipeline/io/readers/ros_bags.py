@@ -117,7 +117,8 @@ class Db3File(Container):
 
     def _read_index(self) -> tuple[Int, Int, Int]:
         """Return row, topic and time [ns] of all messages in the order of time, shape (N,) each. Damaged ones
-        are left out; damaged pages end the list and are counted."""
+        are left out; damaged pages end the list and are counted. Times behind steps of the recorder's clock
+        are shifted and counted in `clock_steps`."""
         rows: list[tuple[int, int, int]] = []
         cursor = self._database.execute("SELECT rowid, topic_id, timestamp FROM messages")
         try:
@@ -155,11 +156,13 @@ class Db3File(Container):
 
 
 def _shift_after_steps(topic: Int, stamp: Int) -> int:
-    """Shift times behind steps of the recorder's clock, see `Container.clock_steps`; return their number.
+    """Shift times behind steps back of the recorder's clock, see `Container.clock_steps`; return the number
+    of steps, at most MOST_STEPS. A step is a time that is more than STEP_BACK_NS earlier than one of its
+    topic before.
 
     Args:
-        topic: Topic of each message in the order of the file, shape (N,).
-        stamp: Time of recording [ns], shape (N,); changed in place.
+        topic: Topic of each message in the order of the file, int64, shape (N,).
+        stamp: Time of recording [ns], int64, shape (N,); changed in place.
     """
     for steps in range(MOST_STEPS):
         back = np.zeros(len(stamp), dtype=np.bool_)
