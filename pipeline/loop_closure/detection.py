@@ -200,7 +200,7 @@ def through(T_map_local: Pose2, covariance: Float, T_local_base: Pose2, own: Flo
         T_map_local: Pose of a local frame in the map, by a match.
         covariance: Its covariance, shape (3, 3).
         T_local_base: Pose of the base in the local frame.
-        own: Its covariance, shape (3, 3).
+        own: Its covariance, shape (3, 3), independent of `covariance`.
     """
     C = np.eye(3)
     C[:2, :2] = T_map_local.rotation()

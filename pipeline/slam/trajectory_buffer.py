@@ -45,8 +45,8 @@ class TrajectoryBuffer:
         return self._motion[: self._length]
 
     def append(self, stamp_ns: int, motion: Pose2) -> None:
-        """Add a scan with its time [ns] and the odometry step to it. Its sigma is undefined until
-        `set_sigma`."""
+        """Add a scan with its time [ns] and the odometry step from the scan before to it. Its sigma is
+        undefined until `set_sigma`."""
         if self._length == len(self._stamp):
             self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
             self._sigma = np.concatenate([self._sigma, np.zeros_like(self._sigma)])

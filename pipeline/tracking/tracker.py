@@ -233,7 +233,8 @@ class Tracker:
         t.P[rows, 2:, :2] = 0.0
 
     def _begin(self, stamp_ns: int, landmark: Int, position: Float, own: Float, added: Float) -> None:
-        """Begin trees at positions, with the numbers from `next_number` on.
+        """Begin trees without observations at positions, with the numbers from `next_number` on, after all
+        others in `tracks`.
 
         Args:
             stamp_ns: Time of the scan.

@@ -154,7 +154,8 @@ SHOWN_NS = 1_000_000_000
 
 
 def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:
-    """Return the nearest stamp for each time [ns], and whether it is within `SAME_TIME_NS`, shape (M,) each.
+    """Return the nearest stamp for each time [ns], the earlier one of two, and whether it is within
+    `SAME_TIME_NS`, shape (M,) each.
 
     Args:
         stamps: Stamps, ascending [ns], shape (N,), N >= 1.

@@ -44,7 +44,7 @@ def is_cloud(uri: str) -> bool:
 
 
 def open_cloud(uri: str) -> WholeCloud:
-    """Open a whole cloud.
+    """Open a whole cloud by its first bytes or its suffix: E57, LAS or LAZ, else a PLY, NumPy or PCD file.
 
     Raises:
         SourceError: It does not exist, has an unknown format, or is damaged.

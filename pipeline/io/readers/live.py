@@ -118,7 +118,7 @@ class ArrivalReader:
 
     @property
     def base(self) -> str:
-        """Name of the base frame, "" when it is unknown."""
+        """Name of the base frame, "" if it is unknown or the source is not described yet."""
         return "" if self._source is None else self._source.base
 
     def add(self, message: Message) -> list[Record]:
@@ -385,12 +385,13 @@ class LiveRecording(MessageSource):
         self._description = self._describe(reader.description, paths)
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int:
-        """Return the time of a picture [ns]."""
+        """Return the time of a picture [ns], see `time_beside`; never None."""
         return time_beside(stamp_ns, message.log_ns, self._offset_ns)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of arrival; those with a stamp before `start_ns` [ns] are left out
-        without being decoded."""
+        """Yield records in the order of arrival, with `as_live` only those that the live run mapped. Those
+        with a stamp before `start_ns` [ns] are left out without being decoded; what cannot be used is counted
+        in `losses`."""
         reader = self._reader()
         self._losses = reader.losses
         reader.from_ns = start_ns
@@ -423,7 +424,9 @@ class LiveRecording(MessageSource):
         return reader
 
     def _describe(self, known: SourceDescription, paths: list[Path]) -> SourceDescription:
-        """Return the description of the recording.
+        """Return the description of the recording: that of its first messages with the number of scans,
+        times, digest, and parameters of the live run. If the live run skipped scans and all are read here,
+        only its last parameters apply, from the first scan on, and a warning is added.
 
         Args:
             known: Description of its first messages as a live run.

@@ -88,7 +88,7 @@ def open_table(path: Path) -> PointTable:
 
 
 def read_columns(path: Path, losses: dict[str, int], *, limit: int = POINT_LIMIT) -> Columns:
-    """Read a file as a whole; columns of shape (N,).
+    """Return all columns of a file by name, shape (N,) each; of a damaged file the points before the damage.
 
     Args:
         path: A PLY, NumPy or PCD file.

@@ -29,7 +29,7 @@ class TextError(Exception):
 
 
 def read_poses(path: Path) -> list[Pose3]:
-    """Read poses of the LiDAR (x forward), one per scan.
+    """Return poses of the LiDAR (x forward) from a file, one per row.
 
     A row has the 12 numbers of a 3 x 4 matrix. KITTI writes the poses of its left camera (x right, y down, z
     forward); others write those of the LiDAR. With a file `calib.txt` with a row `Tr:` in the same folder,
@@ -56,7 +56,8 @@ def read_poses(path: Path) -> list[Pose3]:
 
 
 def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
-    """Read poses of the LiDAR: TUM rows t x y z qx qy qz qw with times [ns], or KITTI rows (times None).
+    """Return times and poses of the LiDAR from a file: TUM rows t x y z qx qy qz qw with times [ns], or KITTI
+    rows (times None).
 
     Raises:
         TextError: It has neither format, times that do not ascend, quaternions of no length, or positions

@@ -215,7 +215,9 @@ class RosSource(MessageSource):
                     yield Stamped(time_ns, 0, Odometry(time_ns, pose))
 
     def _upright(self, scan: Scan) -> Scan:
-        """Return a scan whose rings are numbered from below, as defined for `Scan`."""
+        """Return a scan whose rings are numbered from below, as defined for `Scan`. The scan itself if it has
+        no ring numbers, or if those of the first scan were numbered so; rings beyond those of the sensor
+        become 0."""
         if self._top_ring is None or scan.ring is None:
             return scan
         return replace(scan, ring=np.maximum(self._top_ring - scan.ring, 0).astype(np.int32))

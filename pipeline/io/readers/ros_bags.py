@@ -246,13 +246,13 @@ class BagFolder(Container):
                 count_loss(self.damage, reason, count)
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return a time shortly before the end of the last file [ns], see `Container.tail_ns`."""
+        """Return the latest of the times of all files [ns], see `Container.tail_ns`."""
         return max(part.tail_ns(_own(numbers, index)) for index, part in enumerate(self._parts))
 
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield messages of all files, see `Container.messages`."""
+        """Yield messages of all files, merged by their times of recording, see `Container.messages`."""
         streams = [
             _renumbered(part.messages(_own(numbers, index), start_ns, losses), index)
             for index, part in enumerate(self._parts)

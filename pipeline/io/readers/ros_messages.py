@@ -118,7 +118,8 @@ class MessageDecoder:
 
 @cache
 def standard_types(encoding: str) -> Typestore:
-    """Return the definitions of ROS ("cdr": ROS 2, "ros1"), with those of Velodyne and tf."""
+    """Return the definitions of ROS 1 for "ros1" and of ROS 2 for any other encoding, with those of Velodyne
+    and tf; the same object at each call."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_JAZZY)
     for name, text in _EXTRA.items():
         if name not in store.fielddefs:

@@ -209,7 +209,7 @@ class RecordDecoder:
         Args:
             message: Cloud, laser scan or packets.
             stamp_ns: Time of the scan [ns].
-            losses: Counts scans and points that cannot be used.
+            losses: Counts packets that are no data packets; changed in place.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
@@ -239,7 +239,7 @@ class RecordDecoder:
         return self._decoder.decode(self._channels[message.channel], message.payload)
 
     def fix(self, message: Message, stamp_ns: int) -> tuple[Fix | None, str]:
-        """Decode a GNSS fix; return it, None when the receiver had no fix, and the frame of its antenna.
+        """Return a GNSS fix, None if the receiver had no fix, and the name of the frame of its antenna.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
@@ -253,7 +253,8 @@ class RecordDecoder:
         return Fix.of(stamp_ns, float(decoded.latitude), float(decoded.longitude), covariance, kind), frame
 
     def other_pose(self, message: Message, stamp_ns: int) -> tuple[OtherPose, str]:
-        """Decode a pose of another SLAM; return it and the name of its frame.
+        """Return a pose of another SLAM and the name of its frame. It is that of the base if fixed transforms
+        link the child frame of the message to the base, else that of the message.
 
         Raises:
             NoPoseError: Its covariance is invalid.

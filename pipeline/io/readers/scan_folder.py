@@ -149,8 +149,8 @@ class ScanFolder(FileSource):
     def _read_texts(
         self, places: list[Path], names: Iterable[str], read: Callable[[Path], T]
     ) -> Iterator[tuple[Path, T]]:
-        """Yield the files of some names that exist and can be read, each with its contents. A file that
-        cannot be read becomes a warning.
+        """Yield the files of some names that exist and can be read, each with its contents. Missing files are
+        skipped; a file that cannot be read becomes a warning.
 
         Args:
             places: Folders, searched in this order.
@@ -262,7 +262,8 @@ def _times_in_names(files: list[Path]) -> Int | None:
 
 
 def _name_ns(stem: str) -> int:
-    """Return the time in a file name [ns]: seconds with decimals, microseconds or nanoseconds since 1970."""
+    """Return the time in a file name [ns]: seconds with decimals, microseconds (16 digits) or nanoseconds (19
+    digits) since 1970; 0 for other names."""
     match = _TIME_NAME.fullmatch(stem)
     word = match.group(1) if match else "0"
     if "." in word or "_" in word:

@@ -76,7 +76,8 @@ class Topics:
         return frozenset[int]().union(*found)
 
     def recorded(self) -> tuple[RecordedTopic, ...]:
-        """Describe all topics for the user, each with its role."""
+        """Return all topics with the role in which each is read, the role that it could have, and the reason
+        why it is not read."""
         reading = {topic: "transforms" for topic in self.every if topic.msgtype in TRANSFORM_TYPES}
         if "camera" in self.chosen:
             reading |= {topic: "camera" for topic in self.every if topic.msgtype == CAMERA_INFO}

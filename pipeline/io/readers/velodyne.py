@@ -343,8 +343,8 @@ def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
 
 
 def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]) -> tuple[int, int]:
-    """Return the position of the 1206 bytes of a captured data packet, and the address and port of its sender
-    as one number; (0, 0) for other packets.
+    """Return the position of the 1206 bytes of a captured data packet, and the address of its sender and its
+    destination port as one number; (0, 0) for other packets.
 
     Args:
         buffer: Bytes of the file.
