@@ -31,17 +31,21 @@ _EXAMPLE = "E.g. --param-grid clustering.eps=0.1,0.15,0.2 or clustering.eps=0.1.
 
 @dataclass(frozen=True, slots=True)
 class GridAxis:
-    """A parameter, by its dotted name or PRESET, and the values that it takes."""
+    """A parameter, by its dotted name or PRESET, and its different values."""
 
     name: str
     values: tuple[Value, ...]
 
 
 def read_axes(words: Iterable[str]) -> tuple[GridAxis, ...]:
-    """Return the axes that `--param-grid` names: `NAME=VALUES`, or the name of a TOML file.
+    """Return the axes that `--param-grid` names, in their order; () without words.
+
+    Args:
+        words: `NAME=VALUES`, or the name of a TOML file.
 
     Raises:
-        ParameterError: A name, a value or a file is invalid, or there are too many sets.
+        ParameterError: A name, a value or a file is invalid, a name is given twice, or there are more than
+            `MOST_SETS` sets.
     """
     axes: dict[str, GridAxis] = {}
     for word in words:
@@ -75,7 +79,8 @@ def spec_of(name: str) -> FieldSpec:
 
 
 def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
-    """Return every combination of the values as dicts by parameter name; the last axis changes fastest."""
+    """Return every combination of the values as dicts by parameter name; the last axis changes fastest.
+    Without axes there is one empty combination."""
     return [
         dict(zip((axis.name for axis in axes), values, strict=True))
         for values in itertools.product(*(axis.values for axis in axes))
@@ -83,11 +88,17 @@ def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
 
 
 def words_of(changes: Mapping[str, Value]) -> str:
-    """Return a combination as text in the syntax of `--set`; "unchanged" for an empty one."""
+    """Return a combination as text in the syntax of `--set`, separated by spaces; "unchanged" for an empty
+    one."""
     return " ".join(f"{name}={value_text(value)}" for name, value in changes.items()) or "unchanged"
 
 
 def _axes_of(file: Path) -> list[GridAxis]:
+    """Return the axes of a TOML file with one table per stage and the optional key `preset`.
+
+    Raises:
+        ParameterError: The file cannot be read, is larger than 1 MB, or has invalid names or values.
+    """
     try:
         if file.stat().st_size > _LARGEST_FILE:
             raise ParameterError("the file is larger than 1 MB", where=str(file))
@@ -114,6 +125,16 @@ def _axes_of(file: Path) -> list[GridAxis]:
 
 
 def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
+    """Return the axis of a parameter or PRESET; equal values are merged.
+
+    Args:
+        name: Dotted name, or PRESET.
+        entries: Values, or texts in the syntax of the command line.
+
+    Raises:
+        ParameterError: The name is unknown, a value is invalid or out of bounds, or there are none or more
+            than `MOST_VALUES`.
+    """
     if name == PRESET:
         values: list[Value] = [word for entry in entries for word in _parts(str(entry))]
         unknown = [value for value in values if value not in PRESETS]
@@ -132,15 +153,23 @@ def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
 
 
 def _text(entry: object) -> str:
-    """Return an entry of a TOML file in the syntax of the command line."""
+    """Return an entry of a TOML file as text in the syntax of the command line; true and false in lower case."""
     return str(entry).lower() if isinstance(entry, bool) else str(entry)
 
 
 def _parts(text: str) -> list[str]:
+    """Split a text at its commas; blank parts are dropped."""
     return [part.strip() for part in text.split(",") if part.strip()]
 
 
 def _values(spec: FieldSpec, text: str) -> list[Value]:
+    """Return the values of one part of a list: a single value, or those of a range "LOW..HIGH/COUNT" or
+    "LOW..HIGH/COUNTlog". Bounds of the declaration are not checked.
+
+    Raises:
+        ParameterError: The text cannot be parsed, a range has fewer than 2 or more than `MOST_VALUES` values,
+            or the ends are not finite (or not above 0 for "log").
+    """
     start, dots, rest = text.partition("..")
     if not dots:
         return [_value(spec, text)]
@@ -163,10 +192,10 @@ def _values(spec: FieldSpec, text: str) -> list[Value]:
 
 
 def spread(low: float, high: float, count: int, *, ratio: bool) -> list[float]:
-    """Return values from low to high, ends included.
+    """Return `count` values from low to high, ends included and exact.
 
     Args:
-        low, high: The ends.
+        low, high: The ends, in any order; both above 0 for equal ratios.
         count: Number of values, at least 2.
         ratio: Whether neighbouring values have equal ratios; otherwise equal differences.
     """
@@ -179,12 +208,15 @@ def spread(low: float, high: float, count: int, *, ratio: bool) -> list[float]:
 
 
 def _rounded(spec: FieldSpec, value: float) -> Value:
+    """Return a value of a range: rounded to a whole number for kind "int", otherwise to 12 significant
+    digits."""
     # Twelve digits, so that 0.1..0.3/3 contains exactly 0.2.
     return round(value) if spec.kind == "int" else float(f"{value:.12g}")
 
 
 def _value(spec: FieldSpec, text: str) -> Value:
-    """Parse a value, with or without its unit."""
+    """Parse a value, with or without its unit; raises ParameterError if it is invalid. Bounds are not
+    checked."""
     bare = text.strip()
     if spec.kind in ("int", "float") and spec.unit:
         bare = bare.removesuffix(spec.unit).strip()

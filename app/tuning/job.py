@@ -39,11 +39,12 @@ class TuneSearch:
     """The newest search of the page.
 
     Args:
-        tell: Called with the state for the browsers whenever it changes.
+        tell: Called with the state for the browsers whenever it changes, see `as_plain`.
         command: Program and arguments of the child process.
 
     Attributes:
-        plan, request: The search, and the request of the browser from which it was made.
+        plan, request: The search, and the request of the browser from which it was made; None without a
+            search.
         result: The result, once the search has ended.
     """
 
@@ -63,16 +64,17 @@ class TuneSearch:
 
     @property
     def is_under_way(self) -> bool:
-        """Whether the child process runs."""
+        """Whether the search runs in its child process."""
         return self._task is not None and not self._task.done()
 
     @property
     def can_go_on(self) -> bool:
-        """Whether the search was stopped before its last trial."""
+        """Whether there is a search that does not run and has not made all its trials: it was stopped,
+        failed, or its time was over."""
         return self.plan is not None and not self.is_under_way and len(self._trials) < self.plan.trials
 
     async def start(self, plan: Plan, request: SearchRequest | None = None) -> None:
-        """Start a search. A stopped search is removed.
+        """Start a search in a child process, and send its state. A stopped search and its trials are removed.
 
         Args:
             plan: The search.
@@ -87,13 +89,14 @@ class TuneSearch:
             await self._run(plan, request)
 
     async def go_on(self, now: Plan) -> None:
-        """Continue the stopped search with its trials.
+        """Continue the stopped search with its trials and its time limit from 0 on.
 
         Args:
             now: The plan that the same request gives now.
 
         Raises:
-            StemmapError: No search was stopped, or true trees or parameters have changed since it began.
+            StemmapError: Another search runs, no search was stopped, no process can be started, or true trees
+                or parameters have changed since it began.
         """
         self._check_idle()
         if self.plan is None or not self.can_go_on:
@@ -103,14 +106,15 @@ class TuneSearch:
             await self._run(self.plan, self.request)
 
     async def stop(self) -> None:
-        """Ask the process to stop; it then sends the result."""
+        """Ask the process to stop; it then sends the result. Does nothing if no search runs."""
         if self._process is not None and self.is_under_way:
             self._state = "stopping"
             self.show()
             await self._process.send("stop")
 
     async def leave(self) -> None:
-        """End the search and remove its result, because the run is closed."""
+        """End the search, if it runs, remove its trials and its result, and send the state, because the run
+        is closed."""
         async with self._turn:
             task, self._task = self._task, None
             await cancel(task)
@@ -118,10 +122,16 @@ class TuneSearch:
         self.show()
 
     def _check_idle(self) -> None:
+        """Raise StemmapError if a search runs, or is being started or removed."""
         if self.is_under_way or self._turn.locked():
             raise StemmapError("a search is under way", remedy="Stop it first")
 
     async def _run(self, plan: Plan, request: SearchRequest | None) -> None:
+        """Start the child process, send it the plan with the trials so far, and listen to it in a task.
+
+        Raises:
+            StemmapError: No process can be started.
+        """
         process = self._process = await ChildProcess.start(self._command)
         self.plan, self.request, self._state, self._error = plan, request, "looking", ""
         self._began = False
@@ -146,7 +156,7 @@ class TuneSearch:
         self._tell(self.as_plain())
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state and the progress for the browsers."""
+        """Return the state and the progress for the browsers; only the state "none" without a search."""
         if self.plan is None:
             return {"state": "none"}
         return {
@@ -157,14 +167,18 @@ class TuneSearch:
         }
 
     def _forget(self) -> None:
+        """Remove the search, its trials and its result. The child process is not ended."""
         self._state, self._error = "none", ""
         self.plan = self.result = self._start = self.request = None
         self._trials = {}
 
     def _made(self) -> list[Trial]:
+        """Return the trials so far, by number."""
         return [self._trials[number] for number in sorted(self._trials)]
 
     async def _listen(self, process: ChildProcess) -> None:
+        """Process the messages of the child process until it ends, and send the state after each. The state
+        becomes "failed" after a protocol error, or if the process ends without a result."""
         try:
             while (message := await process.receive(SearchMessage)) is not None:
                 self._take(message)
@@ -177,6 +191,7 @@ class TuneSearch:
             self._fail("the search ended unexpectedly. Start it again; the terminal may show why")
 
     def _take(self, message: SearchMessage) -> None:
+        """Update trials, result and state from a message of the child process."""
         self._trials |= {trial.number: trial for trial in message.trials}
         if message.start is not None:
             self._start, self._began = message.start, True
@@ -257,12 +272,13 @@ def other_runs(
     open_digest: str,
     may_be_opened: Callable[[str], str | None],
 ) -> list[OtherRun]:
-    """Return the runs of the list except the open one, one per source. Checks whether their files exist.
+    """Return the runs of the list except the open one, one per source, in the order of their newest records.
+    Runs that cannot be scored are included, with the reason in `why_not`. Checks whether their files exist.
 
     Args:
         rows: Records of the store, the newest first.
         annotated: Sources with annotations.
-        open_digest: Digest of the open run.
+        open_digest: Digest of the open run; empty if none is open.
         may_be_opened: Returns the URI that is opened for a URI, or None if that is not allowed.
     """
     contents = {each.source: each.annotations for each in annotated}
@@ -301,16 +317,19 @@ def plan_of(
     preset: str,
     others: Sequence[OtherRun],
 ) -> Plan:
-    """Return the plan of a search.
+    """Return the plan of a search over the open run and the other runs that the request names.
 
     Args:
         request: The request.
-        source, digest, truth: The open run; the digest is empty where none is open.
+        source, digest, truth: The open run; the digest is empty where none is open, truth is None where no
+            true trees are known.
         parameters, preset: Those in force.
         others: The other runs of the list.
 
     Raises:
-        StemmapError: The request cannot be searched.
+        StemmapError: No run is open, it is live or has no true trees; a parameter or its bounds are invalid;
+            or a further run is unknown, named twice or cannot be scored, or there are more than
+            `MOST_OTHERS`.
     """
     known = check_run(digest, source.uri, truth)
     axes = axes_of(request.over)
@@ -361,6 +380,12 @@ def check_same(stopped: Plan, now: Plan) -> None:
 
 
 def _planned(request: SearchRequest, others: Sequence[OtherRun]) -> list[PlannedRun]:
+    """Return the further runs of a request, first those that guide the search, then the held-out ones.
+
+    Raises:
+        StemmapError: A record is not in the list, its run cannot be scored or is named twice, or there are
+            more than `MOST_OTHERS` runs.
+    """
     by_record = {record: run for run in others for record in run.records}
     planned: list[PlannedRun] = []
     named: set[str] = set()
@@ -387,6 +412,8 @@ def _planned(request: SearchRequest, others: Sequence[OtherRun]) -> list[Planned
 
 
 def _why_gone(uri: str) -> str:
+    """Return the reason why a recording cannot be opened again: it is live, or its file does not exist; empty
+    if it can. A simulated run can always be opened."""
     if is_live(uri):
         return "it is a live run, which cannot be mapped again"
     if uri.startswith("sim:"):

@@ -82,8 +82,8 @@ class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def problem(self) -> str:
-        """Reason why the scores say nothing, for people: a failure, or no ground truth near the path; empty
-        otherwise."""
+        """Reason why the scores have no meaning, for people: a failure, or no ground truth near the path;
+        empty otherwise."""
         if self.scores is not None and self.scores.TA.of + self.scores.TR.of == 0:
             return far_truth(self.scores.reach)
         return self.error
@@ -91,7 +91,8 @@ class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @cache
 def code_digest() -> str:
-    """Return the version and a SHA-256 of the sources of the pipeline."""
+    """Return the version and the first 16 hex digits of a SHA-256 of the sources (.py and .json) of the
+    pipeline, as "version+digest". It is computed once per process."""
     assert pipeline.__file__ is not None  # noqa: S101 - the package has an __init__.py
     folder = Path(pipeline.__file__).parent
     state = hashlib.sha256()
@@ -102,15 +103,16 @@ def code_digest() -> str:
 
 
 def check_run(digest: str, uri: str, truth: TruthTrees | None) -> list[Content]:
-    """Return the true trees of the open run, if it can be mapped again and scored.
+    """Return the true trees and other objects of the open run, after a check that it can be mapped again and
+    scored.
 
     Args:
         digest: Digest of the run; empty where none is open.
         uri: URI of its source.
-        truth: Its true trees, with the annotations.
+        truth: Its true trees, with the annotations; None where none are known.
 
     Raises:
-        StemmapError: No run is open, it is live, or no true trees are known of it.
+        StemmapError: No run is open, it is live, or its truth has no tree.
     """
     if not digest:
         raise StemmapError("no run is open", remedy="Open one")

@@ -91,11 +91,13 @@ class Goal:
         """Return the loss that the search minimises.
 
         A set that violates the bound of the goal has a larger loss than every set that satisfies it, and the
-        loss grows with the violation. Without the bound an empty map would have the smallest errors.
+        loss grows with the violation. Without the bound an empty map would have the smallest errors. For
+        "position" and "pairs" the loss is the error itself ([m], [%]); a set whose error is unknown, or whose
+        F1 is below that of the start, violates the bound.
 
         Args:
             pooled: Scores of the set.
-            start: Scores of the parameters with which the search begins.
+            start: Scores of the parameters with which the search begins; not used by "f1" and "ta".
         """
         if self.name == "f1":
             return 1.0 - pooled.f1
@@ -107,11 +109,12 @@ class Goal:
         return _BROKEN[self.name] + max(short, 0.0) if error is None or short > 1e-12 else error
 
     def is_kept(self, loss: float) -> bool:
-        """Return whether a loss is that of a set that satisfies the bound of the goal."""
+        """Return whether a loss is that of a set that satisfies the bound of the goal; always True for "f1"."""
         return self.name == "f1" or loss < _BROKEN[self.name]
 
     def figure(self, loss: float) -> float:
-        """Return the score, in `unit`, of a loss that satisfies the bound."""
+        """Return the score, in `unit`, of a loss that satisfies the bound: 1 - loss for "f1" and "ta", cm for
+        "position", % for "pairs". The result has no meaning for other losses, see `is_kept`."""
         if self.name in ("f1", "ta"):
             return 1.0 - loss
         return 100.0 * loss if self.name == "position" else loss
@@ -128,8 +131,8 @@ class Goal:
         return 100.0 * figure if self.name == "position" and figure is not None else figure
 
     def shown(self, loss: float) -> str:
-        """Return a loss as text, for example "RMSE 3.20 cm"; "outside the bound" if the goal does not accept
-        it."""
+        """Return a loss as text, for example "RMSE 3.20 cm" or "F1 0.912"; "outside the bound" if the goal
+        does not accept it."""
         if not self.is_kept(loss):
             return "outside the bound"
         digits = 2 if self.name == "position" else 3
@@ -166,7 +169,8 @@ def score_of(e: MapScores) -> RunScore:
 
 
 def pool(scores: Sequence[RunScore]) -> Pooled:
-    """Return the scores of several runs together, see `Pooled`."""
+    """Return the scores of several runs together, see `Pooled`. Without scores, f1, ta and false_share are 0
+    and the errors are None."""
     ta, fr = sum(s.TA for s in scores), sum(s.FR for s in scores)
     wrong = sum(s.FA + s.spurious for s in scores)
     squares = [(s.TA, s.position_rmse**2) for s in scores if s.position_rmse is not None]
@@ -182,6 +186,7 @@ def pool(scores: Sequence[RunScore]) -> Pooled:
 
 
 def _mean(weighed: list[tuple[int, float]]) -> float | None:
+    """Return the weighted mean of (weight, value) pairs; None if the weights sum to 0."""
     whole = sum(weight for weight, _ in weighed)
     return sum(weight * value for weight, value in weighed) / whole if whole else None
 
@@ -225,7 +230,8 @@ class SearchAxis(msgspec.Struct, frozen=True):
     choices: tuple[str | bool, ...] = ()
 
     def distribution(self) -> Any:  # noqa: ANN401 - Optuna has no types
-        """Return the distribution of Optuna from which a value is suggested."""
+        """Return the distribution of Optuna from which a value is suggested. The scale is logarithmic if the
+        lower bound is above 0 and the upper bound is at least 100 times as large."""
         from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
         log = self.low > 0.0 and self.high >= _LOG_FROM * self.low
@@ -236,8 +242,12 @@ class SearchAxis(msgspec.Struct, frozen=True):
         return FloatDistribution(self.low, self.high, log=log)
 
     def value_of(self, suggested: Any) -> Value:  # noqa: ANN401
-        """Return the parameter value for a value of Optuna: rounded to `_DIGITS` significant digits, within
-        the bounds."""
+        """Return the parameter value for a value of Optuna.
+
+        A number of kind "float" is rounded to `_DIGITS` significant digits and clipped to the bounds. Kind
+        "int" is truncated to int without a check of the bounds. A choice is returned as it is, without a
+        check.
+        """
         if self.kind == "choice":
             return suggested if isinstance(suggested, bool) else str(suggested)
         if self.kind == "int":
@@ -245,7 +255,8 @@ class SearchAxis(msgspec.Struct, frozen=True):
         return min(max(float(f"{suggested:.{_DIGITS}g}"), self.low), self.high)
 
     def holds(self, value: Value) -> bool:
-        """Return whether a value is within the bounds."""
+        """Return whether a value is within the bounds, ends included. A choice must also have the same type;
+        text is never within the bounds of a number."""
         if self.kind == "choice":
             return any(type(c) is type(value) and c == value for c in self.choices)
         return not isinstance(value, str) and self.low <= value <= self.high
@@ -259,13 +270,14 @@ class SearchAxis(msgspec.Struct, frozen=True):
 
 
 def axes_of(texts: Sequence[str]) -> tuple[SearchAxis, ...]:
-    """Return the axes of a search.
+    """Return the axes of a search, in the order of the texts.
 
     Args:
         texts: `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`; without bounds those of the declaration are used.
 
     Raises:
-        ParameterError: A name is unknown or given twice, or bounds contradict the declaration.
+        ParameterError: A name is unknown or given twice, belongs to a stage that does not change the map, or
+            bounds or choices contradict the declaration.
     """
     axes = tuple(_axis(text) for text in texts)
     names = [axis.name for axis in axes]
@@ -278,12 +290,16 @@ def axes_of(texts: Sequence[str]) -> tuple[SearchAxis, ...]:
 def check(axes: Iterable[SearchAxis], start: Parameters) -> None:
     """Check that the search space contains a set without contradictions.
 
+    Only the corners of the space are tried. A space with more than `_CORNERS` corners is accepted without a
+    check, because each trial is checked anyway.
+
     Args:
         axes: The search space.
         start: Values of all other parameters.
 
     Raises:
-        ParameterError: All corners of the space contradict themselves; the message names the contradiction.
+        ParameterError: All corners of the space contradict themselves; the message has the first
+            contradiction.
     """
     ends = [[(axis.name, value) for value in _ends(axis)] for axis in axes]
     refusal: ParameterError | None = None
@@ -304,16 +320,18 @@ def check(axes: Iterable[SearchAxis], start: Parameters) -> None:
 
 
 def values_of(axes: Iterable[SearchAxis], suggested: Mapping[str, Any]) -> dict[str, Value]:
-    """Return the parameter values of a trial by name.
+    """Return the parameter values of a trial by name, rounded and clipped by `SearchAxis.value_of`.
 
     Args:
         axes: The search space.
-        suggested: Values of Optuna by name.
+        suggested: Values of Optuna by name, one for each axis.
     """
     return {axis.name: axis.value_of(suggested[axis.name]) for axis in axes}
 
 
 def _axis(text: str) -> SearchAxis:
+    """Parse one text of `axes_of`; raises its errors. A switch without values has both values as choices, a
+    name needs at least two."""
     name, given, bounds = (part.strip() for part in text.partition("="))
     spec = spec_of(name)
     why = _NO_PART_OF_THE_MAP.get(name.partition(".")[0])
@@ -328,6 +346,12 @@ def _axis(text: str) -> SearchAxis:
 
 
 def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
+    """Parse "LOW..HIGH" for a numeric parameter.
+
+    Raises:
+        ParameterError: The text is not two numbers (whole numbers for kind "int"), the lower one is not below
+            the upper one, or one is outside of the bounds of the declaration.
+    """
     first, dots, last = bounds.partition("..")
     try:
         if not dots:
@@ -352,6 +376,11 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
 
 
 def _choice(spec: FieldSpec, words: str) -> SearchAxis:
+    """Parse "A,B" for a parameter with choices or a switch; repeated choices are merged.
+
+    Raises:
+        ParameterError: A choice is unknown, or there are fewer than two different ones.
+    """
     known = {value_text(choice): choice for choice in _all_choices(spec)}
     given = [word.strip() for word in words.split(",")]
     unknown = [word for word in given if word not in known]
@@ -362,6 +391,11 @@ def _choice(spec: FieldSpec, words: str) -> SearchAxis:
 
 
 def _names(spec: FieldSpec, words: str) -> SearchAxis:
+    """Parse "A,B" for a parameter whose value is a free name; empty and repeated names are dropped.
+
+    Raises:
+        ParameterError: There are fewer than two different names, or one has an invalid syntax.
+    """
     given = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
     if len(given) < 2:
         raise ParameterError(
@@ -377,6 +411,7 @@ def _all_choices(spec: FieldSpec) -> tuple[str | bool, ...]:
 
 
 def _ends(axis: SearchAxis) -> tuple[Value, ...]:
+    """Return the bounds of a number, rounded as the values of trials are, or all values of a choice."""
     if axis.kind == "choice":
         return axis.choices
     return axis.value_of(axis.low), axis.value_of(axis.high)
@@ -441,7 +476,8 @@ class Plan(msgspec.Struct, frozen=True):
 
     @property
     def parameters(self) -> Parameters:
-        """The parameters with which the search begins."""
+        """The parameters with which the search begins, validated at each access; raises ParameterError if
+        `start` is invalid."""
         return validated({stage: dict(values) for stage, values in self.start.items()})
 
     @property
@@ -468,8 +504,8 @@ class Trial(msgspec.Struct, frozen=True):
 
 
 def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
-    """Return all that decides the result of a trial. Searches with the same identity share their trials;
-    neither the place of a recording nor the held-out runs belong to it.
+    """Return all that decides the result of a trial, as values that JSON can store. Searches with the same
+    identity share their trials; neither the location of a recording nor the held-out runs belong to it.
 
     Args:
         plan: The search.

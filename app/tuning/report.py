@@ -100,14 +100,19 @@ class Comparison:
 
 
 def _most(name: str) -> Callable[[Figures], tuple[float, ...] | None]:
+    """Return a criterion function whose value is a figure, where larger is better; None where the figure is
+    unknown."""
     return lambda f: None if f[name] is None else (float(f[name] or 0.0),)
 
 
 def _least(name: str) -> Callable[[Figures], tuple[float, ...] | None]:
+    """Return a criterion function that prefers a small figure, then a large F1; None where the figure is
+    unknown."""
     return lambda f: None if f[name] is None else (-float(f[name] or 0.0), float(f["f1"] or 0.0))
 
 
 def _careful(f: Figures) -> tuple[float, ...] | None:
+    """Criterion function: fewest false trees (FA and spurious), then most true ones; never None."""
     wrong = float(f["FA"] or 0) + float(f["spurious"] or 0)
     return (-wrong, float(f["TA"] or 0))
 
@@ -126,7 +131,7 @@ def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) 
 
     Args:
         plan: The comparison.
-        answers: Results by number of the set and of the run.
+        answers: Results by number of the set and of the run, from 0 on; one for each job of the plan.
     """
     rows, means = [], []
     for s in range(len(plan.sets)):
@@ -139,6 +144,8 @@ def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) 
 
 
 def _row(plan: SweepPlan, answers: dict[tuple[int, int], JobResult], s: int, r: int) -> Row:
+    """Return the row of set `s` and run `r`, both from 0 on. A set that was left out, failed, or has no
+    ground truth near the path has no figures and an error."""
     if (s, r) in plan.left_out:
         return Row(s + 1, r + 1, {}, error=plan.left_out[s, r])
     answer = answers[s, r]
@@ -158,8 +165,14 @@ def _figures(answer: JobResult, scores: MapScores) -> Figures:
 
 
 def _mean(set_number: int, rows: Sequence[Row]) -> Row:
-    """Counts are summed over the runs; all other figures are means of the runs that have them, with equal
-    weights. A set that failed on a run has no mean, because it could not be compared with the others."""
+    """Return the row of a set over all runs. Counts are summed over the runs; all other figures are means of
+    the runs that have them, with equal weights, and None without any. A set that failed on a run has the
+    error of the first failure and no figures, because it could not be compared with the others.
+
+    Args:
+        set_number: Number of the set, from 1 on.
+        rows: Its rows, one per run.
+    """
     failed = [row for row in rows if row.error]
     seconds = sum(row.seconds for row in rows)
     if failed:
@@ -175,7 +188,8 @@ def _mean(set_number: int, rows: Sequence[Row]) -> Row:
 
 
 def best_of(means: Sequence[Row], goal: Criterion) -> int:
-    """Return the number of the best set, the first of equals; 0 if no value is known or all are equal.
+    """Return the number of the best set, the first of equals; 0 if no value is known, or if several are known
+    and all are equal. A single set with a known value is the best.
 
     Args:
         means: One row per set.
@@ -189,10 +203,11 @@ def best_of(means: Sequence[Row], goal: Criterion) -> int:
 
 
 def figure_words(figures: Figures, name: str, scale: float) -> str:
-    """Return a score as text; TA and TR with their totals, "-" if it is unknown.
+    """Return a score as text: TA and TR as "count/total", other counts as whole numbers, all else with two
+    decimals; "-" if it is unknown.
 
     Args:
-        figures: Scores of a row.
+        figures: Scores of a row; must have the name.
         name: Name of the score.
         scale: Factor from the stored value to the shown one.
     """
@@ -212,7 +227,11 @@ _COMPUTED = ("=", "+", "-", "@", "\t", "\r")
 
 def lines(comparison: Comparison) -> list[str]:
     """Return the comparison as text: a table with a row per set, preceded by the rows of its runs if they are
-    few, and the best sets."""
+    few, and the best sets.
+
+    With more than `MOST_LINES` rows, the rows of single runs are omitted; with still more, only the
+    `MOST_LINES` sets with the largest F1 are shown, sorted by F1, and a line gives the number of the others.
+    """
     plan = comparison.plan
     one = len(plan.runs) == 1
     rows: list[Row] = []
@@ -238,10 +257,12 @@ def lines(comparison: Comparison) -> list[str]:
 
 
 def files(comparison: Comparison, folder: Path) -> list[str]:
-    """Write results.csv, means.csv, results.json, times.csv and report.html, and return their names.
+    """Write results.csv, means.csv, results.json, times.csv and report.html into a folder, and return their
+    names. The folder is created; existing files are replaced.
 
     Raises:
         StemmapError: A file cannot be written. Each file is complete or unchanged.
+        OSError: The folder cannot be created.
     """
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
@@ -258,7 +279,7 @@ def files(comparison: Comparison, folder: Path) -> list[str]:
 
 
 def json_text(comparison: Comparison) -> str:
-    """Return everything but the times as JSON."""
+    """Return everything but the times as JSON text that ends with a newline."""
     plan = comparison.plan
     record: dict[str, Any] = {
         "stemmap": version(),
@@ -282,6 +303,7 @@ def json_text(comparison: Comparison) -> str:
 
 
 def _record(row: Row) -> dict[str, Any]:
+    """Return a row for JSON: set, run (not for a mean), and either all scores or the error."""
     numbers = {"set": row.set_number, **({"run": row.run} if row.run else {})}
     if row.error:
         return {**numbers, "error": row.error}
@@ -289,6 +311,7 @@ def _record(row: Row) -> dict[str, Any]:
 
 
 def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
+    """Return rows as CSV text: set, parameters, run and source (not for means), COLUMNS and error."""
     plan = comparison.plan
     axes = list(plan.sets[0]) if plan.sets else []
     of_runs = any(row.run for row in rows)
@@ -307,6 +330,7 @@ def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
 
 
 def _times(comparison: Comparison) -> str:
+    """Return the computing times as CSV text, without rows that failed."""
     rows = [
         [str(r.set_number), str(r.run), f"{r.seconds:.3f}", str(r.looked).lower()]
         for r in comparison.rows
@@ -316,8 +340,8 @@ def _times(comparison: Comparison) -> str:
 
 
 def _cell(cell: object) -> str:
-    """Return a cell as it is written: empty for None, and with an apostrophe in front of a text that a
-    spreadsheet would compute, such as a file name `=1+1.mcap`."""
+    """Return a cell as it is written: empty for None, true or false for a bool, and with an apostrophe before
+    a text that a spreadsheet would compute, such as a file name `=1+1.mcap`."""
     if cell is None:
         return ""
     if isinstance(cell, bool):
@@ -326,6 +350,8 @@ def _cell(cell: object) -> str:
 
 
 def _cells(comparison: Comparison, row: Row, *, one: bool) -> list[str]:
+    """Return the cells of a row of the text table: set, parameters, run (not if there is `one` run), scores
+    and seconds. A row that failed ends with its error in place of the scores."""
     plan = comparison.plan
     first = [str(row.set_number), words_of(plan.sets[row.set_number - 1])]
     if not one:
@@ -340,6 +366,8 @@ def _cells(comparison: Comparison, row: Row, *, one: bool) -> list[str]:
 
 
 def _aligned(rows: list[list[str]]) -> list[str]:
+    """Return the table as lines with aligned columns. Rows that are shorter than the first one (failures) do
+    not count for the widths."""
     whole = [row for row in rows if len(row) == len(rows[0])]
     width = [max(len(row[k]) for row in whole) for k in range(len(rows[0]))]
     words = len(rows[0]) - len(SHOWN) - 1  # columns of text, aligned left; figures are aligned right
@@ -353,6 +381,8 @@ def _aligned(rows: list[list[str]]) -> list[str]:
 
 
 def _best_lines(comparison: Comparison) -> list[str]:
+    """Return one line per criterion with the best set. For a single set a criterion without a known value has
+    no line."""
     lines = []
     for goal, number in comparison.best.items():
         if number:
@@ -408,7 +438,8 @@ def _best(rows: list[Row]) -> dict[str, float | None]:
 
 
 def _f1_by_value(comparison: Comparison) -> dict[str, dict[float, list[float]]]:
-    """F1 [%] of all sets by the value of each numeric parameter with at least two values."""
+    """Return F1 [%] of all sets by parameter name and value. Parameters that are not numeric or have fewer
+    than two values with a known F1 are omitted."""
     plan, found = comparison.plan, {}
     for axis in plan.sets[0] if plan.sets else ():
         points: dict[float, list[float]] = {}
@@ -422,7 +453,16 @@ def _f1_by_value(comparison: Comparison) -> dict[str, dict[float, list[float]]]:
 
 
 def _chart(axis: str, points: dict[float, list[float]]) -> dict[str, Any]:
-    """Coordinates of the lines through the best and the mean F1 of the sets with each value."""
+    """Return a chart of F1 over a parameter for the template.
+
+    Args:
+        axis: Name of the parameter.
+        points: F1 [%] of the sets by value; at least two values.
+
+    Returns:
+        Name of the parameter, "x,y" coordinates [px] of the lines through the best and the mean F1 at each
+            value, and the labels of the ends of both axes.
+    """
     xs = sorted(points)
     best, mean = [max(points[x]) for x in xs], [sum(points[x]) / len(points[x]) for x in xs]
     low, high = min(mean), max(best)

@@ -96,12 +96,12 @@ def result_of(search: Search) -> Result:
 
 def toml_of(plan: Plan, result: Result, date: str) -> str:
     """Return the best set as the text of a file for `--config`. Comments at its top contain the provenance as
-    TOML.
+    TOML. If no set is better, the text has the parameters of the start.
 
     Args:
         plan: The search.
         result: Its result.
-        date: Date of the search.
+        date: Date of the search, as it is written.
     """
     parameters = best_parameters(plan, result)
     head, _, rest = file_of(plan.preset, parameters).partition("\n")
@@ -111,17 +111,18 @@ def toml_of(plan: Plan, result: Result, date: str) -> str:
 
 
 def best_parameters(plan: Plan, result: Result) -> Parameters:
-    """Return all parameters of the best set."""
+    """Return all parameters of the best set; those of the start if no set was better."""
     return plan.parameters.replace(dict(result.best.values) if result.better else {})
 
 
 def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
     """Return the provenance of the best set: goal, trials, runs with their digests, scores before and after.
+    Without None, because TOML has no null.
 
     Args:
         plan: The search.
         result: Its result.
-        date: Date of the search.
+        date: Date of the search, as it is written.
     """
     return {
         "tuned": {
@@ -158,7 +159,9 @@ def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
 
 
 def lines_of(plan: Plan, result: Result) -> list[str]:
-    """Return the result as text for a terminal."""
+    """Return the result as text for a terminal: goal and number of trials, scores before and after for the
+    search runs and the held-out runs, and each searched parameter with its change and importance. Without a
+    better set, one line states that the start was written."""
     goal = plan.aim
     refused = f", {result.refused} of them with contradicting values" if result.refused else ""
     lines = [f"{goal.words}: {count(result.made, 'trial')} over {len(plan.axes)} parameters{refused}"]
@@ -179,7 +182,8 @@ def lines_of(plan: Plan, result: Result) -> list[str]:
 
 
 def warning_of(result: Result) -> str:
-    """Return a warning where the best set is worse on held-out runs; empty otherwise."""
+    """Return a warning if F1 of the best set is smaller on held-out runs than that of the start; empty
+    otherwise, also without held-out scores or a better set."""
     if not result.better or not result.best.held_out:
         return ""
     before, after = pool(result.start.held_out).f1, pool(result.best.held_out).f1
@@ -192,6 +196,7 @@ def warning_of(result: Result) -> str:
 
 
 def _change(before: Sequence[RunScore], after: Sequence[RunScore]) -> str:
+    """Return the pooled scores before and after as text, "-" for unknown ones."""
     a, b = _file_scores(before), _file_scores(after)
     return ", ".join(
         f"{_LABELS[name]} {_decimal(a.get(name))} -> {_decimal(b.get(name))}" for name in _LABELS
@@ -208,7 +213,8 @@ _LABELS = {
 
 
 def _file_scores(scores: Sequence[RunScore]) -> dict[str, float]:
-    """Pooled scores for a file, without those that are unknown, because TOML has no null."""
+    """Return the pooled scores for a file, rounded to 6 decimals. Unknown ones are omitted, because TOML has
+    no null."""
     pooled = pool(scores)
     values = {
         "f1": pooled.f1,
@@ -221,15 +227,25 @@ def _file_scores(scores: Sequence[RunScore]) -> dict[str, float]:
 
 
 def _scores(trial: Trial, held_out: bool) -> tuple[RunScore, ...]:
+    """Return the scores of a trial for the held-out runs or for the search runs; () for a trial whose
+    held-out runs were not scored."""
     return trial.held_out if held_out else trial.training
 
 
 def _by_run(trial: Trial, sources: Sequence[tuple[str, str, bool]]) -> list[RunScore]:
+    """Return the scores of a trial in the order of the runs. The trial must have held-out scores if a run is
+    held out.
+
+    Args:
+        trial: The trial.
+        sources: URI, digest and whether it is held out, by run.
+    """
     training, held_out = iter(trial.training), iter(trial.held_out)
     return [next(held_out if held else training) for _, _, held in sources]
 
 
 def _decimal(value: float | None) -> str:
+    """Return a number with three decimals; "-" for None."""
     return "-" if value is None else f"{value:.3f}"
 
 
@@ -237,7 +253,8 @@ def _decimal(value: float | None) -> str:
 
 
 def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
-    """Return the trial with the smallest loss, the earliest of equals; None without a scored trial.
+    """Return the trial with the smallest loss, the one with the smallest number among equals; None without a
+    scored trial.
 
     Args:
         trials: Trials of the search.
@@ -252,11 +269,14 @@ def for_page(
 ) -> dict[str, Any]:
     """Return the progress of a search for the page, without its state.
 
+    The points of the chart are (number, score); the score is None for contradicting values. Trials outside
+    the bound of the goal are omitted, and of more than 400 points only every n-th is sent.
+
     Args:
         plan: The search.
         trials: The trials so far.
-        start: The start of the search, once it is scored.
-        result: The result, once the search has ended.
+        start: The start of the search, once it is scored; None before.
+        result: The result, once the search has ended; None before.
     """
     goal, best = plan.aim, best_of(trials, start)
     points = [
@@ -285,12 +305,14 @@ def for_page(
 
 
 def _trial_figures(plan: Plan, trial: Trial | None) -> dict[str, Any] | None:
+    """Return number, loss as text and pooled scores of the search runs of a trial; None for None."""
     if trial is None:
         return None
     return {"number": trial.number, "shown": plan.aim.shown(trial.loss or 0.0), **_figures(trial.training)}
 
 
 def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
+    """Return pooled scores for the page, with units in the names; unknown errors are None."""
     pooled = pool(scores)
     return {
         "f1": pooled.f1,
@@ -331,6 +353,6 @@ def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float |
 
 
 def _changes(plan: Plan, result: Result) -> list[list[Any]]:
-    """Return name, value at the start and best value of each parameter."""
+    """Return [name, value at the start, best value] of each searched parameter."""
     before = plan.parameters.flat()
     return [[name, before[name], value] for name, value in result.best.values.items()]

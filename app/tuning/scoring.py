@@ -74,7 +74,7 @@ class OpenDrive:
         preset: Name of the preset that suits the source.
 
     Raises:
-        StemmapError: It cannot be read.
+        StemmapError: It cannot be read; nothing remains open.
     """
 
     def __init__(self, source: SourceRequest) -> None:
@@ -97,8 +97,12 @@ class OpenDrive:
     def map(self, parameters: Parameters) -> MappedRun:
         """Map the run with these parameters, as `stemmap map` does.
 
+        Results of the front end are read from the disk cache if an earlier call stored those of all scans
+        under the same front-end parameters. Otherwise the front end runs and fills the cache.
+
         Raises:
             SourceError: There is no scan.
+            StemmapError: The source cannot be read.
         """
         cache, mapper = self._caches.of(parameters), self._mapper(parameters)
         if self._scans > 0 and cache.has_all(self._scans):
@@ -118,6 +122,13 @@ class OpenDrive:
         return mapper_of(self._source.description, parameters, self._seed)
 
     def _mapped(self, mapper: Mapper, frames: Iterator[Frame], *, front_end_ran: bool) -> MappedRun:
+        """Consume the frames and return the map after the last one; raises SourceError without a frame.
+
+        Args:
+            mapper: The mapper that makes the frames.
+            frames: One frame per scan; the scans are mapped while it is consumed.
+            front_end_ran: As in `MappedRun`.
+        """
         start_ns, frame = 0, None
         for frame in frames:
             if frame.index == 0:
@@ -128,6 +139,8 @@ class OpenDrive:
         return MappedRun(trees, path, frame.index + 1, front_end_ran)
 
     def _from_cache(self, mapper: Mapper, cache: ScanCache) -> Iterator[Frame]:
+        """Yield the frames of all scans, with the cached results of the front end; raises
+        `_DamagedCacheError` if one cannot be read."""
         for index in range(self._scans):
             cached = cache.read(index)
             if cached is None:  # the source still has the scan
@@ -135,6 +148,8 @@ class OpenDrive:
             yield mapper.process(*cached)
 
     def _from_scans(self, mapper: Mapper, cache: ScanCache) -> Iterator[Frame]:
+        """Yield the frames of all scans; the front end runs and its results are cached. The scans stay in
+        memory for the next call if their points have at most `_STEPS_LIMIT` bytes."""
         held: list[Step] | None = []
         size = 0
         for step in self._read_steps():
@@ -149,13 +164,19 @@ class OpenDrive:
         self._steps = held
 
     def _read_steps(self) -> Iterator[Step]:
+        """Return the scans with their motion, from memory or from the source."""
         if self._steps is not None:
             return iter(self._steps)
         return steps(self._source.records(), odometry=self._odometry.steps)
 
 
 class OpenCloud:
-    """A whole cloud of a plot, with the methods of `OpenDrive`. It has no path, so all true trees count."""
+    """A whole cloud of a plot, with the methods of `OpenDrive`. It has no path and no true trees of its own.
+    Because it has no path, all true trees that are given count.
+
+    Raises:
+        StemmapError: The cloud cannot be read.
+    """
 
     own_truth: TruthTrees | None = None
     preset = "forest"
@@ -165,7 +186,12 @@ class OpenCloud:
         self.digest = self.recording_digest = open_cloud(source.uri).description.digest
 
     def map(self, parameters: Parameters) -> MappedRun:
-        """Map the cloud with these parameters, as `stemmap map` does."""
+        """Map the cloud with these parameters, as `stemmap map` does. The file is read at each call.
+        Positions are in the frame of the file; `path` is empty and `scans` is 0.
+
+        Raises:
+            StemmapError: The cloud cannot be read or mapped.
+        """
         from pipeline.inventory import map_plot
 
         cloud = open_cloud(self._uri)
@@ -186,7 +212,7 @@ OpenRun = OpenDrive | OpenCloud
 
 
 def open_run(source: SourceRequest) -> OpenRun:
-    """Open a source.
+    """Open a source. The caller closes it.
 
     Raises:
         StemmapError: It cannot be read.
@@ -199,7 +225,8 @@ class NotHereError(StemmapError):
 
 
 class Scorer:
-    """Scores jobs. The runs of the last jobs stay open.
+    """Scores jobs. The runs of the last jobs stay open; the one that was opened first is closed when there
+    are too many.
 
     Args:
         runs: Number of runs that stay open; each may hold 0.5 GB of points.
@@ -210,7 +237,8 @@ class Scorer:
         self._open: dict[bytes, OpenRun] = {}
 
     def score(self, job: Job) -> JobResult:
-        """Return the result of a job; an exception becomes its `error`."""
+        """Return the result of a job; every exception becomes its `error`. The fault is "version" if the job
+        was made by other code, "worker" if the recording or the forest is missing here, otherwise "job"."""
         if job.code != code_digest():
             other = f"this worker has stemmap {code_digest()}, the job comes from {job.code}"
             return _failed(f"{other}. Install the same version on both", "version")
@@ -233,11 +261,17 @@ class Scorer:
         return JobResult(scores, mapped.scans, len(mapped.trees.number), seconds, mapped.front_end_ran)
 
     def close(self) -> None:
-        """Close the runs."""
+        """Close the runs that are open."""
         while self._open:
             self._open.popitem()[1].close()
 
     def _run(self, requested: RunWithTruth) -> OpenRun:
+        """Return an open run, from memory or newly opened.
+
+        Raises:
+            NotHereError: It cannot be opened on this worker, or is another recording.
+            ParameterError: The request is invalid on every worker.
+        """
         key = msgspec.json.encode([requested.source, requested.digest])
         if key not in self._open:
             if len(self._open) >= self._most:
@@ -251,7 +285,8 @@ _scorer_lock = threading.Lock()
 
 
 def score_json(text: bytes) -> bytes:
-    """Return the result of a job on a worker of a cluster, both as JSON."""
+    """Return the result of a job on a worker of a cluster, both as JSON. One job at a time is computed in
+    this process. Invalid JSON gives a result with the fault "version"."""
     try:
         job = msgspec.json.decode(text, type=Job)
     except msgspec.MsgspecError as error:
@@ -263,7 +298,8 @@ def score_json(text: bytes) -> bytes:
 @contextlib.contextmanager
 def one_compiler_at_a_time() -> Iterator[None]:
     """Inside, a kernel that must be compiled waits until no other worker of this machine compiles. The second
-    worker then finds the compiled kernel."""
+    worker then finds the compiled kernel. The lock is held from the first compilation to the end of the
+    block; Windows has no lock."""
     with contextlib.ExitStack() as stack:
         held: list[IO[bytes]] = []
 
@@ -277,6 +313,8 @@ def one_compiler_at_a_time() -> Iterator[None]:
 
 
 def _lock(file: IO[bytes]) -> None:
+    """Wait for an exclusive lock of an open file, which ends when the file is closed; does nothing on
+    Windows."""
     if sys.platform != "win32":
         import fcntl
 
@@ -284,6 +322,12 @@ def _lock(file: IO[bytes]) -> None:
 
 
 def _opened(requested: RunWithTruth) -> OpenRun:
+    """Open a run and check its digest.
+
+    Raises:
+        NotHereError: It cannot be opened here, or is another recording than that of the job.
+        ParameterError: The request is invalid on every worker.
+    """
     with _errors_of_this_worker():
         run = open_run(requested.source)
     if run.digest != requested.digest:
@@ -308,11 +352,16 @@ def _errors_of_this_worker() -> Iterator[None]:
 
 
 def _failed(error: str, fault: Fault = "job") -> JobResult:
+    """Return a result without scores."""
     return JobResult(None, error=error, fault=fault)
 
 
 def main(words: list[str]) -> None:
-    """Receive jobs and send their results until the parent ends; the program of a child process."""
+    """Receive jobs and send their results until the parent ends; the program of a child process.
+
+    Args:
+        words: Arguments of the command line: --low-priority, --runs N.
+    """
     parser = argparse.ArgumentParser()
     parser.add_argument("--low-priority", action="store_true")
     parser.add_argument("--runs", type=int, default=1, help="number of runs that stay open")

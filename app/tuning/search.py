@@ -61,10 +61,10 @@ class SearchRun:
 
 
 def _prepared(plan: Plan, planned: PlannedRun) -> SearchRun:
-    """Open a run and read its true trees.
+    """Open a run, read its true trees, and close it again.
 
     Raises:
-        SourceError: It cannot be read, is another recording than the annotated one, or has no true trees.
+        StemmapError: It cannot be read, is another recording than the annotated one, or has no true trees.
     """
     uri = planned.source.uri
     with closing(open_run(planned.source)) as run:
@@ -116,7 +116,7 @@ def check_start(uri: str, scores: MapScores, match_distance: float) -> None:
         match_distance: Largest distance between a tree and its ground truth [m].
 
     Raises:
-        StemmapError: No true tree is near the path, or the map has none of them.
+        StemmapError: No true tree is near the path, or no tree of the map is near a true tree.
     """
     if not scores.TA.of:
         others = scores.TR.of > 0
@@ -156,7 +156,8 @@ class _Attempt:
 
 
 class Search:
-    """A search whose sets of parameters are scored by workers.
+    """A search whose sets of parameters are scored by workers. The constructor opens every run of the plan
+    and the storage, but starts no job.
 
     Args:
         plan: The search.
@@ -169,7 +170,8 @@ class Search:
         lost: Number of workers that were lost, by reason.
 
     Raises:
-        StemmapError: A run cannot be read, or the storage cannot be used or belongs to another search.
+        StemmapError: A run cannot be read, the search space has no set without contradictions, or the storage
+            cannot be used or belongs to another search.
     """
 
     def __init__(self, plan: Plan, workers: Workers, known: Sequence[Trial] = ()) -> None:
@@ -197,7 +199,7 @@ class Search:
         self._learn()
 
     def close(self) -> None:
-        """Close the storage."""
+        """Close the storage; the workers remain open."""
         self._trials.close()
 
     @property
@@ -215,7 +217,8 @@ class Search:
         return list(self._trials.all)
 
     def best(self) -> Trial | None:
-        """Return the trial with the smallest loss, the earliest of equals; None before the first."""
+        """Return the trial with the smallest loss, the earliest of equals; None before the first scored
+        trial. The start is not included."""
         return best_of(self._trials.all, None)
 
     def advance(self, wait_s: float = 0.2) -> list[Trial]:
@@ -223,13 +226,16 @@ class Search:
         scored first.
 
         Args:
-            wait_s: Longest wait [s].
+            wait_s: Longest wait [s]. The call returns earlier with the first result, and at once if no job is
+                in progress.
 
         Returns:
-            The trials that were completed here.
+            The trials that were completed in this call, with those that need no mapping (repeated or
+                contradicting values).
 
         Raises:
-            StemmapError: A run cannot be mapped or scored, or the trials cannot be stored.
+            StemmapError: A run cannot be mapped or scored, one set lost `MOST_LOSSES` workers, or the trials
+                cannot be stored.
         """
         self._completed = []
         for worker in self._workers.free():
@@ -263,7 +269,8 @@ class Search:
         return None
 
     def _suggested(self) -> _Attempt | None:
-        """Return the next set; None for one that needs no scoring, which is a trial at once."""
+        """Return the next set to score. None for a set that needs no scoring: one whose values equal an
+        earlier trial, or contradict one another. Such a set is stored as a trial at once."""
         values = self._suggestion()
         known = next((trial for trial in self._trials.all if trial.values == values), None)
         if known is not None:
@@ -277,8 +284,8 @@ class Search:
         return _Attempt(values, parameters.model_dump(), deque(self._training))
 
     def _suggestion(self) -> dict[str, Value]:
-        """Return the values to try next: those of the start, if they are within the bounds, then those that
-        Optuna suggests."""
+        """Return the values to try next: as the first of all (only on the first machine) those of the start,
+        if they are within the bounds; then those that Optuna suggests."""
         from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 
@@ -294,6 +301,12 @@ class Search:
         return values_of(axes, trial.params)
 
     def _receive(self, event: Done | Lost) -> None:
+        """Store the score of a run of a set, or queue the run again after a lost worker.
+
+        Raises:
+            StemmapError: The job failed, the start cannot be scored (see `check_start`), or one set lost
+                `MOST_LOSSES` workers.
+        """
         attempt, run = self._doing.pop(event.worker)
         if isinstance(event, Lost):
             self.lost[event.reason] += 1
@@ -311,7 +324,8 @@ class Search:
         self._finish(attempt)
 
     def _finish(self, attempt: _Attempt) -> None:
-        """Complete a set whose runs are all scored. Held-out runs are scored if it is the best so far."""
+        """Complete a set if all its runs are scored; otherwise do nothing. If it is the best so far and has
+        held-out runs without scores, these are queued first. The first set becomes `start`."""
         if attempt.waiting or any(other is attempt for other, _ in self._doing.values()):
             return
         training, held_out = attempt.scores_of(self._training), attempt.scores_of(self._held_out)
@@ -329,6 +343,7 @@ class Search:
         self._attempts.remove(attempt)
 
     def _complete(self, trial: Trial) -> None:
+        """Store a trial, unless the search has all its trials, and let Optuna learn from it."""
         added = self._trials.add(trial, self.plan.trials)
         if added is not None:
             self._completed.append(added)
@@ -348,13 +363,15 @@ class Search:
         self._learned = len(self._trials.all)
 
     def _start_values(self) -> dict[str, Value]:
+        """Return the values of the searched parameters at the start, by name."""
         flat = self._parameters.flat()
         return {axis.name: flat[axis.name] for axis in self.plan.axes}
 
 
 def importances(study: Any) -> dict[str, float]:  # noqa: ANN401 - Optuna has no types
     """Return the share of the variance of the loss that each parameter explains (fANOVA, Hutter et al. 2014),
-    the largest first. Empty if there are too few trials or all have the same loss.
+    by name, the largest first. Shares that are not finite are omitted. Empty if there are too few trials or
+    all have the same loss.
 
     Args:
         study: Study of Optuna.
@@ -369,7 +386,12 @@ def importances(study: Any) -> dict[str, float]:  # noqa: ANN401 - Optuna has no
 
 
 def search_processes(plan: Plan, number: int = 1) -> Processes:
-    """Return processes that score the sets of a search; each keeps all runs open."""
+    """Return processes that score the sets of a search; each keeps all runs open. The caller closes them.
+
+    Args:
+        plan: The search.
+        number: Number of processes.
+    """
     return Processes(number, python_module(SCORING, "--runs", str(len(plan.runs))))
 
 
@@ -377,8 +399,9 @@ _MESSAGE_INTERVAL_S = 0.25
 
 
 def search_for_page(parent: ParentConnection) -> None:
-    """Receive a `SearchStart`, search until a further message arrives, and send `SearchMessage`s; the program
-    of the child process of the page."""
+    """Receive a `SearchStart`, search until a further message arrives, all trials are made or the time is
+    over, and send `SearchMessage`s; the program of the child process of the page. Errors are sent as the last
+    message, not raised."""
     begin = parent.receive(SearchStart)
     try:
         with (
@@ -393,6 +416,9 @@ def search_for_page(parent: ParentConnection) -> None:
 
 
 def _search_for_page(search: Search, begin: SearchStart, parent: ParentConnection) -> None:
+    """Advance a search and send its progress, at most every 0.25 s, and its result. If a message arrives
+    before the start is scored, an empty `SearchMessage` is sent and there is no result. The time limit counts
+    from the scored start on."""
     while search.start is None:
         if parent.has_message:
             parent.send(SearchMessage())

@@ -52,27 +52,30 @@ def question_of(
     name: str,
     values: list[Value],
 ) -> Question:
-    """Return the sensitivity curve of the open run that is to be computed.
+    """Return the sensitivity curve of the open run that is to be computed. The name and the number of values
+    are checked by `Sensitivity.ask`.
 
     Args:
         source, digest: The open run; the digest is empty if none is open.
-        truth: True trees, with the annotations.
+        truth: True trees, with the annotations; None where none are known.
         parameters: The parameters in force.
         name: Dotted name of the parameter.
         values: Its values, in the order in which they are computed.
 
     Raises:
-        StemmapError: The run cannot be read again, or has no true trees.
+        StemmapError: No run is open, it is live, or it has no true trees.
     """
     run = RunWithTruth(source.request(), digest, check_run(digest, source.uri, truth))
     return Question(run, parameters, name, tuple(values))
 
 
 class Sensitivity:
-    """Computes the newest sensitivity curve, point by point.
+    """Computes the newest sensitivity curve, point by point. Results of earlier points are reused until
+    `leave`.
 
     Args:
-        tell: Called with the points so far after each point, and with {} when the curve is removed.
+        tell: Called with the curve and its points so far after each point (see `_state_of`), and with {} when
+            the curve is removed.
         command: Program and arguments of the child process.
         idle_s: Time without a new curve after which the process ends [s].
     """
@@ -91,11 +94,11 @@ class Sensitivity:
         self._known: dict[str, JobResult] = {}
 
     def ask(self, question: Question) -> None:
-        """Start a curve in place of the one before, whose present point is still completed, because its cache
-        serves both.
+        """Start a curve, and send it without points. It replaces the one before, whose current point is still
+        completed, because its cache serves both. The caller needs a running event loop.
 
         Raises:
-            ParameterError: There is no such parameter, or there are too many values.
+            ParameterError: There is no such parameter, or there are no or more than `MOST_VALUES` values.
         """
         spec_of(question.name)
         if not 1 <= len(question.values) <= MOST_VALUES:
@@ -108,7 +111,8 @@ class Sensitivity:
             self._task = asyncio.create_task(self._work(self._scorer), name="sensitivity")
 
     async def leave(self) -> None:
-        """Cancel the curve and end the process, because the run or the curve is closed."""
+        """Cancel the curve, wait until the process has ended, forget all results and send {}, because the run
+        or the curve is closed. Without a curve only {} is sent."""
         scorer, task = self._scorer, self._task
         self._question = self._scorer = self._task = None
         self._changed.set()
@@ -119,7 +123,7 @@ class Sensitivity:
         self._tell({})
 
     async def _work(self, scorer: _ScoringProcess) -> None:
-        """Compute curves until none was requested for `idle_s`."""
+        """Compute curves until none was requested for `idle_s` or `leave` was called; then end the process."""
         while self._scorer is scorer and (question := self._question) is not None:
             self._changed.clear()
             await self._compute(question, scorer)
@@ -131,7 +135,8 @@ class Sensitivity:
         await scorer.end()
 
     async def _compute(self, question: Question, scorer: _ScoringProcess) -> None:
-        """Compute the points of a curve until it is complete or replaced."""
+        """Compute the points of a curve until it is complete or replaced, and send it after each point. A
+        StemmapError is sent with the curve and ends it; it is not raised."""
         points: list[dict[str, Any]] = []
         error = ""
         try:
@@ -150,6 +155,12 @@ class Sensitivity:
     async def _point(
         self, question: Question, value: Value, code: str, scorer: _ScoringProcess
     ) -> dict[str, Any]:
+        """Return a point for the page: the value with its scores, or with an error if the value contradicts
+        other parameters or the job failed; {} after `leave`.
+
+        Raises:
+            StemmapError: The recording is missing, or the process has other code or ended twice.
+        """
         try:
             parameters = question.parameters.replace({question.name: value})
         except ParameterError as error:  # it contradicts another one
@@ -199,7 +210,7 @@ class _ScoringProcess:
         raise StemmapError("the process that maps the run ended twice", remedy="The terminal may show why")
 
     async def end(self) -> None:
-        """End the process. A call of `score` in progress returns None."""
+        """End the process, if it runs. A call of `score` in progress returns None, as do later calls."""
         self._is_ended = True
         if self._process is not None:
             await self._process.end()
@@ -223,7 +234,7 @@ def _state_of(question: Question, points: list[dict[str, Any]], error: str = "")
 
 
 async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
-    """Return the result of a job; None if the process ends or sends something else."""
+    """Return the result of a job; None if the process ends or sends something else. There is no time limit."""
     await process.send(job)
     try:
         return await process.receive(JobResult)
@@ -232,7 +243,8 @@ async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
 
 
 def _figures(answer: JobResult) -> dict[str, Any]:
-    """Return the scores of a point for the page, with units in the names."""
+    """Return the scores of a point for the page, with units in the names; only "error" if the job failed or
+    no ground truth is near the path."""
     s = answer.scores
     if s is None or answer.problem:
         return {"error": answer.problem}

@@ -43,12 +43,13 @@ def is_server(storage: str) -> bool:
 
 
 def open_trials(storage: str, identity: dict[str, Any], known: Sequence[Trial] = ()) -> Trials:
-    """Open the trials of a search.
+    """Open the trials of a search: `SharedTrials`, `Journal` or `Trials`. A journal that does not exist is
+    created.
 
     Args:
         storage: Path of a journal, address of a database, or "" for the memory.
         identity: All that decides the result of a trial, see `app.tuning.plan.identity`.
-        known: Earlier trials, for the memory.
+        known: Earlier trials, for the memory; ignored by the other storages, which read their own.
 
     Raises:
         StemmapError: The storage cannot be written, is damaged, or belongs to another search.
@@ -75,13 +76,13 @@ class Trials:
         self.all = list(known)
 
     def refresh(self) -> None:
-        """Read the trials that other machines have added."""
+        """Read the trials that other machines have added; only `SharedTrials` does anything."""
 
     def add(self, trial: Trial, most: int) -> Trial | None:
-        """Store a trial under the next number, and return it with its number.
+        """Store a trial under the next number, append it to `all`, and return it with its number.
 
         Args:
-            trial: The trial.
+            trial: The trial; its number is ignored.
             most: Number of trials of the search; where there are so many, nothing is stored and None is
                 returned.
 
@@ -94,7 +95,7 @@ class Trials:
         return self.all[-1]
 
     def close(self) -> None:
-        """Close the file or the connection."""
+        """Close the file or the connection, if there is one."""
 
 
 class Journal(Trials):
@@ -121,7 +122,7 @@ class Journal(Trials):
             raise
 
     def add(self, trial: Trial, most: int) -> Trial | None:
-        """Store a trial, see `Trials.add`. On a full disk nothing is written."""
+        """Store a trial, see `Trials.add`. On a full disk nothing is written and StemmapError is raised."""
         added = super().add(trial, most)
         if added is not None:
             self._append(added)
@@ -132,6 +133,16 @@ class Journal(Trials):
         self._file.close()
 
     def _read(self, header: dict[str, Any]) -> None:
+        """Lock the file, read its trials into `all`, and remove an incomplete last line. The header is
+        written into an empty file.
+
+        Args:
+            header: The first line that the file must have, with the identity of the search.
+
+        Raises:
+            StemmapError: Another process holds the lock, the file is larger than 1 GB or cannot be read, is
+                not a journal, belongs to another search, or a line is invalid or missing.
+        """
         try:
             hold(self._file)
             if self._file.seek(0, os.SEEK_END) > _LARGEST:
@@ -165,6 +176,12 @@ class Journal(Trials):
             self._append(header)
 
     def _check_header(self, line: bytes, expected: dict[str, Any]) -> None:
+        """Compare the first line of the file with the expected header.
+
+        Raises:
+            StemmapError: The line is not a header, or belongs to another search; the message names what
+                differs.
+        """
         try:
             theirs = msgspec.json.decode(line, type=dict[str, dict[str, Any]])["search"]
         except (msgspec.MsgspecError, UnicodeDecodeError, KeyError):
@@ -179,6 +196,8 @@ class Journal(Trials):
             )
 
     def _append(self, record: object) -> None:
+        """Append a record as one line of JSON. After a disk error the file has its earlier length, and
+        StemmapError is raised."""
         begin, rest = self._file.seek(0, os.SEEK_END), memoryview(_line(record))
         try:
             while rest:  # a full disk may accept a part
@@ -208,10 +227,15 @@ _TABLES = (
 
 
 class SharedTrials(Trials):
-    """Trials in a table of a PostgreSQL database. Every machine reads the trials of the others.
+    """Trials in a table of a PostgreSQL database. Every machine reads the trials of the others. The schema
+    and the table are created if they do not exist.
+
+    Args:
+        address: Address of the database, postgresql://user:password@host/name.
+        identity: All that decides the result of a trial; only trials under the same identity are read.
 
     Raises:
-        StemmapError: The database cannot be used.
+        StemmapError: The address is invalid, the driver is not installed, or the database cannot be used.
     """
 
     def __init__(self, address: str, identity: dict[str, Any]) -> None:
@@ -263,7 +287,8 @@ class SharedTrials(Trials):
             raise self._refused(error) from None
 
     def add(self, trial: Trial, most: int) -> Trial | None:
-        """Store a trial, see `Trials.add`. It is atomic among the processes that share the database."""
+        """Store a trial, see `Trials.add`. It is atomic among the processes that share the database; trials
+        that others have added are read first and count against `most`."""
         from sqlalchemy import text
         from sqlalchemy.exc import SQLAlchemyError
 
@@ -286,7 +311,8 @@ class SharedTrials(Trials):
 
     @contextmanager
     def _locked(self) -> Iterator[Connection]:
-        """Begin a transaction during which no other machine changes the table."""
+        """Begin a transaction during which no other machine changes the table. It is committed at the end,
+        and rolled back after an exception."""
         from sqlalchemy import text
 
         with self._engine.begin() as connection:
@@ -294,6 +320,7 @@ class SharedTrials(Trials):
             yield connection
 
     def _read(self, connection: Connection) -> None:
+        """Append the trials of this search to `all` that it does not have yet."""
         from sqlalchemy import text
 
         select = text(
@@ -304,5 +331,7 @@ class SharedTrials(Trials):
         self.all += [msgspec.json.decode(row, type=Trial) for row in rows]
 
     def _refused(self, error: Exception) -> StemmapError:
+        """Return the error for people, with at most 200 characters of the reason and without the password of
+        the address."""
         reason = " ".join(str(getattr(error, "orig", None) or error).split())[:200]
         return StemmapError(f"the database cannot be used: {reason}", where=self._where)

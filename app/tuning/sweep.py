@@ -66,14 +66,14 @@ class SweepPlan:
 
 
 def prepare_run(source: SourceRequest, truth: TruthTrees | None) -> PreparedRun:
-    """Open a run and read its true trees.
+    """Open a run, read its true trees and close it. A path in the result is absolute.
 
     Args:
         source: The run; the URI may be a folder that `stemmap map` wrote, which names its source.
-        truth: True trees that replace the source's own.
+        truth: True trees that replace the source's own; None for these.
 
     Raises:
-        StemmapError: It cannot be read, or has no true trees.
+        StemmapError: It cannot be read, has no true trees, or the folder's map was made of several sources.
     """
     name, source = source.uri, _source_of(source)
     with closing(open_run(source)) as run:
@@ -89,14 +89,15 @@ def plan_jobs(
     sets: Sequence[dict[str, Value]],
     base: Callable[[PreparedRun, dict[str, Value]], Parameters],
 ) -> SweepPlan:
-    """Return the jobs of all sets and runs.
+    """Return the jobs of all sets and runs. Combinations that contradict themselves are left out, with the
+    reason.
 
     Args:
         runs, sets: What is combined.
-        base: Returns the parameters that a combination changes, for a run.
+        base: Returns the parameters that a combination changes, for a run; may raise ParameterError.
 
     Raises:
-        ParameterError: Every set contradicts itself.
+        ParameterError: Every set contradicts itself for every run.
     """
     jobs: dict[tuple[int, int], Job] = {}
     left_out: dict[tuple[int, int], str] = {}
@@ -136,7 +137,8 @@ def _source_of(source: SourceRequest) -> SourceRequest:
 
 
 def _absolute(uri: str) -> str:
-    """Return a path as an absolute path, because workers run in other folders; other URIs unchanged."""
+    """Return an existing path as an absolute path, because workers run in other folders; other URIs
+    unchanged."""
     try:
         path = Path(uri).expanduser()
         return str(path.absolute()) if path.exists() else uri
@@ -161,7 +163,8 @@ class ResultStore:
         self.refusal = ""
 
     def get(self, key: str) -> JobResult | None:
-        """Return the result of the job with this key, None if it is not stored."""
+        """Return the result of the job with this key; None if it is not stored, is larger than 1 MB or cannot
+        be read. A file that cannot be used counts in `damaged`."""
         file = self._file(key)
         if file is None:
             return None
@@ -178,8 +181,9 @@ class ResultStore:
         return None
 
     def put(self, key: str, answer: JobResult) -> None:
-        """Store a result that has scores. Failures are not stored, because they may not happen again. After a
-        disk error nothing is written any more."""
+        """Store a result that has scores, in place of an earlier one. Failures are not stored, because they
+        may not happen again. After a disk error nothing is written any more, and `refusal` has the reason;
+        nothing is raised."""
         file = self._file(key)
         if file is None or answer.scores is None or self.refusal:
             return
@@ -192,6 +196,7 @@ class ResultStore:
             self.refusal = f"results are not stored for later: {why}"
 
     def _file(self, key: str) -> Path | None:
+        """Return the file of a key; None if nothing is stored."""
         return None if self._folder is None else self._folder / key[:2] / f"{key}.json"
 
 
@@ -219,19 +224,26 @@ def sweep(
     progress: Callable[[int], object] = lambda _jobs: None,
     nobody_s: float = NOBODY_S,
 ) -> SweepResult:
-    """Compute all jobs, or read their stored results.
+    """Compute all jobs, or read their stored results. Equal jobs are computed once. A job that fails has an
+    error in its result.
 
     Args:
         jobs: The jobs; the results have the same order.
         workers: Compute the jobs; the caller closes them.
         kept: Stored results; each new result is added at once.
-        progress: Called with the number of jobs that were completed since the last call.
+        progress: Called with the number of jobs that were completed since the last call; first with the
+            number of stored results.
         nobody_s: Time without any worker after which the remaining jobs fail [s].
+
+    Raises:
+        StemmapError: The workers cannot be reached any more.
     """
     return _Sweep(jobs, workers, kept, progress, nobody_s).run()
 
 
 class _Sweep:
+    """The state of one call of `sweep`, with the same arguments."""
+
     def __init__(
         self,
         jobs: Sequence[Job],
@@ -252,6 +264,7 @@ class _Sweep:
         self._outcome = SweepResult([])
 
     def run(self) -> SweepResult:
+        """Compute all jobs; see `sweep`."""
         first = {key: number for number, key in reversed(list(enumerate(self._keys)))}
         for number in sorted(first.values()):  # equal jobs are computed once
             job = self._jobs[number]
@@ -278,6 +291,7 @@ class _Sweep:
         return self._outcome
 
     def _hand_out(self) -> None:
+        """Give a waiting job to each free worker that is suitable for one."""
         for worker in self._workers.free():
             group = self._best_group(worker)
             if group is None:
@@ -302,6 +316,8 @@ class _Sweep:
         return max(fit, key=lambda g: (g not in others, len(self._waiting[g])), default=None)
 
     def _hear(self, event: Done | Lost) -> None:
+        """Process an event: store the result, or queue the job again. An event of a worker without a job is
+        ignored."""
         number = self._doing.pop(event.worker, None)
         if number is None:  # it was lost while it had no job; the next job restarts it
             self._groups.pop(event.worker, None)
@@ -317,6 +333,12 @@ class _Sweep:
             self._finish(number, answer)
 
     def _lost(self, number: int, reason: str) -> None:
+        """Count a lost worker; the job is queued again, or fails after `MOST_LOSSES` losses.
+
+        Args:
+            number: Number of the job.
+            reason: Why the worker was lost.
+        """
         self._outcome.lost[reason] += 1
         self._losses[number] += 1
         if self._losses[number] >= MOST_LOSSES:
@@ -350,20 +372,24 @@ class _Sweep:
             self._again(number)
 
     def _again(self, number: int) -> None:
+        """Queue a job as the next one of its group."""
         self._waiting.setdefault(_group(self._jobs[number]), deque()).appendleft(number)
 
     def _give_up(self) -> None:
+        """Let all waiting jobs fail, because there was no worker."""
         gone = JobResult(None, error=f"no worker was available for {self._nobody_s:.0f} s", fault="worker")
         for number in [n for jobs in self._waiting.values() for n in jobs]:
             self._finish(number, gone)
         self._waiting.clear()
 
     def _finish(self, number: int, answer: JobResult) -> None:
+        """Record the result of a job, store it, and report progress."""
         self._answers[number] = answer
         self._kept.put(self._keys[number], answer)
         self._progress(1)
 
     def _storage_warnings(self) -> list[str]:
+        """Return warnings on stored results that could not be read or written."""
         warnings = []
         if self._kept.damaged:
             warnings.append(f"{count(self._kept.damaged, 'stored result')} could not be read; computed again")

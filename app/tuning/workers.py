@@ -48,7 +48,7 @@ class Workers(Protocol):
         """Return the names of the workers without a job."""
 
     def give(self, worker: str, job: Job) -> None:
-        """Start a job on a free worker."""
+        """Start a job on a worker, which must be free."""
 
     def events(self, timeout_s: float, /) -> list[Event]:
         """Return results and losses since the last call; wait at most `timeout_s` for the first."""
@@ -61,8 +61,8 @@ class Processes:
     """Processes on this machine. Each starts with its first job and restarts after a loss.
 
     Args:
-        count: Number of processes.
-        command: The program of a process.
+        count: Number of processes, at least 1.
+        command: The program of a process; empty for `app.tuning.scoring`.
     """
 
     def __init__(self, count: int, command: Sequence[str] = ()) -> None:
@@ -78,7 +78,8 @@ class Processes:
         return [name for name in self._names if name not in busy]
 
     def give(self, worker: str, job: Job) -> None:
-        """Start a job on a process; start the process if necessary."""
+        """Start a job on a process; start the process if it does not run. An error of the job or the process
+        becomes an event."""
         child = self._children.get(worker)
         if child is None or child.returncode is not None:
             if child is not None:
@@ -87,7 +88,8 @@ class Processes:
         self._jobs[self._pool.submit(_ask, child, job)] = worker
 
     def events(self, timeout_s: float) -> list[Event]:
-        """Return results and losses since the last call; wait at most `timeout_s` for the first."""
+        """Return results and losses since the last call; wait at most `timeout_s` for the first. Without jobs
+        it waits the whole time."""
         if not self._jobs:
             time.sleep(timeout_s)
             return []
@@ -107,7 +109,8 @@ class Processes:
 
 
 def _ask(child: BlockingChildProcess, job: Job) -> JobResult | str:
-    """Return the result of a job, or the reason why the process was lost."""
+    """Return the result of a job, or the reason why the process was lost, as text. In the second case the
+    process is ended."""
     try:
         child.send(job)
         answer = child.receive(JobResult)
@@ -163,7 +166,11 @@ class DaskWorkers:
         self._doing: dict[str, Any] = {}
 
     def free(self) -> list[str]:
-        """Return the workers without a job of this comparison."""
+        """Return the names of the workers of the cluster without a job of this comparison, sorted.
+
+        Raises:
+            StemmapError: The scheduler has ended.
+        """
         return sorted(self._present() - set(self._doing))
 
     def give(self, worker: str, job: Job) -> None:
@@ -179,7 +186,11 @@ class DaskWorkers:
         )
 
     def events(self, timeout_s: float) -> list[Event]:
-        """Return results and losses since the last call; wait at most `timeout_s` for the first."""
+        """Return results and losses since the last call; wait at most `timeout_s` for the first.
+
+        Raises:
+            StemmapError: The scheduler has ended.
+        """
         until = time.monotonic() + timeout_s
         while True:
             events = self._events()
@@ -196,6 +207,8 @@ class DaskWorkers:
         self._client.close()
 
     def _present(self) -> set[str]:
+        """Return the names of the workers that are connected to the scheduler; raises StemmapError if it has
+        ended."""
         try:
             return set(self._client.scheduler_info(n_workers=-1)["workers"])
         except (OSError, ValueError) as error:
@@ -204,7 +217,7 @@ class DaskWorkers:
             ) from None
 
     def _wait(self, seconds: float) -> None:
-        """Wait until a job is done, at most this time."""
+        """Wait until a job is done, at most `seconds`; without jobs the whole time."""
         from distributed import TimeoutError as TooLong
         from distributed import wait
 
@@ -215,6 +228,12 @@ class DaskWorkers:
             wait(list(self._doing.values()), timeout=seconds, return_when="FIRST_COMPLETED")
 
     def _events(self) -> list[Event]:
+        """Return the events of all jobs that have ended, without waiting, and forget these jobs. A job whose
+        worker left the cluster is cancelled and reported as lost.
+
+        Raises:
+            StemmapError: The scheduler has ended.
+        """
         if self._client.status not in ("running", "connecting"):
             raise StemmapError("the Dask scheduler has ended", remedy="Start it again, then this command")
         present, events = self._present(), []
@@ -235,7 +254,7 @@ class DaskWorkers:
 
 
 def answered(worker: str, text: bytes) -> Event:
-    """Return the event of a worker of a cluster that sent a result as JSON."""
+    """Return the event of a worker of a cluster that sent a result as JSON; `Lost` if the JSON is invalid."""
     try:
         return Done(worker, msgspec.json.decode(text, type=JobResult))
     except msgspec.MsgspecError:
@@ -243,6 +262,8 @@ def answered(worker: str, text: bytes) -> Event:
 
 
 def _why(future: Any) -> str:  # noqa: ANN401 - a future of the library
+    """Return the reason why a Dask job ended without a result: its status, or the exception, of at most 300
+    characters."""
     if future.status != "error":
         return str(future.status)
     error = future.exception()
