@@ -58,7 +58,7 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
         cluster: Row of the cluster in the frame.
 
     Raises:
-        StemmapError: No run is open, or the scan has no such cluster.
+        StemmapError: `run` is None, or the scan has no such cluster.
     """
     if run is None or not 0 <= cluster < len(frame.clusters.size):
         raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
@@ -101,7 +101,7 @@ def tree_story(run: Run | None, number: int) -> TreeStory:
         number: Number of the tree.
 
     Raises:
-        StemmapError: The run has no such tree at this time.
+        StemmapError: No run is open, no scan was mapped, or there is no such tree at this time.
     """
     frame = run.frame if run else None
     rows = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
@@ -208,7 +208,8 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sen
 
 
 def _decided_by(share: Float, tree_share: float) -> tuple[Verdict, ...]:
-    """Return the verdicts that the votes give without a rule.
+    """Return the only verdict that the votes give without a rule, as a tuple. If trees have most votes but
+    not their required share, it is OTHER.
 
     Args:
         share: Share of votes by class, in the order of CLASSES.
@@ -221,6 +222,13 @@ def _decided_by(share: Float, tree_share: float) -> tuple[Verdict, ...]:
 
 
 def _nearest_tree(frame: Frame, place: Float, reach: float) -> tuple[int | None, float]:
+    """Return number and distance [m] of the nearest confirmed tree; None and NaN if none is within `reach`.
+
+    Args:
+        frame: Results of the scan.
+        place: x, y in the map [m].
+        reach: Maximum distance [m].
+    """
     trees = frame.trees
     rows = np.flatnonzero(trees.confirmed)
     if not len(rows):
@@ -233,8 +241,8 @@ def _nearest_tree(frame: Frame, place: Float, reach: float) -> tuple[int | None,
 
 
 def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
-    """Return the row of the cluster nearest to a place, preferring clusters with the verdict tree; None if
-    none is near.
+    """Return the row of the cluster nearest to a place; None if none is near. A cluster that is not a
+    detected tree is returned only if no detected one is within `reach`.
 
     Args:
         frame: Results of the scan.
@@ -250,13 +258,25 @@ def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
 
 
 def _to_picture(centre: Float) -> Float:
-    """Return the rotation of level sensor coordinates after which up points away from the sensor, (2, 2)."""
+    """Return the rotation of level sensor coordinates after which up points away from the sensor, shape (2,
+    2).
+
+    Args:
+        centre: x, y of the cluster from the sensor [m].
+    """
     reach = max(float(np.hypot(*centre)), 1e-9)
     ux, uy = centre / reach
     return np.array([[uy, -ux], [ux, uy]])
 
 
 def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
+    """Return a fitted stem as it is drawn.
+
+    Args:
+        fit: The fit in level sensor coordinates.
+        covariance: Covariance of the centre in the same frame, shape (2, 2) [m^2].
+        to_picture: Rotation to the picture, shape (2, 2).
+    """
     turn = float(np.arctan2(to_picture[1, 0], to_picture[0, 0]))
     lean = to_picture @ fit.lean
     major, minor, angle = half_axes((to_picture @ covariance @ to_picture.T)[None])[0].tolist()
@@ -274,6 +294,13 @@ def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
 
 
 def _axes(points: Float, to_picture: Float) -> list[tuple[float, float]]:
+    """Return one standard deviation along the major and the minor principal axis of points, as (right, up) in
+    the picture [m]; [] without points.
+
+    Args:
+        points: x, y in level sensor coordinates, shape (N, 2) [m].
+        to_picture: Rotation to the picture, shape (2, 2).
+    """
     if not len(points):  # an external stem
         return []
     spread = points - points.mean(axis=0)

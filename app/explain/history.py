@@ -37,7 +37,8 @@ class TreeHistory:
         return self._count
 
     def record(self, frame: Frame, start_ns: int) -> None:
-        """Add a scan. The rows of this scan and of later ones are replaced, because the run went back.
+        """Add a row for each tree that the scan detected. Rows of this scan and of later ones are removed
+        first, because the run went back.
 
         Args:
             frame: Result of the scan.
@@ -51,7 +52,7 @@ class TreeHistory:
 
     def of(self, number: int) -> History:
         """Return the estimates of the tree with this number: at most 200 rows, the first and the last among
-        them."""
+        them; empty columns for an unknown tree."""
         known = self._rows[: self._count]
         mine = known[known[:, _NUMBER] == number]
         if len(mine) > _MOST_RETURNED:  # denser for the first observations, where the ellipse changes fastest
@@ -70,6 +71,8 @@ class TreeHistory:
         )
 
     def _append(self, rows: NDArray[np.float64]) -> None:
+        """Append rows, shape (R, _WIDTH). Above 200,000 rows the later estimates of every second scan are
+        dropped, repeatedly."""
         while self._count + len(rows) > len(self._rows):
             grown = np.empty((2 * len(self._rows), _WIDTH))
             grown[: self._count] = self._rows[: self._count]
@@ -115,14 +118,14 @@ def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:
 
 
 class RecentScans:
-    """The scans that were sent to the browsers last, without their raw points. Thread-safe."""
+    """The 60 scans that were sent to the browsers last, without their raw points. Thread-safe."""
 
     def __init__(self) -> None:
         self._frames: OrderedDict[tuple[int, int], Frame] = OrderedDict()
         self._lock = threading.Lock()
 
     def keep(self, run: int, frame: Frame) -> None:
-        """Store a scan that is being sent to the browsers.
+        """Store a scan that is being sent to the browsers, in place of an earlier result of the same scan.
 
         Args:
             run: Number of the run.

@@ -66,7 +66,11 @@ class Frames:
         return self._how.get(name, f"its frame is not known yet{why}")
 
     async def try_one(self, maps: dict[str, tuple[str, Map]]) -> bool:
-        """Try to align one more map; return whether an alignment was computed.
+        """Try to align one more map; return whether an alignment was computed, successful or not. Maps that
+        need no computation (the first with enough trees, the same recording) get their pose in passing.
+
+        A map is tried only with at least LEAST_TREES trees, and after a failure again with MORE_TREES more.
+        Poses of runs that are not in `maps` any more are removed.
 
         Args:
             maps: By name: digest of the run, and the map with a list of trees as on the page.
@@ -94,6 +98,7 @@ class Frames:
         return False
 
     def _set(self, name: str, digest: str, pose: Pose2 | None, how: str) -> None:
+        """Store how the pose of a map was found, and the pose unless it is None."""
         self._of[name], self._how[name] = digest, how
         if pose is not None:
             self._pose[name] = pose
@@ -116,7 +121,8 @@ MOST_POINTS = 400
 
 
 def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
-    """Return state and key figures of a robot as JSON values.
+    """Return state and key figures of a robot as JSON values; without an open run, of the source that the
+    dashboard will open.
 
     Args:
         name: Name of the robot on the page.
@@ -145,7 +151,7 @@ def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
 
 def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
     """Return trees, path and pose of the robot of a dashboard in the frame of its map, as JSON values; None
-    before the first scan."""
+    before the first scan. The path has at most about 400 points, the newest among them."""
     shown = dashboard.shown
     if shown is None:
         return None
@@ -160,8 +166,8 @@ def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
 
 
 def drawn(own: dict[str, Any], pose: Pose2 | None, how: str) -> dict[str, Any]:
-    """Return a map as the page draws it: [x, y, DBH in cm or None] of each tree, and the pose of its frame in
-    the common one.
+    """Return a map as the page draws it: [x, y, DBH in cm or None] of each tree, path, pose of the robot, the
+    pose [x, y, yaw] of its frame in the common one or None, and how that was found.
 
     Args:
         own: Result of `shown_map`.
@@ -212,7 +218,7 @@ class Member:
 
     @property
     def ended(self) -> bool:
-        """Whether the server ended without a call of `close`, which is a fault."""
+        """Whether the server has ended; without a call of `close` this is a fault."""
         return self._task is not None and self._task.done()
 
     @property
@@ -221,7 +227,8 @@ class Member:
         return self.started and not self.ended
 
     async def close(self) -> None:
-        """End the server and the worker."""
+        """End the server and the worker, wait for them, and close the socket. Errors of the server are
+        ignored."""
         self._server.should_exit = True
         if self._task is not None:
             with contextlib.suppress(Exception):
@@ -239,7 +246,8 @@ class _Server(uvicorn.Server):
 
 
 def next_port(settings: Settings, after: int) -> socket.socket:
-    """Return a listening socket on the first free port after port `after`.
+    """Return a listening socket on the first free port after port `after`; at most PORTS_TRIED ports are
+    tried.
 
     Raises:
         StemmapError: No port is free.
@@ -299,8 +307,9 @@ class Fleet:
         self._aligning: asyncio.Task[None] | None = None
 
     def add(self, name: str, source: Open) -> bool:
-        """Add a robot and start its dashboard; return False if there is no room for it, which the page
-        reports.
+        """Add a robot and start its dashboard (or let it start after `warm`). Return whether the robot is in
+        the fleet: True also if it was there before; False with more than MOST_ROBOTS or without a free port,
+        which `notice` then reports.
 
         Args:
             name: Name of the robot on the page.
@@ -335,18 +344,19 @@ class Fleet:
         return True
 
     def start(self) -> None:
-        """Start to send states and maps to the pages."""
+        """Start to send states and maps to the pages, and await `warm`. Needs a running event loop."""
         self._task = asyncio.create_task(self._send_states(), name="fleet")
         if self._warm is not None:
             self._warming = asyncio.create_task(self._begin_when_warm(self._warm()), name="warm")
 
     async def close(self) -> None:
-        """Close all dashboards at the same time."""
+        """Stop sending, and close all dashboards at the same time."""
         for task in (self._warming, self._task, self._aligning):
             await cancel(task)
         await asyncio.gather(*(member.close() for member in self.members.values()))
 
     async def _begin_when_warm(self, warming: Awaitable[None]) -> None:
+        """Await the compilation and start all dashboards; an error of the compilation is only logged."""
         try:
             await warming
         except StemmapError:  # the workers compile then
@@ -356,6 +366,8 @@ class Fleet:
             member.start()
 
     async def _send_states(self) -> None:
+        """Send states every 0.5 s, maps every 1 s, and align a map every 5 s, until the task is cancelled.
+        Errors are only logged."""
         rounds = 0
         while True:
             try:
@@ -370,13 +382,14 @@ class Fleet:
             await asyncio.sleep(_CARDS_S)
 
     async def _align(self) -> None:
+        """Try to align one map; errors are only logged."""
         try:
             await self._frames.try_one(self._maps())
         except Exception:  # the other maps are still to be aligned
             _log.exception("a map could not be aligned with the common one")
 
     def send_cards(self) -> None:
-        """Send the states of the robots to the pages."""
+        """Send the states of all robots and the notice to the pages, as the message "fleet"."""
         cards = [card(name, m.dashboard) | {"answers": m.answers} for name, m in self.members.items()]
         for shown, member in zip(cards, self.members.values(), strict=True):
             if not self._is_warm:
@@ -387,7 +400,7 @@ class Fleet:
         self.live.publish("fleet", {"members": cards, "notice": self.notice})
 
     def send_maps(self) -> None:
-        """Send the maps to the pages."""
+        """Send the maps that exist to the pages, as the message "maps"."""
         maps = {
             name: drawn(own, self._frames.pose(name), self._frames.how(name))
             for name, (_, own) in self._maps().items()
@@ -395,7 +408,8 @@ class Fleet:
         self.live.publish("maps", {"maps": maps})
 
     def _maps(self) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Return digest and map of each robot that has a map, by name."""
+        """Return digest and map of each robot that has a map, by name; a robot that maps by itself has the
+        digest "remote:" and its name."""
         found = {name: (m.dashboard.digest, shown_map(m.dashboard)) for name, m in self.members.items()}
         maps = {name: (digest, own) for name, (digest, own) in found.items() if own is not None}
         return maps | {name: (f"remote:{name}", own) for name, (_, own) in self.remote.items()}

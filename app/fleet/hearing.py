@@ -43,6 +43,9 @@ class RobotReport(msgspec.Struct, frozen=True):
 
     Attributes:
         silence_s: Age of the newest pose [s]; None before the first.
+        rate_hz: Mean rate of the last 20 poses [Hz]; 0 with fewer than two.
+        distance_m: Length of the published path up to the newest pose [m].
+        clearance: Zone and free distances as on the page; None before the first zone.
         unreadable: Number of messages that could not be read.
         map: Trees, path and pose as `app.fleet.fleet.shown_map` returns them.
         alive: Whether its results are announced now.
@@ -58,7 +61,13 @@ class RobotReport(msgspec.Struct, frozen=True):
 
 
 class FleetReport(msgspec.Struct, frozen=True):
-    """Message to the server: the connection in words, and the robots by namespace."""
+    """Message to the server.
+
+    Attributes:
+        problem: What is wrong with the connection, for people; empty for nothing.
+        place: Description of the connection, for people.
+        robots: Reports by namespace.
+    """
 
     problem: str
     place: str
@@ -86,7 +95,7 @@ class Results:
         self._came_s: deque[float] = deque(maxlen=_RATE_OVER)
 
     def take(self, topic: str, payload: bytes, now_s: float) -> None:
-        """Read a message; if it cannot be read, count it in `losses`.
+        """Read a message; if it cannot be read, count it in `losses`. Raises nothing.
 
         Args:
             topic: One of TOPICS.
@@ -100,6 +109,12 @@ class Results:
             self.losses[UNREADABLE] = self.losses.get(UNREADABLE, 0) + 1
 
     def _take(self, topic: str, message: Any, now_s: float) -> None:  # noqa: ANN401
+        """Store the contents of a decoded message. At most MOST_TREES trees are read; a path is thinned to
+        about MOST_POSES points with the newest among them.
+
+        Raises:
+            ValueError: A number is not finite or too large; the previous contents remain.
+        """
         match topic:
             case outputs.ODOMETRY:
                 self._pose = _finite(*_placed(message.pose.pose))
@@ -157,10 +172,10 @@ def _placed(pose: Any) -> tuple[float, float, float]:  # noqa: ANN401
 
 
 def _finite(*values: float) -> list[float]:
-    """Return the values, rounded to millimetres.
+    """Return the values, rounded to three decimals.
 
     Raises:
-        ValueError: A value is not finite, or its magnitude is above 1e7.
+        ValueError: A value is not finite, or its magnitude is 1e7 or more.
     """
     if not all(math.isfinite(value) and abs(value) < 1e7 for value in values):
         raise ValueError("not a place")
@@ -168,7 +183,13 @@ def _finite(*values: float) -> list[float]:
 
 
 def _tree(detection: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return the tree of a vision_msgs/Detection3D as JSON values for the page."""
+    """Return the tree of a vision_msgs/Detection3D as JSON values for the page. The ellipse is a circle with
+    the larger standard deviation; a width outside of 0 to 10 m gives no DBH.
+
+    Raises:
+        ValueError: Position or covariance is not finite.
+        IndexError: The detection has no result.
+    """
     centre, width = detection.bbox.center.position, float(detection.bbox.size.x)
     x, y = _finite(float(centre.x), float(centre.y))
     covariance = np.asarray(detection.results[0].pose.covariance, np.float64)
@@ -202,7 +223,7 @@ class ResultReceiver:
 
     def subscribe_to_new(self) -> None:
         """Subscribe to results that were not announced before. Topics of other types, and robots beyond
-        MOST_ROBOTS, are ignored."""
+        MOST_ROBOTS, are ignored. Nothing happens if the announcements have not changed."""
         if self._version == self._link.version:
             return
         self._version = self._link.version
@@ -219,13 +240,14 @@ class ResultReceiver:
             self._link.subscribe([Channel(number, publisher.topic, publisher.msgtype, "cdr", "", "", 0)])
 
     def take(self, now_s: float) -> None:
-        """Read all messages that arrived; `now_s` is the present time [s] from any origin."""
+        """Read all messages that arrived into the results of their robots; `now_s` is the present time [s]
+        from any origin."""
         while (message := self._inbox.take()) is not None:
             robot, topic = self._topics[message.channel]
             self._robots[robot].take(topic, message.payload, now_s)
 
     def report(self, now_s: float) -> FleetReport:
-        """Return the present state of all robots; `now_s` as in `take`."""
+        """Return the present state of all robots whose results were ever announced; `now_s` as in `take`."""
         alive = {found[0] for p in self._link.publishers() if (found := results_topic(p.topic)) is not None}
         robots = {name: self._report_of(name, name in alive, now_s) for name in self._robots}
         return FleetReport(self._link.problem, self._link.place, robots)
@@ -248,7 +270,8 @@ class ResultReceiver:
 
 
 def results_topic(topic: str) -> tuple[str, str] | None:
-    """Return the namespace of the robot and the name of the result of a topic; None for any other topic."""
+    """Return the namespace of the robot ("" for none) and the name of the result of a topic; None for any
+    other topic."""
     head, _, last = topic.rpartition("/")
     if last not in TOPICS or not head.endswith("/stemmap"):
         return None
@@ -262,6 +285,9 @@ def main(uri: str, ending: threading.Event, parent: ParentConnection) -> None:
         uri: Address of the router.
         ending: Event that is set when the parent closes the connection.
         parent: Connection to the server.
+
+    Raises:
+        SystemExit: The address is not one of Zenoh.
     """
     address = parse_address(uri)
     if not isinstance(address, ZenohAddress):

@@ -72,6 +72,8 @@ class RemoteRobots:
         await cancel(self._task)
 
     async def _keep(self) -> None:
+        """Run the process and restart it after 2 s whenever it ends or fails, until the task is cancelled;
+        `notice` of the fleet has the reason."""
         while True:
             try:
                 await self._receive()
@@ -83,12 +85,19 @@ class RemoteRobots:
             await asyncio.sleep(_RETRY_S)
 
     async def _receive(self) -> None:
+        """Start the process and process its reports until it ends.
+
+        Raises:
+            StemmapError: The process cannot be started, or sends something else.
+        """
         command = (*self._command, self._uri)
         async with await ChildProcess.start(command, line_limit=_LONGEST_LINE) as child:
             while (report := await child.receive(FleetReport)) is not None:
                 self._take(report)
 
     def _take(self, report: FleetReport) -> None:
+        """Merge a report with the known robots and pass them to the fleet. A robot that a restarted process
+        does not know keeps its last map and is not alive."""
         self._fleet.notice = f"Waiting: {report.problem}" if report.problem else ""
         if not report.robots and not report.problem:
             self._fleet.notice = f"Waiting: {report.place}; no robot publishes a map of its own"
@@ -118,7 +127,8 @@ def _aged(robot: RobotReport, reported_s: float, now_s: float) -> RobotReport:
 
 
 def card_of(name: str, uri: str, robot: RobotReport, *, receiving: bool) -> dict[str, Any]:
-    """Return the card of a robot, in the form of `app.fleet.fleet.card`.
+    """Return the card of a robot, in the form of `app.fleet.fleet.card`. The state is "waiting" if there was
+    no pose for more than SILENT_S or `receiving` is False, otherwise "playing".
 
     Args:
         name: Name of the robot.
@@ -155,7 +165,8 @@ WARMING = python_module("app.worker.numba_warmup", "warm_up")
 
 
 async def warm_kernels(command: Sequence[str] = WARMING) -> None:
-    """Compile the kernels of the mapper in a child process, so that the workers find them in the cache.
+    """Compile the kernels of the mapper in a child process, so that the workers find them in the cache. It
+    returns when the process ends, also with an error, or after a time limit.
 
     Args:
         command: Program and arguments of the child process.
@@ -169,7 +180,9 @@ async def warm_kernels(command: Sequence[str] = WARMING) -> None:
 
 
 def named(sources: Sequence[Open]) -> dict[str, Open]:
-    """Return the sources by short names: for a file its stem, with a number appended if two are equal."""
+    """Return the sources by short names: for a file its stem, for a simulated run or an address with options
+    the whole address, with " (2)" and so on appended if two are equal. With several sources, the names of
+    their recordings get the name, see `recorded_apart`."""
     found: dict[str, Open] = {}
     for source in sources:
         short = source.uri
@@ -189,11 +202,12 @@ def named(sources: Sequence[Open]) -> dict[str, Open]:
 
 
 def recorded_apart(source: Open, name: str, taken: Iterable[str]) -> Open:
-    """Return a source whose recording has the name of the robot in its file name.
+    """Return a source whose recording has the name of the robot in its file name; the same source if it is
+    not recorded.
 
     Args:
         source: The run that is opened.
-        name: Name of the robot.
+        name: Name of the robot; characters other than letters, digits, "-" and "_" become "_".
         taken: Recordings of the other robots. Names that give the same file (`a/b`, `a_b`) are numbered.
     """
     if not source.record:
@@ -223,6 +237,7 @@ _DISCOVERY_S, _SETTLED_S = 3.0, 0.7
 
 class RobotWatch:
     """Adds each robot that appears at a router to a fleet. It does not subscribe to messages of the robots.
+    The constructor connects to the router in the background.
 
     Args:
         fleet: The fleet.
@@ -240,11 +255,13 @@ class RobotWatch:
         self._task = asyncio.create_task(self._watch(), name="watch robots")
 
     async def close(self) -> None:
-        """Disconnect from the router."""
+        """Stop to watch, and disconnect from the router."""
         await cancel(self._task)
         await asyncio.to_thread(self._link.close)
 
     async def _watch(self) -> None:
+        """Add the robots of the router every 0.5 s until the task is cancelled. While the fleet is empty,
+        `notice` has the problem or that no robot is announced."""
         while True:
             for robot in self._link.robots():
                 self.take(robot)
@@ -266,7 +283,8 @@ class RobotWatch:
 
 
 def robots_at(address: ZenohAddress) -> list[str]:
-    """Return the namespaces of the robots at a router; [] if the router does not answer."""
+    """Return the namespaces of the robots at a router; [] if the router does not answer. It blocks for up to
+    3 s: until a short time after the connection, or after the second robot appeared."""
     link = ZenohLink(address, Inbox())
     end = time.monotonic() + _DISCOVERY_S
     connected_s = None
@@ -331,14 +349,14 @@ def build_fleet(
 
 @router.get("/")
 def fleet_page(request: Request) -> Response:
-    """Return the page of all robots."""
+    """GET /: return the page of all robots."""
     return page_answer(request, page_folder() / "fleet.html")
 
 
 @router.get("/robots/{name:path}")
 def robot_page(request: Request, name: str) -> Response:
-    """Redirect to the dashboard of a robot, with a ticket for the role of the caller; 404 for an unknown
-    robot, 503 if its dashboard does not answer."""
+    """GET /robots/{name}: redirect to the dashboard of a robot, with a ticket for the role of the caller; 404
+    for an unknown robot, 503 if its dashboard does not answer."""
     fleet: Fleet = request.app.state.fleet
     member = fleet.members.get(name)
     if member is None:
@@ -353,7 +371,9 @@ def robot_page(request: Request, name: str) -> Response:
 
 @router.websocket("/api/fleet")
 async def fleet_live(browser: WebSocket) -> None:
-    """Send the states of all robots as they change. Messages of the browser are ignored."""
+    """WebSocket /api/fleet: send states and maps of all robots as they change. A message of the browser
+    closes the connection with code 1003; without room for another connection it is closed with 1013 before it
+    is accepted."""
     fleet: Fleet = browser.app.state.fleet
     with fleet.pages.place(role_of(browser.scope)) as free:
         if not free:

@@ -58,16 +58,18 @@ class _Answer(msgspec.Struct, frozen=True):
 async def ask(
     question: dict[str, Any], *, patience_s: float = PATIENCE_S, command: Sequence[str] = COMMAND
 ) -> dict[str, Any]:
-    """Return the answer of a child process to a question.
+    """Return the answer of a child process to a question. At most two questions of an event loop are answered
+    at the same time; further ones wait, without a time limit.
 
     Args:
         question: `ask` is a key of `QUESTIONS`, `path` the source; further values depend on the question.
-        patience_s: Time limit [s].
+        patience_s: Time limit of the answer [s].
         command: Program and arguments of the child process.
 
     Raises:
         SourceError: The source cannot be read; the error gives the reason.
         TookTooLongError: There was no answer in time.
+        StemmapError: The process cannot be started.
     """
     path = question.get("path", "")
     if path:
@@ -94,8 +96,8 @@ async def ask(
 
 
 async def check_source(request: SourceRequest) -> None:
-    """Check that a source can be opened. A child process reads the first scan of a file; of simulated runs
-    and live robots only the address is checked.
+    """Check that a source can be opened. A child process reads the first scan of a file, within 300 s; of
+    simulated runs and live robots only the address is checked.
 
     Raises:
         StemmapError: It cannot be opened; the error gives the reason.
@@ -115,13 +117,20 @@ HYPOTHESES = 1_000_000
 
 
 def recording(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the format of a recording, detected from its contents."""
+    """Return {"kind": format} of a recording, detected from its contents.
+
+    Args:
+        question: The key "path" has the path.
+
+    Raises:
+        SourceError: It cannot be read.
+    """
     with closing(open_source(question["path"])) as source:
         return {"kind": source.description.kind}
 
 
 def first_scan(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the time of the first scan of a source [ns], read as a `SourceRequest` chooses.
+    """Return {"stamp_ns": time of the first scan [ns]} of a source, read as a `SourceRequest` chooses.
 
     Args:
         question: `request` has the fields of the `SourceRequest`.
@@ -140,7 +149,7 @@ def first_scan(question: dict[str, Any]) -> dict[str, Any]:
 
 def inside(question: dict[str, Any]) -> dict[str, Any]:
     """Return the topics of a recording or a live robot with their roles, and the mounting of the LiDAR, as
-    JSON values.
+    JSON values; see `recorded` and `heard`.
 
     Args:
         question: The key "path" has the path of the recording or the address of the robot.
@@ -152,7 +161,15 @@ def inside(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def finished(question: dict[str, Any]) -> dict[str, Any]:
-    """Return map and figures of a folder that `stemmap map` wrote, as the store keeps them for a run."""
+    """Return map and figures of a folder that `stemmap map` wrote, as the store keeps them for a run. Long
+    texts are cut.
+
+    Args:
+        question: The key "path" has the folder.
+
+    Raises:
+        StemmapError: The files of the folder cannot be read or are damaged.
+    """
     import numpy as np
 
     from app.batch.run_folder import read_run, read_run_record
@@ -182,12 +199,12 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def alignment(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the pose of one map in another, found by stem matching, the reason if there is none, and the
-    number of matched stems.
+    """Return the pose [x, y, yaw] of one map in another, found by stem matching, or None; the reason if there
+    is none; and the number of matched stems.
 
     Args:
-        question: `local` and `reference` are the maps, with a row per stem: x, y, sigma, DBH and its
-            sigma [m].
+        question: `local` and `reference` are the maps, with a row per stem: x, y, sigma, DBH and its sigma
+            [m]; None for an unknown DBH.
     """
     import numpy as np
 
@@ -222,7 +239,8 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 
 def answer(parent: ParentConnection) -> None:
-    """Answer one question of the parent process."""
+    """Answer one question of the parent process. A StemmapError or lack of memory is sent as an error; other
+    exceptions end the process."""
     question = parent.receive(dict)
     try:
         reply = _Answer(QUESTIONS[question["ask"]](question))
@@ -254,10 +272,11 @@ _ROLES = {kind: role for role, kinds in reversed(TYPES_BY_ROLE.items()) for kind
 
 
 def recorded(uri: str) -> dict[str, Any]:
-    """Return the contents of a file, folder or simulated run.
+    """Return the contents of a file, folder or simulated run: format, at most MOST_TOPICS topics with their
+    rates [Hz], mounting (x, y, z [m], roll, pitch, yaw [deg]; None without topics), and at most 20 warnings.
 
     Raises:
-        SourceError: The source cannot be read.
+        SourceError: The source cannot be read, or is a whole cloud.
     """
     if is_cloud(uri):
         raise SourceError("a whole cloud has no topics", where=uri, remedy="Open it as it is")
@@ -278,7 +297,9 @@ def recorded(uri: str) -> dict[str, Any]:
 
 
 def heard(uri: str) -> dict[str, Any]:
-    """Return the topics of a live robot with the rates of the usable ones.
+    """Return the topics of a live robot with the rates of the usable ones, in the form of `recorded`; at most
+    MOST_TOPICS. It waits up to 8 s for topics, then counts messages for 3 s. Without topics the list is empty
+    and there is a warning.
 
     Raises:
         SourceError: The address is invalid.
@@ -319,6 +340,7 @@ def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, An
 
 
 def _rate(messages: int, seconds: float) -> float | None:
+    """Return the mean rate of messages [Hz]; None with fewer than two or without a duration."""
     return round((messages - 1) / seconds, 1) if seconds > 0.0 and messages > 1 else None
 
 

@@ -17,7 +17,8 @@ from pipeline.io.readers import open_source as _open_source
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:
-    """Open a run, see `pipeline.io.readers.open_source`.
+    """Open a run, see `pipeline.io.readers.open_source`. A file or folder is first opened in a child process,
+    so that it is read twice.
 
     Raises:
         SourceError: It cannot be read, or takes more time or memory than a file of its size should.
@@ -30,7 +31,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
 
 
 def open_cloud(uri: str) -> WholeCloud:
-    """Open a whole cloud, see `pipeline.io.readers.clouds.open_cloud`.
+    """Open a whole cloud, see `pipeline.io.readers.clouds.open_cloud`; first in a child process.
 
     Raises:
         SourceError: As for `open_source`.
@@ -40,14 +41,16 @@ def open_cloud(uri: str) -> WholeCloud:
 
 
 def _check(opening: Callable[[], object], uri: str) -> None:
-    """Run an opening in a child process if the source is a file or a folder."""
+    """Run an opening in a child process if the source is a file or a folder; otherwise do nothing. Raises
+    SourceError if it fails or exceeds its limits."""
     size = _size(uri)
     if size is not None:
         run_limited(opening, Limits.for_size(size), uri)
 
 
 def _size(uri: str) -> int | None:
-    """Return the size of a file, or of all files in a folder [bytes]; None if there is none."""
+    """Return the size of a file, or of all files in a folder [bytes]; None if there is no such path, as for a
+    simulated run."""
     with contextlib.suppress(OSError, ValueError, RuntimeError):
         path = Path(uri.removeprefix("file:").removeprefix("//")).expanduser()
         if path.is_dir():

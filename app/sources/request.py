@@ -37,7 +37,7 @@ class SourceRequest(msgspec.Struct, frozen=True):
 
     Attributes:
         uri: Path or address of the source, as the user wrote it.
-        odometry: "auto", "wheels", "kiss-icp", "static", or "file:" and a path (see `app.sources.request`).
+        odometry: "auto", "wheels", "kiss-icp", "static", or "file:" and a path, see `choose_odometry`.
         seed: Random seed of the mapping and of a simulated source.
         topics: Topic name by role, where the user chose one; other topics are found by type.
         mount: Pose of the LiDAR on the robot: x, y, z [m], roll, pitch, yaw [rad]. None uses the pose that
@@ -102,7 +102,8 @@ def request_of_kept(
 
     Args:
         uri, odometry, seed, preset, parameters: As in `SourceRequest`.
-        choices: From `SourceRequest.kept_choices`. Damaged choices are left out.
+        choices: From `SourceRequest.kept_choices`, None for none. If they are damaged, all of them are left
+            out.
     """
     kept = _KeptChoices()
     if choices is not None:
@@ -170,8 +171,9 @@ class ChosenOdometry:
 def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
     """Return the source of motion for a choice of the user.
 
-    "auto" selects the odometry of the source; without it, registration of the scans (KISS-ICP); and where
-    that is impossible, for example with a planar laser, no motion, with a warning.
+    "auto", and any unknown choice, selects the odometry of the source; without it, registration of the scans
+    (KISS-ICP); and where that is impossible, for example with a planar laser, no motion, with a warning. A
+    pose file is not opened here.
 
     Args:
         known: Description of the source.
@@ -243,14 +245,16 @@ def motion_of(known: SourceDescription, choice: str, chosen: ChosenOdometry) -> 
 
 
 def with_odometry(source: Source, choice: str) -> tuple[Source, ChosenOdometry]:
-    """Return the source with the selected motion, and the selection.
+    """Return the source with the selected motion, and the selection. The source itself is returned if it
+    provides the motion or there is none; otherwise a wrapper that closes it, whose digest also covers a pose
+    file.
 
     Args:
         source: The source.
         choice: As in `choose_odometry`.
 
     Raises:
-        SourceError: The choice is not available for this source.
+        SourceError: The choice is not available for this source, or a pose file cannot be read.
     """
     from pipeline.io.readers.base import digest_of
 

@@ -54,7 +54,12 @@ class ExampleCollector:
         self._before: Columns | None = None
 
     def add(self, columns: Columns | None) -> None:
-        """Add the columns after a scan; None where there are none."""
+        """Add the columns after a scan. None, no columns, and the same object as in the last call are
+        ignored.
+
+        The features at an annotation are stored when its nearest column has been observed 3, 10 and 30 times,
+        and each time as the newest.
+        """
         if columns is None or columns is self._before or self._nearest is None or not len(columns.axis):
             return
         self._before = columns
@@ -65,10 +70,12 @@ class ExampleCollector:
                 marks.append(figures)
 
     def examples(self, scene: str, *, all_around: bool) -> Examples:
-        """Return the examples of all annotations with a column, so far.
+        """Return the examples of all annotations with a column, so far. An annotation gives at most four:
+        those after 3, 10 and 30 observations and the newest, which is the last. Annotations without a column
+        give none.
 
-        Their axis is the position of the annotation, by which the examples of one object can be recognised.
-        Of the examples of an object the newest is the last.
+        Their axis has the position of the annotation (and zeros), by which the examples of one object can be
+        recognised.
 
         Args:
             scene: Name of the scene.
@@ -90,7 +97,12 @@ class ExampleCollector:
         )
 
     def _pairs(self, place: Float) -> list[tuple[int, int]]:
-        """Pairs of an annotation and its nearest column, each at most once."""
+        """Return pairs of an annotation (index) and its nearest column (row), each annotation at most once.
+        Columns farther than REACH of the kind of their nearest annotation are ignored.
+
+        Args:
+            place: x, y of the columns, shape (K, 2) [m].
+        """
         assert self._nearest is not None  # noqa: S101 - `add` has checked
         distance, annotation = self._nearest.query(place)
         near = np.flatnonzero(distance <= self._reach[annotation])
@@ -123,7 +135,9 @@ class AnnotatedRun:
 
 
 def annotated_run(source: AnnotatedSource) -> AnnotatedRun:
-    """Return the run of an annotated source, with the parameters that this version knows."""
+    """Return the run of an annotated source, with its parameters. Names that this version does not know are
+    dropped; values that it does not accept let all parameters be those of the preset. An unknown preset
+    becomes "forest"."""
     request = source.request
     start = preset(request.preset if request.preset in PRESETS else "forest")
     known = {name: value for name, value in request.parameters.items() if name in start.flat()}
@@ -140,10 +154,10 @@ def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Exa
     Args:
         run: The run.
         kept: Folder of the examples; None stores nothing.
-        progress: Called while the run is mapped.
+        progress: Called with a text while the run is mapped, every 50 scans.
 
     Raises:
-        SourceError: The run cannot be read, or is another recording.
+        SourceError: The run cannot be read, is live, or is another recording.
         StemmapError: The stored examples are damaged.
     """
     (found,) = stored_or_computed(kept, _key(run), partial(_map_again, run, progress))
@@ -151,7 +165,8 @@ def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Exa
 
 
 def _key(run: AnnotatedRun) -> str:
-    """Everything on which the examples depend: recording, choices, parameters, annotations and features."""
+    """Return a SHA-256 (hex) of everything on which the examples depend: recording, choices, parameters,
+    annotations, features and version."""
     parts = [
         run.digest,
         run.request.seed,
@@ -166,6 +181,15 @@ def _key(run: AnnotatedRun) -> str:
 
 
 def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
+    """Map a run from its source and return its examples, as one set.
+
+    Args:
+        run: The run.
+        progress: Called with a text every 50 scans.
+
+    Raises:
+        SourceError: The run cannot be read, is live, or is another recording.
+    """
     request = run.request
     with closing(open_any(request.uri, request.options())) as source:
         if isinstance(source, LiveSource):

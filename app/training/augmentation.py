@@ -94,12 +94,13 @@ def name_of_copy(scene: str, copy: int) -> str:
 
 
 def is_of(name: str, scene: str) -> bool:
-    """Return whether a name is that of a copy of a scene."""
+    """Return whether a name is that of a copy of a scene, whatever its number."""
     return name.startswith(f"{scene.rstrip('/')} with things ")
 
 
 def digest_of(folder: Path) -> str:
-    """Return the digest of everything that decides the copies of labelled scans."""
+    """Return the first 16 hex digits of a SHA-256 of everything that decides the copies of labelled scans:
+    FORMAT, points and labels."""
     digest = sha256(f"{FORMAT}".encode())
     for points, label in labelled_scans(folder):
         digest.update(points.tobytes() + label.tobytes())
@@ -107,7 +108,8 @@ def digest_of(folder: Path) -> str:
 
 
 def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: float) -> Iterator[Examples]:
-    """Yield the examples of a copy of labelled scans with inserted objects, see `paste`.
+    """Yield the examples of a copy of labelled scans with inserted objects, see `paste`: one set at each of
+    MARKS scans and at the end, see `columns_of`.
 
     Args:
         folder: The labelled scans, see `labelled_scans`.
@@ -130,7 +132,15 @@ def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: floa
 
 def paste(folder: Path, copy: int) -> AugmentedScans:
     """Return a copy of labelled scans: some of the scans and returns, scaled, perhaps mirrored, with inserted
-    objects, at another pose in the map, so that voxels contain other returns."""
+    objects, at another pose in the map, so that voxels contain other returns.
+
+    The same folder contents and number give the same copy. Fewer objects than drawn (8 to 16) are inserted if
+    there is too little free ground.
+
+    Args:
+        folder: The labelled scans, see `labelled_scans`.
+        copy: Number of the copy.
+    """
     rng = np.random.default_rng([int(digest_of(folder), 16), copy])
     scans = _changed(_without_repeats(labelled_scans(folder)), rng)
     points, label = (np.concatenate(each) for each in zip(*scans, strict=True))
@@ -144,11 +154,13 @@ def paste(folder: Path, copy: int) -> AugmentedScans:
 
 
 def _without_repeats(scans: _Scans) -> _Scans:
-    """Return the scans without repetitions: a recording may hold a scan twice."""
+    """Return the scans without those that equal the scan before them: a recording may hold a scan twice."""
     return [s for k, s in enumerate(scans) if k == 0 or s[0].tobytes() != scans[k - 1][0].tobytes()]
 
 
 def _changed(scans: _Scans, rng: np.random.Generator) -> _Scans:
+    """Return 1 to 8 random scans in their order, each with a random share (0.6 to 1) of its points, all
+    scaled by the same random factor (0.88 to 1.14) and perhaps mirrored left to right."""
     number = min(int(rng.choice([1, 2, 3, 6, 8])), len(scans))
     chosen = np.sort(rng.permutation(len(scans))[:number])
     size = float(rng.uniform(0.88, 1.14)) * np.array([1.0, rng.choice([-1.0, 1.0]), 1.0])
@@ -162,7 +174,13 @@ def _changed(scans: _Scans, rng: np.random.Generator) -> _Scans:
 
 
 def _inserted(place: Float, tree: Bool, rng: np.random.Generator) -> tuple[Solids, Int]:
-    """Return objects at positions (M, 3) [m] in the sensor frame, and the label of each owner of solids."""
+    """Return simulated objects and the label of each owner of solids.
+
+    Args:
+        place: Position x, y and ground height of each object in the sensor frame, shape (M, 3) [m].
+        tree: Whether the object is a young tree, shape (M,); the others are drawn from POLES.
+        rng: Random numbers of the objects.
+    """
     scene = SceneBuilder(_NO_GROUND, rng)
     for (x, y, ground), is_tree in zip(place.tolist(), tree.tolist(), strict=True):
         scene.terrain = SimulatedTerrain(np.array([[0.0, 0.0, ground, 0.0]]))
@@ -202,7 +220,13 @@ def _seen_with(
 
 
 def _hidden(new: Float32, real: Float32) -> Bool:
-    """Return which new points are behind the real one that is nearest in direction, shape (N,)."""
+    """Return which new points are behind the real point that is nearest in direction, shape (N,). Only real
+    points within `SAME_DIRECTION` count; a new point must be more than `HIDDEN` farther. All False if either
+    set is empty.
+
+    Args:
+        new, real: Points in the sensor frame, shapes (N, 3) and (K, 3) [m].
+    """
     from scipy.spatial import cKDTree
 
     (to_new, towards), (to_real, known) = _directions(new), _directions(real)
@@ -214,13 +238,23 @@ def _hidden(new: Float32, real: Float32) -> Bool:
 
 
 def _directions(points: Float32) -> tuple[Float, Float]:
-    """Return the distances of points [m], shape (N,), and unit vectors towards them, shape (N, 3)."""
+    """Return the distances of points from the origin [m], shape (N,), and unit vectors towards them, shape
+    (N, 3); a point at the origin has a zero vector."""
     away = np.linalg.norm(points.astype(np.float64), axis=1)
     return away, points / np.maximum(away, 1e-9)[:, None]
 
 
 def _places(points: Float32, label: Int, number: int, rng: np.random.Generator) -> Float:
-    """Return positions x, y on visible ground and its height there, shape (M, 3) [m], M at most `number`."""
+    """Return random positions x, y on visible ground and its height there, shape (M, 3) [m]; M is less than
+    `number` if 50 `number` tries find too few. Positions are between NEAR and FAR from the sensor, within
+    ASIDE of the x axis, and apart from trunks and one another.
+
+    Args:
+        points: All points of the scans in the sensor frame, shape (N, 3) [m].
+        label: Their labels, shape (N,).
+        number: Number of positions.
+        rng: Random numbers.
+    """
     ground = points[np.isin(label, GROUND)].astype(np.float64)
     trunk, found = trunks(points.astype(np.float64), label, 1, np.inf), np.zeros((0, 3))
     for _ in range(50 * number):
@@ -236,6 +270,7 @@ def _places(points: Float32, label: Int, number: int, rng: np.random.Generator) 
 
 
 def _to_map(points: Float32 | Float, pose: Pose2) -> Float:
+    """Return points (N, 3) [m] of the sensor frame in the map; heights remain unchanged."""
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     moved: Float = points.astype(np.float64) @ turn + np.array([pose.x, pose.y, 0.0])

@@ -61,12 +61,12 @@ def stored_or_computed(
     """Return the examples of a scene from the folder, or compute and store them.
 
     Args:
-        folder: Folder of the examples; None stores nothing.
+        folder: Folder of the examples, which is created; None stores nothing.
         name: Name of the scene, which must contain everything on which the examples depend.
-        make: Computes the examples.
+        make: Computes the examples, at least one set, all of one scene; only called if none are stored.
 
     Raises:
-        StemmapError: The stored examples are damaged.
+        StemmapError: The stored examples are damaged, or cannot be written.
     """
     file = None if folder is None else folder / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
     if file is not None and file.is_file():
@@ -92,11 +92,16 @@ def stored_or_computed(
 
 
 def read_examples(folder: Path) -> list[Examples]:
-    """Return all examples of a folder."""
+    """Return all examples of the .npz files in a folder, by file name; [] without files.
+
+    Raises:
+        StemmapError: A file is damaged.
+    """
     return [e for file in sorted(folder.glob("*.npz")) for e in _read(file)]
 
 
 def _read(file: Path) -> list[Examples]:
+    """Return the examples of a file; raises StemmapError if it is damaged. Pickled objects are refused."""
     try:
         _check_sizes(file)
         with np.load(file, allow_pickle=False) as kept:

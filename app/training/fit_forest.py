@@ -110,7 +110,9 @@ class FittedForest:
 
 
 def fit(examples: list[Examples], kind: str, seed: int = 0) -> FittedForest:
-    """Fit a forest that separates trees from all else; its leaves hold the shares of all classes.
+    """Fit a forest that separates trees from all else; its leaves hold the shares of all classes. Examples
+    with the label UNKNOWN and scenes without weight for this kind of sensor are not used; at least one must
+    remain, see `can_fit`.
 
     Args:
         examples: Examples of all training scenes.
@@ -127,7 +129,8 @@ def fit(examples: list[Examples], kind: str, seed: int = 0) -> FittedForest:
 
 
 def fit_free_end(augmented: list[Examples], seed: int = 0) -> FittedForest | None:
-    """Fit a forest that separates trees from poles that end in free air; None unless there are both.
+    """Fit a forest that separates trees from poles that end in free air; None unless there are examples of
+    both.
 
     Args:
         augmented: Real scenes with inserted poles and trees, see `augmentation`.
@@ -146,6 +149,15 @@ def fit_free_end(augmented: list[Examples], seed: int = 0) -> FittedForest | Non
 
 
 def _fitted(figures: Float, label: Int, weight: Float, settings: ForestSettings, seed: int) -> FittedForest:
+    """Fit a forest of scikit-learn; features of rays are removed unless the settings use them.
+
+    Args:
+        figures: Features, shape (N, features).
+        label: Index in CLASSES, shape (N,), none UNKNOWN.
+        weight: Weight of each example, shape (N,).
+        settings: Settings of the forest.
+        seed: Random seed.
+    """
     from sklearn.ensemble import ExtraTreesClassifier, RandomForestClassifier
 
     known = (figures if settings.rays else figures[:, :RAYS]).astype(np.float32)
@@ -162,7 +174,8 @@ def _fitted(figures: Float, label: Int, weight: Float, settings: ForestSettings,
 
 
 def _class_weight(weight: Float, label: Int, settings: ForestSettings) -> Float:
-    """Return weights (N,) multiplied by those of the classes."""
+    """Return weights (N,) multiplied by those of the classes: `tree` for trees, `upright` for poles and
+    persons, 1 for all others."""
     factor = np.where(label == TREE, settings.tree, 1.0)
     factor[np.isin(label, UPRIGHT)] = settings.upright
     return weight * factor
@@ -195,11 +208,12 @@ def fit_all(
 
 
 def can_fit(examples: list[Examples], kind: str) -> bool:
-    """Return whether any of the scenes has a weight for this kind of sensor."""
+    """Return whether any of the scenes has a weight for this kind of sensor; False without scenes."""
     return any(_weight(e, kind) > 0.0 for e in examples)
 
 
 def _weight(examples: Examples, kind: str) -> float:
+    """Return the weight of the examples of a scene for a kind of sensor, see `ForestSettings`."""
     settings = SETTINGS[kind]
     is_same = examples.all_around == (kind == ALL_AROUND)
     if examples.simulated:
@@ -208,6 +222,15 @@ def _weight(examples: Examples, kind: str) -> float:
 
 
 def _shares(tree: Any, figures: Float32, label: Int, weight: Float) -> Float:  # noqa: ANN401
+    """Return the class shares of the nodes of a tree, shape (nodes, classes), rounded to 2 decimals; zeros
+    for nodes that are no leaves.
+
+    Args:
+        tree: Tree of scikit-learn.
+        figures: Features of the training examples, shape (N, features).
+        label: Index in CLASSES, shape (N,).
+        weight: Weight of each example, shape (N,).
+    """
     share = np.zeros((tree.tree_.node_count, len(CLASSES)))
     np.add.at(share, (tree.apply(figures), label), weight)
     rounded: Float = np.round(share / np.maximum(share.sum(axis=1, keepdims=True), 1e-12), 2)
@@ -215,7 +238,12 @@ def _shares(tree: Any, figures: Float32, label: Int, weight: Float) -> Float:  #
 
 
 def as_json(fitted: dict[str, FittedForest], scenes: list[str]) -> dict[str, Any]:
-    """Return the JSON that `pipeline.classification.forest.read_forest` reads."""
+    """Return the JSON that `pipeline.classification.forest.read_forest` reads.
+
+    Args:
+        fitted: Forests by their key in the JSON.
+        scenes: Names of the training scenes, which are only written.
+    """
     return {
         "about": "Votes on what a column is, made by `stemmap train`; see docs/trunks.md.",
         "scenes": scenes,
@@ -231,7 +259,8 @@ def as_json(fitted: dict[str, FittedForest], scenes: list[str]) -> dict[str, Any
 
 
 def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
-    """Return the JSON of a node of a tree of scikit-learn.
+    """Return the JSON of a node of a tree of scikit-learn, with all nodes below it. A split whose two leaves
+    are equal becomes a leaf.
 
     Args:
         tree: The tree.
@@ -269,7 +298,8 @@ def all_expanded(
 def expanded(
     trees: list[dict[str, Any]], settings: ForestSettings, figures: Float, label: Int, thing: Int, seed: int
 ) -> list[dict[str, Any]]:
-    """Return the extended trees of a forest.
+    """Return the extended trees of a forest; the given ones remain unchanged. Leaves that no example reaches,
+    and all leaves without examples, stay as they are.
 
     Args:
         trees: Trees as in the JSON.
@@ -291,6 +321,15 @@ def expanded(
 def _expanded_node(
     node: dict[str, Any], figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
 ) -> dict[str, Any]:
+    """Return a node with its leaves extended by the examples that reach it; the node itself without examples.
+
+    Args:
+        node: Node as in the JSON.
+        figures, label: Features and classes of the examples that reach it, shapes (N, features) and (N,).
+        weight: Their weights, shape (N,).
+        settings: Settings of the forest.
+        draw: Random seed of this tree.
+    """
     if not len(label):
         return node
     if "share" in node:
@@ -306,6 +345,15 @@ def _expanded_node(
 def _leaf(
     share: Float, figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
 ) -> dict[str, Any]:
+    """Return a leaf, or the splits in its place, at most DEEPER levels. Each new leaf mixes the previous
+    shares, with weight PRIOR, and those of its examples.
+
+    Args:
+        share: Previous class shares, shape (classes,).
+        figures, label, weight: The examples, at least one, see `_expanded_node`.
+        settings: Settings of the forest.
+        draw: Random seed.
+    """
     from sklearn.tree import DecisionTreeClassifier
 
     known = figures if settings.rays else figures[:, :RAYS]

@@ -51,7 +51,8 @@ def columns_of(
     run: Iterable[Step], sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters
 ) -> Iterator[Columns]:
     """Yield the columns of a run that is mapped with the poses of its odometry, each time that the number of
-    scans is one of MARKS, and at the end. A scan that is equal to the one before is skipped.
+    scans is one of MARKS, and at the end. A scan that is equal to the one before is skipped and not counted.
+    A step without a pose is at the origin.
 
     Args:
         run: Steps with the poses.
@@ -102,7 +103,8 @@ def street_examples(seed: int, one_way: bool, parameters: Parameters, reach: flo
 def stand_examples(
     uri: str, parameters: Parameters, every: int, *, furnished: bool = False
 ) -> Iterator[Examples]:
-    """Yield the examples of a simulated run, with classes by its ground truth.
+    """Yield the examples of a simulated run, with classes by its ground truth, see `columns_of` for their
+    times.
 
     Args:
         uri: Address of the run, `sim:`.
@@ -125,7 +127,8 @@ def stand_name(uri: str, furnished: bool) -> str:
 
 def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
     """Return the class of each column by the objects of the ground truth near it, as indices in CLASSES,
-    shape (K,): OTHER without a near object, and UNKNOWN if a tree is near but not at the column.
+    int64, shape (K,): OTHER without a near object, and UNKNOWN if a tree or a hidden tree is near but not at
+    the column.
 
     Args:
         axis: Columns, x, y first [m].
@@ -146,7 +149,13 @@ def label_by_truth(axis: Float, truth: TruthTrees) -> Int:
 
 def labelled_examples(folder: Path, parameters: Parameters, reach: float) -> Iterator[Examples]:
     """Yield the examples of scans from one place (`velodyne/*.bin`, `labels/*.label`), or of one pair of
-    files."""
+    files, with classes by their labels; the sensor does not move.
+
+    Args:
+        folder: The scans, see `labelled_scans`.
+        parameters: See `columns_of`.
+        reach: Distance from the sensor within which columns become examples [m].
+    """
     points, label = labelled_points(folder)
     of_trunks = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)
     with closing(open_source(str(folder))) as source:
@@ -166,7 +175,8 @@ def examples_by_points(
     named: tuple[str, bool, bool],
     centre: tuple[float, float] = (0.0, 0.0),
 ) -> Iterator[Examples]:
-    """Yield the examples of columns within a radius, with classes by labelled points.
+    """Yield the examples of columns within a radius, with classes by labelled points; one set for each
+    element of `found`.
 
     Args:
         found: Columns at several times.
@@ -182,13 +192,14 @@ def examples_by_points(
 
 
 def looks_all_around(folder: Path) -> bool:
-    """Return whether the sensor of labelled scans sees all around."""
+    """Return whether the sensor of labelled scans sees all around (has rings)."""
     with closing(open_source(str(folder))) as source:
         return source.description.sensor.rings > 0
 
 
 def labelled_points(folder: Path) -> tuple[Float, Int]:
-    """Return all points (N, 3) [m] of a place and their labels; returns at the origin are left out."""
+    """Return all points, float64, shape (N, 3) [m], of a place and their labels, shape (N,); returns at the
+    origin are left out. Raises the errors of `labelled_scans`."""
     scans = labelled_scans(folder)
     cloud = np.concatenate([points for points, _ in scans]).astype(np.float64)
     return cloud, np.concatenate([label for _, label in scans])
@@ -224,7 +235,7 @@ def labelled_scans(folder: Path) -> list[tuple[Float32, Int]]:
 
 def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
     """Return the middles, shape (N, 2) [m], of the labelled trunks: groups of points of class TRUNK, linked
-    at 0.3 m.
+    at 0.3 m. Shape (0, 2) without such points.
 
     Args:
         points, label: See `labelled_points`.
@@ -243,7 +254,9 @@ def trunks(points: Float, label: Int, least: int, reach: float) -> Float:
 
 
 def label_by_points(axis: Float, points: Float, label: Int, sure: Float, any_trunk: Float) -> Int:
-    """Return the class of each column, as indices in CLASSES: a trunk, or the most frequent class around it.
+    """Return the class of each column, as indices in CLASSES, int64, shape (K,): TREE within SAME of a sure
+    trunk; UNKNOWN near a trunk but not at it; otherwise the most frequent labelled class within 0.35 m, OTHER
+    without one.
 
     Args:
         axis: Axes of the columns, shape (K, 5).

@@ -69,10 +69,11 @@ def learn(
     seed: int = 0,
     progress: Progress = lambda _: None,
 ) -> LearningResult:
-    """Extend the forest of the package with the annotations of runs.
+    """Extend the forest of the package with the annotations of runs. Nothing is stored except the examples of
+    the runs.
 
     Args:
-        runs: The annotated runs.
+        runs: The annotated runs. One that cannot be read is left out with a warning.
         in_force: The parameters in force, with the name of the present forest and its threshold.
         folder: Data folder, with the present forest and stored examples; None where there is none.
         date: Date that is stored with the forest.
@@ -80,7 +81,8 @@ def learn(
         progress: Called with progress messages.
 
     Raises:
-        StemmapError: There are too few examples; the message names the numbers.
+        StemmapError: There are too few examples for every kind of sensor (the message names the numbers), or
+            the present forest or stored examples cannot be read.
     """
     if lacking := too_few(each.kind for run in runs for each in run.annotations):
         raise StemmapError(f"too few annotations: {lacking}")
@@ -128,21 +130,27 @@ def learn(
 
 
 def seen_by(data: dict[str, Any]) -> tuple[str, ...]:
-    """Return the digests of the runs with which a learned forest was trained, from its JSON."""
+    """Return the digests of the runs with which a learned forest was trained, from its JSON; () for a forest
+    without such a record."""
     learned = data.get("learned")
     runs = learned.get("runs") if isinstance(learned, dict) else None
     return tuple(str(run.get("source")) for run in runs or [] if isinstance(run, dict))
 
 
 def things_by_class(examples: Sequence[Examples]) -> Counter[str]:
-    """Return the number of objects of each class."""
+    """Return the number of objects of each class, by the label of the class."""
     label = [int(k) for e in examples for k in e.label]
     of_thing = dict(zip(object_numbers(examples).tolist(), label, strict=True))
     return Counter(CLASSES[k].label for k in of_thing.values())
 
 
 def too_few(kinds: Iterable[str]) -> str:
-    """Return why there are too few objects of these kinds; "" where there are enough."""
+    """Return why there are too few objects of these kinds for a training: less than 10 trees or 5 others; ""
+    where there are enough.
+
+    Args:
+        kinds: Kind of each object; all but "tree" count as others.
+    """
     by_class = Counter(kinds)
     trees = by_class["tree"]
     others = by_class.total() - trees
@@ -153,7 +161,7 @@ def too_few(kinds: Iterable[str]) -> str:
 
 
 def what_lacks(examples: Sequence[Examples]) -> str:
-    """Return why there are too few examples; "" where there are enough."""
+    """Return why there are too few examples for a training and its scores; "" where there are enough."""
     if lacking := too_few(things_by_class(examples).elements()):
         return lacking
     if len(np.unique(groups_of(examples)[1])) < 2:
@@ -164,7 +172,14 @@ def what_lacks(examples: Sequence[Examples]) -> str:
 def _examples(
     runs: Sequence[AnnotatedRun], kept: Path | None, progress: Progress, warnings: list[str]
 ) -> list[tuple[AnnotatedRun, Examples]]:
-    """The examples of each run that can be mapped."""
+    """Return the examples of each run that can be mapped; the others are left out with a warning.
+
+    Args:
+        runs: The runs.
+        kept: Folder of stored examples; None stores nothing.
+        progress: Called with progress messages.
+        warnings: Warnings are appended to it.
+    """
     found = []
     for run in runs:
         progress(f"Mapping {run.name}")
@@ -181,7 +196,8 @@ def _examples(
 
 
 def table_lines(learned: LearningResult) -> list[str]:
-    """Return a table of TA, FR, TR and FA of the present and the new forest for each kind of sensor."""
+    """Return a table of TA, FR, TR and FA of the present and the new forest for each kind of sensor, as lines
+    of text; the first line gives the number of objects by class."""
     classes = ", ".join(
         f"{n} {name}" for name, n in sorted(learned.things.items(), key=lambda item: -item[1])
     )
@@ -203,6 +219,7 @@ def _cells(rates: Rates) -> list[str]:
 
 
 def _cell(rate: Rate) -> str:
+    """Return a rate as text, for example "9/10 (90.0 %)"; "-" in place of the percentage if its total is 0."""
     part = "-" if rate.rate is None else f"{100.0 * rate.rate:.1f} %"
     return f"{rate.count}/{rate.of} ({part})"
 
@@ -230,7 +247,15 @@ class LearningRequest(msgspec.Struct, frozen=True):
 
 
 def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Train a forest and store it under its name. It is not in force yet."""
+    """Train a forest, store it under its name, and return the result for the page. It is not in force yet.
+
+    Args:
+        request: What is trained.
+        progress: Called with progress messages.
+
+    Raises:
+        StemmapError: See `learn`, or the forest cannot be stored.
+    """
     folder, present = Path(request.folder), Classification.model_validate(request.classification)
     runs = [annotated_run(source) for source in request.sources]
     learned = learn(runs, present, folder, date=request.date, seed=request.seed, progress=progress)
@@ -238,7 +263,13 @@ def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str
 
 
 def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
-    """Return the result for the page."""
+    """Return the result for the page, with at most 20 warnings.
+
+    Args:
+        learned: The result.
+        name: Name under which the new forest is stored.
+        old: Name of the present forest.
+    """
     return {
         "name": name,
         "against": old,
@@ -250,7 +281,8 @@ def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
 
 
 def serve(parent: ParentConnection) -> None:
-    """Answer one request."""
+    """Receive one `LearningRequest`, send progress and then the result or the error; the program of the child
+    process."""
     try:
         request = parent.receive(LearningRequest)
         parent.send({"learned": train(request, lambda text: parent.send({"progress": text}))})

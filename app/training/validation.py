@@ -34,7 +34,7 @@ class Rates:
 
     @classmethod
     def of(cls, accepted: Bool, tree: Bool) -> Rates:
-        """Count the rates of accepted objects and true trees, shape (N,) each."""
+        """Return the rates of accepted objects and true trees, shape (N,) each."""
         trees, others = int(tree.sum()), int((~tree).sum())
         ta, fa = int((accepted & tree).sum()), int((accepted & ~tree).sum())
         return cls(Rate(ta, trees), Rate(others - fa, others), Rate(fa, others), Rate(trees - ta, trees))
@@ -59,7 +59,8 @@ class Validation:
 def validate(
     examples: Sequence[Examples], base: dict[str, Any], kind: str, old: Forest, share: float, seed: int
 ) -> Validation:
-    """Cross-validate the training.
+    """Cross-validate the training. The new forest decides on each object in the fold that left it out; only
+    the last example of each object counts.
 
     Args:
         examples: Examples of one kind of sensor, from at least two places.
@@ -92,10 +93,14 @@ def validate(
 
 
 def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
-    """Return the kind of group that is left out, "run" or "place", and the group number of each example.
+    """Return the kind of group that is left out, "run" or "place", and the group number of each example,
+    shape (N,). Runs are left out if there are at least LEAST_RUNS groups of them, otherwise places.
 
     Runs that share a place form one group, and so do places with the same coordinates in two runs, because
     drives that begin at the same point see the same stems.
+
+    Args:
+        examples: Examples of each run; together at least one.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -134,6 +139,8 @@ def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
 
 
 def _accepted(figures: Float, forest: Forest, share: float) -> Bool:
+    """Return which examples are accepted as trees, shape (N,): their share of votes suffices and they have
+    enough observations."""
     accepted: Bool = (vote(figures, forest)[:, 0] >= share) & ~too_few(figures)
     return accepted
 
@@ -166,7 +173,7 @@ def count(scene: Examples, votes: Float, share: float) -> tuple[int, int, int]:
 
     Columns with the required share of votes are accepted, those with most votes first; of columns within
     APART only the first counts. An accepted column is right within APART of a tree, and false elsewhere
-    unless its class is unknown.
+    unless its class is unknown. Each tree is found at most once.
 
     Args:
         scene: Examples of one scene.
@@ -183,7 +190,12 @@ def count(scene: Examples, votes: Float, share: float) -> tuple[int, int, int]:
 
 
 def _apart(place: Float, rows: Int) -> list[int]:
-    """Return the first rows of which no two are within APART."""
+    """Return the rows of which no two are within APART; the earlier one is kept.
+
+    Args:
+        place: Positions of all examples, shape (N, 2) [m].
+        rows: Rows in the order of preference.
+    """
     kept: list[int] = []
     for k in rows.tolist():
         if all(np.hypot(*(place[k] - place[j])) > APART for j in kept):

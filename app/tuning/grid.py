@@ -153,7 +153,7 @@ def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
 
 
 def _text(entry: object) -> str:
-    """Return an entry of a TOML file as text in the syntax of the command line; true and false in lower case."""
+    """Return an entry of a TOML file as text in the syntax of the command line; a bool in lower case."""
     return str(entry).lower() if isinstance(entry, bool) else str(entry)
 
 

@@ -109,7 +109,7 @@ class Goal:
         return _BROKEN[self.name] + max(short, 0.0) if error is None or short > 1e-12 else error
 
     def is_kept(self, loss: float) -> bool:
-        """Return whether a loss is that of a set that satisfies the bound of the goal; always True for "f1"."""
+        """Return whether a loss is that of a set that satisfies the bound of the goal; True for "f1"."""
         return self.name == "f1" or loss < _BROKEN[self.name]
 
     def figure(self, loss: float) -> float:

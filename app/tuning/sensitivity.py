@@ -123,7 +123,7 @@ class Sensitivity:
         self._tell({})
 
     async def _work(self, scorer: _ScoringProcess) -> None:
-        """Compute curves until none was requested for `idle_s` or `leave` was called; then end the process."""
+        """Compute curves until none was requested for `idle_s`, or until `leave`; then end the process."""
         while self._scorer is scorer and (question := self._question) is not None:
             self._changed.clear()
             await self._compute(question, scorer)
@@ -234,7 +234,7 @@ def _state_of(question: Question, points: list[dict[str, Any]], error: str = "")
 
 
 async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
-    """Return the result of a job; None if the process ends or sends something else. There is no time limit."""
+    """Return the result of a job, without a time limit; None if the process ends or sends something else."""
     await process.send(job)
     try:
         return await process.receive(JobResult)
