@@ -23,14 +23,14 @@ async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
     """Compare two finished runs, both with their `map`.
 
     Maps of the same recording share a frame. Other maps are aligned by the distances between their stems; if
-    that fails, they are compared without alignment.
+    that fails, they are compared without alignment, and `how` has the reason.
 
     Args:
         a, b: The runs.
         same_source: Whether both are of the same recording.
 
     Returns:
-        The tables of the page; positions of b are in the frame of a.
+        The tables of the page; positions of b are in the frame of a. `shift_rms_m` is None without a pair.
     """
     known, how = (Pose2(), "same recording") if same_source else await align(a, b)
     pose, how = (Pose2(), f"not aligned: {how}") if known is None else (known, how)
@@ -59,7 +59,12 @@ async def compare(a: Run, b: Run, *, same_source: bool) -> dict[str, Any]:
 
 
 async def align(a: Run, b: Run) -> tuple[Pose2 | None, str]:
-    """Return the pose of map b in map a and how it was found; where it is unknown, None and the reason."""
+    """Return the pose of map b in map a and how it was found; where it is unknown, None and the reason. It is
+    computed in a child process; its errors are returned as the reason.
+
+    Args:
+        a, b: Runs with `map`, of which the trees are used.
+    """
     try:
         found = await inspection.ask({"ask": "alignment", "local": _stems(b), "reference": _stems(a)})
     except StemmapError as error:
@@ -70,6 +75,8 @@ async def align(a: Run, b: Run) -> tuple[Pose2 | None, str]:
 
 
 def _stems(run: Run) -> list[list[float | None]]:
+    """Return x, y, sigma, DBH and its sigma [m] of each tree of a run; None for an unknown DBH. Sigma is at
+    least 0.02 m."""
     rows = []
     for tree in run["map"]["trees"]:
         known = tree["dbh_cm"] is not None and tree["sigma_dbh_cm"] is not None
@@ -79,10 +86,12 @@ def _stems(run: Run) -> list[list[float | None]]:
 
 
 def _places(run: Run) -> Float:
+    """Return the positions of the trees of a run, shape (T, 2) [m]."""
     return _rows([[tree["x"], tree["y"]] for tree in run["map"]["trees"]])
 
 
 def _rows(points: list[list[float]]) -> Float:
+    """Return points as an array of shape (N, 2); (0, 2) for []."""
     return np.array(points, np.float64).reshape(-1, 2)
 
 
@@ -119,11 +128,13 @@ def _paired(
 
 
 def _change(before: float | None, after: float | None) -> float | None:
+    """Return after - before, rounded to 2 decimals; None if one is None."""
     return None if before is None or after is None else round(after - before, 2)
 
 
 def _differences(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return name and both values of each parameter that differs."""
+    """Return name and both values of each parameter that differs; None for a parameter that one run does not
+    have."""
     names = dict.fromkeys([*a, *b])
     return [
         {"name": name, "a": _plain(a.get(name)), "b": _plain(b.get(name))}
@@ -133,4 +144,5 @@ def _differences(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - whatever a parameter is
+    """Return a value for JSON: None for NaN and infinity, all else unchanged."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

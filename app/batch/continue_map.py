@@ -88,11 +88,11 @@ class SavedRun:
     map: SavedMap
 
     def chosen_parameters(self) -> Parameters:
-        """Return the parameters at the end of the run."""
+        """Return the parameters at the end of the run; raises ParameterError if they are invalid."""
         return validated(json.loads(self.parameters))
 
     def as_bytes(self) -> bytes:
-        """Return the contents of the file."""
+        """Return the contents of the file state.zip."""
         return write_archive(*encode(self))
 
 
@@ -100,7 +100,8 @@ def read_saved_run(folder: Path) -> SavedRun:
     """Read the saved state in the folder of a run.
 
     Raises:
-        StemmapError: There is none, or it is damaged or has another version.
+        StemmapError: There is none, it is larger than 4 GB, damaged or has another version, or the folder is
+            that of a whole cloud.
     """
     file = folder / STATE
     try:
@@ -136,6 +137,7 @@ def read_saved_run(folder: Path) -> SavedRun:
 
 
 def _is_map_of_cloud(folder: Path) -> bool:
+    """Return whether a folder has the map of a whole cloud; False if it has no map."""
     try:
         return is_of_cloud(read_run_record(folder))
     except StemmapError:
@@ -175,6 +177,7 @@ class RunStart:
 
     def steps(self, source: Source, odometry: OdometryChoice, left_out: Counter[str]) -> Iterator[Step]:
         """Yield the steps that are not in the map yet, with indices and times that continue those of the map.
+        Scans up to `after_ns` are skipped and not counted.
 
         Args:
             source: Source of the run.
@@ -195,7 +198,7 @@ def at_origin(source: Source, warnings: list[str]) -> RunStart:
 
     Args:
         source: Source of the run.
-        warnings: Messages for the user are appended.
+        warnings: Messages for the user, the first warnings of the run.
     """
     known = source.description
     first = RunSource(known.uri, known.digest, 0, "origin", (0.0, 0.0, 0.0), 0, 0)
@@ -213,12 +216,14 @@ def continue_map(
     """Load the saved map into a new mapper, and return how the run begins in it.
 
     Args:
-        continued: The saved run, and where the robot starts.
+        continued: The saved run, and where the robot starts; the totals of the saved run are continued in
+            place.
         source: Source of the new run.
-        mapper: A mapper before its first scan.
+        mapper: A mapper before its first scan; it receives the map and, unless the start is "resume" or
+            "last", the pose of the start.
         odometry: Choice of the odometry.
         seed: Random seed.
-        warnings: Messages for the user are appended.
+        warnings: Messages for the user that are added to the totals, except with "resume".
 
     Raises:
         StemmapError: The start had to be found by the stems and was not.
@@ -249,6 +254,8 @@ def continue_map(
 
 
 def _resumed(begin: RunStart, source: Source) -> RunStart:
+    """Return the start of a run that continues the same drive. If the source is the last one of the map, its
+    losses are cleared, because it is read from its start; another source is added to the sources."""
     known, last = source.description, begin.sources[-1]
     begin.stamp_shift_ns = last.stamp_shift_ns
     if known.digest == last.digest:
@@ -262,6 +269,16 @@ def _resumed(begin: RunStart, source: Source) -> RunStart:
 def _in_another_run(
     begin: RunStart, source: Source, start: Start, pose: Pose2, found: Match | None, warnings: list[str]
 ) -> RunStart:  # fmt: skip
+    """Return the start of another drive; its times follow those of the map by PAUSE_NS where they overlap.
+
+    Args:
+        begin: The start so far, which is changed.
+        source: Source of the new run.
+        start: Where the user starts it.
+        pose: Pose of its first scan in the map.
+        found: The match by stems; None without one.
+        warnings: Messages for the user that are added to the totals.
+    """
     known, after_ns = source.description, begin.after_ns or 0
     first_ns = next((s.scan.stamp_ns for s in steps(source.records(), odometry="static")), 0)
     begin.stamp_shift_ns = max(after_ns + PAUSE_NS - first_ns, 0) if first_ns <= after_ns else 0
@@ -281,8 +298,8 @@ def _in_another_run(
 def localise(
     source: Source, parameters: Parameters, reference: MapStems, odometry: OdometryChoice, seed: int
 ) -> Match:
-    """Return the pose of the first scan of a source in a map. The first scans are mapped separately until
-    their stems match.
+    """Return the match of the first scans of a source with a map; its pose is that of the first scan. The
+    scans are mapped separately until their stems match, at first after 10 scans.
 
     Args:
         source: The source.
@@ -292,7 +309,7 @@ def localise(
         seed: Random seed.
 
     Raises:
-        StemmapError: No match was found; the message has the last reason.
+        StemmapError: No match was found up to the last scan; the message has the last reason.
     """
     mapper = mapper_of(source.description, parameters, seed)
     due, match = float(FIRST_TRY), None

@@ -59,8 +59,11 @@ class MapFrame:
 
 
 def projected(crs: str) -> str:
-    """Return a projected reference system with metres, east and north, in the normal form of its authority
-    (EPSG:25832).
+    """Return a projected reference system with metres in the normal form of its authority (EPSG:25832), or as
+    WKT without one.
+
+    Args:
+        crs: A code such as "25832" or "EPSG:25832", or any text that pyproj reads.
 
     Raises:
         StemmapError: It is unknown, has degrees (geographic) or another unit than metres.
@@ -86,14 +89,15 @@ def projected(crs: str) -> str:
 
 
 def check_area(crs: str, points: Float) -> None:
-    """Check that positions lie in the area for which a reference system is defined.
+    """Check that positions are in the area for which a reference system is defined, with a margin of 3
+    degrees; for a system without an area only that they have a longitude and latitude.
 
     Args:
         crs: The reference system.
         points: East, north, shape (N, 2) [m].
 
     Raises:
-        StemmapError: A position is far outside; the message gives its longitude and latitude.
+        StemmapError: A position is outside; the message gives its longitude and latitude.
     """
     import pyproj
 
@@ -123,10 +127,10 @@ def check_area(crs: str, points: Float) -> None:
 
 def read_map_frame(folder: FilePath) -> MapFrame:
     """Return the frame of the map of a run: that of georeference.json, else that of a whole cloud with a
-    reference system, else the local one.
+    reference system, else the local one. The reference system is not checked.
 
     Raises:
-        SourceError: A file is damaged.
+        SourceError: run.json is missing, or a file is damaged.
     """
     record = read_run_record(folder)
     file = folder / FILE
@@ -150,10 +154,10 @@ def read_map_frame(folder: FilePath) -> MapFrame:
 
 
 def write_map_frame(folder: FilePath, frame: MapFrame) -> None:
-    """Write georeference.json.
+    """Write georeference.json, in place of an earlier one.
 
     Raises:
-        OSError: The folder cannot be written.
+        StemmapError: The file cannot be written.
     """
     record = {
         "crs": frame.crs,

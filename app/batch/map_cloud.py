@@ -51,14 +51,14 @@ def map_plot_run(
         cloud: The cloud.
         preset: Name of the preset.
         parameters: All parameters.
-        truth: True trees, or None.
-        folder: Folder for the files.
+        truth: True trees in the coordinates of the cloud, or None.
+        folder: Folder for the files; those of an earlier run are replaced.
 
     Returns:
-        The result for people.
+        The result for people; it has no times.
 
     Raises:
-        SourceError: The cloud cannot be read.
+        StemmapError: The cloud cannot be read, or the forest that is named does not exist.
         OSError: The folder cannot be written; it is unchanged then.
     """
     files = RunFiles(folder)
@@ -72,6 +72,7 @@ def map_plot_run(
 def _map(
     cloud: WholeCloud, preset: str, parameters: Parameters, truth: TruthTrees | None, files: RunFiles
 ) -> MappingResult:
+    """Map the cloud and finish its files; arguments and errors as in `map_plot_run`."""
     about = cloud.description
     plot = map_plot(cloud, parameters, kept_forests())
     trees = replace(plot.trees, position=plot.trees.position + about.offset[:2])
@@ -112,7 +113,7 @@ def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
     Args:
         position: x, y [m] in the reference system, shape (N, 2).
         crs: The reference system as text for pyproj; "" for none.
-        warnings: Receives the warning.
+        warnings: The warning is appended to it.
     """
     if not crs:
         return None
@@ -131,6 +132,12 @@ def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
 
 
 def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
+    """Yield a row of DETECTION_COLUMNS for each candidate; scan 0, without times.
+
+    Args:
+        plot: The map in local coordinates.
+        offset: Origin of the local coordinates in those of the cloud, x, y, z [m].
+    """
     c = plot.candidates
     for k in range(len(c.verdict)):
         x, y = c.place[k] + offset[:2]
@@ -151,6 +158,8 @@ def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
 
 
 def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
+    """Yield a row of SLICE_COLUMNS for each cross-section with a known radius; arguments as in
+    `_detection_rows`."""
     for number, slices in zip(plot.trees.number, plot.slices, strict=True):
         for height, s in zip(plot.slice_height, slices, strict=True):
             if np.isfinite(s[2]):
@@ -178,6 +187,7 @@ def _terrain_rows(ground: TerrainRaster, offset: Float) -> Iterator[list[str]]:
 
 
 def _text(value: float, digits: int) -> str:
+    """Return a number with some decimals; "" where not finite."""
     return f"{value:.{digits}f}" if math.isfinite(value) else ""
 
 
@@ -190,6 +200,15 @@ def _run_record(
     warnings: list[str],
     losses: dict[str, int],
 ) -> dict[str, Any]:
+    """Return the contents of run.json, without times of day and computing times.
+
+    Args:
+        cloud, plot: The cloud and its map.
+        preset, parameters: With which it was mapped.
+        evaluation: Scores; None without ground truth.
+        warnings: Messages for people.
+        losses: Number of left-out points by reason.
+    """
     about = cloud.description
     verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict)
     return {
@@ -222,6 +241,14 @@ def _range(values: Float) -> tuple[float, float]:
 
 
 def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None) -> list[str]:
+    """Return the result as lines for people.
+
+    Args:
+        uri: URI of the cloud.
+        plot: The map.
+        trees: Its trees.
+        evaluation: Scores; None without ground truth.
+    """
     dbh = 100.0 * trees.dbh[np.isfinite(trees.dbh)]
     wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} measured)" if len(dbh) else ", no DBH"
     verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict if v != Verdict.TREE)

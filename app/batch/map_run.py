@@ -57,9 +57,14 @@ class OfflineRun:
     """A run to be mapped.
 
     Attributes:
+        source: The source, without a choice of the odometry.
+        preset, parameters: Name of the preset, and all parameters at the start.
+        seed: Random seed.
         odometry: Source of the motion, see `app.sources.request`.
-        stop_after: Maximum number of scans.
-        revisions: Parameter changes: first scan and parameters.
+        truth_trees: True trees that replace those of the source; None for these.
+        continued: The map that is continued; None begins a map.
+        stop_after: Maximum number of scans; None for all.
+        revisions: Parameter changes: first scan and parameters, in order.
         on_frame: Called with the results of each scan.
         chosen: Topics and mounting that the user chose, see `SourceRequest.kept_choices`.
     """
@@ -98,16 +103,18 @@ class MappingResult:
 def map_run(
     plan: OfflineRun, folder: FilePath, progress: Progress, earlier: FilePath | None = None
 ) -> MappingResult:
-    """Map a run, write its files, and return the result for people.
+    """Map a run, write its files, and return the result for people. Pictures of trees are written at the end,
+    if the source has a camera and no map is continued; their errors are warnings.
 
     Args:
         plan: The run.
-        folder: Folder for the files.
-        progress: Updated after each scan.
+        folder: Folder for the files; those of an earlier run are replaced.
+        progress: Updated after each scan, and closed at the end.
         earlier: Folder of the run that is continued, or None.
 
     Raises:
-        SourceError: The source cannot be read.
+        StemmapError: The source cannot be read or has no scan, the odometry is not available, or the start in
+            a continued map was not found.
         OSError: The folder cannot be written; it is unchanged then.
     """
     files = RunFiles(folder, earlier)
@@ -140,6 +147,13 @@ def _map(
     stopwatch: Stopwatch,
     earlier: FilePath | None,
 ) -> tuple[MappingResult, _Mapped]:
+    """Map the run and finish its files; return the result and the input of the pictures.
+
+    Args:
+        plan, progress, earlier: As in `map_run`.
+        files: Output files.
+        stopwatch: Measures the stages.
+    """
     moving, chosen = with_odometry(plan.source, plan.odometry)
     plan = replace(plan, source=moving)
     description = plan.source.description
@@ -203,12 +217,15 @@ def _map_scans(
     Args:
         plan: The run.
         mapper: The mapper.
-        begun: How the run begins.
+        begun: How the run begins; its tally is updated.
         to_map: Steps of the scans.
         files: Output files.
         progress: Updated after each scan.
         stopwatch: Measures the stages.
         seen: Receives what the scans observed.
+
+    Raises:
+        SourceError: There is no scan that is not in the map yet.
     """
     start_ns, frame = begun.start_ns, None
     for step in to_map:
@@ -253,13 +270,15 @@ def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) ->
 
 
 def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
+    """Give the mapper the parameters in force at a scan, if a revision changed them."""
     in_force = [parameters for first, parameters in plan.revisions if first <= scan]
     if in_force and in_force[-1] is not mapper.parameters:
         mapper.parameters = in_force[-1]
 
 
 def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
-    """Return the parameter changes of each revision for run.json."""
+    """Return the parameter changes of each revision for run.json, first an empty one from scan 0 on.
+    Revisions without a change are omitted."""
     revisions: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
     before = plan.parameters.flat()
     for first, parameters in plan.revisions:
@@ -272,6 +291,8 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
 
 
 def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunStart:
+    """Return how the run begins; loads a continued map into the mapper. The warnings of source and odometry
+    are counted."""
     warned = (chosen.warning,) if chosen.warning else ()
     warnings = [*warned, *plan.source.description.warnings]
     if plan.continued is None:
@@ -282,6 +303,15 @@ def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunS
 def _saved(
     plan: OfflineRun, begun: RunStart, mapper: Mapper, start_ns: int, losses: dict[str, int]
 ) -> SavedRun:
+    """Return the state with which the run can be continued.
+
+    Args:
+        plan: The run.
+        begun: Sources and totals.
+        mapper: The mapper after the last scan.
+        start_ns: Time of the first scan [ns].
+        losses: Number of left-out records by reason.
+    """
     return SavedRun(
         FORMAT,
         begun.sources,
@@ -296,6 +326,8 @@ def _saved(
 
 
 def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
+    """Return the ground truth: trees of the plan, else those of the source in the frame of the map; and its
+    path."""
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 

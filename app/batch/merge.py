@@ -47,7 +47,8 @@ def merge_runs(
     *,
     force: bool = False,
 ) -> MergeResult:
-    """Merge run b into run a, and write the files of a run and correspondence.csv.
+    """Merge run b into run a, and write the files of a run and correspondence.csv. Scores of run a are not
+    part of the result.
 
     Args:
         folder_a, folder_b: Folders of finished runs.
@@ -55,8 +56,12 @@ def merge_runs(
         parameters: Parameters of the merged map; None for those of run a.
         force: Whether the map of another source may be overwritten.
 
+    Returns:
+        Numbers of confirmed trees, and the match of the maps.
+
     Raises:
-        StemmapError: A run cannot be read, or the two maps do not match with confidence.
+        StemmapError: A run cannot be read, the two maps do not match with confidence, or `out` has the map of
+            another source.
         OSError: The folder cannot be written; it is unchanged then.
     """
     a, b = read_saved_run(folder_a), read_saved_run(folder_b)
@@ -99,6 +104,16 @@ def merge_runs(
 def _joined(
     a: SavedRun, b: SavedRun, merged: MergedMap, match: Match, shift: int, parameters: Parameters
 ) -> SavedRun:
+    """Return the saved state of the merged run; scan numbers, times and poses of the sources of b are those
+    in run a.
+
+    Args:
+        a, b: The runs.
+        merged: Their merged map.
+        match: Pose of the map of b in that of a.
+        shift: Offset that is added to the times of run b [ns].
+        parameters: Parameters of the merged map.
+    """
     scans, pose = len(a.map.stamp_ns), match.pose or Pose2()
     moved = []
     for source in b.sources:
@@ -130,6 +145,7 @@ def _joined(
 
 
 def _path(merged: MergedMap) -> Path:
+    """Return the path of a merged map, that of a first."""
     m = merged.map
     poses = m.slam.genealogy.path(m.slam.best)
     return Path(m.stamp_ns, poses[:, 0], poses[:, 1], poses[:, 2], m.sigma_xy)
@@ -212,6 +228,9 @@ def _moved_rows(
         scans: Number of scans of run a.
         shift: Offset that is added to the times of run b [ns].
         a, b: The two runs.
+
+    Raises:
+        StemmapError: The table cannot be read or is damaged.
     """
     seconds = (b.start_ns + shift - a.start_ns) * 1e-9
     try:

@@ -22,17 +22,19 @@ _RADII = ("radius_m", "radius", "r_m")
 def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list[Plot]:
     """Return the plots of a file in the frame of the map of a run.
 
-    Polygons are plots; points are circles if a column `radius_m` gives their radius. Names are those of a
-    column `name`, `plot` or `id`, else the numbers of the rows.
+    Polygons are plots; points are circles if a column `radius_m` (or `radius`, `r_m`) gives their radius.
+    Names are those of a column `name`, `plot`, `id` or similar, else the numbers of the rows.
 
     Args:
-        file: A GeoPackage, Shapefile or GeoJSON.
+        file: A GeoPackage, Shapefile or GeoJSON of at most 64 MB and PLOTS_MAX rows.
         run: Folder of the run.
         crs: Reference system of a file without one: an EPSG code, or "local" for the frame of the map. It
-            also says that a GeoJSON, which is WGS84 by its standard, is in that system.
+            also states that a GeoJSON, which is WGS84 by its standard, is in that system. It is ignored for
+            other files with a reference system.
 
     Raises:
-        StemmapError: The file cannot be read, has no plots, or its reference system does not fit the run.
+        StemmapError: geopandas is not installed; the file cannot be read or has no plots; a shape is not a
+            valid area; or its reference system does not fit the run.
     """
     geopandas = needed("geopandas", "gis", "plots from files")
     if file.suffix.lower() not in SUFFIXES:
@@ -65,7 +67,16 @@ def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list
 
 
 def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN401 - a pyproj.CRS
-    """Return the reference system of a file; None for the frame of the map."""
+    """Return the reference system of a file; None for the frame of the map.
+
+    Args:
+        file: The file, for messages and for the members of a GeoJSON.
+        table: Its GeoDataFrame.
+        given: The system that the user gives, or None.
+
+    Raises:
+        StemmapError: It is unknown, or there is none.
+    """
     import pyproj
 
     declared = table.crs
@@ -93,7 +104,17 @@ def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN4
 
 
 def _in_map(table: Any, crs: Any, frame: MapFrame, file: FilePath) -> list[Any]:  # noqa: ANN401
-    """Return the shapes of a table in the frame of the map."""
+    """Return the shapes of a table in the frame of the map; None for a row without a shape.
+
+    Args:
+        table: GeoDataFrame.
+        crs: Reference system of its shapes; None for the frame of the map.
+        frame: The frame of the map.
+        file: The file, for messages.
+
+    Raises:
+        StemmapError: The shapes have a reference system, but the map has none.
+    """
     if crs is None:
         return list(table.geometry)
     if not frame.crs:

@@ -73,10 +73,11 @@ class FinishedRun:
 
 
 def read_run(folder: FilePath) -> FinishedRun:
-    """Return the run in a folder that `stemmap map` wrote.
+    """Return the run in a folder that `stemmap map` wrote: its run.json, path.csv and trees.csv. The trees
+    have no velocity, diagonal covariances, and are all confirmed.
 
     Raises:
-        SourceError: A file is missing or damaged.
+        SourceError: A file is missing, damaged or larger than 256 MB.
     """
     try:
         record = json.loads(_text(folder / "run.json"))
@@ -95,7 +96,8 @@ def read_run(folder: FilePath) -> FinishedRun:
 
 
 def read_seen_area(folder: FilePath) -> SeenArea | None:
-    """Return the area that a run observed, from seen.csv; None without this file.
+    """Return the area that a run observed, from seen.csv; None without this file. An unknown number of views
+    is 0.
 
     Raises:
         SourceError: The file is damaged.
@@ -107,11 +109,11 @@ def read_seen_area(folder: FilePath) -> SeenArea | None:
 
 
 def read_ground_area(folder: FilePath) -> SeenArea | None:
-    """Return the area in which a run observed the ground, from terrain.csv, with unknown distances; None
-    without cells. Gaps up to 1 m, such as the feet of stems, are closed.
+    """Return the area in which a run observed the ground, from terrain.csv, with unknown distances (NaN) and
+    0 views; None without cells. Gaps up to 1 m, such as the feet of stems, are closed.
 
     Raises:
-        SourceError: The file is missing or damaged.
+        SourceError: The file is missing or damaged, or the cells are too far apart.
     """
     from scipy.ndimage import binary_closing
 
@@ -140,6 +142,7 @@ def read_terrain(folder: FilePath) -> Float:
 
 
 def _seen_area(c: dict[str, Float], cell: float) -> SeenArea:
+    """Return the area from the columns of seen.csv; `cell` is the size of its cells [m]."""
     place = np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / cell).astype(np.int64)
     return SeenArea(cell, place, c["nearest_m"], np.nan_to_num(c["views"]).astype(np.int64))
 
@@ -150,7 +153,7 @@ def is_of_cloud(record: dict[str, Any]) -> bool:
 
 
 def read_run_record(folder: FilePath) -> dict[str, Any]:
-    """Return run.json of a folder.
+    """Return run.json of a folder; "source" and "parameters" are dicts, all else is unchecked.
 
     Raises:
         SourceError: It is missing or damaged.
@@ -166,7 +169,8 @@ def read_run_record(folder: FilePath) -> dict[str, Any]:
 
 def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
     """Return the confirmed trees and the path with the precision of their files, so that scores after mapping
-    equal scores of the files.
+    equal scores of the files. As from `read_run`, the trees have no velocity and diagonal covariances, and
+    times count from `start_ns`.
 
     Args:
         trees, path: The map.
@@ -197,6 +201,11 @@ def score_map(trees: Trees, path: Path, truth: TruthTrees, parameters: Parameter
 
 
 def _text(file: FilePath) -> str:
+    """Return the text of a file.
+
+    Raises:
+        SourceError: It cannot be read, is larger than 256 MB, or is not UTF-8.
+    """
     try:
         if file.stat().st_size > LARGEST_FILE:
             raise SourceError("the file is larger than 256 MB", where=str(file))
@@ -212,6 +221,16 @@ def _text(file: FilePath) -> str:
 
 
 def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
+    """Return the columns of a CSV file by name; an empty cell is NaN.
+
+    Args:
+        file: The file.
+        names: Its expected header.
+
+    Raises:
+        SourceError: The file cannot be read, has another header or a damaged row, or a cell of `_NEVER_EMPTY`
+            is empty.
+    """
     rows = list(csv.reader(_text(file).splitlines()))
     if not rows or tuple(rows[0]) != names:
         raise SourceError(f"the columns are not {', '.join(names)}", where=str(file))
@@ -226,25 +245,27 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
 
 
 def _table(rows: list[list[str]], names: tuple[str, ...]) -> dict[str, Float]:
-    """Return the columns of a CSV table by name; an empty cell is NaN.
+    """Return the columns of a CSV table by name, shape (rows,) each; an empty cell is NaN.
 
     Args:
-        rows: Cells of the rows, the header first.
+        rows: Cells of the rows, without the header.
         names: Names of the columns.
 
     Raises:
-        ValueError: A row does not fit the columns.
+        ValueError: A row does not fit the columns, or a cell is not a number.
     """
     table = np.array([[float(cell) if cell else math.nan for cell in row] for row in rows], np.float64)
     return dict(zip(names, table.reshape(len(rows), len(names)).T, strict=True))
 
 
 def _path(c: dict[str, Float]) -> Path:
+    """Return the path from the columns of path.csv."""
     stamp = np.round(c["t_s"] * 1e9).astype(np.int64)
     return Path(stamp, c["x_m"], c["y_m"], c["yaw_rad"], c["sigma_xy_m"])
 
 
 def _trees(c: dict[str, Float]) -> Trees:
+    """Return the trees from the columns of trees.csv, see `read_run`."""
     n = len(c["tree"])
     covariance = np.zeros((n, 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = c["sigma_x_m"] ** 2, c["sigma_y_m"] ** 2
@@ -273,18 +294,19 @@ def _stamps(seconds: Float) -> Int:
 
 
 def check_folder(folder: FilePath, digest: str, *, force: bool) -> bool:
-    """Check whether the files of a run may be written to a folder.
+    """Check whether the files of a run may be written to a folder. Nothing is changed.
 
     Args:
-        folder: The folder for the files.
+        folder: The folder for the files; it need not exist.
         digest: Digest of the run's first source. A run of the same source may be replaced.
         force: Whether anything may be overwritten.
 
     Returns:
-        Whether a run in the folder will be replaced.
+        Whether files in the folder will be replaced.
 
     Raises:
-        StemmapError: The folder contains the run of another source, or files of that name from elsewhere.
+        StemmapError: The folder contains the run of another source, or files of that name from elsewhere, and
+            `force` is not set.
     """
     if not (folder / "run.json").exists():
         there = [name for name in _FILES if (folder / name).exists()]
@@ -316,8 +338,9 @@ QUIET_S = 600.0  # a folder that was written to more recently may belong to a ru
 
 
 def finished_folders(settings: Settings) -> dict[str, FilePath]:
-    """Return the folders of finished runs by name; of two with the same name the first. Links that point
-    outside of the data folders are left out."""
+    """Return the folders of finished runs in the data folders by name, at most 500; of two with the same name
+    the first. Links that point outside of the data folders, and data folders that cannot be read, are left
+    out."""
     found: dict[str, FilePath] = {}
     for folder in settings.data_folders:
         try:
@@ -347,6 +370,12 @@ async def read_folder(name: str, settings: Settings) -> dict[str, Any]:
 
 
 def _is_finished(path: FilePath, folder: FilePath) -> bool:
+    """Return whether a path is the folder of a finished run inside of a data folder.
+
+    Args:
+        path: The path.
+        folder: The data folder.
+    """
     try:
         if path.name.startswith(".") or not path.resolve().is_relative_to(folder.resolve()):
             return False
@@ -360,10 +389,10 @@ class PartialOutput:
     """A folder that a killed process left.
 
     Attributes:
-        name: FilePath relative to the data folder.
+        name: Path relative to the data folder.
         size: Size of its files [bytes].
         changed_s: Time of the last change [s since 1970].
-        quiet: Whether it can be deleted, because no process writes to it.
+        quiet: Whether it can be deleted: no process holds it, and it was not changed for QUIET_S.
     """
 
     name: str
@@ -373,7 +402,7 @@ class PartialOutput:
 
 
 def partial_outputs(settings: Settings, now_s: float | None = None) -> list[PartialOutput]:
-    """Return the partial outputs in the data folders, the newest first.
+    """Return at most 100 partial outputs in the data folders, the newest first.
 
     Args:
         settings: Settings of the deployment.
@@ -385,7 +414,7 @@ def partial_outputs(settings: Settings, now_s: float | None = None) -> list[Part
 
 
 def delete_partial_output(name: str, settings: Settings, now_s: float | None = None) -> None:
-    """Delete a partial output.
+    """Delete a partial output with all its files.
 
     Args:
         name: Its path relative to the data folder.
@@ -417,7 +446,7 @@ def delete_partial_output(name: str, settings: Settings, now_s: float | None = N
 
 
 def partial_output_warnings(folder: FilePath) -> list[str]:
-    """Return a warning for each partial output in a folder."""
+    """Return a warning for each partial output directly in a folder; [] if the folder does not exist."""
     return [
         f"{path} is the partial output of a run that was killed: delete it, unless another stemmap process "
         "writes to it"
@@ -426,7 +455,8 @@ def partial_output_warnings(folder: FilePath) -> list[str]:
 
 
 def _partial_folders(settings: Settings) -> dict[str, FilePath]:
-    """Folders by their path relative to the data folder, without links."""
+    """Return at most 100 partial outputs by their path relative to the data folder, in the data folders and
+    in the folders in these, without links."""
     found: dict[str, FilePath] = {}
     for folder in settings.data_folders:
         for path in [*_inside(folder), *(each for run in _folders(folder) for each in _inside(run))]:
@@ -435,10 +465,12 @@ def _partial_folders(settings: Settings) -> dict[str, FilePath]:
 
 
 def _inside(folder: FilePath) -> list[FilePath]:
+    """Return the partial outputs directly in a folder."""
     return [path for path in _folders(folder) if path.name.startswith(UNFINISHED)]
 
 
 def _folders(folder: FilePath) -> list[FilePath]:
+    """Return the folders in a folder without links, sorted; [] if it cannot be read."""
     try:
         return sorted(path for path in folder.iterdir() if path.is_dir() and not path.is_symlink())
     except OSError:

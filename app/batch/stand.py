@@ -55,7 +55,7 @@ class StandResult:
 
 
 def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[Plot] = ()) -> StandResult:
-    """Return the stand figures of a finished run.
+    """Return the stand figures of a finished run. Nothing is written.
 
     Args:
         folder: Its folder.
@@ -107,6 +107,7 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[Plot] = ()) ->
 
 
 def _extent(points: np.ndarray) -> str:
+    """Return the bounding box of points, shape (N, 2) [m], as text; N is at least 1."""
     low, high = points.min(axis=0), points.max(axis=0)
     return f"x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} to {high[1]:.0f} m"
 
@@ -117,7 +118,7 @@ CLASS_COLUMNS = ("plot", "from_cm", "to_cm", "trees", "n_ha", "n_ha_se", "g_ha",
 
 def stand_files(result: StandResult) -> dict[str, str]:
     """Return the texts of stand.csv (one row per plot, and `mean` for several), classes.csv and stand.json by
-    name."""
+    name. Unknown values are empty cells or null."""
     header = (*PLOT_COLUMNS, *(f"{name}{end}" for name in FIGURES for end in ("", "_se")))
     rows = []
     for name, f in result.figures.items():
@@ -173,6 +174,7 @@ def stand_record(result: StandResult) -> dict[str, Any]:
 
 
 def _pair(estimate: Estimate) -> list[float | None]:
+    """Return an estimate (value, standard error) for JSON; None where not finite."""
     return [_finite(value) for value in estimate]
 
 
@@ -181,18 +183,22 @@ def _finite(value: float) -> float | None:
 
 
 def _number(value: float) -> str:
+    """Return a number with four decimals; "" where not finite."""
     return f"{value:.4f}" if math.isfinite(value) else ""
 
 
 def _cells(values: dict[str, Estimate]) -> list[str]:
+    """Return value and standard error of each figure of FIGURES as cells."""
     return [_number(value) for name in FIGURES for value in values[name]]
 
 
 def write_stand(result: StandResult, folder: FilePath) -> list[FilePath]:
     """Write the files of `stand_files` to a folder, which is created if necessary; return their paths.
+    Existing files are replaced.
 
     Raises:
-        OSError: The folder cannot be written.
+        OSError: The folder cannot be created.
+        StemmapError: A file cannot be written; it is unchanged then.
     """
     folder.mkdir(parents=True, exist_ok=True)
     written = []
@@ -204,7 +210,7 @@ def write_stand(result: StandResult, folder: FilePath) -> list[FilePath]:
 
 
 def stand_summary(result: StandResult) -> list[str]:
-    """Return the figures as lines for people."""
+    """Return the figures as lines for people; figures without a value are omitted."""
     seen = sum(f.seen for f in result.figures.values())
     area = sum(f.area for f in result.figures.values())
     trees = sum(f.trees for f in result.figures.values())
@@ -234,4 +240,5 @@ def stand_summary(result: StandResult) -> list[str]:
 
 
 def _digits(value: float) -> str:
+    """Return a number with three significant digits or, from 100 on, as a whole number."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"

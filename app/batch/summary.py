@@ -74,7 +74,8 @@ class RunHealth:
         return cls(first._scans + second._scans, spans[:MOST_SPANS], left_out, second._was, worst)
 
     def add(self, frame: Frame) -> None:
-        """Add the next scan."""
+        """Add the next scan: count its state, update the worst values, and extend or begin a span if it is
+        not good."""
         health = frame.health
         self._scans[health.state] += 1
         self._remember_worst(health)
@@ -83,6 +84,8 @@ class RunHealth:
         self._was = health.state
 
     def _extend(self, frame: Frame, health: Health) -> None:
+        """Extend the last span if the state is the same as in the scan before, else begin one; above
+        MOST_SPANS spans are only counted."""
         if health.state == self._was and (self._spans or self._spans_left_out):
             if not self._spans_left_out:
                 self._spans[-1].last, self._spans[-1].end_ns = frame.index, frame.stamp_ns
@@ -93,6 +96,8 @@ class RunHealth:
             self._spans_left_out += 1
 
     def _remember_worst(self, health: Health) -> None:
+        """Update the worst values: the least of n_eff and ancestors, else the largest; values that are not
+        finite are ignored."""
         found = {
             "sigma_xy_m": health.sigma_xy,
             "sigma_yaw_deg": math.degrees(health.sigma_yaw),
@@ -107,7 +112,8 @@ class RunHealth:
             self._worst[name] = min(value, self._worst.get(name, math.inf))
 
     def record(self, start_ns: int) -> dict[str, Any]:
-        """Return the record for run.json; times are seconds after `start_ns`."""
+        """Return the record for run.json: scans by state, worst values, and at most MOST_SPANS spans; times
+        are seconds after `start_ns`."""
         return {
             "scans": {state: self._scans[state] for state in ("good", "weak", "lost")},
             "worst": {name: round(value, 4) for name, value in sorted(self._worst.items())},
@@ -172,14 +178,14 @@ class RunTotals:
     health: RunHealth = field(default_factory=RunHealth)
 
     def add(self, frame: Frame) -> None:
-        """Add the next scan."""
+        """Add the next scan: its pose quality, counts of points, verdicts of clusters and warnings."""
         self.health.add(frame)
         self.points.update(frame.counts)
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
 
     def warn_of_unconfirmed(self, frame: Frame, hits: int) -> None:
-        """Add a warning if trees were seen in too few scans.
+        """Add a warning if trees are not confirmed at the end.
 
         Args:
             frame: Results of the last scan.
@@ -208,7 +214,8 @@ def far_truth(reach: float) -> str:
 
 
 def far_map(scores: MapScores, match_distance: float) -> str:
-    """Return the message for a map without any of the true trees; empty if it has one, or there are none.
+    """Return the message for a map that has none of the true trees; empty if it has at least one, or there
+    are no true trees.
 
     Args:
         scores: Scores of the map.
@@ -220,16 +227,17 @@ def far_map(scores: MapScores, match_distance: float) -> str:
 
 
 def breaks_of(sources: Iterable[RunSource]) -> list[int]:
-    """Return the indices of the scans with which another drive begins."""
+    """Return the indices of the scans with which another drive begins; a resumed drive is not another one."""
     return [source.from_scan for source in sources if source.start not in _SAME_DRIVE]
 
 
 def driven(path: Path, breaks: Iterable[int] = ()) -> tuple[float, float]:
-    """Return duration [s] and distance [m] of the drives, without the gaps between two drives.
+    """Return duration [s] and distance [m] of the drives, without the gaps between two drives; 0, 0 for fewer
+    than two scans.
 
     Args:
         path: One row per scan.
-        breaks: First scan of each further drive, see `breaks_of`.
+        breaks: First scan of each further drive, see `breaks_of`; others than 1 to N - 1 are ignored.
     """
     is_step = np.ones(max(len(path.x) - 1, 0), np.bool_)
     is_step[[scan - 1 for scan in breaks if 0 < scan < len(path.x)]] = False
@@ -270,9 +278,11 @@ def summary_lines(
 
 
 def evaluation_lines(e: MapScores, *, whole: bool = False) -> list[str]:
-    """Return the scores as text, with counts and rates.
+    """Return the scores as text, with counts and rates; "-" for an unknown value, and a warning if the ground
+    truth is in doubt.
 
     Args:
+        e: The scores.
         whole: Whether a whole cloud was mapped, so that all true trees count.
     """
     where = "in the whole cloud" if whole else f"within {e.reach:g} m of the path"
@@ -317,7 +327,8 @@ def _pair(value: float | None) -> str:
 
 
 def start_lines(last: RunSource) -> list[str]:
-    """Return where a run was found to start in an earlier map, if it was found by its stems."""
+    """Return where a run was found to start in an earlier map, as one line; [] if it was not found by its
+    stems."""
     if last.start != "constellation":
         return []
     x, y, yaw = last.pose

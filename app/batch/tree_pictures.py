@@ -59,6 +59,17 @@ def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[St
 def _best_view(
     camera: Camera, trees: Trees, row: int, path: Path, taken: Int, there: Bool
 ) -> StemPicture | None:
+    """Return the view of a tree whose distance is nearest to BEST and that is nearest to the middle of the
+    picture; None if no picture shows it between NEAREST and FARTHEST.
+
+    Args:
+        camera: The camera.
+        trees: Trees of the map.
+        row: Row of the tree.
+        path: Path of the robot, N poses.
+        taken: Time of the picture nearest to each pose, shape (N,) [ns].
+        there: Whether that picture is near enough in time, shape (N,).
+    """
     dx, dy = trees.position[row, 0] - path.x, trees.position[row, 1] - path.y
     c, s = np.cos(path.yaw), np.sin(path.yaw)
     ahead, left = c * dx + s * dy, c * dy - s * dx
@@ -80,11 +91,11 @@ def _best_view(
 
 
 def stem_corners(x: float, y: float, dbh: float) -> Float:
-    """Return the corners of a stem as seen from the robot, shape (4, 3) [m].
+    """Return the corners of a stem between FROM_Z and TO_Z as seen from the robot, shape (4, 3) [m].
 
     Args:
-        x, y: Position in the base frame [m].
-        dbh: Diameter [m]; NaN where unknown.
+        x, y: Position in the base frame [m], not the origin.
+        dbh: Diameter [m]; NaN where unknown, which is drawn as THIN.
     """
     half = 0.5 * (dbh if np.isfinite(dbh) else THIN)
     across = np.array([-y, x, 0.0]) * half / np.hypot(x, y)
@@ -92,7 +103,8 @@ def stem_corners(x: float, y: float, dbh: float) -> Float:
 
 
 def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) -> tuple[int, str]:
-    """Write a picture of each tree to `folder`/pictures; pictures of an earlier run are deleted.
+    """Write a picture of each tree that the camera saw to `folder`/pictures, at most MOST; pictures of an
+    earlier run are deleted, also if there are no new ones.
 
     Args:
         source: The source, with its camera.
@@ -100,10 +112,11 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
         folder: Folder of the run.
 
     Returns:
-        Number of pictures, and a warning; "" for none.
+        Number of pictures, and a warning; 0 and "" for a source without a camera.
 
     Raises:
-        OSError: The folder cannot be written.
+        OSError: An old picture cannot be deleted, or the folder cannot be created.
+        StemmapError: A picture cannot be written.
     """
     for old in (folder / FOLDER).glob("tree_*.jpg"):
         old.unlink()

@@ -61,7 +61,7 @@ _PYTHON_FORMAT = warnings.formatwarning
 
 
 def command() -> NoReturn:
-    """The program `stemmap`: runs `main` and ends the process with its exit code."""
+    """The program `stemmap`: runs `main` and ends the process with its exit code. It never returns."""
     warnings.formatwarning = _format_warning
     code = main()
     if "zenoh" in sys.modules:
@@ -84,7 +84,9 @@ def _format_warning(
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line.
+    """Run the command line; errors are printed to standard error, except unexpected ones, which are raised.
+
+    Without a command, or if the first word is no command, the command is `serve`.
 
     Args:
         arguments: Words after the program's name; None takes those of this process.
@@ -140,8 +142,11 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
 def _check_command(words: list[str]) -> None:
     """Report a mistyped command, such as `stemmap mpa run.mcap`, as such and not as a missing file.
 
+    Args:
+        words: Words of the command line after `main` has inserted `serve`.
+
     Raises:
-        UsageError: The first word is not a source but similar to a command.
+        UsageError: The first word is no command and no existing file, but similar to a command.
     """
     if len(words) < 2 or words[0] != "serve" or words[1].startswith("-") or ":" in words[1]:
         return  # a flag, or an address such as sim:stand
@@ -152,7 +157,8 @@ def _check_command(words: list[str]) -> None:
 
 @contextlib.contextmanager
 def _sigterm_as_ctrl_c() -> Iterator[None]:
-    """Treat SIGTERM as Ctrl-C inside the context, so that partial outputs are removed."""
+    """Treat SIGTERM as Ctrl-C inside the context, so that partial outputs are removed. Outside of the main
+    thread nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -192,5 +198,6 @@ def _build_parser(wanted: str) -> tuple[argparse.ArgumentParser, dict[str, argpa
 
 
 def _complain(error: object, code: int) -> int:
+    """Print an error to standard error and return the exit code."""
     print(f"stemmap: {error}", file=sys.stderr)
     return code

@@ -47,10 +47,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the benchmarks.
+    """Run the benchmarks and write docs/benchmarks.md or --out; with --list or --pictures only list them or
+    draw pictures. --seeds is passed on by an environment variable.
+
+    Returns:
+        Exit code: 1 if a benchmark failed, else 0.
 
     Raises:
-        StemmapError: This is not the source tree, a name is unknown, or a benchmark failed.
+        StemmapError: This is not the source tree, or a name is unknown.
     """
     _find_benchmarks(_ROOT)
     from tests.benchmarks.runner import descriptions
@@ -77,6 +81,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _find_benchmarks(root: Path) -> None:
+    """Make the package `tests` of the source tree importable by adding the tree to `sys.path`.
+
+    Raises:
+        StemmapError: The folder is not the source tree.
+    """
     if not (root / "tests" / "benchmarks" / "runner.py").is_file():
         raise StemmapError(
             "the benchmarks are not part of the installed package",
@@ -87,12 +96,14 @@ def _find_benchmarks(root: Path) -> None:
 
 
 def _seeds(text: str) -> str:
+    """Return the text if it is a number or a range A-B; raises argparse.ArgumentTypeError otherwise."""
     if not re.fullmatch(r"\d{1,9}(-\d{1,9})?", text):
         raise argparse.ArgumentTypeError(f"{text!r} is not a range of seeds like 1-20")
     return text
 
 
 def _date(text: str) -> date:
+    """Parse a date YYYY-MM-DD; raises argparse.ArgumentTypeError for other texts."""
     try:
         return date.fromisoformat(text)
     except ValueError:

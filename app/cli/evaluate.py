@@ -59,7 +59,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Score the runs and print the scores, one set of parameters or, with --param-grid, many.
+    """Score the runs and print the scores, with one set of parameters or, with --param-grid, with many. A run
+    that cannot be scored is reported on standard error if there are several.
 
     Returns:
         Exit code: 0; 3 if some runs could not be scored; 1 if none could.
@@ -98,6 +99,13 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print(arguments: argparse.Namespace, evaluation: MapScores, whole: bool) -> int:
+    """Print the scores of a run as lines or, with --json, as JSON; return 0.
+
+    Args:
+        arguments: Arguments of the command.
+        evaluation: The scores.
+        whole: Whether the run is a whole cloud.
+    """
     from app.batch.summary import evaluation_lines
 
     if arguments.json:
@@ -137,7 +145,8 @@ def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]
 
 
 def _given_truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
-    """Return the true trees that --truth gives for a run, or None."""
+    """Return the true trees that --truth gives for a run: its own file, or the only one; None without
+    --truth. Raises StemmapError if the file cannot be read."""
     from pipeline.io.ground_truth import read_truth_trees
 
     if not arguments.truth:
@@ -147,6 +156,16 @@ def _given_truth(arguments: argparse.Namespace, number: int) -> TruthTrees | Non
 
 
 def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) -> TruthTrees:
+    """Return the true trees of a run: those of --truth, else those of its source, which is opened again.
+
+    Args:
+        arguments: Arguments of the command.
+        finished: The run.
+        number: Its position in the arguments, from 0 on.
+
+    Raises:
+        StemmapError: There are no true trees, or the file or the source cannot be read.
+    """
     from contextlib import closing
 
     from pipeline.io.readers import SourceOptions, open_source
@@ -233,16 +252,20 @@ def refuse_without_grid(arguments: argparse.Namespace) -> None:
 
 
 def distances(arguments: argparse.Namespace) -> list[str]:
-    """Return --match-distance and --reach as assignments of parameters."""
+    """Return --match-distance and --reach, where given, as assignments of parameters in the syntax of --set."""
     values = (("match_distance", arguments.match_distance), ("reach", arguments.reach))
     return [f"evaluation.{name}={value}" for name, value in values if value is not None]
 
 
 def run_grid(arguments: argparse.Namespace) -> int:
-    """Compare all sets on all runs; return the exit code. It is 1 if no run can be used.
+    """Compare all sets on all runs, print the comparison and write its files.
+
+    Returns:
+        Exit code: 0; 3 if results or runs are missing; 1 if no run can be used or all results failed.
 
     Raises:
-        StemmapError: An argument is wrong, or more than MOST_JOBS results are requested.
+        StemmapError: An argument is wrong, every set contradicts itself, or more than MOST_JOBS results are
+            requested.
     """
     from app.tuning.grid import combinations, read_axes
 
@@ -269,7 +292,7 @@ def run_grid(arguments: argparse.Namespace) -> int:
 
 
 def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
-    """Return the runs that can be scored, and the number of the others, which are reported."""
+    """Return the runs that can be scored, and the number of the others, which are reported on standard error."""
     from app.sources.request import SourceRequest, mount_of_degrees
     from app.tuning.sweep import prepare_run
 
@@ -292,8 +315,17 @@ def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
 
 
 def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Value]) -> Parameters:
-    """Return the parameters that a set changes: the preset that the set names, else that of the run, with the
-    flags applied."""
+    """Return the parameters that a set changes: the preset that the set names, else --preset, else that of
+    the run, with --config and --set applied.
+
+    Args:
+        arguments: Arguments of the command.
+        run: The run.
+        changes: Values of the set by name, perhaps with PRESET.
+
+    Raises:
+        StemmapError: A flag is invalid for this preset.
+    """
     from app.tuning.grid import PRESET
     from pipeline.config import preset
 
@@ -303,6 +335,7 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
 
 
 def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
+    """Compute all jobs of a plan with a progress bar, and return their results."""
     from tqdm import tqdm
 
     from app.common.settings import from_environment
@@ -321,6 +354,8 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
 
 @contextlib.contextmanager
 def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
+    """Yield the workers of --dask or --jobs (default: one process per usable core, at most one per job), and
+    close them at the end."""
     from app.tuning.workers import DaskWorkers, Processes
 
     workers: Workers

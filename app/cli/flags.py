@@ -28,12 +28,14 @@ SOURCE_HELP = (
 
 
 def program() -> str:
-    """Return how the program is called here, so that a printed command can be pasted."""
+    """Return how the program is called here ("stemmap" or "uv run stemmap"), so that a printed command can be
+    pasted."""
     return "uv run stemmap" if os.environ.get("UV_RUN_RECURSION_DEPTH") else "stemmap"
 
 
 def plain(text: str) -> str:
-    """Return text without characters that control a terminal."""
+    """Return text in which "?" replaces each character that is not printable, such as those that control a
+    terminal."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 
@@ -122,14 +124,16 @@ def add_live_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
-    """Return the file of --record; "" without a recording.
+    """Return the absolute path of the file of --record: the given one, or a name by the time in the data
+    folder; "" without a recording. Nothing is created.
 
     Args:
         arguments: Parsed arguments with the flags of `add_live_flags`.
-        sources: URIs of the sources, which must be live with --record.
+        sources: URIs of the sources.
 
     Raises:
-        ParameterError: A source is not live.
+        ParameterError: With --record or --publish a source is not live or maps by itself, or with --publish
+            is not reached over Zenoh.
     """
     import time
 
@@ -158,17 +162,21 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
 
 
 def says_parameters(arguments: argparse.Namespace) -> bool:
-    """Whether the command line has a preset, a parameter file or values."""
+    """Return whether the command line has a preset, a parameter file or values."""
     return bool(arguments.preset or arguments.config or arguments.assignments)
 
 
 def _odometry(text: str) -> str:
+    """Return the text if it is a choice of --odometry; raises argparse.ArgumentTypeError otherwise. The pose
+    file of file:POSES need not exist."""
     if text in ("auto", "wheels", "kiss-icp", "static") or (text.startswith("file:") and len(text) > 5):
         return text
     raise argparse.ArgumentTypeError(f"{text!r} is not auto, wheels, kiss-icp, static or file:poses.txt")
 
 
 def _topic(text: str) -> tuple[str, str]:
+    """Parse ROLE=NAME as (role, name); raises argparse.ArgumentTypeError for an unknown role or an empty
+    name."""
     role, equals, name = text.partition("=")
     if not (equals and name and role in ("scan", "odometry", "imu", "gnss", "pose", "camera")):
         raise argparse.ArgumentTypeError(
@@ -178,6 +186,8 @@ def _topic(text: str) -> tuple[str, str]:
 
 
 def _mount(text: str) -> tuple[float, ...]:
+    """Parse x, y, z [m], roll, pitch, yaw [deg]; raises argparse.ArgumentTypeError unless these are six
+    numbers of at most 360."""
     try:
         numbers = tuple(float(part) for part in text.split(","))
     except ValueError:
@@ -188,7 +198,7 @@ def _mount(text: str) -> tuple[float, ...]:
 
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
-    """Return the options of the source that the flags give."""
+    """Return the options of the source that the flags give; the angles of --mount are converted to radians."""
     from math import radians
 
     from pipeline.geometry.poses import Pose3
@@ -215,7 +225,7 @@ def source(text: str) -> str:
 
 
 def seed(text: str) -> int:
-    """Parse a random seed: a whole number that is not negative."""
+    """Parse a random seed: a whole number from 0 to 2^63 - 1; ArgumentTypeError for other texts."""
     return whole_number(0, (1 << 63) - 1)(text)
 
 
@@ -232,7 +242,13 @@ def whole_number(low: int, high: int) -> Callable[[str], int]:
 
 
 def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
-    """Return a parser of numbers above 0 and below a limit, for argparse; `quantity` names them in errors."""
+    """Return a parser of numbers above 0 and below a limit, for argparse; it raises ArgumentTypeError for
+    other texts.
+
+    Args:
+        limit: Upper limit, not included.
+        quantity: Name of the number in errors.
+    """
 
     def parse(text: str) -> float:
         try:
@@ -258,19 +274,21 @@ def share(text: str) -> float:
 
 
 def cannot_write(error: OSError, place: Path) -> StemmapError:
-    """Return the error of a file or folder that cannot be written."""
+    """Return the error of a file or folder that cannot be written; `place` is named if the error has no file."""
     return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or place))
 
 
 def chosen_parameters(
     arguments: argparse.Namespace, suggested: str, present: Parameters | None = None
 ) -> tuple[str, Parameters]:
-    """Return the name of the preset and the parameters of the flags.
+    """Return the name of the preset and the parameters of the flags: the preset, with the values of --config
+    and then of --set.
 
     Args:
         arguments: Parsed, with the flags of `add_parameter_flags`.
         suggested: Preset that suits the source, used where none is named.
-        present: Parameters of a continued map, which replace the suggested preset.
+        present: Parameters of a continued map, which replace the suggested preset unless --preset is given;
+            None without one.
 
     Raises:
         ParameterError: A name, value or file is invalid.

@@ -32,7 +32,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the description."""
+    """Print the description as lines or, with --json, as JSON; return 0.
+
+    Raises:
+        StemmapError: The source cannot be read.
+    """
     from app.sources.opening import open_cloud, open_source
     from pipeline.io.readers.clouds import is_cloud
 
@@ -52,6 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _record(opened: Source) -> dict[str, Any]:
+    """Return the description of a source as JSON values; times are ns, lengths m."""
     from dataclasses import asdict
 
     d, truth = opened.description, opened.truth()
@@ -76,6 +81,7 @@ def _record(opened: Source) -> dict[str, Any]:
 
 
 def _lines(opened: Source) -> list[str]:
+    """Return the description of a source as lines: a table, warnings and losses, topics, commands."""
     from app.common.text import count
     from app.sources.request import choose_odometry
 
@@ -104,6 +110,7 @@ def _lines(opened: Source) -> list[str]:
 
 
 def _topic_lines(d: SourceDescription) -> list[str]:
+    """Return a table of the topics with messages and mean rates; [] for a source without topics."""
     if not d.topics:
         return []
     lines = ["", "topics (* is used; --topic ROLE=NAME selects another)"]
@@ -120,16 +127,19 @@ def _topic_lines(d: SourceDescription) -> list[str]:
 
 
 def _not_read(topic: RecordedTopic) -> str:
+    """Return why a topic is not used, and the role that it could have."""
     could = f", could be {topic.fits}" if topic.fits and topic.messages else ""
     return f"not used: {plain(topic.why_not)}{could}"
 
 
 def _commands(d: SourceDescription) -> list[str]:
+    """Return lines with the commands that show and map the source."""
     uri, command = shlex.quote(d.uri), program()
     return ["", f"watch it:  {command} {uri}", f"map it:    {command} map {uri} --out out"]
 
 
 def _scans(d: SourceDescription) -> str:
+    """Return number, duration and rate of the scans as text, as far as they are known."""
     if d.scans is None:
         return "unknown number"
     if d.start_ns is None or d.end_ns is None or d.end_ns <= d.start_ns:
@@ -147,7 +157,7 @@ def _sensor(sensor: Sensor) -> str:
 
 
 def _truth_counts(truth: Truth | None) -> tuple[int, int]:
-    """Return the numbers of true trees and of other known objects."""
+    """Return the numbers of true trees and of other known objects; 0, 0 for None."""
     kinds = () if truth is None or truth.trees is None else truth.trees.kind
     trees = sum(kind == "tree" for kind in kinds)
     return trees, len(kinds) - trees
@@ -159,6 +169,7 @@ SQUARE_M = 1.0  # smallest area for the point density [m^2]
 
 
 def _cloud_record(d: CloudDescription) -> dict[str, Any]:
+    """Return the description of a cloud as JSON values; null where unknown."""
     extent = _extent(d)
     return {
         "uri": d.uri,
@@ -175,6 +186,7 @@ def _cloud_record(d: CloudDescription) -> dict[str, Any]:
 
 
 def _cloud_lines(d: CloudDescription) -> list[str]:
+    """Return the description of a cloud as lines."""
     rows = [
         ("kind", f"whole cloud, {d.kind}"),
         ("points", f"{d.points:,}"),
@@ -195,7 +207,8 @@ def _cloud_lines(d: CloudDescription) -> list[str]:
 
 
 def _extent(d: CloudDescription) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the corners of a cloud [m]; None if the file has no valid extent."""
+    """Return the lowest and the highest corner of a cloud, shape (3,) each [m]; None if the file has no valid
+    extent."""
     import numpy as np
 
     if d.low is None or d.high is None:
@@ -206,6 +219,8 @@ def _extent(d: CloudDescription) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _extent_rows(d: CloudDescription) -> list[tuple[str, str]]:
+    """Return rows (name, text) with size, point density and corners; one row "unknown" without a valid
+    extent."""
     extent = _extent(d)
     if extent is None:
         return [("extent", "unknown")]
@@ -225,7 +240,8 @@ def _extent_rows(d: CloudDescription) -> list[tuple[str, str]]:
 
 
 def _crs_words(crs: str) -> str:
-    """Return the name of a reference system, given as WKT or "EPSG:..."."""
+    """Return the name of a reference system, given as WKT or "EPSG:...", with its code; a remark for "" and
+    for an unknown one."""
     if not crs:
         return "none: positions have no longitude and latitude"
     import pyproj

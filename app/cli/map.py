@@ -79,7 +79,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Map a run of scans, or a whole cloud with --kind plot or a file that holds one; return the exit code.
+    """Map a run of scans, or a whole cloud with `--as plot` or a file that holds one; print the result.
+
+    Returns:
+        Exit code: 3 if messages or points were left out, else 0.
 
     Raises:
         StemmapError: The arguments contradict each other, or the run cannot be mapped.
@@ -124,6 +127,15 @@ def _run_plot(arguments: argparse.Namespace) -> int:
 
 
 def _run_scans(arguments: argparse.Namespace) -> int:
+    """Map a run of scans, recorded, simulated or live; return the exit code.
+
+    With --continue, seed and parameters are those of the saved run unless flags give others. Without flags
+    for parameters, a recorded live run is mapped with the parameters of its recording.
+
+    Raises:
+        StemmapError: The source cannot be read, the start in the map was not found, or the folder has the map
+            of another source or cannot be written.
+    """
     from tqdm import tqdm
 
     from app.batch.continue_map import ContinuedMap, read_saved_run
@@ -200,7 +212,7 @@ def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
 def _tell(
     summary: list[str], out: Path, warnings: list[str], losses: dict[str, int], *, replaces: bool
 ) -> int:
-    """Print the result of a mapping command; return the exit code.
+    """Print the result of a mapping command; return the exit code: 3 with losses, else 0.
 
     Args:
         summary: Lines to print.
@@ -220,6 +232,7 @@ def _tell(
 
 
 def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
+    """Return the start of --start: a pose for three numbers (m, m, rad), "auto" for None."""
     from pipeline.geometry.poses import Pose2
 
     if isinstance(start, tuple):
@@ -228,6 +241,8 @@ def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
 
 
 def _start(text: str) -> str | tuple[float, float, float]:
+    """Parse --start: auto, last, resume, or x, y [m], yaw [deg], which is returned in radians; raises
+    argparse.ArgumentTypeError for other texts and for values beyond 1e6 m or 360 degrees."""
     if text in ("auto", "last", "resume"):
         return text
     try:
@@ -249,13 +264,14 @@ def _listening(
     source: Source | LiveSource, recording: str, *, publish: bool, pictures: Path
 ) -> Iterator[None]:
     """Wait until a live source sends scans. Inside, Ctrl-C and SIGTERM end its records and not the command.
-    Other sources are ready at once.
+    Other sources are ready at once and keep both signals.
 
     Args:
         source: Live or not.
         recording: File to which the messages are recorded; "" for none.
         publish: Whether results are published on the network of the robot.
-        pictures: Folder on whose disk pictures for the trees are stored.
+        pictures: Folder on whose disk pictures for the trees are stored; if that fails, it is reported and
+            there are none.
 
     Raises:
         SourceError: It was stopped before a scan arrived, a message cannot be read, or no recording can be

@@ -28,7 +28,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Merge the runs."""
+    """Merge the runs, write the files to --out and print a summary; return 0.
+
+    Raises:
+        StemmapError: A run cannot be read, the maps do not match with confidence, or the folder has the map
+            of another source or cannot be written.
+    """
     import numpy as np
 
     from app.batch.continue_map import read_saved_run

@@ -34,7 +34,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print them."""
+    """Print the parameters in the chosen format; return 0. Markdown shows all presets and ignores the flags
+    that choose values.
+
+    Raises:
+        StemmapError: A flag of `add_parameter_flags` is invalid.
+    """
     from pipeline.config import PRESETS, markdown_table, preset, to_toml
 
     name, parameters = chosen_parameters(arguments, "forest")
@@ -48,6 +53,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _print_table(name: str, parameters: Parameters) -> None:
+    """Print each parameter with its value, bounds and description.
+
+    Args:
+        name: Name of the preset.
+        parameters: All parameters.
+    """
     from app.common.text import preset_words
     from pipeline.config import field_specs
 

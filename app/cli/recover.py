@@ -18,13 +18,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the readable messages of a damaged recording to a new file.
+    """Write the readable messages of a damaged recording to a new file, and print what was lost.
 
     Returns:
         Exit code: 3 if parts are lost, else 0.
 
     Raises:
-        StemmapError: The output is the damaged file, or exists and --force is not given.
+        StemmapError: The output is the damaged file, exists and --force is not given, or cannot be written;
+            or nothing is readable.
     """
     from pipeline.errors import StemmapError
     from pipeline.io.recording.mcap_writer import mend

@@ -56,7 +56,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve until Ctrl-C; return the exit code."""
+    """Serve until Ctrl-C; return the exit code. Several sources, or a router with several robots, are served
+    as a fleet.
+
+    Raises:
+        StemmapError: An argument is wrong, a source does not exist, or the port cannot be used.
+    """
     from app.common.settings import from_environment
 
     settings = from_environment()
@@ -105,8 +110,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
-    """Return the router whose robots are all shown, if an address has robot=* or names several robots, and
-    how they are opened; else None."""
+    """Return the router whose robots are all shown and how they are opened, if an address has robot=*, asks
+    for maps that robots compute, or names no robot and several are found; else None. In the last case it asks
+    the router, which takes up to 3 s."""
     from app.robot.address import ALL_ROBOTS, ZenohAddress, is_live, parse_address
 
     if len(sources) != 1 or not is_live(sources[0].uri):
@@ -126,6 +132,7 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
 
 
 def _report_partial_outputs(settings: Settings) -> None:
+    """Print how many partial outputs are in the data folders; nothing without any."""
     from app.batch.run_folder import partial_outputs
     from app.common.text import count
 
@@ -136,7 +143,7 @@ def _report_partial_outputs(settings: Settings) -> None:
 
 def _check_source(uri: str) -> None:
     """Check that a file or scenario exists, and the form of an address. The worker checks the contents of a
-    file.
+    file; an unknown scheme is accepted here.
 
     Raises:
         StemmapError: It does not exist, or the address is wrong.
@@ -159,6 +166,7 @@ def _check_source(uri: str) -> None:
 
 
 def _exists(path: str) -> bool:
+    """Return whether a path exists; False if it is no valid path."""
     try:
         return Path(path).expanduser().exists()
     except (OSError, ValueError, RuntimeError):  # RuntimeError: unknown home directory

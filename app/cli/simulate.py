@@ -37,7 +37,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Write the recording and a table of its trees next to it; return the exit code."""
+    """Write the recording and a table of its trees next to it; return 0.
+
+    Raises:
+        StemmapError: The scenario is invalid, a file exists without --force, or cannot be written.
+    """
     from app.common.text import count
     from pipeline.io.readers.simulated import open_simulated
     from pipeline.io.recording import write_recording
@@ -66,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _mcap(text: str) -> Path:
+    """Return the path; raises argparse.ArgumentTypeError unless it ends in .mcap."""
     path = Path(text)
     if path.suffix.lower() != ".mcap":
         raise argparse.ArgumentTypeError(f"{text} must end in .mcap")
@@ -73,7 +78,7 @@ def _mcap(text: str) -> Path:
 
 
 def _uri(arguments: argparse.Namespace) -> str:
-    """Return the URI of the scenario with the flags as options."""
+    """Return the URI of the scenario with the flags as options; sim: is added if it is missing."""
     uri: str = arguments.scenario if arguments.scenario.startswith("sim:") else f"sim:{arguments.scenario}"
     for key in ("seed", "duration"):
         value = getattr(arguments, key)
@@ -83,6 +88,7 @@ def _uri(arguments: argparse.Namespace) -> str:
 
 
 def _refuse_to_overwrite(paths: list[Path], force: bool) -> None:
+    """Raise StemmapError if a file exists, unless `force`."""
     from pipeline.errors import StemmapError
 
     for path in paths:
@@ -93,6 +99,7 @@ def _refuse_to_overwrite(paths: list[Path], force: bool) -> None:
 
 
 def _with_progress(source: SimulatedSource) -> Iterator[Record]:
+    """Yield the records of a source, with a progress bar of its scans if standard error is a terminal."""
     from tqdm import tqdm
 
     from pipeline.types.records import Scan
@@ -105,6 +112,8 @@ def _with_progress(source: SimulatedSource) -> Iterator[Record]:
 
 
 def _write_trees(path: Path, source: SimulatedSource) -> None:
+    """Write the true objects of the scene as CSV: x, y [m], DBH [cm] (empty if unknown), class; raises
+    StemmapError if the file cannot be written."""
     from pipeline.io.atomic_files import write_beside
 
     trees = source.run.scene.truth

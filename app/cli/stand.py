@@ -87,10 +87,10 @@ def add_stand_flags(parser: argparse.ArgumentParser, without: tuple[str, ...] = 
 
 
 def stand_parameters(arguments: argparse.Namespace) -> Stand:
-    """Return the parameters that the flags give.
+    """Return the parameters that the flags give; declared defaults for the others.
 
     Raises:
-        ParameterError: A value is not valid.
+        ParameterError: A value is not a number or out of bounds.
     """
     from pydantic import ValidationError
 
@@ -115,7 +115,8 @@ def stand_parameters(arguments: argparse.Namespace) -> Stand:
 
 
 def chosen_plots(arguments: argparse.Namespace) -> list[Plot]:
-    """Return the plots that the flags define, in the frame of the map.
+    """Return the plots that the flags define, in the frame of the map: those of --plots, then circles and
+    rectangles, then those along the path. [] without such flags.
 
     Raises:
         StemmapError: A plot or a file is not valid.
@@ -146,6 +147,17 @@ def chosen_plots(arguments: argparse.Namespace) -> list[Plot]:
 
 
 def _numbers(flag: str, text: str) -> list[float]:
+    """Parse the numbers of --circle (x, y, radius) or --rectangle (x, y, length, width, and optionally an
+    angle).
+
+    Args:
+        flag: "--circle" or "--rectangle".
+        text: Numbers with commas between them.
+
+    Raises:
+        StemmapError: The number of numbers is wrong, one is 1e8 or larger or no number, or a size is not
+            above 0.
+    """
     sizes = (3,) if flag == "--circle" else (4, 5)
     try:
         numbers = [float(part) for part in text.split(",")]
@@ -161,10 +173,13 @@ def _numbers(flag: str, text: str) -> list[float]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the figures and write the files.
+    """Print the figures, print warnings to standard error, and with --out write the files.
 
     Returns:
         Exit code: 3 with warnings, else 0.
+
+    Raises:
+        StemmapError: A flag or plot is not valid, the run cannot be read, or a file cannot be written.
     """
     import sys
 

@@ -77,10 +77,11 @@ def run(arguments: argparse.Namespace) -> int:
     --annotations, annotated runs are used instead of scenes.
 
     Returns:
-        The exit code.
+        0.
 
     Raises:
-        StemmapError: --out is missing, or there are no examples.
+        StemmapError: --out is missing without --annotations, its folder or labelled scans do not exist, or
+            there are no or too few examples.
     """
     if arguments.annotations:
         return learn_from_annotations(arguments.places, arguments.out, arguments.seed)
@@ -123,7 +124,7 @@ def _look_for(arguments: argparse.Namespace) -> None:
 
 
 def _scenes(arguments: argparse.Namespace) -> list[str]:
-    """Description of the training data for the JSON file."""
+    """Return a description of the training data for the JSON file."""
     stands = [name for name in arguments.scenes.split(",") if name]
     names = [f"sim:{name}, seeds {arguments.seeds}, every second one furnished" for name in stands]
     copied = [
@@ -135,6 +136,8 @@ def _scenes(arguments: argparse.Namespace) -> list[str]:
 
 
 def _examples(arguments: argparse.Namespace) -> list[Examples]:
+    """Return the examples of all scenes, stored or computed: simulated stands, sim:wild, streets and parks,
+    and labelled scans."""
     from functools import partial
 
     from app.training.examples import stored_or_computed
@@ -167,7 +170,7 @@ def _examples(arguments: argparse.Namespace) -> list[Examples]:
 
 
 def _pasted(arguments: argparse.Namespace) -> list[Examples]:
-    """Copies of the labelled forward-looking scans with additional poles and trees."""
+    """Return the examples of copies of the labelled forward-looking scans with additional poles and trees."""
     from app.training.augmentation import FOLDER, copies
     from pipeline.config import preset
 
@@ -179,7 +182,7 @@ def _pasted(arguments: argparse.Namespace) -> list[Examples]:
 
 
 def _one_way(arguments: argparse.Namespace) -> list[Path]:
-    """The labelled scans of forward-looking sensors."""
+    """Return the labelled scans of forward-looking sensors; opens each of them."""
     from app.training.labelled_scenes import looks_all_around
 
     return [folder for folder in arguments.labelled if not looks_all_around(folder)]
@@ -189,12 +192,17 @@ def _one_way(arguments: argparse.Namespace) -> list[Path]:
 
 
 def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int:
-    """Train a random forest with annotations, print its scores beside those of the present one, and write it.
+    """Train a random forest with annotations, print its scores and those of the present one, and write it;
+    return 0. Warnings and progress go to standard error.
 
     Args:
         names: Annotated runs by URI or by their name in the dashboard; empty for all.
         out: File to write; None for the data folder.
         seed: Random seed.
+
+    Raises:
+        StemmapError: There is no data folder, a run is unknown, the folder for `out` does not exist, or there
+            are too few annotations.
     """
     from contextlib import closing
 
@@ -233,6 +241,16 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
 
 
 def _chosen(store: Store, names: list[str]) -> list[AnnotatedRun]:
+    """Return the annotated runs of the names, each once, or all of them.
+
+    Args:
+        store: The store.
+        names: Digest, URI, path or name of each run; empty for all.
+
+    Raises:
+        UsageError: A name is unknown.
+        StemmapError: There are no annotations at all.
+    """
     from app.training.annotated_runs import annotated_run
 
     sources = store.annotated_sources()

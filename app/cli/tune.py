@@ -95,7 +95,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 @flags.compilation_notice()
 def run(arguments: argparse.Namespace) -> int:
-    """Search and write the best set; return the exit code."""
+    """Search and write the best set to --out.
+
+    Returns:
+        Exit code: 0, or STOPPED if trials are missing (time limit or Ctrl-C).
+
+    Raises:
+        StemmapError: An argument is wrong, or a run cannot be read or scored.
+        KeyboardInterrupt: Ctrl-C before the first trial; nothing is written.
+    """
     from app.tuning.search import Search, search_processes
     from app.worker.numba_warmup import compile_ahead
 
@@ -110,6 +118,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _plan(arguments: argparse.Namespace) -> Plan:
+    """Return the plan that the arguments give; opens the first run to find its preset.
+
+    Raises:
+        StemmapError: A run is live, or named twice, an argument is wrong, or the folder for --out does not
+            exist.
+    """
     from app.robot.address import is_live
     from app.sources.request import SourceRequest
     from app.tuning.plan import SENSIBLE, Plan, axes_of
@@ -142,6 +156,11 @@ def _plan(arguments: argparse.Namespace) -> Plan:
 
 
 def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
+    """Return the runs of the search, the held-out ones last.
+
+    Raises:
+        StemmapError: A run is named twice, or a file of true trees cannot be read or assigned.
+    """
     from app.sources.request import SourceRequest
     from app.store.records import contents_of
     from app.tuning.plan import PlannedRun
@@ -162,14 +181,15 @@ def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
 
 
 def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
-    """Return the file with the true trees by run.
+    """Return the file with the true trees by run; runs without a file are missing.
 
     Args:
         uris: The runs in their order, held-out runs last.
-        truths: `FILE` or `RUN=FILE`.
+        truths: `FILE` or `RUN=FILE`. Files without a run belong to the remaining runs in their order; there
+            must be one for each of these, or none.
 
     Raises:
-        ParameterError: A file cannot be assigned to a run.
+        ParameterError: A file cannot be assigned to a run, or a run has two.
     """
     named: dict[str, str] = {}
     bare = []
@@ -195,6 +215,12 @@ def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
 
 
 def _storage(arguments: argparse.Namespace) -> str:
+    """Return the path of the journal (default: --out with the suffix .journal) or the address of the
+    database.
+
+    Raises:
+        ParameterError: --storage gives no address of a PostgreSQL database.
+    """
     from app.common.settings import from_environment
     from app.tuning.storage import is_server
 
@@ -211,7 +237,13 @@ def _storage(arguments: argparse.Namespace) -> str:
 
 
 def _search(search: Search) -> bool:
-    """Make the trials; return whether the search stopped before the last one."""
+    """Make the trials and show progress; return whether the search stopped before the last one, by the time
+    limit or Ctrl-C.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C before the first trial.
+        StemmapError: A run cannot be mapped or scored, or the trials cannot be stored.
+    """
     import time
 
     plan, bar = search.plan, _SearchProgress(search.plan)
@@ -234,6 +266,14 @@ def _search(search: Search) -> bool:
 
 
 def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool) -> int:
+    """Write the best set to --out, print the result, and print warnings to standard error; return the exit
+    code.
+
+    Args:
+        search: The search, whose start is scored.
+        arguments: Arguments of the command.
+        stopped: Whether trials are missing.
+    """
     from datetime import date
 
     from app.common.text import count

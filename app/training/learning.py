@@ -219,7 +219,7 @@ def _cells(rates: Rates) -> list[str]:
 
 
 def _cell(rate: Rate) -> str:
-    """Return a rate as text, for example "9/10 (90.0 %)"; "-" in place of the percentage if its total is 0."""
+    """Return a rate as text, for example "9/10 (90.0 %)"; "-" for the percentage if its total is 0."""
     part = "-" if rate.rate is None else f"{100.0 * rate.rate:.1f} %"
     return f"{rate.count}/{rate.of} ({part})"
 
