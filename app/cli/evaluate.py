@@ -252,7 +252,8 @@ def refuse_without_grid(arguments: argparse.Namespace) -> None:
 
 
 def distances(arguments: argparse.Namespace) -> list[str]:
-    """Return --match-distance and --reach, where given, as assignments of parameters in the syntax of --set."""
+    """Return --match-distance and --reach, where given, as assignments of parameters in the syntax of --set;
+    [] without them."""
     values = (("match_distance", arguments.match_distance), ("reach", arguments.reach))
     return [f"evaluation.{name}={value}" for name, value in values if value is not None]
 
@@ -292,7 +293,8 @@ def run_grid(arguments: argparse.Namespace) -> int:
 
 
 def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
-    """Return the runs that can be scored, and the number of the others, which are reported on standard error."""
+    """Return the runs that can be scored, and the number of the others, which are reported on standard
+    error."""
     from app.sources.request import SourceRequest, mount_of_degrees
     from app.tuning.sweep import prepare_run
 

@@ -198,7 +198,8 @@ def _mount(text: str) -> tuple[float, ...]:
 
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
-    """Return the options of the source that the flags give; the angles of --mount are converted to radians."""
+    """Return the options of the source that the flags give; the angles of --mount are converted to
+    radians."""
     from math import radians
 
     from pipeline.geometry.poses import Pose3
@@ -274,7 +275,8 @@ def share(text: str) -> float:
 
 
 def cannot_write(error: OSError, place: Path) -> StemmapError:
-    """Return the error of a file or folder that cannot be written; `place` is named if the error has no file."""
+    """Return the error of a file or folder that cannot be written; `place` is named if the error has no
+    file."""
     return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or place))
 
 

@@ -26,12 +26,13 @@ SAME_THING = 0.5
 
 
 def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> TruthTrees | None:
-    """Return the ground truth against which the map is scored; None where there is none.
+    """Return the ground truth against which the map is scored; None where there is none, see `counted`.
 
     Args:
         own: Ground truth of the source, if any. It is not changed.
         rows: The annotations.
-        against: "own" ignores the annotations, "annotations" the ground truth of the source.
+        against: "own" ignores the annotations, "annotations" the ground truth of the source; "both" applies
+            the annotations to it.
     """
     used, contents = counted(own, rows, against), [row.content for row in rows]
     if used == "both":
@@ -44,7 +45,8 @@ def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Agains
 def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> Counted:
     """Return which ground truth is used for the scores; arguments as in `truth_of`.
 
-    "none" is returned if the chosen ground truth does not exist; with "both", the one that exists is used.
+    "none" is returned if the chosen ground truth does not exist, except that without ground truth of the
+    source "both" uses the annotations, and without annotations the source.
     """
     if own is None:
         return "annotations" if rows and against != "own" else "none"
@@ -58,13 +60,14 @@ def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against
 
 def laid_over(own: TruthTrees | None, contents: Sequence[Content]) -> TruthTrees | None:
     """Return the ground truth of the source with the annotations applied; None if there are neither.
+    Annotations without an object of the source near them are added.
 
     An annotation replaces the object within SAME_THING that has another class. One of the same class keeps
     the position of the source, and its diameter unless one was typed, because a person who confirms a mapped
     tree has not measured its position.
 
     Args:
-        own: Ground truth of the source, if any.
+        own: Ground truth of the source, if any; it is not changed.
         contents: The annotations.
     """
     if not contents:
@@ -159,7 +162,8 @@ class AnnotationEditor:
         self._generation = 0  # grows whenever another run is opened or the run is left
 
     async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
-        """Read the annotations of a run that was opened. An error of the store is stored in `problem`.
+        """Read the annotations of a run that was opened; it is added to the store if necessary. An error of
+        the store is stored in `problem` and logged. If another run is opened meanwhile, nothing changes.
 
         Args:
             source: Digest of the recording, or its URI if it has no digest.
@@ -191,25 +195,28 @@ class AnnotationEditor:
             self.problem = str(error)
 
     def leave(self) -> None:
-        """Forget the annotations, because the run was closed."""
+        """Forget the annotations and the choice of the ground truth, because the run was closed; the store
+        does not change."""
         self._generation += 1
         self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
 
     def score_against(self, against: Against) -> None:
-        """Choose the ground truth for the scores, see `truth_of`; no annotation changes."""
+        """Choose the ground truth for the scores, see `truth_of`, and call `changed`; no annotation changes."""
         self.against = against
         self.truth = truth_of(self._own, self.rows, against)
         self.changed()
 
     async def edit(self, run: int, function: Callable[[Store], T]) -> T:
-        """Run an edit in the thread of the store, update the annotations, and return the result of the edit.
+        """Run an edit in the thread of the store, update the annotations, call `changed` (and `edited` if any
+        annotation differs), and return the result of the edit.
 
         Args:
             run: Number of the run that is edited.
             function: The edit; it is called with the store.
 
         Raises:
-            StaleError: Another run was opened meanwhile, or another person has changed the annotation.
+            StaleError: Another run was opened meanwhile, or another person has changed the annotation; in the
+                second case the annotations are updated.
             StemmapError: Nothing can be annotated.
         """
         if self.problem:
@@ -244,7 +251,8 @@ class AnnotationEditor:
         return done
 
     async def read(self, function: Callable[[Store, int], T]) -> T | None:
-        """Return the result of a function of the store and the number of the run; None if no run is open."""
+        """Return the result of a function of the store and the number of the run; None if no run is open or
+        nothing can be annotated. Raises StemmapError if the store cannot be used."""
         run = self.run
         if run is None or self.problem:
             return None
@@ -267,7 +275,8 @@ class AnnotationEditor:
 
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
-    """Return the author of the newest edit and the number of annotations that differ between two states."""
+    """Return the author of the newest edit ("" if annotations were only deleted) and the number of
+    annotations that were added, changed or deleted between two states."""
     old = {row.id: row.version for row in before}
     new = {row.id: row.version for row in after}
     edited = [row for row in after if old.get(row.id) != row.version]

@@ -39,12 +39,12 @@ class Broadcast:
         return len(self._listeners)
 
     def publish(self, kind: str, content: object) -> None:
-        """Replace the message of a kind.
+        """Replace the message of a kind and wake the listeners; nothing happens if it equals the one before.
 
         Args:
             kind: Kind of the message; it becomes its field `type`.
-            content: A dict or record, whose fields become those of the message; other values become the field
-                `value`.
+            content: A dict or record, whose fields become those of the message; other values, also None,
+                become the field `value`.
         """
         plain = msgspec.to_builtins(content) if content is not None else None
         # Without content, the page shows the empty state.
@@ -56,7 +56,7 @@ class Broadcast:
         self._wake()
 
     def show(self, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> None:
-        """Replace the map.
+        """Replace the map and wake the listeners.
 
         Args:
             payload: Message "map" without its path.
@@ -66,7 +66,8 @@ class Broadcast:
         self._wake()
 
     def forget_map(self) -> None:
-        """Replace the map with an empty one, because another run begins."""
+        """Replace the map with an empty one (index -1), because another run begins; nothing if no map was
+        shown."""
         if self._map is not None:
             self.show(_EMPTY_MAP, np.zeros((0, 2)))
 
@@ -142,6 +143,7 @@ class Listener:
                 yield self._map_message(*shown)
 
     async def _wait(self) -> None:
+        """Wait for news, or until a map that waits may be sent."""
         waiting = self._live.map_after(self._map_seen) is not None
         timeout = max(0.0, self._map_wait()) if waiting else None
         try:
@@ -150,9 +152,17 @@ class Listener:
             return
 
     def _map_wait(self) -> float:
+        """Return the time until the next map may be sent [s]; negative if it may be sent now."""
         return self._map_at + MAP_PAUSE_S - time.monotonic()
 
     def _map_message(self, count: int, payload: bytes, path_xy: NDArray[np.float64]) -> bytes:
+        """Return a map with the rows of its path that this browser does not have, as JSON.
+
+        Args:
+            count: Number of the message.
+            payload: JSON of the map without its path.
+            path_xy: The path, shape (N, 2) [m].
+        """
         start = first_difference(self._path, path_xy)
         self._map_seen, self._map_at, self._path = count, time.monotonic(), path_xy
         return b'%s,"path":%s}' % (payload[:-1], self._live.path_json(count, path_xy, start))

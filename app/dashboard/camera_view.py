@@ -44,20 +44,24 @@ class CameraView:
         self._of += 1
 
     def jpeg(self, stamp_ns: int) -> bytes | None:
-        """Return the picture with a stamp that `look` returned as JPEG; None if it is not kept any more."""
+        """Return the picture with a stamp that `look` returned as JPEG; None if it is not among the 8 newest
+        any more."""
         return self._kept.get(stamp_ns)
 
     async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
         """Return the camera picture at the time of a scan as JSON values: its stamp, the boxes of trees and
-        clusters in it, the reason if there are no boxes, and `of`, a number of the run.
+        clusters in it, the reason if there are no boxes, and `of`, a number of the run. Calls wait for one
+        another, so that there are at most about three pictures per second.
 
         Args:
             frame: Results of the scan.
             path: Path of the run, from which the pose of the robot at the time of the picture is
-                interpolated.
+                interpolated; None assumes no motion.
 
         Raises:
-            NoStoryError: There is no picture; the message has the reason.
+            NoStoryError: There is no picture, it cannot be decoded, or another run was opened; the message
+                has the reason.
+            WorkerBusyError: The worker did not answer in time.
         """
         async with self._turn:
             of = self._of
@@ -121,6 +125,7 @@ def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]
 
 
 def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    """Return a box for each confirmed tree in view between NEAREST and FARTHEST; arguments as in `marks_of`."""
     trees = frame.trees
     marks = []
     places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)
@@ -137,6 +142,7 @@ def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
 
 
 def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
+    """Return a box for each cluster with points in view; arguments as in `marks_of`."""
     verdicts = clusters_payload(frame)["verdict"]
     points = frame.filtered.astype(np.float64) + frame.sensor_offset
     points[:, :2] = moved.inverse().apply(points[:, :2])
@@ -156,8 +162,8 @@ def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]
 
 
 def _box(camera: Camera, points: Float) -> dict[str, float] | None:
-    """Return the box around points of the base frame, shape (N, 3) [m], as shares of the size of the picture;
-    None if it is not in view."""
+    """Return the box around points of the base frame, shape (N, 3) [m], as shares of the size of the picture,
+    clipped to it; None if it is not in view or a point is nearer than NEAREST to the camera plane."""
     pixels, depth = camera.project(points)
     if not (depth > NEAREST).all():
         return None

@@ -53,6 +53,12 @@ class Dashboard:
         parameters: Parameters at the beginning.
         live: Broadcast to the browsers.
         store: Access to the store; None keeps everything in memory.
+
+    Attributes:
+        status: Newest status of the worker.
+        shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
+        truth: Ground truth with annotations; None where none is known.
+        source, digest: Requested source, and digest (or URI) of the open run, "" before it is open.
     """
 
     worker: WorkerProcess
@@ -111,7 +117,7 @@ class Dashboard:
         await self.open(source)
 
     async def close(self) -> None:
-        """End the worker, the scene and the store."""
+        """Write pending records, and end searches, the worker, the store and the scene."""
         self.scores.close()
         await self.sensitivity.leave()
         self.selector.leave()
@@ -125,7 +131,12 @@ class Dashboard:
     # --- actions of users ------------------------------------------------------------------------
 
     async def command(self, command: protocol.ToWorker) -> None:
-        """Send a command to the worker."""
+        """Send a command to the worker and clear the notice. Play and Open are repeated if the worker is
+        being restarted.
+
+        Raises:
+            WorkerBusyError: The worker cannot receive it now.
+        """
         self._notice = ""
         # A worker that is down comes back with the source closed; then this is still to be done.
         self._go = isinstance(command, protocol.Play | protocol.Open) and self.worker.pid is None
@@ -135,11 +146,11 @@ class Dashboard:
         """Set a choice of the 3D scene for all browsers.
 
         Args:
-            name: Name of a layer, of "follow", or of the choice of colours or labels.
-            value: Visibility, or the name of the choice.
+            name: Name of a layer, "follow", "colour_by" or "label_by".
+            value: Visibility or following as bool; for colours and labels the name of the choice.
 
         Raises:
-            ParameterError: There is no such choice.
+            ParameterError: There is no such choice, or the value is not one of it.
         """
         self.scene.choose(name, value)
         self.live.publish("view", self.scene.view)
@@ -152,9 +163,11 @@ class Dashboard:
         return msgspec.structs.replace(self.source, preset=state.preset, parameters=changed)
 
     async def open(self, request: SourceRequest) -> None:
-        """Close the run and open another source, with the parameters of the request if it has any.
+        """Close the run and open another source, with the parameters of the request if it has any. It returns
+        when the command is sent; `receive` learns whether the source could be opened.
 
-        The source is checked before an open run is closed. Of several requests, only the newest is opened.
+        While a run is open, the source is checked before that run is closed. Of several requests, only the
+        newest is opened.
 
         Raises:
             StemmapError: The source cannot be opened, or the parameters are not valid in this version; the
@@ -194,7 +207,7 @@ class Dashboard:
         """Change values by dotted name, as part of a gesture (see `ParameterState.change`).
 
         Raises:
-            ParameterError: A value is not valid; nothing changes.
+            StemmapError: A value is not valid; nothing changes.
         """
         await self.tune(lambda state: state.change(changes, gesture))
 
@@ -215,7 +228,8 @@ class Dashboard:
         await self.tune(lambda state: state.reset(names))
 
     async def tune(self, change: Callable[[ParameterState], None]) -> None:
-        """Change parameters, and send them to the worker, the scene, the browsers and the store.
+        """Change parameters, and send them to the worker, the scene, the browsers and the store. The map is
+        scored again.
 
         Args:
             change: Called with the parameter state, which it changes.
@@ -245,14 +259,16 @@ class Dashboard:
         await self._send_parameters()
 
     def how_much_matters(self, name: str, values: list[Value]) -> None:
-        """Start the sensitivity analysis of a parameter: the whole run is scored with each value.
+        """Start the sensitivity analysis of a parameter: the whole run is scored with each value. The points
+        are broadcast as "sensitivity".
 
         Args:
             name: Dotted name of the parameter.
             values: Its values, in the order in which they are computed.
 
         Raises:
-            StemmapError: The run cannot be scored; the message has the reason.
+            StemmapError: The run cannot be scored, or name or number of values are invalid; the message has
+                the reason.
         """
         state = self.parameters.parameters
         self.sensitivity.ask(question_of(self.source, self.digest, self.truth, state, name, values))
@@ -269,11 +285,13 @@ class Dashboard:
             cluster: Row of the cluster in it.
 
         Raises:
-            NoStoryError: The scan is not stored any more.
+            NoStoryError: The scan is not stored any more, or has no such cluster.
+            WorkerBusyError: The worker did not answer in time.
         """
         await self.selector.cluster(scan, cluster)
 
     def _show_parameters(self) -> None:
+        """Broadcast parameters and saved sets, and set the widgets of the scene."""
         state = self.parameters
         name = self.sets.name_of(state.preset, state.parameters)
         self.live.publish("sets", self.sets.as_plain())
@@ -291,7 +309,8 @@ class Dashboard:
     # --- messages of the worker ------------------------------------------------------------------
 
     async def receive(self, message: protocol.FromWorker) -> None:
-        """Process a message of the worker. Messages of a run that has been left are ignored."""
+        """Process a message of the worker: update the state and broadcast it. Messages of a run that has been
+        left are ignored."""
         match message:
             case protocol.Report(status=status):
                 self._set_status(status)
@@ -391,6 +410,8 @@ class Dashboard:
             self._broadcast_events()
 
     async def _show(self, shown: protocol.Shown) -> None:
+        """Take over the results of a scan: extend the path, broadcast map and events, record, score and draw
+        it. Results of a run that was left are ignored."""
         if shown.run != self._run:  # of a run that was left
             return
         number = self._opens
@@ -428,11 +449,14 @@ class Dashboard:
         self.run_recorder.scored(score)
 
     def _score(self) -> None:
+        """Request the score of the shown map; nothing without a map or ground truth."""
         if self.shown is not None and self.truth is not None:
             evaluation = self.parameters.parameters.evaluation
             self.scores.ask(self.shown.frame.trees, self.truth, evaluation, self.path_xy)
 
     def _set_status(self, status: protocol.Status) -> None:
+        """Broadcast a status of the worker, and add events for new warnings. While paused, a notice replaces
+        its detail."""
         if self._notice and status.state == "paused":
             status = replace(status, detail=self._notice)
         self.status = status
@@ -442,7 +466,8 @@ class Dashboard:
 
 
 def _open_command(request: SourceRequest) -> protocol.Open:
-    """Return the command that opens a source. Only the command line can request a recording or publishing."""
+    """Return the command that opens a source: the request itself if it is one. Only the command line can
+    request a recording or publishing."""
     if isinstance(request, protocol.Open):
         return request
     return protocol.Open(**{name: getattr(request, name) for name in SourceRequest.__struct_fields__})
@@ -467,12 +492,13 @@ class LoopPlayback:
         self._turning = False
 
     def choose(self, span: Span | None) -> None:
-        """Set the part that is repeated; None ends the repetition."""
+        """Set the part that is repeated and broadcast it; None ends the repetition. The run does not seek."""
         self.span, self._turning = span, False
         self._dashboard.live.publish("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
 
     async def shown(self, time_s: float, status: protocol.Status) -> None:
-        """Seek to the beginning of the part if the shown scan is at its end and the run plays.
+        """Seek to the beginning of the part if the shown scan is at its end and the run plays or is finished;
+        a finished run plays again. Ignored while the worker is being restarted.
 
         Args:
             time_s: Time of the shown scan [s since the first scan].

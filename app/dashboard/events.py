@@ -111,9 +111,9 @@ class Events:
         return bool(new)
 
     def changed(self, before: dict[str, Value], after: dict[str, Value], time_s: float) -> None:
-        """Add a change of parameters. Successive changes at one time (a slider drag) become one event.
-
-        Later events of the run are flagged as from before the change.
+        """Add a change of parameters. Successive changes at one time (a slider drag) become one event, which
+        disappears if the values are as before. It lists at most three parameters. Later events of the run are
+        flagged as from before the change.
 
         Args:
             before, after: All values by dotted name.
@@ -167,10 +167,17 @@ class Events:
 
     @staticmethod
     def _times(frame: Frame, confirmed_s: Float) -> dict[int, float]:
+        """Return the confirmation time [s] of each confirmed tree by its number, without unknown ones.
+
+        Args:
+            frame: The frame.
+            confirmed_s: Confirmation time of each tree of the frame [s], shape (T,); NaN if unknown.
+        """
         rows = np.flatnonzero(frame.trees.confirmed & np.isfinite(confirmed_s))
         return dict(zip(frame.trees.number[rows].tolist(), confirmed_s[rows].tolist(), strict=True))
 
     def _note(self, key: str, event: Event) -> None:
+        """Add an event unless one has its key, and remove the oldest beyond _MOST."""
         self._events.setdefault(key, event)
         while len(self._events) > _MOST:
             del self._events[next(iter(self._events))]

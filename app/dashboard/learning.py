@@ -62,6 +62,9 @@ class Learning:
 
         Args:
             in_force: Name of the forest in force.
+
+        Raises:
+            StemmapError: The store cannot be used, or the forest cannot be read.
         """
         in_use = await asyncio.to_thread(self._forests.provenance, in_force)
         sources = await self._store.ask(lambda store: store.annotated_sources())
@@ -76,13 +79,13 @@ class Learning:
         }
 
     async def begin(self, parameters: Parameters) -> None:
-        """Start a training with all annotations.
+        """Start a training with all annotations in the background.
 
         Args:
             parameters: Parameters in force, with the forest that is compared.
 
         Raises:
-            StemmapError: A training runs already, or there is no data folder.
+            StemmapError: A training runs already, there is no data folder, or the store cannot be used.
         """
         if self._task is not None:
             raise StemmapError(_UNDER_WAY)
@@ -100,7 +103,7 @@ class Learning:
         self._become("idle", "")
 
     async def close(self) -> None:
-        """End the child process."""
+        """End the child process, if one runs; the state is not changed."""
         task, self._task = self._task, None
         await cancel(task)
 
@@ -109,10 +112,18 @@ class Learning:
         return {"state": self.state, "words": self.words, "learned": self.learned}
 
     def _become(self, state: str, words: str, learned: dict[str, Any] | None = None) -> None:
+        """Set state, text and result, and send them to the browsers."""
         self.state, self.words, self.learned = state, words, learned
         self._tell(self.as_plain())
 
     async def _learn(self, sources: list[AnnotatedSource], parameters: Parameters, folder: Path) -> None:
+        """Run a training in a child process and set the state to "done" or "failed".
+
+        Args:
+            sources: All annotated sources.
+            parameters: Parameters in force.
+            folder: Data folder, where the forest is stored.
+        """
         question = {
             "sources": sources,
             "classification": parameters.classification.model_dump(),
@@ -131,7 +142,12 @@ class Learning:
             self._become("failed", str(reply.get("error") or broke))
 
     async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Return the last message of the child process; the messages before are progress."""
+        """Return the last message of the child process, {} without any; the messages before are progress and
+        shown.
+
+        Raises:
+            StemmapError: The process cannot be started, or sends something else.
+        """
         last: dict[str, Any] = {}
         async with await ChildProcess.start(self._command, line_limit=LONGEST_LINE) as process:
             await process.send(question)

@@ -24,7 +24,7 @@ _MOST_STEPS = 200
 
 
 def preset_alone(name: str) -> tuple[str, Parameters]:
-    """Return the name and the parameters of a preset."""
+    """Return the name and the parameters of a preset; raises ParameterError for an unknown one."""
     return name, preset(name)
 
 
@@ -57,8 +57,8 @@ class ParameterState:
 
     Attributes:
         preset, parameters: Name of the preset and the values in force.
-        revision: Number of changes so far.
-        step: Number of steps of the undo history so far.
+        revision: Number of actions so far, also of those that set the values that were in force.
+        step: Number of new steps, undos and redos so far.
         whole: Whether a change applies to the whole run, which is then mapped again, or from the current scan
             onwards.
         check: Called with parameters before they are used; raises a StemmapError if they cannot be used.
@@ -81,11 +81,11 @@ class ParameterState:
         Args:
             changes: New values by dotted name.
             gesture: Identifier of a slider drag, whose values are one undo step however long it takes. Empty
-                if unknown; then changes in quick succession are one step.
+                if unknown; then changes of the same names within 1.5 s are one step.
 
         Raises:
-            ParameterError: A name is unknown, a value is out of bounds, or two values contradict each other;
-                nothing changes.
+            StemmapError: A name is unknown, a value is out of bounds, two values contradict each other, or
+                `check` refuses them; nothing changes.
         """
         parameters = self.parameters.replace(changes)
         names, now = frozenset(changes), self._clock()
@@ -95,22 +95,22 @@ class ParameterState:
         self._gesture = _Gesture(names, gesture, now)
 
     def use_preset(self, name: str) -> None:
-        """Use all values of a preset.
+        """Use all values of a preset, as one undo step.
 
         Raises:
-            ParameterError: There is no preset of this name.
+            StemmapError: There is no preset of this name, or `check` refuses it; nothing changes.
         """
         self._become(name, preset(name))
 
     def use(self, preset_name: str, parameters: Parameters) -> None:
-        """Use all values of a parameter set.
+        """Use all values of a parameter set, as one undo step.
 
         Args:
             preset_name: Preset with which the set is compared.
             parameters: The values.
 
         Raises:
-            ParameterError: There is no such preset.
+            StemmapError: There is no such preset, or `check` refuses the values; nothing changes.
         """
         preset(preset_name)
         self._become(preset_name, parameters)
@@ -119,7 +119,7 @@ class ParameterState:
         """Undo the last step, whoever made it.
 
         Raises:
-            StemmapError: There is no step to undo.
+            StemmapError: There is no step to undo, or `check` refuses its values.
         """
         self._go_back(self._undo, self._redo, "there is no change of a parameter to undo")
 
@@ -127,7 +127,7 @@ class ParameterState:
         """Repeat the step that was undone last.
 
         Raises:
-            StemmapError: No step was undone, or a parameter was changed since.
+            StemmapError: No step was undone, a parameter was changed since, or `check` refuses the values.
         """
         self._go_back(self._redo, self._undo, "there is no change of a parameter to do again")
 
@@ -144,21 +144,21 @@ class ParameterState:
         self._become(self.preset, self.parameters.replace({name: wanted[name] for name in names or wanted}))
 
     def take(self, preset_name: str, values: dict[str, Value]) -> None:
-        """Use the parameters of another run.
+        """Use the parameters of another run, as one undo step.
 
         Args:
             preset_name: Its preset; an unknown or empty name means the preset in force.
             values: Values by dotted name that differ from the preset.
 
         Raises:
-            ParameterError: A name is unknown or a value is not valid.
+            StemmapError: A name is unknown, a value is not valid, or `check` refuses them; nothing changes.
         """
         name = preset_name if preset_name in PRESETS else self.preset
         self._become(name, preset(name).replace(values))
 
     def suit(self, name: str) -> bool:
-        """Use the preset that suits a source, unless a person has changed a parameter. Return whether
-        anything changed."""
+        """Use the preset that suits a source, unless a person has changed a parameter or the preset cannot be
+        used. Return whether anything changed. It is no undo step."""
         if self._chosen:
             return False
         try:
@@ -191,12 +191,16 @@ class ParameterState:
         return {**self.as_plain(), "specs": _SPECS, "presets": presets}
 
     def _become(self, preset_name: str, parameters: Parameters, goes_on: bool = False) -> None:
-        """Put parameters in force.
+        """Put parameters in force as a step, and clear the redo steps. Equal parameters only increase the
+        revision. At most 200 steps are kept.
 
         Args:
             preset_name: Name of their preset.
             parameters: The values.
             goes_on: Whether the change belongs to the step before.
+
+        Raises:
+            StemmapError: `check` refuses them; nothing changes.
         """
         before = _Standing(self.preset, self.parameters)
         self.check(parameters)
@@ -212,6 +216,15 @@ class ParameterState:
         self.preset, self.parameters = preset_name, parameters
 
     def _go_back(self, steps: list[_Standing], others: list[_Standing], none: str) -> None:
+        """Put the last of `steps` in force, and append the present state to `others`.
+
+        Args:
+            steps, others: The undo and redo steps, or the reverse.
+            none: Message of the error if `steps` is empty.
+
+        Raises:
+            StemmapError: There is no step, or `check` refuses its values.
+        """
         if not steps:
             raise StemmapError(none)
         self.check(steps[-1].parameters)
@@ -244,7 +257,7 @@ def read_file(text: str, where: str, otherwise: str = DEFAULT_PRESET) -> tuple[s
     Args:
         text: Contents of the file.
         where: Name of the file in errors.
-        otherwise: Preset if the file names none.
+        otherwise: Preset if the file names none or an unknown one.
 
     Raises:
         ParameterError: The file or a value is not valid.
@@ -270,7 +283,8 @@ class ParameterSets:
         self._values: dict[str, tuple[str, Parameters]] = {}
 
     async def load(self) -> None:
-        """Read the saved sets. Without access to the store there are none; `save` then raises the error."""
+        """Read the saved sets and call `changed`. Without access to the store there are none; `save` then
+        raises the error."""
         try:
             rows = await self._store.ask(lambda store: store.sets.all())
         except StemmapError:
@@ -311,6 +325,7 @@ class ParameterSets:
 
         Raises:
             UnknownError: There is no set of this name.
+            StemmapError: The store cannot be used.
         """
         await self._store.ask(lambda store: store.sets.delete(name))
         await self.load()
@@ -337,7 +352,8 @@ class ParameterSets:
         return read_file(self.text(name), name)
 
     def name_of(self, preset_name: str, parameters: Parameters) -> str:
-        """Return the name of the saved set with these values; empty if there is none.
+        """Return the name of the saved set with these values and preset; empty if there is none. Presets are
+        not considered.
 
         Args:
             preset_name: Name of the preset.

@@ -27,7 +27,8 @@ _DIGITS = 4
 
 
 def map_payload(shown: Shown) -> dict[str, Any]:
-    """Return the message "map" without its path."""
+    """Return the message "map" without its path. Times are seconds since the first scan, `sigma_xy` is the
+    root mean square of the standard deviations of x and y [m]; points are not included."""
     frame = shown.frame
     estimate = frame.estimate
     return {
@@ -102,7 +103,8 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 
 def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
-    """Return the confirmed trees of a table as dicts for the page; unknown values are None.
+    """Return the confirmed trees of a table as dicts for the page. Unknown diameters, eccentricities and
+    coverages are None.
 
     Args:
         trees: The table.
@@ -139,7 +141,7 @@ def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:
 
 
 def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
-    """Return the ground truth trees, or None."""
+    """Return the objects of the ground truth (all classes), or None for None; unknown diameters are None."""
     if truth is None:
         return None
     rows = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
@@ -153,15 +155,18 @@ def path_points(path_xy: Float, start: int) -> dict[str, Any]:
 
 
 def _rounded(values: Float) -> list[float]:
+    """Return values rounded to 0.1 mm, as a list of the same shape."""
     rounded: list[float] = np.round(values, _DIGITS).tolist()
     return rounded
 
 
 def _known(value: float) -> float | None:
+    """Return a number rounded to three decimals; None if it is not finite."""
     return round(value, 3) if math.isfinite(value) else None
 
 
 def _finite(values: Float) -> list[float | None]:
+    """Return numbers, shape (N,), rounded to two decimals; None where not finite."""
     return [round(v, 2) if math.isfinite(v) else None for v in values.tolist()]
 
 
@@ -221,7 +226,8 @@ class BeforeAfter:
         self._before = self._now
 
     def shown(self, counts: Counts) -> dict[str, Any]:
-        """Set the counts of the displayed scan and return the message for the page."""
+        """Set the counts of the displayed scan and return the message for the page; `before` is None if
+        another scan was displayed since the change."""
         self._now = counts
         if self._before is not None and self._before.index != counts.index:
             self._before = None  # from another scan
@@ -233,12 +239,13 @@ REACH = 0.45  # m; maximum distance between a tree and its column
 
 
 def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
-    """Return number and votes of each confirmed tree, the most uncertain first.
+    """Return number and votes of each confirmed tree, and the class with most votes besides "tree", the most
+    uncertain first. [] without confirmed trees.
 
-    Trees without a voxel column have no votes and come last.
+    Trees without a voxel column within REACH have no votes (None) and come last.
 
     Args:
-        frame: Results of the newest scan, with its voxel columns.
+        frame: Results of the newest scan, with its voxel columns; None for these gives no votes.
         tree_share: Share of the votes that a tree needs.
     """
     from scipy.spatial import cKDTree
@@ -261,6 +268,7 @@ def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
 
 
 def _margin(votes: float | None, tree_share: float) -> float:
+    """Return how far the votes are from the required share; infinite for None."""
     return float("inf") if votes is None else abs(votes - tree_share)
 
 
@@ -288,7 +296,7 @@ def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
 
 
 def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Return points of shape (N, 3) [m] in whole centimetres, clipped to 327 m."""
+    """Return points of shape (N, 3) [m] in whole centimetres, int16, clipped to 327.67 m."""
     return np.clip(np.round(100.0 * points), -_FARTHEST_CM, _FARTHEST_CM).astype(np.int16)
 
 
@@ -305,7 +313,8 @@ def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> 
 
 
 def stages_payload(frame: Frame) -> bytes:
-    """Return the four stages of Fig. 3: raw scan, filtered scan, clusters and trunks."""
+    """Return the stages of Fig. 3 as a binary block: raw scan, filtered scan with the cluster of each point,
+    and circles of the clusters; no ground truth."""
     arrays = {"raw": in_centimetres(frame.raw), **_clustered(frame)}
     return packed(described(frame, None, 0.0), arrays)
 
@@ -329,6 +338,8 @@ def comparison_payload(
 
 
 def _clustered(frame: Frame) -> dict[str, NDArray[Any]]:
+    """Return filtered points [cm], the cluster of each, and x, y, radius, height [m] of each cluster, as
+    arrays for `packed`."""
     circles = np.column_stack([frame.clusters.centre, frame.clusters.radius, frame.clusters.centroid[:, 2]])
     return {
         "points": in_centimetres(frame.filtered),

@@ -69,7 +69,8 @@ class _Page:
 
 
 class RunRecorder:
-    """Writes the results of runs to the store, with a delay of some seconds and at their end.
+    """Writes the results of runs to the store, with a delay of some seconds and at their end. Errors of the
+    store are logged once, and the data stay pending.
 
     Args:
         store: Asynchronous access to the store.
@@ -88,10 +89,12 @@ class RunRecorder:
         return self._page.record if self._page else None
 
     def begin(self, run: int | None, source: SourceRequest, opened: Opened, *, again: bool) -> None:
-        """Begin the record of an opened run.
+        """Begin the record of an opened run; the one before is written and ended. It appears in the store
+        with the first scan.
 
         Args:
-            run: Number of its source in the store; None if the store cannot be used.
+            run: Number of its source in the store; None if the store cannot be used, then nothing is
+                recorded.
             source, opened: Requested source and the opened run.
             again: The worker was restarted and opened the same run again; its record continues.
         """
@@ -105,7 +108,7 @@ class RunRecorder:
         self._page = _Page(beginning, opened.scans)
 
     def leave(self) -> None:
-        """Write pending changes, because the run is closed."""
+        """Write pending changes in the background and end the record, because the run is closed."""
         page, self._page = self._page, None
         if self._writer is not None:
             self._writer.cancel()
@@ -116,8 +119,8 @@ class RunRecorder:
             self._start(self._write(page))
 
     def shown(self, state: RunState) -> None:
-        """Record a shown scan. The scan with the largest index counts, so that stepping back keeps the
-        map."""
+        """Record a shown scan. The scan with the largest index counts, so that stepping back keeps the map.
+        Nothing without a record."""
         page = self._page
         if page is None:
             return
@@ -127,7 +130,8 @@ class RunRecorder:
             self._soon(page)
 
     def scored(self, scores: dict[str, Any] | None) -> None:
-        """Record the score of the scan that was displayed last."""
+        """Record the score of the scan that was displayed last; ignored for None, and if that scan is not the
+        farthest one."""
         page = self._page
         if page is None or page.best is None or page.best is not page.newest or scores is None:
             return
@@ -138,7 +142,7 @@ class RunRecorder:
     def changed(
         self, before: dict[str, Value], after: dict[str, Value], preset: str, revision: int, who: str
     ) -> None:
-        """Record a change of parameters.
+        """Record a change of parameters. Ignored before the first scan, or if no value differs.
 
         Args:
             before, after: All values by dotted name.
@@ -161,10 +165,12 @@ class RunRecorder:
             await asyncio.gather(*self._tasks)
 
     def _soon(self, page: _Page) -> None:
+        """Start to write the record, unless it is being written."""
         if self._writer is None or self._writer.done():
             self._writer = asyncio.create_task(self._write_on(page), name="run_recorder")
 
     async def _write_on(self, page: _Page) -> None:
+        """Write the record every 5 s as long as it changes."""
         while page.dirty:
             await asyncio.shield(self._start(self._write(page)))
             await asyncio.sleep(_PAUSE_S)
@@ -181,6 +187,8 @@ class RunRecorder:
             await self._ask(lambda store: store.book.revise_all(record, changes))
 
     async def _write(self, page: _Page) -> None:
+        """Write the best state of a record, creating the record if necessary. After an error of the store it
+        stays pending."""
         async with page.lock:
             state, page.dirty = page.best, False
             if state is None:
@@ -199,6 +207,7 @@ class RunRecorder:
                 page.dirty = True
 
     async def _ask(self, work: Any) -> Any:  # noqa: ANN401 - as the store's
+        """Run a function of the store; an error is logged, unless it equals the one before, and raised."""
         try:
             done = await self._store.ask(work)
         except StemmapError as error:
@@ -210,6 +219,8 @@ class RunRecorder:
         return done
 
     def _start(self, work: Any) -> asyncio.Task[None]:  # noqa: ANN401 - any coroutine
+        """Run a coroutine as a task for which `close` waits; its StemmapErrors are dropped."""
+
         async def quiet() -> None:
             with contextlib.suppress(StemmapError):  # the error was logged
                 await work
@@ -221,6 +232,12 @@ class RunRecorder:
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
+    """Return the figures of a state for the store.
+
+    Args:
+        state: The state.
+        all_scans: Number of scans of the source; None if unknown.
+    """
     shown = state.shown
     frame = shown.frame
     trees = trees_payload(frame.trees, start_ns=frame.stamp_ns - round(shown.time_s * 1e9))
@@ -243,7 +260,8 @@ def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
 
 
 def thinned(path_xy: Float) -> list[list[float]]:
-    """Return a path of shape (N, 2) [m] reduced to at most MOST_PATH_POINTS rows including both ends."""
+    """Return a path of shape (N, 2) [m] reduced to at most MOST_PATH_POINTS rows including both ends, rounded
+    to millimetres; [] for an empty path."""
     n = len(path_xy)
     rows = np.unique(np.linspace(0, n - 1, min(n, MOST_PATH_POINTS)).round().astype(np.int64))
     points: list[list[float]] = np.round(path_xy[rows], 3).tolist()

@@ -46,7 +46,8 @@ class Scores:
         self._runs = 0
 
     def ask(self, trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> None:
-        """Request the score of a map.
+        """Request the score of a map; it replaces a request that has not begun. `tell` receives it, at most
+        about three times a second. A score that fails is only logged.
 
         Args:
             trees: The map.
@@ -59,7 +60,8 @@ class Scores:
             self._task = asyncio.create_task(self._work(), name="scores")
 
     def forget(self) -> None:
-        """Remove the score, because there is no map any more."""
+        """Remove the score and a pending request, and call `tell` with None, because there is no map any
+        more."""
         self._requested = self.latest = None
         self._runs += 1
         self._tell(None)
@@ -70,6 +72,7 @@ class Scores:
             self._task.cancel()
 
     async def _work(self) -> None:
+        """Compute the requested scores, with a pause after each, until none is requested."""
         while self._requested is not None:
             requested, self._requested = self._requested, None
             run = self._runs
@@ -118,10 +121,11 @@ def score_payload(score: MapScores) -> dict[str, Any]:
 
 
 def pairs_payload(trees: Trees, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the distances between the confirmed trees [m], and their errors [%] if both trees are matched,
-    as JSON values.
+    """Return the distances between the confirmed trees [m], and their errors [%] if both trees are matched
+    with true trees (NaN otherwise; None for all without ground truth), as JSON values.
 
-    Only the first MOST_PAIRED trees are included, because a larger matrix cannot be drawn.
+    Only the first MOST_PAIRED trees are included, because a larger matrix cannot be drawn; `left_out` is the
+    number of the others.
 
     Args:
         trees: The map.

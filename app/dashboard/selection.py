@@ -80,7 +80,7 @@ class WorkerClient:
         return _known(answer.tree)
 
     async def compare(self, sets: list[Parameters]) -> list[Frame]:
-        """Return the results of the current scan under each of several parameter sets."""
+        """Return the results of the current scan under each of several parameter sets, in their order."""
         plain = [each.model_dump() for each in sets]
         answer = await self._ask(AskCompare(next(self._tickets), self._shown_run(), plain))
         return _known(answer.frames)
@@ -91,12 +91,19 @@ class WorkerClient:
         return _known(answer.camera)
 
     def _shown_run(self) -> int:
+        """Return the number of the shown run; raises NoStoryError if there is none."""
         run = self._run()
         if run is None:
             raise _nothing_mapped()
         return run
 
     async def _ask(self, question: Question) -> Answer:
+        """Send a question and return its answer.
+
+        Raises:
+            WorkerBusyError: 100 questions wait already, or there is no answer in time.
+            NoStoryError: The worker answers that the object does not exist.
+        """
         if len(self._waiting) >= _MOST_WAITING:
             raise WorkerBusyError("too many requests at once", remedy="Try again")
         waiting = self._waiting[question.ticket] = asyncio.get_running_loop().create_future()
@@ -113,6 +120,7 @@ class WorkerClient:
 
 
 def _known(found: T | None) -> T:
+    """Return the part of an answer; raises NoStoryError if it is None."""
     if found is None:
         raise NoStoryError("there is no answer")
     return found
@@ -136,8 +144,8 @@ class Selection:
 
     @property
     def ring(self) -> tuple[float, float, float] | None:
-        """Position and size of the selected cluster in the map: x, y, radius [m]; None if no cluster is
-        selected."""
+        """Position and size of the selected cluster in the map: x, y, radius [m], where the radius reaches
+        its farthest point; None if no cluster is selected."""
         story = self.cluster
         if story is None:
             return None
@@ -183,15 +191,18 @@ class Selector:
         self._task: asyncio.Task[None] | None = None
 
     def tree(self, number: int | None) -> None:
-        """Select a tree; None selects nothing."""
+        """Select a tree in place of the selection, and cancel a pending request; None selects nothing.
+        Whether the tree exists is not checked."""
         self.leave()
         self._select(Selection(number))
 
     async def cluster(self, scan: int, cluster: int) -> None:
-        """Select a cluster of a recently displayed scan, with its tree.
+        """Select a cluster of a recently displayed scan, with its tree. Nothing is selected if another run
+        was opened meanwhile.
 
         Raises:
             NoStoryError: The cluster is no longer available.
+            WorkerBusyError: The worker did not answer in time.
         """
         run = self._run()
         story = await self.story(scan, cluster)
@@ -199,7 +210,8 @@ class Selector:
             self._select(Selection(story.tree, story))
 
     def cluster_soon(self, scan: int, cluster: int) -> None:
-        """Select a cluster in the background; of several calls the last one counts.
+        """Select a cluster in the background; of several calls the last one counts. If it does not exist, the
+        browsers receive the message "missing".
 
         Args:
             scan: Index of the scan.
@@ -218,6 +230,7 @@ class Selector:
 
         Raises:
             NoStoryError: The cluster is not available.
+            WorkerBusyError: The worker did not answer in time.
         """
         kept = self.selection.cluster
         if kept is not None and (kept.scan, kept.cluster) == (scan, cluster):
@@ -225,7 +238,8 @@ class Selector:
         return await self._client.cluster(self._newest() if scan is None else scan, cluster)
 
     def renamed(self, numbers: Mapping[int, int]) -> None:
-        """Select the tree under its new number, or clear the selection if the tree does not exist any more.
+        """Select the tree under its new number, or clear the selection of the tree if it does not exist any
+        more. A selected cluster stays.
 
         Args:
             numbers: New number by old number.
@@ -240,12 +254,14 @@ class Selector:
             self._task.cancel()
 
     async def _if_known(self, scan: int, cluster: int) -> None:
+        """Select a cluster; if it does not exist, broadcast the message "missing"."""
         try:
             await self.cluster(scan, cluster)
         except NoStoryError as error:
             self._live.publish("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
 
     def _select(self, selection: Selection) -> None:
+        """Set the selection, highlight it in the scene and broadcast it."""
         self.selection = selection
         self._mark(selection.tree, selection.ring)
         self._live.publish("selection", selection.as_plain())

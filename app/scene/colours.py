@@ -73,7 +73,7 @@ _RAMP = np.array(
 
 
 def by_verdict(verdicts: NDArray[np.integer]) -> Colours:
-    """Return the colour of each verdict, uint8, shape (K, 3).
+    """Return the colour of each verdict, uint8, shape (K, 3). Numbers outside of `Verdict` are clipped to it.
 
     Args:
         verdicts: Values of `Verdict`, shape (K,).
@@ -83,13 +83,15 @@ def by_verdict(verdicts: NDArray[np.integer]) -> Colours:
 
 
 def by_category(numbers: NDArray[np.integer]) -> Colours:
-    """Return a colour for each number, uint8, shape (K, 3); equal numbers have equal colours."""
+    """Return a colour for each number, uint8, shape (K, 3); equal numbers have equal colours, and the 12
+    colours repeat."""
     chosen: Colours = _CATEGORIES[np.asarray(numbers) % len(_CATEGORIES)]
     return chosen
 
 
 def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
-    """Return colours from violet (`low`) to yellow (`high`), uint8, shape (K, 3); NaN counts as `high`."""
+    """Return colours from violet (`low`) to yellow (`high`), uint8, shape (K, 3). Values outside are clipped;
+    NaN counts as `high`."""
     t = (np.nan_to_num(values, nan=high, posinf=high, neginf=low) - low) / max(high - low, 1e-9)
     place = np.clip(t, 0.0, 1.0) * (len(_RAMP) - 1)
     rgb = np.stack([np.interp(place, np.arange(len(_RAMP)), _RAMP[:, c]) for c in range(3)], axis=-1)
@@ -110,7 +112,7 @@ def of_points(cluster_colours: Colours, labels: NDArray[np.integer], noise: Rgb)
 
 
 def choose(first: NDArray[np.bool_], one: Rgb, other: Rgb) -> Colours:
-    """Return `one` where `first` is true, else `other`, shape (N, 3)."""
+    """Return `one` where `first` is true, else `other`, uint8, shape (N, 3)."""
     return np.array([other, one], dtype=np.uint8)[first.astype(np.int64)]
 
 
@@ -209,4 +211,5 @@ class ViewSettings:
 
 
 def _hex(colour: colours.Rgb | None) -> str | None:
+    """Return a colour as "#rrggbb"; None for None."""
     return None if colour is None else "#{:02x}{:02x}{:02x}".format(*colour)

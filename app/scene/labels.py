@@ -30,7 +30,13 @@ class Label:
 
 
 class LabelNodes:
-    """A pool of label nodes. A node keeps its object, so that an unchanged text is not sent again."""
+    """A pool of label nodes. A node keeps its object, so that an unchanged text is not sent again.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the parent node.
+        scale: Size of the text on the screen.
+    """
 
     def __init__(self, scene: viser.SceneApi, name: str, scale: float = 0.9) -> None:
         self._scene, self._name, self._scale = scene, name, scale
@@ -39,7 +45,8 @@ class LabelNodes:
         self._free: list[viser.LabelHandle] = []
 
     def show(self, labels: Iterable[Label]) -> None:
-        """Show these labels, at most `MOST_LABELS`, and hide all others."""
+        """Show these labels, at most the first `MOST_LABELS`, and hide all others. Of labels with the same
+        key the last counts; a label that moves less than 15 cm keeps its position."""
         wanted = {label.key: label for label in list(labels)[:MOST_LABELS]}
         for key in self._shown.keys() - wanted.keys():
             node = self._node_of.pop(key)
@@ -57,6 +64,7 @@ class LabelNodes:
         return [label.text for label in self._shown.values()]
 
     def _another(self) -> viser.LabelHandle:
+        """Add a hidden node to the pool and return it."""
         return self._scene.add_label(
             f"{self._name}/{len(self._node_of)}",
             "",
@@ -66,6 +74,7 @@ class LabelNodes:
         )
 
     def _place(self, key: int, label: Label) -> None:
+        """Send a label to its node if text or position changed."""
         node, before = self._node_of[key], self._shown.get(key)
         # Moves of a few centimetres make a label hard to read, and each one is a message.
         if before is not None and math.dist(before.place, label.place) < 0.15:
@@ -79,14 +88,14 @@ class LabelNodes:
 def apart(
     places: NDArray[np.float64], order: NDArray[np.int64], robot: NDArray[np.float64], width: float, most: int
 ) -> list[int]:
-    """Return rows of places whose labels do not overlap, in order of preference.
+    """Return rows of places whose labels do not overlap, in order of preference, at most `most`.
 
     Args:
         places: x, y in the frame of the map, shape (N, 2) [m].
         order: Rows, the preferred ones first.
         robot: Position of the robot, shape (2,) [m].
         width: Width of a label as a share of its distance.
-        most: Largest number of labels.
+        most: Largest number of labels, at least 1.
     """
     kept: list[int] = []
     for row in order.tolist():
@@ -99,7 +108,8 @@ def apart(
 
 
 def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Label]:
-    """Return labels for the clusters of a scan without overlaps: trees first, then the nearest.
+    """Return labels for the clusters of a scan without overlaps: trees first, then the nearest, at most
+    MOST_LABELS. Clusters without a text, such as those without a circle by "DBH", have none; [] by "none".
 
     Args:
         frame: Results of the scan.
@@ -123,6 +133,8 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
 
 
 def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
+    """Return the text of cluster `k`; "" if its DBH is unknown. An external stem, which has no eccentricity,
+    has its verdict."""
     verdict = Verdict(int(frame.clusters.verdict[k])).label
     if label_by == "verdict":
         return verdict
@@ -134,12 +146,14 @@ def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
 
 
 def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the drawn height of clusters [m]; an external stem has no measured height."""
+    """Return the drawn height of clusters, shape (K,) [m]: at least 0.2, and STEM_HEIGHT for NaN, because an
+    external stem has no measured height."""
     return np.where(np.isnan(height), STEM_HEIGHT, np.maximum(height, 0.2))
 
 
 def short(value: float) -> str:
-    """Return a number as text: two decimals below 100, one above, so that the text rarely changes."""
+    """Return a number as text that rarely changes: one decimal below 10, a whole number below 100, above that
+    one significant digit; "∞" if it is not finite."""
     if not np.isfinite(value):
         return "∞"
     if value >= 100.0:

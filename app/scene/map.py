@@ -49,7 +49,8 @@ class MapNodes:
                 on_tree(numbers[event.instance_index])
 
     def show(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
-        """Show the map after a scan. Trees that moved by less than a centimetre are not sent again.
+        """Show the map after a scan. The trees are sent again only if one moved by about a centimetre, or
+        changed its radius, height or number. Unconfirmed trees are not shown.
 
         Args:
             frame: Results of the scan.
@@ -84,7 +85,7 @@ class MapNodes:
         )
 
     def show_truth(self, trees: TruthTrees | None) -> None:
-        """Show rings at the objects of the ground truth; None removes them."""
+        """Show rings at the objects of the ground truth, on the known ground; None removes them."""
         self._truth_trees = trees
         if trees is None:
             self._truth.show(np.zeros((0, 2, 3)), np.zeros((0, 3), dtype=np.uint8))
@@ -105,6 +106,12 @@ class MapNodes:
         return self._labels.texts
 
     def _show_trees(self, place: NDArray[np.float64], measured: NDArray[np.bool_]) -> None:
+        """Send the trunks.
+
+        Args:
+            place: Number, x, y, radius and height of the ground of each tree, shape (N, 5) [m].
+            measured: Whether its diameter was measured, shape (N,).
+        """
         self._trees.show(
             place[:, [1, 2, 4]],
             np.column_stack([place[:, 3], place[:, 3], np.full(len(place), TREE_HEIGHT)]),
@@ -112,6 +119,15 @@ class MapNodes:
         )
 
     def _show_mark(self, trees: Trees, selected: int | None, ring: Ring, base_z: float) -> None:
+        """Show the ring of the selected cluster or, without one, a ring around the selected tree; none
+        without a selection.
+
+        Args:
+            trees: Confirmed trees.
+            selected: Number of the selected tree, or None.
+            ring: x, y and radius of the selected cluster [m], or None.
+            base_z: Height where the ground is unknown [m].
+        """
         # Around a cluster there is its own ring; a second one around its tree would only cover it.
         row = trees.number == (-1 if selected is None or ring is not None else selected)
         places, radii = np.round(trees.position[row], 2), []
@@ -124,7 +140,7 @@ class MapNodes:
 
 
 def confirmed(trees: Trees) -> Trees:
-    """Return the confirmed trees of a table."""
+    """Return the confirmed trees of a table; columns that are None stay None."""
     known = {name: column for name in Trees.__slots__ if (column := getattr(trees, name)) is not None}
     return Trees(**{name: column[trees.confirmed] for name, column in known.items()})
 
@@ -132,12 +148,13 @@ def confirmed(trees: Trees) -> Trees:
 def tree_labels(
     trees: Trees, robot: NDArray[np.float64], selected: int | None, foot: NDArray[np.float64]
 ) -> list[Label]:
-    """Return labels for the selected tree and the trees nearest to the robot, without overlaps.
+    """Return labels for the selected tree and the trees nearest to the robot, without overlaps, at most
+    NUMBERS.
 
     Args:
         trees: Trees of the map.
         robot: Position of the robot (x, y) [m].
-        selected: Number of the selected tree.
+        selected: Number of the selected tree, or None.
         foot: Height of the ground at each tree, shape (T,) [m].
     """
     distance = np.linalg.norm(trees.position - robot, axis=1)
@@ -157,6 +174,7 @@ def tree_labels(
 
 
 def _tree_text(trees: Trees, row: int, selected: bool) -> str:
+    """Return the number of a tree; for the selected one with its DBH."""
     number = int(trees.number[row])
     if not selected:
         return f"{number}"
@@ -173,7 +191,11 @@ HEIGHT = 0.08  # above the ground [m]
 
 
 class ErrorNode(Segments):
-    """Errors of the map against the ground truth, as lines: offsets, missed trees and false trees."""
+    """Errors of the map against the ground truth, as lines: offsets, missed trees and false trees.
+
+    Attributes:
+        count: Number of missed and false trees that are shown; 0 while hidden.
+    """
 
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene, "/world/errors", 3.0)
@@ -192,7 +214,8 @@ class ErrorNode(Segments):
         Args:
             trees: The map.
             truth: Ground truth; None hides the errors.
-            path: Positions of the robot, shape (N, 2) [m]; the ground truth within reach of them counts.
+            path: Positions of the robot, shape (N, 2) [m]; the ground truth within reach of them counts. An
+                empty path hides the errors.
             wanted: Distances of a match and of the ground truth from the path.
             ground: Ground with its heights.
         """
@@ -219,8 +242,8 @@ def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> 
     Args:
         trees: The map; confirmed trees count.
         truth: Ground truth.
-        path: Positions of the robot, shape (N, 2) [m]. Only trees within reach of it count as missed or
-            false.
+        path: Positions of the robot, shape (N, 2) [m], N >= 1. Only trees within reach of it count as missed
+            or false; matched trees may be farther away.
         wanted: Distances of a match and of the ground truth from the path.
     """
     from scipy.spatial import cKDTree
@@ -240,6 +263,13 @@ def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> 
 
 
 def _near(way: object, places: Float, reach: float) -> NDArray[np.bool_]:
+    """Return which places are within reach of the path, shape (N,).
+
+    Args:
+        way: KD-tree of the path.
+        places: shape (N, 2) [m].
+        reach: Largest distance [m].
+    """
     if not len(places):
         return np.zeros(0, np.bool_)
     distance: Float = way.query(places)[0]  # type: ignore[attr-defined]
@@ -247,6 +277,7 @@ def _near(way: object, places: Float, reach: float) -> NDArray[np.bool_]:
 
 
 def _crosses(places: Float) -> Float:
+    """Return two diagonal segments at each place (N, 2) [m], shape (2 N, 2, 2)."""
     arms = CROSS * np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]])
     return (places[:, None, None, :] + arms).reshape(-1, 2, 2)
 
@@ -274,7 +305,11 @@ class Accumulated:
         self._scans: list[tuple[int, int, NDArray[np.float64]]] = []  # scan, points before it, pose
 
     def take(self, frame: Frame) -> bool:
-        """Add the filtered points of a scan; if the run went back, remove those of later scans first.
+        """Add the filtered points of a scan; if the run went back, remove those of this and later scans
+        first.
+
+        Nothing is added if the robot moved less than STEP and turned less than TURN since the last added
+        scan. Only the first point of each cell is kept; above MOST_POINTS points are counted in `left_out`.
 
         Returns:
             Whether `points` changed.
@@ -301,6 +336,8 @@ class Accumulated:
         return went_back or len(new) > 0
 
     def _go_back(self, index: int) -> bool:
+        """Remove the points of the scan with this index and of later ones, and reset `left_out` if there were
+        any; return whether there were."""
         keep = None
         while self._scans and self._scans[-1][0] >= index:
             keep = self._scans.pop()[1]
@@ -343,6 +380,7 @@ class MapCloud:
             block.visible = visible and number * BLOCK < len(self._sent)
 
     def _send(self, points: NDArray[np.float32]) -> None:
+        """Send the blocks of points, shape (N, 3) [m], from the first that changed on."""
         first = first_difference(self._sent, points)
         if first == len(points) == len(self._sent):
             return
@@ -356,7 +394,8 @@ class MapCloud:
 
 
 def _keys(points: NDArray[np.floating]) -> NDArray[np.int64]:
-    """Return the key of the cell of each point, shape (N,), for points of shape (N, 3) [m]."""
+    """Return the key of the cell of each point, shape (N,), for points of shape (N, 3) [m]. Coordinates
+    beyond about 105 km share the outermost cells."""
     cell = (
         np.clip(np.floor(np.asarray(points, np.float64) / SIDE), -_HALF, _HALF - 1).astype(np.int64) + _HALF
     )

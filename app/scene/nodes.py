@@ -37,6 +37,8 @@ def box() -> Mesh:
 
 
 def _mesh(shape: trimesh.Trimesh, moved: tuple[float, float, float]) -> Mesh:
+    """Return vertices, float32, shape (V, 3), and faces, uint32, shape (F, 3), of a shape that is moved by an
+    offset."""
     return (shape.vertices + moved).astype(np.float32), shape.faces.astype(np.uint32)
 
 
@@ -61,7 +63,8 @@ def circles(
 
 
 def polyline(points: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Return the segments between consecutive points (N, 3), shape (N - 1, 2, 3)."""
+    """Return the segments between consecutive points (N, 3), float32, shape (N - 1, 2, 3); shape (0, 2, 3)
+    for one point."""
     xyz = points.astype(np.float32)
     return np.stack([xyz[:-1], xyz[1:]], axis=1)
 
@@ -85,6 +88,7 @@ class LayerNode(Generic[N]):
         self._update(self._filled)
 
     def _update(self, filled: bool) -> None:
+        """Set whether the node has content, and send its visibility if it changed."""
         self._filled = filled
         if self.node.visible != (self._on and filled):
             self.node.visible = self._on and filled
@@ -118,12 +122,15 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
         self.count = 0
 
     def show(self, positions: Points, scales: Points, colours: NDArray[np.uint8]) -> None:
-        """Replace the copies.
+        """Replace the copies; without any the node is hidden.
 
         Args:
             positions: Positions of the copies, shape (N, 3) [m].
             scales: Their sizes along x, y, z in units of the mesh, shape (N, 3).
             colours: Their colours, uint8, shape (N, 3).
+
+        Raises:
+            ValueError: The lengths differ.
         """
         if not len(positions) == len(scales) == len(colours):
             raise ValueError("positions, scales and colours must have the same length")
@@ -138,6 +145,7 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
 
 
 def _upright(count: int) -> NDArray[np.float32]:
+    """Return identity quaternions (w, x, y, z), float32, shape (count, 4)."""
     return np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (count, 1))
 
 
@@ -168,11 +176,15 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
         self._waiting: tuple[Points, Colours] | None = None
 
     def show(self, points: Points, colours: Colours | Rgb) -> None:
-        """Replace the points.
+        """Replace the points; without any the node is hidden. While the layer is off, they are kept and sent
+        when it is switched on.
 
         Args:
             points: shape (N, 3) [m] in the frame of the parent node.
             colours: One colour, or one for each point.
+
+        Raises:
+            ValueError: The number of colours differs from that of the points.
         """
         each = np.asarray(colours, dtype=np.uint8)
         if each.shape not in ((3,), points.shape):  # viser accepts a wrong length silently
@@ -181,6 +193,7 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
         self._update(self._filled)
 
     def _update(self, filled: bool) -> None:
+        """Send the newest points if they were not sent and the layer is on; then as `LayerNode._update`."""
         if self._waiting is not None and self._on:
             (points, colours), self._waiting = self._waiting, None
             filled = len(points) > 0
@@ -210,7 +223,12 @@ class Segments(LayerNode[viser.LineSegmentsHandle]):
         super().__init__(node)
 
     def show(self, segments: Points, each: Colours) -> None:
-        """Replace the segments, shape (S, 2, 3) [m], with a colour for each, shape (S, 3)."""
+        """Replace the segments; without any the node is hidden.
+
+        Args:
+            segments: Ends of the segments, shape (S, 2, 3) [m].
+            each: Colour of each segment, uint8, shape (S, 3).
+        """
         if len(segments):
             self.node.points = segments.astype(np.float32)
             self.node.colors = np.repeat(colours.of_lines(each), 2, axis=0).reshape(-1, 2, 3)
@@ -264,7 +282,13 @@ class LineNode:
         self._visible = True
 
     def show(self, places: Float, ground: Float | float = 0.0) -> None:
-        """Show the line through places (N, 2) [m], above the heights of the ground there, shape (N,) [m]."""
+        """Show the line through places; fewer than two hide it. Only chunks from the first change on are
+        sent.
+
+        Args:
+            places: Points of the line, shape (N, 2) [m].
+            ground: Heights of the ground there, scalar or shape (N,) [m].
+        """
         places = np.array(places, dtype=np.float64).reshape(-1, 2)
         points = np.column_stack([places, np.broadcast_to(self._height + ground, len(places))])
         first = first_difference(self._sent, points)
@@ -293,6 +317,12 @@ class LineNode:
         return max(-(-(len(self._sent) - 1) // CHUNK), 0)
 
     def _send(self, number: int, points: Float) -> None:
+        """Send one chunk, adding its node if necessary.
+
+        Args:
+            number: Number of the chunk.
+            points: Its points, shape (P, 3) [m].
+        """
         segments = polyline(points)
         if number < len(self._chunks):
             self._chunks[number].points = segments
@@ -338,7 +368,8 @@ class GroundNode(LayerNode[viser.MeshHandle]):
         self._raster, self._low, self._cell = NOTHING, np.zeros(2), 1.0
 
     def show(self, ground: HeightMap | None) -> bool:
-        """Show a height map; None keeps the present one. Return whether the height map changed."""
+        """Show a height map; None keeps the present one. Return whether the height map changed, judged by its
+        identity and not its values."""
         if ground is None or ground is self._shown:
             return False
         self._shown = ground
@@ -353,11 +384,12 @@ class GroundNode(LayerNode[viser.MeshHandle]):
         return True
 
     def heights(self, places: NDArray[np.floating], otherwise: float) -> Float:
-        """Return the heights of the ground, shape (N,) [m].
+        """Return the heights of the ground, shape (N,) [m], of the cell at each position without
+        interpolation.
 
         Args:
             places: Positions, shape (N, 2) [m].
-            otherwise: Height where the ground is unknown [m].
+            otherwise: Height where the ground is unknown, also outside of the map [m].
         """
         cell = np.floor((np.asarray(places, np.float64).reshape(-1, 2) - self._low) / self._cell)
         inside = np.all((cell >= 0) & (cell < self._raster.shape), axis=1)
@@ -388,10 +420,11 @@ def raster(ground: HeightMap) -> tuple[Float, Float, float]:
 
 
 def surface(grid: Float, low: Float, cell: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return a mesh through the centres of the known cells: vertices, shape (V, 3) [m], and faces, shape (F,
-    3).
+    """Return a mesh through the centres of the known cells: vertices, float32, shape (V, 3) [m], and faces,
+    uint32, shape (F, 3).
 
-    Four neighbouring known centres become two triangles.
+    Four neighbouring known centres become two triangles; cells without such neighbours have no vertex. V and
+    F are 0 if there are none.
 
     Args:
         grid, low, cell: Result of `raster`.

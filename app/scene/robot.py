@@ -37,13 +37,14 @@ class RobotNodes:
         self._ground: GroundNode | None = None
 
     def show(self, frame: Frame, path: Float, view: ViewSettings, ground: GroundNode) -> None:
-        """Show a new pose.
+        """Show a new pose. A scan with an index that was shown before, or a smaller one, removes the odometry
+        path from there on, because the run went back.
 
         Args:
             frame: Results of the scan.
             path: Positions at all scans so far in the frame of the map, shape (N, 2) [m].
             view: Visible layers.
-            ground: Ground with its heights.
+            ground: Ground with its heights; it is kept for `repaint`.
         """
         self._ground = ground
         pose = frame.estimate.T_map_base
@@ -59,7 +60,7 @@ class RobotNodes:
         self.repaint(view)
 
     def repaint(self, view: ViewSettings) -> None:
-        """Update the same pose after a change of layers."""
+        """Update the visibility of particles and paths after a change of layers. Requires an earlier `show`."""
         self._particles.visible = view.layers["particles"]
         self._path.visible = view.layers["path"]
         self._odometry.visible = view.layers["odometry"]
@@ -68,13 +69,15 @@ class RobotNodes:
             self._odometry.show(places, self._stepped(places))
 
     def _stepped(self, places: Float) -> Float:
-        """Return heights of the ground at places (N, 2) [m], rounded, so that small changes do not send a
-        line again."""
+        """Return heights of the ground at places (N, 2) [m], shape (N,) [m], rounded to STEP, so that small
+        changes do not send a line again. 0 where the ground is unknown and before the first scan."""
         if self._ground is None:
             return np.zeros(len(places))
         return np.round(self._ground.heights(places, 0.0) / STEP) * STEP
 
     def _follow_odometry(self, frame: Frame) -> None:
+        """Add the pose by odometry only of a scan. Both paths begin at the pose of the first scan that is
+        shown."""
         while self._dead_reckoning and self._dead_reckoning[-1][0] >= frame.index:  # the run went back
             self._dead_reckoning.pop()
         if not self._dead_reckoning:  # both paths start at the same pose, so that the drift is visible
@@ -84,6 +87,7 @@ class RobotNodes:
 
 
 def _add_body(scene: viser.SceneApi) -> None:
+    """Add the boxes and cylinders that represent the robot, as children of its frame."""
     scene.add_box(
         f"{ROBOT}/body", color=colours.ROBOT, dimensions=(0.6, 0.36, 0.2), position=(0.0, 0.0, 0.24)
     )
@@ -125,7 +129,8 @@ class WayNode(Segments):
         self._drawn: tuple[object, ...] | None = None
 
     def show_ahead(self, clearance: Clearance | None, parameters: Obstacles, visible: bool) -> None:
-        """Show the path ahead of the robot.
+        """Show the path ahead of the robot. Nothing is sent for changes below the drawn resolution, and only
+        the visibility changes while the node is hidden.
 
         Args:
             clearance: Path ahead and obstacles at the scan; None hides the node.
@@ -173,13 +178,14 @@ def way_lines(curvature: float, backward: bool, begins: float, parameters: Obsta
 
 
 def _on_way(s: Float, left: float | Float, curvature: float, backward: bool) -> Float:
-    """Return points at a lateral distance from the path ahead, shape (N, 3) [m], in the level base frame.
+    """Return points at a lateral distance from the path ahead, shape (N, 3) [m], in the level base frame, at
+    HEIGHT.
 
     Args:
         s: Distances along the path from the base, shape (N,) [m].
-        left: Distance to the left of the path [m].
-        curvature: Curvature of the path [1/m], positive to the left.
-        backward: Whether the robot drives backward.
+        left: Distance to the left of the path [m], scalar or shape (N,).
+        curvature: Curvature of the path [1/m], positive to the left; below 1e-6 the path is straight.
+        backward: Whether the robot drives backward; then x is negated.
     """
     if abs(curvature) < 1e-6:
         x, y = s, np.zeros_like(s) + left

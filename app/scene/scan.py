@@ -84,10 +84,11 @@ class ScanNodes:
         self._labels.show(shown)
 
     def meant(self, instance: int | None, origin: Float, direction: Float) -> int | None:
-        """Return the row of the cluster of the newest scan that a click hit; None if there is none.
+        """Return the row of the cluster of the newest scan that a click hit; None if there is none, see
+        `meant`.
 
         Args:
-            instance: Number of the hit marker in the scan that the browser showed.
+            instance: Number of the hit marker in the scan that the browser showed; None if unknown.
             origin, direction: Ray of the click in the frame of the map, shape (3,) each.
         """
         return meant(origin, direction, *self._axes, instance)
@@ -101,11 +102,19 @@ class ScanNodes:
     def _ramp_or(
         points: NDArray[np.float32], view: ViewSettings, plain: colours.Rgb
     ) -> Colours | colours.Rgb:
+        """Return colours by height, one per point, if the view is coloured so; otherwise the plain colour.
+
+        Args:
+            points: shape (N, 3) [m] in the level frame of the sensor.
+            view: The choices.
+            plain: The other colour.
+        """
         if view.colour_by == "height":
             return colours.ramp(points[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
         return plain
 
     def _show_fits(self, frame: Frame) -> None:
+        """Show a cylinder for each detected stem with a fitted circle."""
         rows = frame.detections.cluster
         rows = rows[np.isfinite(frame.clusters.radius[rows])]
         clusters = frame.clusters
@@ -136,6 +145,9 @@ class ScanNodes:
 
 
 def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
+    """Let clicks on the copies of a batch call `on_cluster`; the number of the copy is passed only for the
+    markers."""
+
     @batch.node.on_click
     async def _(event: viser.SceneNodePointerEvent[Any]) -> None:
         # There are fewer circles than clusters, so their number is not that of a cluster; the ray decides.
@@ -144,7 +156,8 @@ def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
 
 
 def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:
-    """Return the colours of the filtered points, shape (M, 3).
+    """Return the colours of the filtered points, uint8, shape (M, 3). Points without a cluster have one
+    colour, except by height.
 
     Args:
         frame: Results of the scan.
@@ -215,13 +228,14 @@ class ClusterNumbers:
         self._next = 0
 
     def follow(self, places: Float) -> Int:
-        """Return a number for each cluster at these places.
+        """Return a number for each cluster at these places: that of the cluster of the previous call within
+        REACH, else the next unused one.
 
         Args:
             places: shape (K, 2) [m] in the frame of the map.
 
         Returns:
-            Different numbers, shape (K,).
+            Different numbers, int64, shape (K,).
         """
         numbers = np.full(len(places), -1, dtype=np.int64)
         before = match(places, self._places, REACH)
@@ -239,7 +253,8 @@ NEAR = 0.5  # [m]; a ray that misses a marker by more hit a marker of another sc
 def meant(
     origin: Float, direction: Float, low: Float, high: Float, radius: Float, instance: int | None
 ) -> int | None:
-    """Return the row of the upright cylinder that a ray hits; None if none is near.
+    """Return the row of the upright cylinder that a ray hits; None if none is within NEAR of it, or without
+    cylinders.
 
     While a run plays, the browser shows an older scan, in which the numbers belong to other clusters. If the
     ray misses the cylinder with the reported number, the cylinder nearest to the ray is returned.
@@ -247,7 +262,7 @@ def meant(
     Args:
         origin, direction: Ray, shape (3,) each; the direction may have any length.
         low, high, radius: Base and top of each axis, shape (K, 3) [m], and radii, shape (K,) [m].
-        instance: Number that the browser reports.
+        instance: Number that the browser reports; None if unknown.
     """
     if not len(radius):
         return None

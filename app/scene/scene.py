@@ -30,7 +30,8 @@ RENEW_AFTER = 2_000_000
 
 
 class Scene:
-    """Shows frames in viser and passes the actions of people there to the server.
+    """Shows frames in viser and passes the actions of people there to the server. The constructor starts
+    viser.
 
     All methods are called on `loop`. Callbacks of the thread of viser are passed to `loop` first, so that
     only one thread changes the nodes.
@@ -38,6 +39,9 @@ class Scene:
     Args:
         commands: Commands of the scene to the server.
         loop: Event loop of the server.
+
+    Attributes:
+        secret: Value of the header `X-Stemmap-Secret` that viser requires.
     """
 
     def __init__(self, commands: SceneCommands, loop: asyncio.AbstractEventLoop) -> None:
@@ -65,7 +69,8 @@ class Scene:
         return messages_sent(self._server)
 
     def show(self, frame: Frame, path: Float) -> None:
-        """Show the results of a scan.
+        """Show the results of a scan. After RENEW_AFTER messages viser is restarted first, and `port`
+        changes.
 
         Args:
             frame: Results of the scan.
@@ -95,10 +100,11 @@ class Scene:
             self._map.show_truth(trees)
 
     def select(self, tree: int | None, ring: Ring = None) -> None:
-        """Highlight the selection.
+        """Highlight the selection in place of the one before. It is drawn with the next scan if none is
+        shown.
 
         Args:
-            tree: Number of the selected tree, or None.
+            tree: Number of the selected tree, or None; an unknown number highlights nothing.
             ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
         """
         self._selected, self._ring = tree, ring
@@ -122,16 +128,16 @@ class Scene:
         }
 
     def choose(self, name: str, value: str | bool) -> None:
-        """Set one choice of the view, see `ViewSettings.choose`.
+        """Set one choice of the view, see `ViewSettings.choose`, and draw the shown scan accordingly.
 
         Raises:
-            ParameterError: There is no such choice.
+            ParameterError: There is no such choice, or the value is not one of it; nothing changes.
         """
         self._view.choose(name, value)
         self._repaint()
 
     def clear(self) -> None:
-        """Remove the run from the scene; the panel stays."""
+        """Remove run, ground truth and selection from the scene; the panel and the choices of the view stay."""
         self._frame, self._path = None, np.zeros((0, 2))
         self._truth = self._selected = self._ring = None
         self._accumulated = Accumulated()
@@ -140,7 +146,7 @@ class Scene:
             self._add_nodes()
 
     def close(self) -> None:
-        """Stop viser."""
+        """Cancel commands in progress and stop viser."""
         self._tuning.stop()
         with silenced():
             self._server.stop()
@@ -148,6 +154,7 @@ class Scene:
     # --- building ------------------------------------------------------------------------------
 
     def _build(self) -> None:
+        """Start viser with the panel, the keys and empty nodes."""
         self._server = start_server(self.secret)
         gui = self._server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(0, 105, 78))
@@ -160,6 +167,7 @@ class Scene:
         self._add_nodes()
 
     def _add_nodes(self) -> None:
+        """Add the nodes of all layers, without content."""
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.configure_default_lights(enabled=True, cast_shadow=False)
@@ -185,6 +193,7 @@ class Scene:
         self._way = WayNode(scene, ROBOT)
 
     def _renew(self) -> None:
+        """Start another viser with the same content and stop the old one."""
         old = self._server
         # Browsers lose their connection when the old server stops, and reconnect to the new one by the proxy.
         self._build()
@@ -204,6 +213,7 @@ class Scene:
         return 0.0 if self._frame is None else self._frame.base_z
 
     def _show_frame(self) -> None:
+        """Send the newest scan in one group of messages; nothing without one."""
         if self._frame is None:
             return
         with self._server.atomic():  # otherwise the points would move before the robot
@@ -227,6 +237,7 @@ class Scene:
             self._errors.hide()
 
     def _repaint(self) -> None:
+        """Draw the newest scan after a change of the view; nothing without one."""
         if self._frame is None:
             return
         with self._server.atomic():
@@ -240,6 +251,7 @@ class Scene:
     # --- callbacks in the thread of viser, passed to the loop -------------------------------------
 
     def _cross(self, function: Callable[..., None], *arguments: Any) -> None:  # noqa: ANN401
+        """Call a function on the loop of the server, from any thread; nothing if the loop has ended."""
         with contextlib.suppress(RuntimeError):  # the loop has ended before viser's thread
             self._loop.call_soon_threadsafe(function, *arguments)
 
@@ -253,9 +265,16 @@ class Scene:
         self._cross(lambda: self._tuning.ask(self._commands.reset_parameters(names), client))
 
     def _on_tree(self, number: int) -> None:
+        """Select a tree, or clear the selection if it is selected already."""
         self._tuning.ask(self._commands.select_tree(None if number == self._selected else number), None)
 
     def _on_cluster(self, instance: int | None, origin: Vector, direction: Vector) -> None:
+        """Select the cluster that a click hit; nothing if none is near.
+
+        Args:
+            instance: Number of the hit marker; None if unknown.
+            origin, direction: Ray of the click in the world of viser.
+        """
         if self._frame is None:
             return
         shift = self._follower.shift
@@ -273,6 +292,7 @@ class Scene:
         self._follower.look(client, self._pose, self._base_z, from_above=name == "top")
 
     def _put_back(self) -> None:
+        """Reset the widgets to the present values."""
         self.show_parameters(self._parameters, self._preset)
 
 
@@ -299,7 +319,7 @@ class Follower:
         server.initial_camera.look_at = (0.0, 0.0, 0.5)
 
     def show(self, pose: Pose2, z: float, follow: bool) -> None:
-        """Move the robot to the origin.
+        """Move the world so that the robot is at the origin, if following is on.
 
         Args:
             pose: Pose of the robot in the map.

@@ -45,13 +45,16 @@ def start_server(secret: str) -> viser.ViserServer:
 
 @contextlib.contextmanager
 def silenced() -> Iterator[None]:
-    """Suppress viser's messages on standard output inside the context, because the command line uses it."""
+    """Suppress messages on standard output inside the context, because the command line uses it. It applies
+    to all threads of the process."""
     with contextlib.redirect_stdout(io.StringIO()):
         yield
 
 
 @contextlib.contextmanager
 def _guarded_handshakes(secret: str) -> Iterator[None]:
+    """Inside the context, a server of `websockets` that starts checks the secret of each handshake first. One
+    context at a time is active; others wait."""
     # viser has no login, and every user of this machine can reach its port. It passes its own
     # `process_request` to websockets.asyncio.server.serve inside one long method, so nothing can be
     # overridden. While it starts (its constructor waits until the socket is bound) `serve` is wrapped so that
@@ -72,6 +75,14 @@ def _guarded_handshakes(secret: str) -> Iterator[None]:
 
 
 def _check_first(secret: str, then: Callable[..., Any] | None) -> Callable[..., Any]:
+    """Return a `process_request` of `websockets` that answers 403 without the secret, sets the current user
+    from the header USER_HEADER (SOMEBODY for an invalid name), and then calls `then`.
+
+    Args:
+        secret: Required value of the header SECRET_HEADER.
+        then: viser's own `process_request`, or None.
+    """
+
     async def process_request(connection: ServerConnection, request: Request) -> Response | None:
         given = request.headers.get(SECRET_HEADER, "")
         if not hmac.compare_digest(given.encode(), secret.encode()):
@@ -87,17 +98,20 @@ def _check_first(secret: str, then: Callable[..., Any] | None) -> Callable[..., 
 
 
 def messages_sent(server: viser.ViserServer) -> int:
-    """Return how many message numbers the server has used since it started."""
+    """Return how many message numbers the server has used since it started, for all browsers together."""
     return server._websock_server.get_message_buffer().message_counter
 
 
 def _refuse_tunnels(server: viser.ViserServer) -> None:
+    """Remove viser's handlers of requests for a public address."""
     # Any client could request a public address of this machine; without a handler the message is ignored.
     for message in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
         server._websock_server.unregister_handler(message)
 
 
 def _take_values_only(server: viser.ViserServer) -> None:
+    """Replace viser's handler of changed widgets by one that ignores messages with anything but a value, and
+    values of the wrong type."""
     # viser sets any attribute of a widget that a client names. Only the value may be set here.
     handle = server.gui._handle_gui_updates
     server._websock_server.unregister_handler(_messages.GuiUpdateMessage, handle)
@@ -124,5 +138,5 @@ def add_posed(scene: viser.SceneApi, name: str) -> viser.FrameHandle:
 
 
 def set_value(widget: Any, value: float | int | bool | str) -> None:  # noqa: ANN401
-    """Set the value of a widget from code."""
+    """Set the value of a widget from code; all browsers receive it."""
     widget.value = value
