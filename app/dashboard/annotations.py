@@ -201,7 +201,8 @@ class AnnotationEditor:
         self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
 
     def score_against(self, against: Against) -> None:
-        """Choose the ground truth for the scores, see `truth_of`, and call `changed`; no annotation changes."""
+        """Choose the ground truth for the scores, see `truth_of`, and call `changed`. No annotation
+        changes."""
         self.against = against
         self.truth = truth_of(self._own, self.rows, against)
         self.changed()

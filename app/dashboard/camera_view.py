@@ -125,7 +125,8 @@ def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]
 
 
 def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each confirmed tree in view between NEAREST and FARTHEST; arguments as in `marks_of`."""
+    """Return a box for each confirmed tree in view between NEAREST and FARTHEST. Arguments as in
+    `marks_of`."""
     trees = frame.trees
     marks = []
     places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)

@@ -60,7 +60,8 @@ class RobotNodes:
         self.repaint(view)
 
     def repaint(self, view: ViewSettings) -> None:
-        """Update the visibility of particles and paths after a change of layers. Requires an earlier `show`."""
+        """Update the visibility of particles and paths after a change of layers. `show` must be called
+        before."""
         self._particles.visible = view.layers["particles"]
         self._path.visible = view.layers["path"]
         self._odometry.visible = view.layers["odometry"]

@@ -137,7 +137,8 @@ class Scene:
         self._repaint()
 
     def clear(self) -> None:
-        """Remove run, ground truth and selection from the scene; the panel and the choices of the view stay."""
+        """Remove run, ground truth and selection from the scene. The panel and the choices of the view
+        stay."""
         self._frame, self._path = None, np.zeros((0, 2))
         self._truth = self._selected = self._ring = None
         self._accumulated = Accumulated()

@@ -40,11 +40,12 @@ class AsyncStore:
         self._waiting = 0
 
     async def ask(self, function: Callable[[Store], T]) -> T:
-        """Return the result of a function, which is called with the store in the thread of the store.
+        """Return the result of a function, which is called with the store in the thread of the store; its
+        exceptions are raised here.
 
         Raises:
-            StoreBusyError: Too many requests wait.
-            StemmapError: The store cannot be used.
+            StoreBusyError: LARGEST_QUEUE requests wait.
+            StemmapError: The store cannot be opened or used.
         """
         if self._waiting >= LARGEST_QUEUE:
             raise StoreBusyError("the database is busy", remedy="Try again in some seconds")
@@ -55,12 +56,14 @@ class AsyncStore:
             self._waiting -= 1
 
     async def close(self) -> None:
-        """Finish the requests that wait, and close the database."""
+        """Finish the requests that wait, and close the database. No request may follow."""
         if self._store is not None:
             await self.ask(lambda store: store.close())
         self._thread.shutdown()
 
     def _work(self, function: Callable[[Store], T]) -> T:
+        """Call a function with the store, which is opened if necessary; errors of the database become
+        StemmapErrors."""
         from sqlalchemy.exc import SQLAlchemyError
 
         from app.store.database import reason_of

@@ -53,11 +53,11 @@ def open_engine(folder: Path | None, database: str = "") -> sa.Engine:
 
     Args:
         folder: Folder of the SQLite file, created if necessary; None keeps the database in memory.
-        database: Address of a PostgreSQL database, used instead of the folder.
+        database: Address of a PostgreSQL database, used instead of the folder; empty for none.
 
     Raises:
-        StemmapError: The folder or the server cannot be used, or the database is damaged or of a newer
-            version; it is not modified.
+        StemmapError: The folder or the server cannot be used, or the database is damaged, of another version
+            or of another program; it is not modified.
     """
     if database:
         return _open_server(database)
@@ -76,6 +76,11 @@ def open_engine(folder: Path | None, database: str = "") -> sa.Engine:
 
 
 def _open_server(database: str) -> sa.Engine:
+    """Return the engine of a PostgreSQL database with current tables.
+
+    Raises:
+        StemmapError: The address is invalid, the driver is not installed, or the database cannot be used.
+    """
     remedy = "Give STEMMAP_DATABASE as postgresql://name@host/database"
     try:
         url = sa.make_url(database)
@@ -94,6 +99,8 @@ def _open_server(database: str) -> sa.Engine:
 
 
 def _sqlite(database: str) -> sa.Engine:
+    """Return an engine with one connection to a SQLite file or ":memory:"; each transaction locks out other
+    writers from its beginning."""
     # One connection, used by one thread at a time; an in-memory database exists as long as it.
     engine = sa.create_engine(
         "sqlite+pysqlite://",
@@ -117,6 +124,8 @@ def _sqlite(database: str) -> sa.Engine:
 
 
 def _postgresql(url: sa.URL) -> sa.Engine:
+    """Return an engine with one connection; each transaction holds a lock that all writers share, or fails
+    after 5 s."""
     engine = sa.create_engine(
         url.set(drivername="postgresql+psycopg"),
         pool_size=1,
@@ -135,6 +144,16 @@ def _postgresql(url: sa.URL) -> sa.Engine:
 
 
 def _checked(engine: sa.Engine, where: str) -> sa.Engine:
+    """Check a database, create its tables if it is new, and return the engine; it is disposed of after an
+    error.
+
+    Args:
+        engine: The engine.
+        where: The database, for errors.
+
+    Raises:
+        StemmapError: The database is damaged, of another version or program, or cannot be read.
+    """
     keep = "It was not changed: move it away to start with an empty one, or restore a copy"
     try:
         with engine.begin() as connection:
@@ -161,7 +180,7 @@ def _checked(engine: sa.Engine, where: str) -> sa.Engine:
 
 
 def reason_of(error: Exception) -> str:
-    """Return the reason of a database error in one line."""
+    """Return the reason of a database error in one line of lower case, at most 300 characters."""
     return " ".join(str(getattr(error, "orig", None) or error).lower().split())[:300]
 
 

@@ -35,7 +35,8 @@ _NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def name_of(data: dict[str, Any]) -> str:
-    """Return the name of a forest from its JSON."""
+    """Return the name of a forest from its JSON: 16 hex digits of the SHA-256 of its classes and trees,
+    without provenance."""
     decides = [data.get(key) for key in DECIDES] + ([data[FREE_END]] if FREE_END in data else [])
     text = json.dumps(decides, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -67,7 +68,7 @@ class Forests:
         return self._known[name, all_around]
 
     def check(self, parameters: Parameters) -> None:
-        """Check that the forest of the parameters exists.
+        """Check that the forest of the parameters exists and can be read.
 
         Raises:
             StemmapError: See `__call__`.
@@ -98,6 +99,11 @@ class Forests:
         return self._provenance[name]
 
     def _read(self, name: str) -> tuple[dict[str, Any], list[Forest]]:
+        """Return the JSON of a learned forest and its two forests, for all around and one way.
+
+        Raises:
+            StemmapError: The name or file does not exist, or the file is damaged.
+        """
         file = self._file(name)
         if file is None or not file.is_file():
             raise StemmapError(
@@ -115,7 +121,8 @@ class Forests:
         return data, forests
 
     def keep(self, data: dict[str, Any]) -> str:
-        """Store a forest in the data folder and return its name.
+        """Store a forest in the data folder under its name, and return the name; a file of that name is
+        replaced.
 
         Raises:
             StemmapError: There is no data folder, or it cannot be written.
@@ -132,18 +139,20 @@ class Forests:
         return name
 
     def _file(self, name: str) -> Path | None:
+        """Return the file of a forest; None without a data folder or for an invalid name."""
         return None if self._folder is None or not _NAME.fullmatch(name) else self._folder / f"{name}.json"
 
 
 def write_forest(data: dict[str, Any], file: Path) -> None:
-    """Write a forest as JSON, one line per split."""
+    """Write a forest as JSON, one line per split; raises StemmapError if the file cannot be written."""
     text = json.dumps(data, separators=(",", ":")).replace('{"figure"', '\n{"figure"')
     with write_beside(file) as beside:
         beside.write_text(text + "\n", encoding="utf-8")
 
 
 def kept_forests() -> Forests:
-    """Return the forests of the data folder of this process."""
+    """Return the forests of the data folder that the environment names; the same object for the same
+    folder."""
     return _of(data_folder(os.environ))
 
 

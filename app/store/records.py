@@ -164,5 +164,5 @@ class Change:
 
 
 def moment(at_ns: int) -> str:
-    """Return a time as text with a resolution of one second."""
+    """Return a time [ns since 1970] as text in UTC with a resolution of one second."""
     return datetime.fromtimestamp(at_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

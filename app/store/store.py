@@ -79,7 +79,7 @@ class Sets:
         return [SavedSet(row.name, row.toml, row.who, row.at_ns) for row in rows]
 
     def save(self, name: str, toml: str, who: str) -> None:
-        """Save a set under a name; it replaces a set of the same name.
+        """Save a set under a name; it replaces a set of the same name. The contents are not checked.
 
         Args:
             name: Name of the set.
@@ -87,7 +87,7 @@ class Sets:
             who: Name of the person.
 
         Raises:
-            StemmapError: The maximum number of sets is reached.
+            StemmapError: There are MOST_SETS other sets; nothing changes.
         """
         with self._engine.begin() as connection:
             connection.execute(delete(_sets).where(_sets.c.name == name))
@@ -131,7 +131,8 @@ class RunRecords:
         self._clock = clock
 
     def begin(self, run: NewRun, figures: RunFigures) -> int:
-        """Store the record of a new run and return its number."""
+        """Store the record of a new run and return its number. Runs that were deleted more than 30 days ago
+        are removed for good."""
         now = self._clock()
         with self._engine.begin() as connection:
             _forget_deleted(connection, now - _KEPT_NS)
@@ -155,7 +156,7 @@ class RunRecords:
             return record
 
     def update(self, record: int, figures: RunFigures) -> None:
-        """Update the record of a run.
+        """Update figures and map of a record; nothing happens if it does not exist.
 
         Args:
             record: Number of the record.
@@ -167,14 +168,16 @@ class RunRecords:
             connection.execute(update(_maps).where(_maps.c.record == record).values(map=figures.map))
 
     def revise_all(self, record: int, changes: Sequence[Change]) -> None:
-        """Store changes of parameters in one transaction, the oldest first."""
+        """Store changes of parameters in one transaction, the oldest first. Changes of the same parameters by
+        one person within 3 s become one revision."""
         now = self._clock()
         with self._engine.begin() as connection:
             for change in changes:
                 _revise(connection, record, change, now)
 
     def listed(self) -> list[dict[str, Any]]:
-        """Return the runs without their maps, newest first, at most MOST_LISTED."""
+        """Return the runs without their maps, those that changed last first, at most MOST_LISTED; deleted
+        runs are left out."""
         query = (
             _with_source()
             .where(_records.c.deleted_ns.is_(None))
@@ -208,10 +211,10 @@ class RunRecords:
             connection.execute(update(_records).where(_records.c.id == record).values(name=name))
 
     def delete(self, record: int) -> None:
-        """Delete a run; the deletion can be undone for one month.
+        """Delete a run; the deletion can be undone for 30 days.
 
         Raises:
-            UnknownError: The run does not exist.
+            UnknownError: The run does not exist or was deleted.
         """
         with self._engine.begin() as connection:
             _found(connection, record)
@@ -220,7 +223,7 @@ class RunRecords:
             )
 
     def bring_back(self, record: int) -> None:
-        """Undo the deletion of a run.
+        """Undo the deletion of a run; nothing happens if it was not deleted.
 
         Raises:
             UnknownError: The run does not exist any more.
@@ -254,6 +257,14 @@ class RunRecords:
 
 
 def _revise(connection: Connection, record: int, change: Change, now: int) -> None:
+    """Store a change of parameters, or extend the last revision of the record if both are one move.
+
+    Args:
+        connection: Connection with an open transaction.
+        record: Number of the record.
+        change: The change.
+        now: Time [ns since 1970].
+    """
     query = select(_revisions).where(_revisions.c.record == record).order_by(_revisions.c.id.desc())
     last = connection.execute(query.limit(1)).one_or_none()
     values = {"revision": change.revision, "at_ns": now, "time_s": change.time_s, "preset": change.preset}
@@ -277,6 +288,7 @@ def _figures(figures: RunFigures) -> dict[str, Any]:
 
 
 def _is_one_move(last: Row[Any], change: Change, now: int) -> bool:
+    """Return whether a change continues the last revision: same person and parameters, within 3 s."""
     return bool(
         last.who == change.who
         and last.changes.keys() == change.changes.keys()
@@ -285,6 +297,7 @@ def _is_one_move(last: Row[Any], change: Change, now: int) -> bool:
 
 
 def _found(connection: Connection, record: int) -> Row[Any]:
+    """Return a record with its source; raises UnknownError if it does not exist or was deleted."""
     query = _with_source().where(_records.c.id == record, _records.c.deleted_ns.is_(None))
     row = connection.execute(query).one_or_none()
     if row is None:
@@ -293,6 +306,7 @@ def _found(connection: Connection, record: int) -> Row[Any]:
 
 
 def _forget_deleted(connection: Connection, before_ns: int) -> None:
+    """Remove records that were deleted before a time [ns since 1970], with their maps and revisions."""
     gone = select(_records.c.id).where(_records.c.deleted_ns < before_ns)
     connection.execute(delete(_maps).where(_maps.c.record.in_(gone)))
     connection.execute(delete(_revisions).where(_revisions.c.record.in_(gone)))
@@ -336,8 +350,8 @@ class Store:
         self._engine.dispose()
 
     def open_run(self, source: str, uri: str, name: str) -> int:
-        """Return the number of a source, which is stored if it is new. It does not depend on the path of the
-        recording.
+        """Return the number of a source, which is stored if it is new; URI, name and time of a known one are
+        updated. The number does not depend on the path of the recording.
 
         Args:
             source: Digest of the recording, or its URI if it has no digest.
@@ -354,7 +368,7 @@ class Store:
 
     def annotations(self, run: int) -> list[Annotation]:
         """Return the annotations of the source with this number that are not deleted, in the order of their
-        creation."""
+        creation; [] for an unknown number."""
         query = select(_annotations).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
         with self._engine.begin() as connection:
             rows = connection.execute(query.order_by(_annotations.c.id)).all()
@@ -384,7 +398,7 @@ class Store:
             contents: Contents of the annotations.
 
         Raises:
-            StemmapError: The maximum number of annotations is reached.
+            StemmapError: There would be more than MOST_ANNOTATIONS annotations; none is added.
         """
         with self._engine.begin() as connection:
             counted = select(func.count()).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
@@ -394,7 +408,7 @@ class Store:
             return [self._add(connection, run, step, author, content) for content in contents]
 
     def change(self, run: int, author: Author, id_: int, version: int, content: Content) -> None:
-        """Change the content of an annotation.
+        """Change the content of an annotation. The same content as before changes nothing and is no step.
 
         Args:
             run: Number of the source, see `open_run`.
@@ -405,8 +419,8 @@ class Store:
 
         Raises:
             UnknownError: The run has no annotation with this id.
-            StaleError: The annotation has another version; the message names author and time of the last
-                change.
+            StaleError: The annotation has another version or is deleted; the message names author and time of
+                the last change.
         """
         self._edit(run, author, id_, version, content)
 
@@ -415,7 +429,7 @@ class Store:
         self._edit(run, author, id_, version, None)
 
     def undo(self, run: int, author: Author) -> None:
-        """Undo the last step of a browser.
+        """Undo the last step of a browser that is not undone, with all its annotations.
 
         Args:
             run: Number of the source, see `open_run`.
@@ -423,7 +437,8 @@ class Store:
 
         Raises:
             StemmapError: There is no step to undo.
-            StaleError: Another person has changed the annotation since; the step is skipped from now on.
+            StaleError: Another person has changed an annotation of the step since; nothing is undone, and the
+                step is skipped from now on.
         """
         self._turn(run, author, "undone")
 
@@ -448,6 +463,8 @@ class Store:
     # --- one edit --------------------------------------------------------------------------------
 
     def _edit(self, run: int, author: Author, id_: int, version: int, content: Content | None) -> None:
+        """Set the content of an annotation, or delete it (None), as a new step; arguments and errors as in
+        `change`."""
         with self._engine.begin() as connection:
             row = connection.execute(
                 select(_annotations).where(_annotations.c.id == id_, _annotations.c.run == run)
@@ -469,6 +486,15 @@ class Store:
         return _inserted(connection, insert(_steps).values(run=run, **values))
 
     def _add(self, connection: Connection, run: int, step: int, author: Author, content: Content) -> int:
+        """Insert an annotation with its change, and return its id.
+
+        Args:
+            connection: Connection with an open transaction.
+            run: Number of the source.
+            step: Number of the step.
+            author: Author of the edit.
+            content: Its content.
+        """
         edit = {"who": author.who, "at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
         id_ = _inserted(connection, insert(_annotations).values(run=run, **asdict(content), **edit))
         values = {"step": step, "annotation": id_, "before": None, "after": asdict(content), "made_before": 0}
@@ -479,6 +505,15 @@ class Store:
     def _change(
         self, connection: Connection, step: int, author: Author, row: Row[Any], content: Content | None
     ) -> None:
+        """Store a change of an annotation and set its content.
+
+        Args:
+            connection: Connection with an open transaction.
+            step: Number of the step.
+            author: Author of the edit.
+            row: Present row of the annotation.
+            content: New content; None deletes the annotation.
+        """
         values = {
             "step": step,
             "annotation": row.id,
@@ -511,6 +546,8 @@ class Store:
     # --- back and forth --------------------------------------------------------------------------
 
     def _turn(self, run: int, author: Author, to: Literal["done", "undone"]) -> None:
+        """Undo or redo the next step of a browser; `to` is the state of the step afterwards. Errors as in
+        `undo`."""
         with self._engine.begin() as connection:
             step = _next_step(connection, run, author, to)
             query = select(_changes).where(_changes.c.step == step).order_by(_changes.c.id)

@@ -88,7 +88,8 @@ def build(
     make_worker: MakeWorker | None = None,
     fleet: FleetLink | None = None,
 ) -> FastAPI:
-    """Return the application of one dashboard.
+    """Return the application of one dashboard. Worker, scene and source are started when the application
+    starts, and ended with it.
 
     Args:
         settings: Settings of the deployment.
@@ -182,6 +183,9 @@ class SafeHeaders:
 
 
 def _answer_errors(app: FastAPI) -> None:
+    """Register handlers that return errors as JSON: StemmapError with the status of its class (409 by
+    default; 429 and 503 with Retry-After), failed validation 422, and every other exception as 500, which is
+    logged."""
     statuses = {
         BadRequestError: 422,
         NotPermittedError: 403,
@@ -216,6 +220,7 @@ def _answer_errors(app: FastAPI) -> None:
 
 
 def _worker(folder: Path | None, dashboard: Dashboard) -> WorkerProcess:
+    """Return the worker process of a dashboard, which caches maps in the data folder, if there is one."""
     from app.worker.supervisor import WORKER, WorkerProcess
 
     kept = () if folder is None else (str(folder / "kept"),)

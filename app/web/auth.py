@@ -67,14 +67,15 @@ def new_token() -> str:
 
 
 def viewer_token(token: str) -> str:
-    """Return the token of the view-only link. It is derived from the owner's token, so that it stays valid
-    after a restart with the same token, and does not reveal that one."""
+    """Return the token of the view-only link, 32 characters. It is derived from the owner's token, so that it
+    stays valid after a restart with the same token, and does not reveal that one."""
     made = hmac.new(token.encode(), b"stemmap viewer", "sha256").digest()
     return base64.urlsafe_b64encode(made[:24]).decode()
 
 
 def role_of(scope: Scope) -> Role:
-    """Return the role that the guard determined for a request."""
+    """Return the role that the guard determined for a request; "viewer" for a request that did not pass the
+    guard."""
     role: Role = scope.get("state", {}).get("role", "viewer")
     return role
 
@@ -94,7 +95,7 @@ def session_value(token: str, port: int, expires_s: int) -> str:
 
 
 def ticket(token: str, port: int, role: Role) -> str:
-    """Return a code that opens a dashboard once, within TICKET_S seconds.
+    """Return a code that opens a dashboard once, within TICKET_S seconds, as `/?ticket=CODE`.
 
     Args:
         token: Token of the owner.
@@ -108,6 +109,7 @@ def ticket(token: str, port: int, role: Role) -> str:
 
 
 def _signature(token: str, text: str) -> str:
+    """Return the HMAC-SHA-256 (hex) of a text with the token as key."""
     return hmac.new(token.encode(), text.encode(), "sha256").hexdigest()
 
 
@@ -127,7 +129,9 @@ def is_local(headers: Headers) -> bool:
 
 
 def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozenset[str]:
-    """Return the accepted values of the Host header.
+    """Return the accepted values of the Host header, in lower case: loopback names, `host` and the further
+    names, each with the port (and without it for port 80). If the server listens on any address, the name of
+    this machine is accepted too.
 
     Args:
         host, port: Address on which the server listens.
@@ -140,7 +144,9 @@ def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozense
 
 
 class Guard:
-    """ASGI middleware that refuses requests and websockets without permission.
+    """ASGI middleware that refuses requests and websockets without permission: 401 without a session or
+    token, 403 for a wrong Host or Origin or a viewer who would change something, 413 for a body that is too
+    large.
 
     Args:
         app: The guarded application.
@@ -211,6 +217,8 @@ class Guard:
         return renewing
 
     def _is_half_over(self, headers: Headers) -> bool:
+        """Return whether the request has a session cookie and the one that expires last has less than half of
+        SESSION_S left. Signatures are not checked."""
         ends = [_seconds(value.partition(".")[0]) for value in self._cookies(headers)]
         return bool(ends) and max(end or 0 for end in ends) < time.time() + SESSION_S / 2
 
@@ -231,8 +239,8 @@ class Guard:
         return None
 
     def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return the response to a viewer who tries to change something; None otherwise. Stores the role of
-        the request."""
+        """Return 403 for a viewer who tries to change something; None otherwise, also for all websockets.
+        Stores the role of the request in `scope`."""
         role = self._role(headers)
         scope.setdefault("state", {})["role"] = role
         if role == "owner" or scope["type"] == "websocket" or scope["method"] in _SAFE_METHODS:
@@ -252,8 +260,8 @@ class Guard:
         return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return the response to a link with a token or ticket, or to a request without a session, else
-        None."""
+        """Return the response to a link with a valid token or ticket (see `_welcome`), 401 for a request
+        without a session, else None. A ticket is used up."""
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             given = dict(query)
@@ -291,10 +299,12 @@ class Guard:
         return reply
 
     def _set_session(self, reply: Response, role: Role) -> None:
+        """Add the cookie of a new session for a role to a response."""
         value = session_value(dict(self._tokens)[role], self._port, int(time.time()) + SESSION_S)
         reply.set_cookie(self.cookie, value, max_age=SESSION_S, path="/", httponly=True, samesite="strict")
 
     def _knows_host(self, headers: Headers) -> bool:
+        """Return whether the request has exactly one Host header with an accepted value."""
         given = headers.getlist("host")
         if len(given) != 1:
             return False
@@ -312,6 +322,8 @@ class Guard:
             return False
 
     def _fits_origin(self, scope: Scope, headers: Headers) -> bool:
+        """Return whether the Origin of a request is this server. Without an Origin, requests fit, and
+        websockets only with the token in the header Authorization."""
         origins = headers.getlist("origin")
         if not origins:
             return scope["type"] == "http" or self._role_by_bearer(headers) is not None
@@ -319,9 +331,12 @@ class Guard:
         return len(origins) == 1 and origins[0].lower() in (f"http://{host}", f"https://{host}")
 
     def _role(self, headers: Headers) -> Role | None:
+        """Return the role of a request by its session cookie or its header Authorization; None without a
+        valid one."""
         return self._role_by_cookie(headers) or self._role_by_bearer(headers)
 
     def _role_by_cookie(self, headers: Headers) -> Role | None:
+        """Return the highest role of all valid session cookies; None without one."""
         roles = {self._role_by_session(value) for value in self._cookies(headers)}
         return "owner" if "owner" in roles else "viewer" if "viewer" in roles else None
 
@@ -335,6 +350,8 @@ class Guard:
         ]
 
     def _role_by_session(self, value: str) -> Role | None:
+        """Return the role of the value of a session cookie; None if it is expired or its signature is
+        wrong."""
         expires_s = _seconds(value.partition(".")[0])
         if expires_s is None or expires_s < time.time():
             return None
@@ -342,7 +359,8 @@ class Guard:
         return next((role for role, session in sessions if _same(value, session)), None)
 
     def _role_by_ticket(self, value: str) -> Role | None:
-        """Return the role of a ticket that is valid and was not used before, else None."""
+        """Return the role of a ticket that is valid and was not used before, and mark it as used; else
+        None."""
         signed, _, signature = value.rpartition(".")
         parts = signed.split(".")
         expires_s = _seconds(parts[1]) if len(parts) == 3 else None
@@ -357,18 +375,23 @@ class Guard:
         return "owner" if parts[0] == "owner" else "viewer"
 
     def _role_by_bearer(self, headers: Headers) -> Role | None:
+        """Return the role of the header `Authorization: Bearer TOKEN`; None without a valid one."""
         scheme, _, given = headers.get("authorization", "").partition(" ")
         return self._role_by_token(given.strip()) if scheme.lower() == "bearer" else None
 
     def _role_by_token(self, given: str) -> Role | None:
+        """Return the role of a token; None for a wrong one."""
         return next((role for role, token in self._tokens if _same(given, token)), None)
 
 
 def _same(given: str, secret: str) -> bool:
+    """Return whether two texts are equal, in a time that does not depend on their contents."""
     return hmac.compare_digest(given.encode("utf-8", "replace"), secret.encode())
 
 
 def _cookie_value(part: str, name: str) -> str | None:
+    """Return the value of a cookie in a part of a Cookie header; None if it has another name or is
+    malformed."""
     try:
         morsel = SimpleCookie(part.strip()).get(name)
     except CookieError:
@@ -377,11 +400,13 @@ def _cookie_value(part: str, name: str) -> str | None:
 
 
 def _seconds(text: str) -> int | None:
+    """Return a time as int; None unless the text consists of at most 12 digits."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= 12 else None
 
 
 def _limited(receive: Receive, limit: int) -> Receive:
-    """Return a `receive` that limits the body, also where the request does not announce its length."""
+    """Return a `receive` that limits the body, also where the request does not announce its length; it raises
+    HTTPException 413 beyond `limit` [bytes]."""
     seen = 0
 
     async def counted() -> dict[str, object]:

@@ -40,7 +40,12 @@ class BadRequestError(StemmapError):
 
 
 def json_reply(content: object, status: int = 200) -> Response:
-    """Return records, dicts and lists as JSON; NaN becomes null."""
+    """Return records, dicts and lists as JSON that is not cached; NaN becomes null.
+
+    Args:
+        content: What `msgspec` can encode.
+        status: HTTP status.
+    """
     return Response(
         msgspec.json.encode(content), status, {"Cache-Control": "no-store"}, media_type="application/json"
     )
@@ -70,7 +75,11 @@ def failure_reply(status: int, error: StemmapError, retry_after_s: int | None = 
 
 
 def invalid_reply(errors: Sequence[Any]) -> Response:
-    """Return the first error of a validation: which field does not fit, and why."""
+    """Return 422 with the first error of a validation: which field does not fit, and why.
+
+    Args:
+        errors: Errors of pydantic.
+    """
     first = errors[0] if errors else {}
     place = [str(part)[:100] for part in first.get("loc", ()) if part != "body"]
     given = first.get("ctx", {}).get("tag", "")  # an unknown kind of command

@@ -51,7 +51,7 @@ def page_that_leads_to(link: str) -> Iterator[Path]:
 
 
 def show_in_browser(page: Path) -> None:
-    """Open a file in the default browser, if there is one."""
+    """Open a file in the default browser, if there is one. It may block until the browser has started."""
     import webbrowser
 
     with contextlib.suppress(webbrowser.Error):
@@ -74,7 +74,8 @@ def serve(
     open_browser: bool,
     viewer: bool = False,
 ) -> int:
-    """Serve the dashboard until SIGINT or SIGTERM; return the exit code.
+    """Serve the dashboard until SIGINT or SIGTERM; return the exit code: 0, or 1 if the server could not
+    start.
 
     Args:
         settings: Settings of the deployment.
@@ -103,10 +104,11 @@ def run_server(
     open_browser: bool,
     viewer: bool,
 ) -> int:
-    """Serve an application until SIGINT or SIGTERM; return the exit code.
+    """Serve an application until SIGINT or SIGTERM and print its link; return the exit code: 0, or 1 if the
+    server could not start.
 
     Args:
-        settings: Settings of the deployment.
+        settings: Settings of the deployment; without a token a random one is used.
         make_app: Called on the event loop with port and token; returns the application.
         open_browser: Whether to open the page in the browser of this machine.
         viewer: Whether to print the view-only link.
@@ -153,10 +155,11 @@ def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
 
 
 def bind(settings: Settings) -> socket.socket:
-    """Return a listening socket on the requested port or, without one, on the first free port.
+    """Return a listening socket on the requested port or, without one, on the first free of 10 ports from
+    DEFAULT_PORT on; another port than the first is printed.
 
     Raises:
-        StemmapError: No port is free.
+        StemmapError: No port is free, or the address is not an address of this machine.
     """
     first = DEFAULT_PORT if settings.port is None else settings.port
     listening = first_free(
@@ -180,7 +183,8 @@ def bind(settings: Settings) -> socket.socket:
 
 
 def first_free(host: str, ports: Iterable[int]) -> socket.socket | OSError:
-    """Return a listening socket on the first free of some ports, or the reason why there is none."""
+    """Return a listening socket on the first free of some ports, or the reason why there is none. An error
+    that does not depend on the port ends the search."""
     reason = OSError("no port was tried")
     for port in ports:
         try:
@@ -223,7 +227,8 @@ class LinkedServer(uvicorn.Server):
         self._until_the_end = contextlib.ExitStack()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, then print the link."""
+        """Start; then print the link, a warning if the network can reach the server, and open the browser if
+        that is requested and there is a display."""
         await super().startup(sockets)
         if not self._settings.loopback:
             print(  # noqa: T201

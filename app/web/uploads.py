@@ -56,15 +56,17 @@ class Uploads:
         self._awaited = 0  # bytes that active uploads have not written yet
 
     def room(self) -> int:
-        """Return the maximum size of an upload at present [bytes].
+        """Return the maximum size of an upload at present [bytes]: the limit or the free disk space without a
+        reserve, at least 0. The folder is created.
 
         Raises:
-            UploadError: There is no folder for uploads.
+            UploadError: There is no folder for uploads, or it cannot be created.
         """
         return max(0, min(self.limit, self._free() - self._awaited))
 
     async def take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Receive a file and return its path and description.
+        """Receive a file, check it in a child process, and return its path (`uri`), name, format (`kind`) and
+        size (`bytes`). The file gets a generated name; a refused one is removed.
 
         Args:
             name: Original name of the file.
@@ -72,7 +74,8 @@ class Uploads:
             stream: Yields the bytes.
 
         Raises:
-            UploadError: The file is too large, incomplete, or cannot be read.
+            UploadError: MOST_AT_ONCE uploads are in progress; or the file is empty, too large, incomplete,
+                stalled, cannot be stored, or cannot be read as a recording.
         """
         if self._under_way >= MOST_AT_ONCE:
             raise UploadError(409, f"{MOST_AT_ONCE} uploads are under way", remedy="Wait until one is done")
@@ -83,6 +86,7 @@ class Uploads:
             self._under_way -= 1
 
     async def _take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
+        """Receive a file; as `take`, without the limit of simultaneous uploads."""
         free = await asyncio.to_thread(self._free)
         room = max(
             0, min(self.limit, free - self._awaited)
@@ -113,9 +117,12 @@ class Uploads:
         return {"uri": str(place), "name": _shown(name), "kind": kind, "bytes": size}
 
     def _free(self) -> int:
+        """Return the free disk space without SPARE_BYTES [bytes]; may be negative."""
         return shutil.disk_usage(self._place()).free - SPARE_BYTES
 
     async def _write(self, part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
+        """Write the file, and reserve the space that is not written yet against other uploads. Arguments and
+        errors as in `take`."""
         awaited = size
 
         def wrote(length: int) -> None:
@@ -130,7 +137,8 @@ class Uploads:
             self._awaited -= awaited
 
     def clear(self) -> None:
-        """Remove incomplete uploads of servers that were terminated."""
+        """Remove incomplete uploads that were not written for an hour: those of servers that were
+        terminated."""
         if self._folder is None or not self._folder.is_dir():
             return
         for part in self._folder.glob(f"{_PART}*"):
@@ -139,6 +147,8 @@ class Uploads:
                     part.unlink()
 
     def _place(self) -> Path:
+        """Return the folder, which is created if necessary; raises UploadError if there is none or it cannot
+        be created."""
         if self._folder is None:
             raise UploadError(409, "there is no folder for uploads", remedy="Name one with STEMMAP_FOLDER")
         try:
@@ -183,6 +193,7 @@ async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Cal
 
 
 async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
+    """Yield the pieces of a stream; raises UploadError (408) if none arrives for `_STALLED_S`."""
     pieces = aiter(stream)
     while True:
         try:
@@ -196,7 +207,12 @@ async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 
 async def _look_at(part: Path, name: str) -> str:
-    """Return the format of the file, detected in a child process.
+    """Return the format of the file, detected in a child process; "not looked through yet" if that takes too
+    long.
+
+    Args:
+        part: The incomplete file.
+        name: Its original name, for errors.
 
     Raises:
         UploadError: The file cannot be read.
@@ -228,8 +244,9 @@ router = APIRouter()
 
 @router.get(UPLOADS)
 async def room(request: Request) -> Response:
-    """Return the maximum size of an upload at present [bytes], so that a browser does not send one that is
-    refused."""
+    """GET /api/uploads: return `room`, the maximum size of an upload at present, and `limit`, that of any
+    upload [bytes], so that a browser does not send one that is refused. 409 or 507 without a usable folder.
+    """
     uploads: Uploads = request.app.state.uploads
     try:
         return json_reply({"room": await asyncio.to_thread(uploads.room), "limit": uploads.limit})
@@ -239,9 +256,9 @@ async def room(request: Request) -> Response:
 
 @router.post(UPLOADS)
 async def upload(request: Request, name: Annotated[str, Query(min_length=1, max_length=1000)]) -> Response:
-    """Store a recording, whose bytes are the body of the request, under its name; return how it is stored,
-    with 201. An error, as JSON, for another type than application/octet-stream, without a length, and where
-    the file cannot be stored."""
+    """POST /api/uploads: store a recording, whose bytes are the body of the request, under its name; return
+    how it is stored (see `Uploads.take`), with 201. An error, as JSON, for another type than
+    application/octet-stream (422), without a length (411), and where the file cannot be stored."""
     uploads: Uploads = request.app.state.uploads
     kind = request.headers.get("content-type", "")
     try:
@@ -258,6 +275,7 @@ async def upload(request: Request, name: Annotated[str, Query(min_length=1, max_
 
 
 async def _pieces(request: Request) -> AsyncIterator[bytes]:
+    """Yield the body of a request; raises UploadError if the browser disconnects."""
     try:
         async for piece in request.stream():
             yield piece

@@ -83,11 +83,12 @@ _viewers_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(_Camera
 
 
 def is_allowed(message: bytes, *, looks_only: bool = False) -> bool:
-    """Return whether a browser may send a message to viser.
+    """Return whether a browser may send a message to viser: a known kind of at most 64 kB, without further
+    fields, NaN or infinity.
 
     Args:
         message: The message, as msgpack.
-        looks_only: Whether the browser has a view-only link.
+        looks_only: Whether the browser has a view-only link; then only the pose of its camera is allowed.
     """
     if len(message) > LARGEST:
         return False
@@ -99,6 +100,7 @@ def is_allowed(message: bytes, *, looks_only: bool = False) -> bool:
 
 
 def _is_finite(value: object) -> bool:
+    """Return whether a value of dicts and lists contains no NaN or infinity."""
     if isinstance(value, float):
         return math.isfinite(value)
     if isinstance(value, dict):
@@ -140,7 +142,9 @@ async def bridge(
     user: str,
     looks_only: bool = False,
 ) -> None:
-    """Carry messages between a browser and viser until one of them leaves.
+    """Carry messages between a browser and viser until one of them leaves, then close the websocket. If viser
+    cannot be reached, the websocket is closed with 1013 before it is accepted, which is logged. Messages that
+    are not allowed are dropped.
 
     Args:
         browser: The websocket of the browser, not accepted yet.
@@ -164,6 +168,16 @@ async def bridge(
 
 
 async def _connect(viser: ViserServer, user: str, protocols: list[Subprotocol]) -> ClientConnection:
+    """Return a connection to viser.
+
+    Args:
+        viser: Port and secret of viser.
+        user: Name of the person.
+        protocols: Subprotocols of the browser.
+
+    Raises:
+        OSError, InvalidHandshake, TimeoutError: viser does not answer or refuses the connection.
+    """
     loopback = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     loopback.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BUFFER)
     loopback.setblocking(False)
@@ -209,6 +223,7 @@ async def _carry(browser: WebSocket, upstream: ClientConnection, looks_only: boo
 
 
 async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
+    """Forward messages of viser until one side disconnects."""
     # Sending blocks while the socket of the browser is full; nothing is then received from viser.
     with contextlib.suppress(ConnectionClosed, WebSocketDisconnect):
         async for message in upstream:
@@ -216,6 +231,8 @@ async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
 
 
 async def _to_viser(browser: WebSocket, upstream: ClientConnection, looks_only: bool) -> None:
+    """Forward the allowed binary messages of the browser until one side disconnects; all others are
+    dropped."""
     with contextlib.suppress(ConnectionClosed):
         while (event := await browser.receive())["type"] != "websocket.disconnect":
             message = event.get("bytes")

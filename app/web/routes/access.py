@@ -27,7 +27,7 @@ class TooManyRequestsError(StemmapError):
 
 
 class ConnectionLimit:
-    """Counts the browsers that are connected to one kind of websocket."""
+    """Counts the browsers that are connected to one kind of websocket, at most MOST per role."""
 
     def __init__(self) -> None:
         self._taken: Counter[Role] = Counter()
@@ -37,7 +37,7 @@ class ConnectionLimit:
 
     @contextmanager
     def place(self, role: Role) -> Iterator[bool]:
-        """Take a place inside the context; yields False where none is left."""
+        """Take a place inside the context; yields False, and takes none, where none is left for this role."""
         free = self._taken[role] < MOST[role]
         self._taken[role] += free
         try:
@@ -113,8 +113,9 @@ def _role(connection: HTTPConnection) -> Role:
 
 
 def _may_open_any_file(connection: HTTPConnection) -> bool:
-    """Return whether the request may name any file of this machine, or only recordings in the data
-    folders."""
+    """Return whether the request may name any file of this machine; otherwise only recordings in the data
+    folders. It may as an owner, if the settings allow any file, or allow it locally and the request is local.
+    """
     settings = _settings(connection)
     if role_of(connection.scope) != "owner" or settings.files == "folders":
         return False
@@ -122,7 +123,8 @@ def _may_open_any_file(connection: HTTPConnection) -> bool:
 
 
 async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
-    """Wait for a turn if the request is that of a viewer, because the request costs work."""
+    """Wait for a turn if the request is that of a viewer, because the request costs work; raises
+    TooManyRequestsError if too many wait. Owners do not wait."""
     viewer = role_of(connection.scope) == "viewer"
     async with _limits(connection).viewers.turn() if viewer else nullcontext():
         yield

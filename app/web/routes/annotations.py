@@ -86,7 +86,8 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 
 @router.post("/annotations")
 async def add(body: _Add, dashboard: Dash) -> Response:
-    """Add an annotation; return its number and the numbers of edits that can be undone and repeated."""
+    """Add an annotation; return its number and the numbers of edits that can be undone and repeated, with
+    201. 409 if another run was opened meanwhile or nothing can be annotated."""
     (added,) = await dashboard.annotation_editor.edit(
         body.run, lambda store: store.add(body.run, body.author, [body.content])
     )
@@ -95,8 +96,8 @@ async def add(body: _Add, dashboard: Dash) -> Response:
 
 @router.patch("/annotations/{number}")
 async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
-    """Change an annotation; 409 if it does not have this version any more. Return its number and the numbers
-    of edits that can be undone and repeated."""
+    """Change an annotation; 409 if it does not have this version any more or another run was opened, 404 for
+    an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
     await dashboard.annotation_editor.edit(
         body.run, lambda store: store.change(body.run, body.author, number, body.version, body.content)
     )
@@ -105,8 +106,8 @@ async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
 
 @router.delete("/annotations/{number}")
 async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
-    """Delete an annotation; 409 if it does not have this version any more. Return its number and the numbers
-    of edits that can be undone and repeated."""
+    """Delete an annotation; 409 if it does not have this version any more or another run was opened, 404 for
+    an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
     await dashboard.annotation_editor.edit(
         body.run, lambda store: store.delete(body.run, body.author, number, body.version)
     )
@@ -132,7 +133,8 @@ async def redo(body: _Edit, dashboard: Dash) -> Response:
 @router.post("/annotations/import")
 async def import_table(body: _Import, dashboard: Dash) -> Response:
     """Add the rows of a CSV table in one edit. Return the number of added rows, and the number of rows that
-    were left out because they exist already."""
+    were left out because they exist already. 422 if the table cannot be read, has a row out of bounds or too
+    many rows; then nothing is added."""
     contents = await asyncio.to_thread(_imported, body)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new = [content for content in contents if _key(content) not in existing]
@@ -151,7 +153,8 @@ async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
 
 @router.get("/annotations.csv")
 async def export_table(dashboard: Dash) -> Response:
-    """Return the annotations as a table for the import and for `stemmap evaluate`."""
+    """Return the annotations as a CSV table for the import and for `stemmap evaluate`; only its header
+    without annotations."""
     from pipeline.io.result_files import csv_text
 
     return file_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
@@ -172,6 +175,15 @@ async def export_geojson(dashboard: Dash) -> Response:
 
 
 async def _done(dashboard: Dashboard, edit: _Edit, payload: dict[str, Any], status: int = 200) -> Response:
+    """Return a response with further values, the number of edits so far (`serial`), and how many edits of
+    this browser can be undone and redone.
+
+    Args:
+        dashboard: The dashboard.
+        edit: The edit, with its browser.
+        payload: Further values.
+        status: HTTP status.
+    """
     serial = dashboard.annotation_editor.serial
     steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, edit.browser))
     undo_count, redo_count = steps or (0, 0)
@@ -183,17 +195,20 @@ def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
+    """Return an annotation as a GeoJSON feature; x and y [m] in the frame of the map."""
     properties = {"class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"], "edited": _when(row)}
     geometry = {"type": "Point", "coordinates": [row["x"], row["y"]]}
     return {"type": "Feature", "id": row["id"], "geometry": geometry, "properties": properties}
 
 
 def _row(row: dict[str, Any]) -> list[str]:
+    """Return an annotation as the cells of `_Columns`."""
     dbh = "" if row["dbh_cm"] is None else f"{row['dbh_cm']:.2f}"
     return [f"{row['x']:.4f}", f"{row['y']:.4f}", dbh, row["kind"], row["who"], _when(row)]
 
 
 def _when(row: dict[str, Any]) -> str:
+    """Return the time of the last edit as text."""
     return moment(row["at_s"] * 1_000_000_000)
 
 
@@ -203,7 +218,12 @@ def _key(content: Content) -> tuple[float, float, str]:
 
 
 def _check(content: Content, row: int) -> None:
-    """Apply the bounds of a single annotation to a row of a table."""
+    """Apply the bounds of a single annotation to a row of a table; raises BadRequestError outside of them.
+
+    Args:
+        content: The row.
+        row: Its number, from 0 on.
+    """
     if max(abs(content.x), abs(content.y)) > _FARTHEST_M:
         raise BadRequestError(f"row {row + 1} is farther than {_FARTHEST_M:.0f} m from the origin")
     if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
@@ -213,6 +233,8 @@ def _check(content: Content, row: int) -> None:
 
 
 def _imported(body: _Import) -> list[Content]:
+    """Return the rows of an imported table; raises BadRequestError if it cannot be read, or a row or their
+    number is out of bounds."""
     from pipeline.io.ground_truth import parse_truth_trees
 
     try:

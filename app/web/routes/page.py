@@ -40,19 +40,20 @@ _VISER_POLICY = (
 
 @router.get("/")
 def page(request: Request) -> Response:
-    """Return the dashboard."""
+    """GET /: return the dashboard."""
     return _file(request, page_folder() / "index.html", _PAGE_POLICY)
 
 
 @router.get("/runs")
 def runs_page(request: Request) -> Response:
-    """Return the page of all runs."""
+    """GET /runs: return the page of all runs."""
     return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
 
 
 @router.get("/robots")
 def all_robots(request: Request) -> Response:
-    """Redirect to the page of the fleet that this dashboard belongs to; 404 without a fleet."""
+    """GET /robots: redirect to the page of the fleet that this dashboard belongs to, with a ticket; 404
+    without a fleet."""
     port = request.app.state.fleet_port
     if port is None:
         return error_reply(404, "this dashboard belongs to no fleet", remedy="Open / instead")
@@ -61,7 +62,8 @@ def all_robots(request: Request) -> Response:
 
 @router.get("/api/access")
 def access(request: Request) -> Response:
-    """Return the role of the link, the view-only link for an owner, and the address of the fleet's page."""
+    """GET /api/access: return `role`, `viewer_link` (for an owner, else null) and `robots`, the address of
+    the fleet's page (null without a fleet)."""
     role = role_of(request.scope)
     link = f"/?token={request.app.state.viewer_token}" if role == "owner" else None
     robots = None if request.app.state.fleet_port is None else "/robots"
@@ -70,7 +72,7 @@ def access(request: Request) -> Response:
 
 @router.get("/static/plotly.min.js")
 def plotly(request: Request) -> Response:
-    """Return the plotting library of the installed package."""
+    """GET /static/plotly.min.js: return the plotting library of the installed package, or 304."""
     return _file(request, plotly_script(), _PAGE_POLICY)
 
 
@@ -85,7 +87,7 @@ def page_file(request: Request, path: str) -> Response:
 
 @router.get("/viser/")
 def viser_page(request: Request) -> Response:
-    """Return the page of the 3D scene, of the installed viser."""
+    """GET /viser/: return the page of the 3D scene, of the installed viser, or 304."""
     return _file(request, client_page(), _VISER_POLICY)
 
 

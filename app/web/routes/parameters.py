@@ -65,21 +65,24 @@ class _ParameterFile(Body):
 
 @router.get("/parameters")
 async def read(dashboard: Dash) -> Response:
-    """Return the values, those that differ from the preset, and the declaration of each parameter."""
+    """GET /api/parameters: return the values, the names of those that differ from the preset, the declaration
+    of each parameter, and the presets, see `ParameterState.as_plain`."""
     return json_reply(dashboard.parameters.as_plain_with_specs())
 
 
 @router.patch("/parameters")
 async def change(body: _Changes, dashboard: Dash) -> Response:
-    """Change values by their dotted names; return all values as `GET /api/parameters` does. 422 for an
-    unknown name or a wrong value."""
+    """PATCH /api/parameters: change values by their dotted names; return all values as `GET /api/parameters`
+    does. 422 for an unknown name or a wrong value, 409 for a random forest that does not exist; nothing
+    changes then."""
     await dashboard.change_parameters(dict(body.changes), body.gesture)
     return await read(dashboard)
 
 
 @router.post("/parameters/preset")
 async def use_preset(body: _PresetName, dashboard: Dash) -> Response:
-    """Use all values of a preset; return them as `GET /api/parameters` does."""
+    """POST /api/parameters/preset: use all values of a preset; return them as `GET /api/parameters` does. 422
+    for an unknown preset."""
     await dashboard.use_preset(body.name)
     return await read(dashboard)
 
@@ -110,16 +113,16 @@ async def redo(dashboard: Dash) -> Response:
 
 @router.post("/parameters/reset")
 async def reset(body: _Reset, dashboard: Dash) -> Response:
-    """Set the named parameters, or all without names, to the values of the preset; return the parameters as
-    `GET /api/parameters` does."""
+    """POST /api/parameters/reset: set the named parameters, or all without names, to the values of the
+    preset; return the parameters as `GET /api/parameters` does. 422 for an unknown name."""
     await dashboard.reset_parameters(list(body.names))
     return await read(dashboard)
 
 
 @router.patch("/view")
 async def choose_view(body: _ViewChoice, dashboard: Dash) -> Response:
-    """Show or hide a layer of the scene, or choose colours, labels or whether the view follows the robot;
-    return the view."""
+    """PATCH /api/view: show or hide a layer of the scene, or choose colours, labels or whether the view
+    follows the robot, for all browsers; return the view. 422 for an unknown choice."""
     await dashboard.choose_view(body.name, body.value)
     return json_reply(dashboard.scene.view)
 
@@ -133,14 +136,14 @@ async def download(dashboard: Dash) -> Response:
 
 @router.get("/sets")
 async def saved_sets(dashboard: Dash) -> Response:
-    """Return the saved parameter sets."""
+    """GET /api/sets: return name, author and time of the saved parameter sets."""
     return json_reply(dashboard.sets.as_plain())
 
 
 @router.post("/sets")
 async def save_set(body: SaveSet, dashboard: Dash) -> Response:
-    """Save the values in force under a name; a set of that name is replaced. Return all saved sets; 422 for
-    the name of a preset."""
+    """POST /api/sets: save the values in force under a name; a set of that name is replaced. Return all saved
+    sets, with 201; 422 for the name of a preset, 409 if there are too many."""
     state = dashboard.parameters
     await dashboard.sets.save(body.name, state.preset, state.parameters, body.who)
     return json_reply(dashboard.sets.as_plain(), 201)
@@ -148,7 +151,8 @@ async def save_set(body: SaveSet, dashboard: Dash) -> Response:
 
 @router.post("/sets/use")
 async def use_set(body: _SetName, dashboard: Dash) -> Response:
-    """Use all values of a saved set or a preset. The response is empty; 404 if there is none of this name."""
+    """POST /api/sets/use: use all values of a saved set or a preset, as one change that can be undone. The
+    response is empty; 404 if there is none of this name, 422 if its values are not valid in this version."""
     preset_name, values = dashboard.sets.named(body.name)
     await dashboard.tune(lambda state: state.use(preset_name, values))
     return json_reply({})
@@ -163,7 +167,8 @@ async def delete_set(body: _SetName, dashboard: Dash) -> Response:
 
 @router.post("/sets/upload")
 async def upload_set(body: _ParameterFile, dashboard: Dash) -> Response:
-    """Use the values of a parameter file, as the flag `--config` does. The response is empty."""
+    """POST /api/sets/upload: use the values of a parameter file, as the flag `--config` does; nothing is
+    saved. The response is empty; 422 if the file or a value is not valid."""
     preset_name, values = await asyncio.to_thread(
         read_file, body.text, body.file, dashboard.parameters.preset
     )
@@ -173,5 +178,6 @@ async def upload_set(body: _ParameterFile, dashboard: Dash) -> Response:
 
 @router.get("/sets/{name}.toml")
 async def download_set(name: str, dashboard: Dash) -> Response:
-    """Return a saved set as a file for `--config`."""
+    """GET /api/sets/{name}.toml: return a saved set as a file for `--config`; 404 if there is none of this
+    name."""
     return file_reply(dashboard.sets.text(name), "parameters.toml", _TOML)

@@ -41,7 +41,8 @@ class _Compare(Body):
 
 @router.get("/trees")
 async def trees(dashboard: Dash) -> Response:
-    """Return the confirmed trees as JSON; an empty list before the first map."""
+    """GET /api/trees: return {"trees": [...]}, the confirmed trees, see `trees_payload`; an empty list before
+    the first map."""
     shown = dashboard.shown
     if shown is None:
         return json_reply({"trees": []})
@@ -72,7 +73,8 @@ def path_table(dashboard: Dash) -> Response:
 
 @router.get("/evaluation")
 async def evaluation(dashboard: Dash) -> Response:
-    """Return the score against the ground truth; null without ground truth or before the first score."""
+    """GET /api/evaluation: return the score against the ground truth, see `score_payload`; null without
+    ground truth or before the first score."""
     return json_reply(dashboard.scores.latest)
 
 
@@ -101,8 +103,8 @@ async def doubts(dashboard: Dash) -> Response:
 
 @router.get("/story/cluster/{number}", dependencies=[ViewerTurn])
 async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> Response:
-    """Return verdict, checks and fit of a cluster as JSON; 404 if the scan is no longer available or has no
-    such cluster.
+    """Return verdict, checks and fit of a cluster as JSON (`ClusterStory`); 404 if the scan is no longer
+    available or has no such cluster, 503 if the worker is busy.
 
     Args:
         number: Row of the cluster.
@@ -117,7 +119,8 @@ async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> 
 
 @router.get("/story/tree/{number}", dependencies=[ViewerTurn])
 async def tree_story(number: Number, dashboard: Dash) -> Response:
-    """Return votes, DBH, coverage and history of a tree by its number; 404 if the map has no such tree."""
+    """Return votes, DBH, coverage and history of a tree by its number (`TreeStory`); 404 if the map has no
+    such tree, 503 if the worker is busy."""
     try:
         return json_reply(await dashboard.worker_client.tree(number))
     except NoStoryError as error:
@@ -126,8 +129,8 @@ async def tree_story(number: Number, dashboard: Dash) -> Response:
 
 @router.get("/camera", dependencies=[ViewerTurn])
 async def camera(dashboard: Dash) -> Response:
-    """Return the stamp of the camera picture of the current scan, and the boxes of trees and clusters in it;
-    409 before the first map."""
+    """Return the stamp of the camera picture of the current scan, and the boxes of trees and clusters in it,
+    see `CameraView.look`; 409 before the first map and without a picture, 503 if the worker is busy."""
     if dashboard.shown is None:
         return _nothing_mapped()
     return json_reply(await dashboard.camera.look(dashboard.shown.frame, dashboard.path))
@@ -155,7 +158,8 @@ async def stages(dashboard: Dash) -> Response:
 @router.post("/compare", dependencies=[ViewerTurn])
 async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
     """Map the current scan with each of two parameter sets. Return both frames as a binary block, with the
-    names and the differing parameters in its header."""
+    names and the differing parameters in its header. 404 for an unknown set, 409 without a scan, 429 if too
+    many comparisons wait, 503 if the worker is busy."""
     sets = [_parameters_of(dashboard, name) for name in (body.a, body.b)]
     async with bounds.comparisons.turn():
         frames = await dashboard.worker_client.compare(sets)
@@ -167,6 +171,8 @@ async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
 
 
 def _parameters_of(dashboard: Dashboard, name: str) -> Parameters:
+    """Return the parameters of a preset or saved set; those in force for "". Raises UnknownError for an
+    unknown name."""
     return dashboard.sets.named(name)[1] if name else dashboard.parameters.parameters
 
 

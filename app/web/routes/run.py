@@ -62,6 +62,7 @@ class _SetSpeed(Body):
     @field_validator("factor")
     @classmethod
     def _not_almost_zero(cls, factor: float) -> float:
+        """Refuse factors between 0 and SLOWEST."""
         if 0.0 < factor < SLOWEST:
             raise ValueError(f"should be 0 or at least {SLOWEST}")
         return factor
@@ -101,21 +102,22 @@ class _Uninspected(Body):
 
 @router.get("/status")
 async def status(dashboard: Dash) -> Response:
-    """Return the status of the run."""
+    """GET /api/status: return the status of the run, see `app.worker.protocol.Status`."""
     return json_reply(dashboard.status)
 
 
 @router.post("/command")
 async def command(body: _AnyCommand, dashboard: Dash) -> Response:
-    """Play, pause, advance, seek or set the speed. The response is empty; the status reports the result."""
+    """POST /api/command: play, pause, advance, seek or set the speed. The response is empty (202); the status
+    reports the result. 503 if the worker is being restarted."""
     await dashboard.command(msgspec.convert(body.model_dump(), Command))
     return json_reply({}, 202)
 
 
 @router.post("/loop")
 async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
-    """Repeat a part of the run between two times [s], or end the repetition if a time is missing. The
-    response is empty; 422 for a part shorter than SHORTEST_LOOP_S."""
+    """POST /api/loop: repeat a part of the run between two times [s], or end the repetition if a time is
+    missing. The response is empty (202); 422 for a part shorter than SHORTEST_LOOP_S."""
     if body.from_s is None or body.to_s is None:
         dashboard.loop.choose(None)
     elif body.to_s - body.from_s < SHORTEST_LOOP_S:
@@ -127,8 +129,10 @@ async def loop(body: _LoopSpan, dashboard: Dash) -> Response:
 
 @router.post("/open")
 async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Close the run and open another source, with its parameters if any are given. The response is empty; the
-    status reports the result."""
+    """POST /api/open: close the run and open another source, with its parameters if any are given. The
+    response is empty (202); the status reports the result. 403 for a file that the caller may not open, 422
+    for an unknown odometry or invalid parameters, 409 if the source cannot be opened; the open run is kept
+    then."""
     request = permitted_request(
         SourceRequest(
             body.uri,
@@ -148,8 +152,9 @@ async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_
 
 @router.post("/inside")
 async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) -> Response:
-    """Return the topics of a recording or a robot and the mounting of its LiDAR, read by a child process; 403
-    if the address is not permitted on this server."""
+    """POST /api/inside: return the topics of a recording or a robot and the mounting of its LiDAR, read by a
+    child process (see `app.sources.inspection.inside`); 403 if the address is not permitted on this server,
+    409 if it cannot be read."""
     uri = permitted_uri(body.uri, settings, any_file)
     if uri is None:
         raise not_permitted(body.uri)
@@ -158,7 +163,8 @@ async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) ->
 
 @router.get("/sources")
 async def sources(dashboard: Dash, settings: Deployment) -> Response:
-    """Return scenarios and recordings that can be opened; uploaded recordings with their original names."""
+    """GET /api/sources: return `scenarios` and `recordings` that can be opened, of the latter at most 500;
+    uploaded recordings with their original names."""
     from pipeline.io.readers.simulated import scenarios
 
     try:
@@ -175,6 +181,7 @@ async def sources(dashboard: Dash, settings: Deployment) -> Response:
 
 
 def _listed(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, str]:
+    """Return the path of a recording; for an uploaded one its path, original name and format."""
     known = uploaded.get(path.name)
     if known is None:
         return str(path)
@@ -182,7 +189,8 @@ def _listed(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, 
 
 
 def recordings(folders: Sequence[Path]) -> list[Path]:
-    """Return files and folders in the data folders, without hidden ones and finished maps."""
+    """Return at most 500 files and folders directly in the data folders, without hidden ones and finished
+    maps. Their contents are not checked; folders that cannot be read are skipped."""
     found: list[Path] = []
     for folder in folders:
         with contextlib.suppress(OSError):
@@ -236,14 +244,15 @@ def permitted_request(request: SourceRequest, settings: Settings, any_file: bool
 
 
 def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
-    """Return the source that is opened for a URI, or None if it may not be opened.
+    """Return the source that is opened for a URI, or None if it may not be opened. Whether it exists is not
+    checked.
 
     Args:
         uri: URI of the request.
         settings: Settings of the deployment, with the data folders.
-        any_file: Whether the request may open any file of this machine; else only simulated sources and files
-            in the data folders. For those the result is an absolute path without links, so that the file that
-            was checked is the file that is opened.
+        any_file: Whether the request may open any file of this machine, and live robots; else only simulated
+            sources and files in the data folders. For those the result is an absolute path without links, so
+            that the file that was checked is the file that is opened.
     """
     if any_file:
         return uri
@@ -256,6 +265,8 @@ def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
 
 
 def _permitted_path(name: str, settings: Settings) -> str | None:
+    """Return the absolute path without links if it is in a data folder; else None. Raises OSError, ValueError
+    or RuntimeError for a text that is no path."""
     path = Path(name).expanduser().resolve()
     inside_folder = any(path.is_relative_to(folder.resolve()) for folder in settings.data_folders)
     return str(path) if inside_folder else None

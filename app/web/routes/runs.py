@@ -36,7 +36,8 @@ class _Name(Body):
 
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
-    """Return all runs without their maps, the newest first, finished folders, and partial outputs."""
+    """GET /api/runs: return at most 500 runs without their maps (`runs`), the newest first, finished folders
+    (`folders`), partial outputs (`unfinished`), and the number of the open run (`open`)."""
     rows = await dashboard.store.ask(lambda store: store.book.listed())
     folders, changed, remains = await asyncio.to_thread(_folders, settings)
     return json_reply(
@@ -62,14 +63,15 @@ async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b:
 
 @router.get("/{key}", dependencies=[ViewerTurn])
 async def read_run(key: _Key, dashboard: Dash, settings: Deployment) -> Response:
-    """Return a run of the store or an output folder with its map, its parameters and their history (empty for
-    a folder); 404 if it does not exist."""
+    """Return a run of the store or an output folder ("folder:NAME") with its map, its parameters and their
+    history (empty for a folder); 404 if it does not exist, 409 if the folder cannot be read."""
     return json_reply(await _whole(key, settings, dashboard))
 
 
 @router.patch("/{number}")
 async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
-    """Rename a run; return its number. 422 for a name that is empty or not printable."""
+    """Rename a run; return its number. Spaces are merged. 422 for a name that is empty or not printable, 404
+    for an unknown run."""
     name = " ".join(body.name.split())
     if not name or not name.isprintable():
         raise BadRequestError("the name is empty or has characters that cannot be shown", where="name")
@@ -78,16 +80,16 @@ async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
 
 @router.delete("/unfinished")
 async def delete_remains(name: _KeyInQuery, settings: Deployment) -> Response:
-    """Delete the partial output of an ended run in the data folder, which cannot be undone; return its
-    name."""
+    """Delete the partial output of an ended run in the data folder, which cannot be undone; return its name.
+    404 for an unknown one, 409 if a process may still write to it."""
     await asyncio.to_thread(delete_partial_output, name, settings)
     return json_reply({"name": name})
 
 
 @router.delete("/{number}")
 async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
-    """Delete a run that is not open, and return its number; `restore` undoes the deletion. 409 if it is
-    open."""
+    """Delete a run that is not open, and return its number; `restore` undoes the deletion for a month. 409 if
+    it is open here or in another dashboard of the fleet, 404 for an unknown run."""
     if number in request.app.state.open_records():
         here = number == dashboard.run_recorder.record
         what = "this run is open" if here else "this run is open in the dashboard of another robot"
@@ -100,14 +102,15 @@ async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
 
 @router.post("/{number}/restore")
 async def restore(number: Number, dashboard: Dash) -> Response:
-    """Undo the deletion of a run; return its number."""
+    """Undo the deletion of a run; return its number. 404 if it does not exist any more."""
     return await _done(dashboard, number, lambda book: book.bring_back(number))
 
 
 @router.post("/{key}/replay")
 async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Open the source of a run again, with its topics, mounting and final parameters. The response is empty;
-    the status reports the result."""
+    """Open the source of a run again, with its topics, mounting and final parameters. The response is empty
+    (202); the status reports the result. 403 if the file may not be opened by the caller, 404 for an unknown
+    run."""
     run = await _whole(key, settings, dashboard)
     request = request_of_kept(
         run["uri"],
@@ -122,11 +125,23 @@ async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: Any
 
 
 async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], None]) -> Response:
+    """Run an action on the records, and return the number of the run."""
     await dashboard.store.ask(lambda store: work(store.book))
     return json_reply({"id": number})
 
 
 async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
+    """Return a run with its map and parameter history as the page receives it.
+
+    Args:
+        key: Number of a record, or "folder:" and the name of a finished folder.
+        settings: Settings with the data folders.
+        dashboard: The dashboard with its store.
+
+    Raises:
+        UnknownError: There is no such run.
+        StemmapError: It cannot be read.
+    """
     if key.startswith(_FOLDER):
         name = key.removeprefix(_FOLDER)
         return {"key": key, "revisions": [], **await read_folder(name, settings)}
@@ -137,6 +152,7 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a record without its map for the page, with times in seconds since 1970."""
     kept = {
         name: value for name, value in row.items() if name not in ("map", "revisions", "run", "deleted_ns")
     }
@@ -145,11 +161,13 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _revision(row: dict[str, Any]) -> dict[str, Any]:
+    """Return a change of parameters for the page, with its time in seconds since 1970."""
     names = ("revision", "time_s", "who", "preset", "changes")
     return {**{name: row[name] for name in names}, "at_s": row["at_ns"] // 10**9}
 
 
 def _changed_s(folder: FilePath) -> int | None:
+    """Return the time of the last change of a finished folder [s since 1970]; None if it was removed."""
     try:
         return int((folder / "run.json").stat().st_mtime)
     except OSError:  # it was removed a moment ago
@@ -157,6 +175,7 @@ def _changed_s(folder: FilePath) -> int | None:
 
 
 def _folders(settings: Settings) -> tuple[dict[str, FilePath], dict[str, int | None], list[Any]]:
+    """Return the finished folders and the times of their last change by name, and the partial outputs."""
     folders = finished_folders(settings)
     return (
         folders,

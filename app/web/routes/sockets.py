@@ -45,8 +45,9 @@ _decoder: msgspec.json.Decoder[_Select | _SelectCluster] = msgspec.json.Decoder(
 
 @router.websocket("/api/live")
 async def live(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
-    """Send states as they change, the newest of each kind, and receive selections; those of viewers are
-    ignored. The websocket is closed at once if too many pages are open."""
+    """WebSocket /api/live: send states as they change, the newest of each kind, and receive selections; those
+    of viewers are ignored. The websocket is closed with 1013 before it is accepted if too many pages are
+    open, and with 1003 after an invalid message."""
     with bounds.pages.place(role) as free:
         if not free:
             await browser.close(_TRY_AGAIN_LATER)
@@ -57,6 +58,14 @@ async def live(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: Caller
 
 
 async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool) -> None:
+    """Process the selections of a browser until it disconnects; an invalid message closes the websocket
+    (1003).
+
+    Args:
+        browser: Websocket of the browser.
+        dashboard: The dashboard, whose selection changes.
+        may_select: Whether selections are processed; otherwise they are ignored.
+    """
     while (event := await browser.receive())["type"] != "websocket.disconnect":
         try:
             wanted = _decoder.decode(event.get("text") or b"")
@@ -74,8 +83,8 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool
 @router.websocket("/viser")
 @router.websocket("/viser/")
 async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
-    """Connect the browser with the 3D scene; viewers cannot change it. The websocket is closed at once if too
-    many scenes are open."""
+    """WebSocket /viser: connect the browser with the 3D scene; viewers cannot change it. The websocket is
+    closed with 1013 before it is accepted if too many scenes are open."""
     with bounds.scenes.place(role) as free:
         if not free:
             await browser.close(_TRY_AGAIN_LATER)
@@ -102,5 +111,6 @@ async def telling(browser: WebSocket, live: Broadcast) -> AsyncIterator[None]:
 
 
 async def _send(browser: WebSocket, listener: Listener) -> None:
+    """Send the messages of a listener to a browser without end."""
     async for message in listener.messages():
         await browser.send_text(message.decode())

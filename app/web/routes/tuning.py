@@ -31,8 +31,8 @@ class _Sensitivity(Body):
 
 @router.get("/search")
 async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Return the progress of the search, its possible goals and parameters, and the other recorded runs,
-    which are left out if the store cannot be read."""
+    """GET /api/search: return the progress of the search (see `TuneSearch.as_plain`), its possible goals and
+    parameters, and the other recorded runs, which are left out if the store cannot be read."""
     try:
         runs = [run.as_plain() for run in await _others(dashboard, settings, any_file)]
     except StemmapError:  # the open run can still be searched over
@@ -50,23 +50,25 @@ async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile)
 async def start_search(
     body: SearchRequest, dashboard: Dash, settings: Deployment, any_file: AnyFile
 ) -> Response:
-    """Start a search over the open run, from its first scan to its last, and over other recorded runs. Return
-    the state of the search; 409 while another search runs, or if the run cannot be searched over."""
+    """POST /api/search: start a search over the open run, from its first scan to its last, and over other
+    recorded runs. Return the state of the search, with 202; 409 while another search runs, or if the run
+    cannot be searched over; 422 for invalid parameters or bounds. A stopped search is removed."""
     await dashboard.search.start(await _plan(dashboard, settings, any_file, body), body)
     return json_reply(dashboard.search.as_plain(), 202)
 
 
 @router.post("/search/stop")
 async def stop_search(dashboard: Dash) -> Response:
-    """Stop the search; return its state with the results so far, which `GET /api/search` still returns."""
+    """POST /api/search/stop: stop the search, if one runs; return its state with the results so far, which
+    `GET /api/search` still returns."""
     await dashboard.search.stop()
     return json_reply(dashboard.search.as_plain(), 202)
 
 
 @router.post("/search/go-on")
 async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """Continue the search that was stopped, with the same choices; return its state. 409 if no search was
-    stopped."""
+    """POST /api/search/go-on: continue the search that was stopped, with the same choices; return its state.
+    409 if no search was stopped, or if parameters or true trees have changed since."""
     search = dashboard.search
     if search.request is None:
         raise StemmapError("there is no stopped search", remedy="Start a search")
@@ -94,30 +96,33 @@ async def save_found(body: SaveSet, dashboard: Dash) -> Response:
 
 @router.post("/sensitivity")
 async def start_sensitivity(body: _Sensitivity, dashboard: Dash) -> Response:
-    """Start to score the whole run over values of a parameter, in their order. The response is empty and each
-    score is broadcast; 409 if the run cannot be scored."""
+    """POST /api/sensitivity: start to score the whole run over values of a parameter, in their order. The
+    response is empty (202) and each score is broadcast; 409 if the run cannot be scored, 422 for an unknown
+    parameter."""
     dashboard.how_much_matters(body.name, list(body.values))
     return json_reply({}, 202)
 
 
 @router.delete("/sensitivity")
 async def stop_sensitivity(dashboard: Dash) -> Response:
-    """Stop the sensitivity analysis. The response is empty."""
+    """DELETE /api/sensitivity: stop the sensitivity analysis, if one runs. The response is empty."""
     await dashboard.sensitivity.leave()
     return json_reply({})
 
 
 @router.get("/learning")
 async def learning_state(request: Request, dashboard: Dash) -> Response:
-    """Return the numbers of annotations that a training can use, and its progress."""
+    """GET /api/learning: return the numbers of annotations that a training can use, and its progress, see
+    `Learning.known`."""
     in_force = dashboard.parameters.parameters.classification.forest
     return json_reply(await _learning(request).known(in_force))
 
 
 @router.post("/learning")
 async def start_learning(request: Request, dashboard: Dash) -> Response:
-    """Start to train new decision trees with all annotations, and return the progress. They are not used
-    before `POST /api/learning/use`."""
+    """POST /api/learning: start to train new decision trees with all annotations, and return the progress,
+    with 202. They are not used before `POST /api/learning/use`. 409 while a training runs or without a data
+    folder."""
     await _learning(request).begin(dashboard.parameters.parameters)
     return json_reply(_learning(request).as_plain(), 202)
 
@@ -131,8 +136,8 @@ async def stop_learning(request: Request) -> Response:
 
 @router.post("/learning/use")
 async def use_learned(request: Request, dashboard: Dash) -> Response:
-    """Classify with the new decision trees from the next scan onwards; return the progress of the training.
-    409 if there are none."""
+    """POST /api/learning/use: classify with the new decision trees, as a change of parameters; return the
+    progress of the training. 409 if there are none."""
     learned = _learning(request).learned
     if learned is None:
         raise StemmapError("no decision trees were grown", remedy="Grow them first")
@@ -146,6 +151,14 @@ def _learning(request: Request) -> Learning:
 
 
 async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted: SearchRequest) -> Plan:
+    """Return the plan of a search; errors as in `app.tuning.job.plan_of`.
+
+    Args:
+        dashboard: The open run and the parameters in force.
+        settings: Settings with the permitted folders.
+        any_file: Whether the caller may open every file.
+        wanted: The request.
+    """
     others = await _others(dashboard, settings, any_file) if wanted.also or wanted.held_out else []
     state = dashboard.parameters
     source, digest, truth = dashboard.source, dashboard.digest, dashboard.truth
