@@ -117,7 +117,7 @@ def read_for_export(
 
     Args:
         folder: Folder of the run.
-        plots: Plots in the frame of the map.
+        plots: Plots in the frame of the map; without any, no figures are computed.
         parameters: Parameters of their figures; None for the defaults.
 
     Raises:
@@ -160,9 +160,14 @@ def read_for_export(
 
 
 def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
-    """Write a run to a file whose suffix gives the format; return all files that were written.
+    """Write a run to a file whose suffix gives the format; return all files that were written. Existing files
+    are replaced.
 
     Files are complete or absent: they are written elsewhere first.
+
+    Args:
+        run: The run.
+        file: File with a suffix of WRITERS; its folder must exist. A Shapefile has further files beside it.
 
     Raises:
         StemmapError: The suffix is unknown, a package is missing, or the run lacks what the format shows.
@@ -183,7 +188,8 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
 
 
 def _layers(run: ExportedRun) -> dict[str, Any]:
-    """Return the layers as GeoDataFrames by name: trees, and path, plots and contours where there are any."""
+    """Return the layers as GeoDataFrames by name: trees, and path, plots and contours where there are any.
+    Raises StemmapError if a package is not installed."""
     geopandas = needed("geopandas", "gis", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -218,6 +224,7 @@ def _layers(run: ExportedRun) -> dict[str, Any]:
 
 
 def _write_layers(run: ExportedRun, file: FilePath) -> None:
+    """Write a GeoPackage with all layers and their styles."""
     import pyogrio
 
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")})
@@ -259,6 +266,15 @@ def _write_styles(file: FilePath) -> None:
 
 
 def _qml(kind: str, symbol: str, layer: str, properties: dict[str, str], extra: str = "") -> str:
+    """Return a QGIS style with one symbol as XML.
+
+    Args:
+        kind: Type of the symbol: "marker", "line" or "fill".
+        symbol: Class of its symbol layer.
+        layer: Further XML in the symbol layer.
+        properties: Options of the symbol layer.
+        extra: Further XML after the renderer.
+    """
     options = "".join(f'<Option name="{k}" type="QString" value="{v}"/>' for k, v in properties.items())
     return (
         f'<!DOCTYPE qgis PUBLIC "http://mrcc.com/qgis.dtd" "SYSTEM"><qgis version="3.28" '
@@ -296,6 +312,8 @@ _STYLES = {
 
 
 def _write_shapefiles(run: ExportedRun, file: FilePath) -> None:
+    """Write a Shapefile per layer: the trees to `file`, the others to `file` with `_` and the name of the
+    layer. Columns have their short names; a local map has no .prj."""
     import pyogrio
 
     short = {field.name: field.short for field in TREE_FIELDS} | PLOT_SHORT
@@ -311,6 +329,7 @@ def _write_shapefiles(run: ExportedRun, file: FilePath) -> None:
 
 
 def _write_geojson(run: ExportedRun, file: FilePath) -> None:
+    """Write the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map."""
     lon_lat = None
     if run.frame.crs:
         import pyproj
@@ -321,6 +340,8 @@ def _write_geojson(run: ExportedRun, file: FilePath) -> None:
 
 
 def _write_dxf(run: ExportedRun, file: FilePath) -> None:
+    """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS and CONTOURS. A tree without a
+    diameter is a point without a circle, one without a height has z 0."""
     ezdxf = needed("ezdxf", "gis", "DXF files")
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
@@ -357,6 +378,7 @@ def _write_dxf(run: ExportedRun, file: FilePath) -> None:
 
 
 def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
+    """Write a workbook with the sheets trees, plots (if there are any), fields and about."""
     xlsxwriter = needed("xlsxwriter", "gis", "XLSX files")
     book = xlsxwriter.Workbook(str(file), {"nan_inf_to_errors": False, "strings_to_formulas": False})
     book.set_properties({"created": _DATE.replace(tzinfo=None), "comments": f"stemmap {version()}"})
@@ -395,6 +417,14 @@ def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
 
 
 def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # noqa: ANN401
+    """Add a sheet with a column per entry of a table; values that are not finite are empty cells.
+
+    Args:
+        book: Workbook of xlsxwriter.
+        name: Name of the sheet.
+        table: Values by title; columns may differ in length.
+        bold: Format of the titles.
+    """
     sheet = book.add_worksheet(name)
     sheet.freeze_panes(1, 0)
     for column, (title, values) in enumerate(table.items()):
@@ -411,11 +441,12 @@ def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # n
 
 def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
     """Return the terrain as a north-up raster in the coordinates of the files, rows from north to south, NaN
-    where unknown, with west and north of its corner [m]; None without terrain. A turned map is resampled
-    linearly from the centres of its cells.
+    where unknown, with west and north of its corner [m]; None without terrain. Cells have TERRAIN_CELL
+    metres. A turned map is resampled linearly from the centres of its cells, within 0.75 cells of a known
+    one.
 
     Raises:
-        SourceError: The raster would be too large.
+        SourceError: The raster would have more than 25 million cells.
     """
     from scipy.interpolate import LinearNDInterpolator
     from scipy.spatial import cKDTree
@@ -450,7 +481,13 @@ def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
 
 
 def contours(run: ExportedRun) -> list[tuple[float, Float]]:
-    """Return height and line, shape (N, 2), of contours every CONTOUR_STEP metres; none without terrain."""
+    """Return height [m] and line, shape (N, 2) [m], of contours every CONTOUR_STEP metres, in the coordinates
+    of the files; [] without terrain or with a single row or column of cells. Lines of fewer than three points
+    are omitted.
+
+    Raises:
+        StemmapError: contourpy is not installed, or the raster would be too large.
+    """
     found = terrain_raster(run)
     if found is None or min(found[0].shape) < 2:
         return []
@@ -470,6 +507,12 @@ def contours(run: ExportedRun) -> list[tuple[float, Float]]:
 
 
 def _write_geotiff(run: ExportedRun, file: FilePath) -> None:
+    """Write the terrain as a GeoTIFF of float32 with NaN as no-data.
+
+    Raises:
+        StemmapError: The run has no terrain, its reference system has no EPSG code up to 32766, or tifffile
+            is not installed.
+    """
     tifffile = needed("tifffile", "gis", "GeoTIFF files")
     found = terrain_raster(run)
     if found is None:

@@ -181,18 +181,22 @@ _POINTS_MAX = 1000
 
 
 def by_control_points(folder: FilePath, file: FilePath, crs: str, point_sigma: float | None) -> MapFrame:
-    """Return the frame of a map by control points: trees by their numbers, or positions in the map.
+    """Return the frame of a map by control points: trees by their numbers, or positions in the map. It is not
+    written.
 
-    Heights, if the file has them, give the height of the map's zero with the terrain of the run.
+    Heights, if the file has them, give the height of the map's zero with the terrain of the run; it is 0
+    without heights.
 
     Args:
         folder: Folder of the run.
-        file: CSV with a header.
+        file: CSV with a header: easting and northing (or lon and lat), tree or x_m and y_m, optionally name
+            and elevation_m.
         crs: Reference system, see `projected`.
         point_sigma: See `fit_control_points`; None for 0.125 m.
 
     Raises:
-        StemmapError: The table is damaged or names unknown trees, or the points contradict one another.
+        StemmapError: The table is damaged or names unknown trees, the points are not in the area of the
+            reference system or contradict one another, or the run has no terrain at a point with a height.
     """
     import pyproj
 
@@ -239,7 +243,12 @@ def by_control_points(folder: FilePath, file: FilePath, crs: str, point_sigma: f
 
 
 def _control_rows(file: FilePath) -> list[tuple[int, dict[str, str]]]:
-    """Return line number and cells by lower-case header of each row that is not empty."""
+    """Return line number and cells by lower-case header of each row that is not empty, at least one and at
+    most _POINTS_MAX.
+
+    Raises:
+        SourceError: The file cannot be read, is larger than 1 MB, or has an incomplete header or no rows.
+    """
     try:
         if file.stat().st_size > _LARGEST_FILE:
             raise SourceError("the table of control points is larger than 1 MB", where=str(file))
@@ -272,6 +281,16 @@ def _control_rows(file: FilePath) -> list[tuple[int, dict[str, str]]]:
 
 
 def _cell(row: dict[str, str], names: tuple[str, ...], line: int, file: FilePath) -> float:
+    """Return the number in the first column of some names that a row has.
+
+    Args:
+        row: Cells by header.
+        names: Names of the column; of several that exist the first.
+        line, file: Line and file, for errors.
+
+    Raises:
+        SourceError: The cell is missing, not a number, or its magnitude is 1e8 or more.
+    """
     name = next((name for name in names if name in row), names[0])
     try:
         value = float(row[name])
@@ -283,11 +302,18 @@ def _cell(row: dict[str, str], names: tuple[str, ...], line: int, file: FilePath
 
 
 def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, z: float) -> MapFrame:
-    """Return the frame of a map by the position of its origin [m], the angle of its x axis from east to north
-    [rad], and the height of its zero [m].
+    """Return the frame of a map by the position of its origin. It is not written.
+
+    Args:
+        folder: Folder of the run.
+        crs: Reference system, see `projected`.
+        east, north: Position of the origin [m].
+        turn: Angle of the x axis from east to north [rad].
+        z: Height of the map's zero [m].
 
     Raises:
-        StemmapError: The position is not in the area of the reference system.
+        StemmapError: The folder is not that of a run, or the position is not in the area of the reference
+            system.
     """
     read_run_record(folder)
     check_area(crs, np.array([[east, north]]))
@@ -296,10 +322,16 @@ def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, 
 
 def by_gnss(folder: FilePath, crs: str) -> MapFrame:
     """Return the frame of a map by the GNSS fixes of its recording, fitted to the whole path. Fixes that are
-    far from the path, compared with the others, do not count.
+    far from the path, compared with the others, do not count. The height of the map's zero is 0. It is not
+    written.
+
+    Args:
+        folder: Folder of the run, whose recording must still exist.
+        crs: Reference system, see `projected`.
 
     Raises:
-        StemmapError: The recording cannot be read, has no fixes, or they do not fit the path.
+        StemmapError: The recording or the saved state cannot be read, the recording has no fixes, or they do
+            not fit the path.
     """
     import pyproj
 
@@ -352,8 +384,8 @@ def by_gnss(folder: FilePath, crs: str) -> MapFrame:
 
 
 def ground_heights(folder: FilePath, points: Float) -> Float:
-    """Return the height of the terrain of a run at positions in the map, shape (N, 2): that of the nearest
-    cell within 2 m; NaN without one.
+    """Return the height of the terrain of a run at positions in the map, shape (N, 2), as shape (N,) [m]:
+    that of the nearest cell within 2 m; NaN without one.
 
     Raises:
         SourceError: terrain.csv is missing or damaged.

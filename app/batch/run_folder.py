@@ -132,7 +132,8 @@ def read_ground_area(folder: FilePath) -> SeenArea | None:
 
 
 def read_terrain(folder: FilePath) -> Float:
-    """Return the terrain of a run, terrain.csv, as x, y, z of its cells, shape (K, 3) [m].
+    """Return the terrain of a run, terrain.csv, as x, y, z of its cells, shape (K, 3) [m]; shape (0, 3)
+    without cells.
 
     Raises:
         SourceError: The file is missing or damaged.

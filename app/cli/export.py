@@ -46,13 +46,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files.
+    """Write the files that --to names, and print them. Files other than those of Tree Manager replace
+    existing ones.
 
     Returns:
         Exit code: 3 if trees far from the path were left out of tree-manager files, else 0.
 
     Raises:
-        StemmapError: The run cannot be read, or lacks what the format shows.
+        StemmapError: A flag is wrong, the run cannot be read or lacks what the format shows, a package is not
+            installed, or a file cannot be written.
     """
     if arguments.to == TREE_MANAGER:
         return _tree_manager(arguments)
@@ -71,7 +73,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _tree_manager(arguments: argparse.Namespace) -> int:
-    """Write poses and trees of a mapped run as files of Tree Manager."""
+    """Write poses and trees of a mapped run as files of Tree Manager to the new or empty folder --out.
+
+    Returns:
+        Exit code: 3 if trees far from the path were left out, else 0.
+
+    Raises:
+        StemmapError: --out is missing, not empty or cannot be written, the run cannot be read, or it is the
+            map of a whole cloud.
+    """
     from app.batch.run_folder import read_run
     from app.common.text import count
     from pipeline.io.readers.tree_manager import write_tree_manager

@@ -45,7 +45,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Find the frame of the map, write it and print its residuals."""
+    """Find the frame of the map, write it and print its residuals. --remove deletes georeference.json;
+    without a method the present frame is printed and nothing is written.
+
+    Returns:
+        0.
+
+    Raises:
+        StemmapError: A flag is wrong, the folder is not that of a run, the frame cannot be found, or the file
+            cannot be written.
+    """
     from app.batch import georeference
     from app.batch.run_folder import read_run_record
 
@@ -77,6 +86,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _by_hand(text: str) -> tuple[float, float, float, float]:
+    """Parse east, north [m], angle [deg] and optionally height [m]; the angle is returned in radians, a
+    missing height is 0.
+
+    Raises:
+        StemmapError: The text is not three or four numbers below 1e8.
+    """
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:

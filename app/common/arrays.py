@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 
 def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:
-    """Return the number of leading rows that are equal in two arrays.
+    """Return the number of leading rows that are equal in two arrays, at most the number of rows of the
+    shorter one. NaN differs from NaN.
 
     Args:
         old: Shape (M, ...); None has no rows.
@@ -23,6 +24,6 @@ def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:
 
 
 def evenly_spaced(n: int, most: int) -> NDArray[np.int64]:
-    """Return at most `most` row numbers of a table of n rows, evenly spaced, ascending and without
-    repetition."""
+    """Return at most `most` row numbers of a table of n rows, int64, evenly spaced, ascending and without
+    repetition; all of them if there are no more."""
     return np.arange(n) if n <= most else np.arange(most) * n // most

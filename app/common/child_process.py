@@ -110,7 +110,8 @@ class ChildProcess:
         await self.end()
 
     async def send(self, message: object) -> None:
-        """Send a message. If the child has ended, nothing is raised; `receive` then returns None."""
+        """Send a message as a line of JSON; waits while the pipe is full. If the child has ended, nothing is
+        raised; `receive` then returns None."""
         with contextlib.suppress(ConnectionError):
             self._stdin.write(_encoded(message))
             await self._stdin.drain()
@@ -134,10 +135,11 @@ class ChildProcess:
         return _decoded(line, kind)
 
     async def end(self, grace_s: float = 0.0) -> int:
-        """Close the child's standard input, wait for `grace_s` and kill the child if it still runs.
+        """Close the child's standard input, wait for `grace_s` [s] and kill the child if it still runs. A
+        second call returns the same code.
 
         Returns:
-            Its return code.
+            Its return code; negative number of the signal that ended it.
         """
         self._stdin.close()
         try:
@@ -198,7 +200,8 @@ class BlockingChildProcess:
         return self._process.poll()
 
     def send(self, message: object) -> None:
-        """Send a message. If the child has ended, nothing is raised; `receive` then returns None."""
+        """Send a message as a line of JSON; waits while the pipe is full. If the child has ended, nothing is
+        raised; `receive` then returns None."""
         with contextlib.suppress(ConnectionError):
             self._stdin.write(_encoded(message))
             self._stdin.flush()
@@ -208,10 +211,10 @@ class BlockingChildProcess:
 
         Args:
             kind: Type that the message must have.
-            timeout_s: After this time the child is killed; None for no limit.
+            timeout_s: After this time the child is killed [s]; None for no limit.
 
         Raises:
-            ProtocolError: The line is too long or is not of this type.
+            ProtocolError: The line is too long or is not of this type; the child is to be ended.
         """
         timer = None if timeout_s is None else threading.Timer(timeout_s, self._process.kill)
         if timer is not None:
@@ -226,11 +229,11 @@ class BlockingChildProcess:
         return _decoded(line, kind)
 
     def end(self, grace_s: float = 0.0) -> int:
-        """Close the child's standard input, wait for `grace_s` and kill the child if it still runs. A thread
-        that waits in `receive` gets None.
+        """Close the child's standard input, wait for `grace_s` [s] and kill the child if it still runs. A
+        thread that waits in `receive` gets None.
 
         Returns:
-            Its return code.
+            Its return code; negative number of the signal that ended it.
         """
         with contextlib.suppress(ConnectionError):
             self._stdin.close()
@@ -262,7 +265,8 @@ class ParentConnection:
         return not self._lines.empty()
 
     def receive(self, kind: type[T]) -> T:
-        """Wait for the next message.
+        """Wait for the next message, without a time limit. If the parent ends, `on_close` is called in
+        another thread.
 
         Raises:
             ProtocolError: It is not of this type.
@@ -277,6 +281,8 @@ class ParentConnection:
         self._outgoing.flush()
 
     def _read(self) -> None:
+        """Queue the lines of the parent until it closes the connection; then call `on_close`. Runs in a
+        thread."""
         for line in self._incoming:
             if line.endswith(b"\n"):
                 self._lines.put(line)
@@ -290,7 +296,8 @@ def run_child(
     low_priority: bool = False,
     on_close: Callable[[], None] | None = None,
 ) -> NoReturn:
-    """Run the program of a child process, then end the process.
+    """Run the program of a child process, then end the process with code 0, or 1 after an exception, which is
+    printed. It never returns.
 
     What libraries print goes to standard error. Ctrl-C is ignored: the parent ends its children.
 
@@ -334,6 +341,7 @@ def private_streams() -> tuple[BinaryIO, BinaryIO]:
 
 
 def _limit_memory(limit: int) -> None:
+    """Limit the data segment of this process [bytes]; nothing happens where the system cannot limit it."""
     with contextlib.suppress(ImportError, OSError, ValueError):
         import resource
 
@@ -348,6 +356,7 @@ def _environment(one_thread: bool) -> dict[str, str]:
 
 
 def _encoded(message: object) -> bytes:
+    """Return a message as a line of JSON; raises NotImplementedError for a value that cannot be sent."""
     return msgspec.json.encode(message, enc_hook=_number) + b"\n"
 
 
@@ -359,6 +368,11 @@ def _number(value: object) -> object:
 
 
 def _decoded(line: bytes, kind: type[T]) -> T | None:
+    """Return the message of a line; None for an incomplete line.
+
+    Raises:
+        ProtocolError: The line is not JSON of this type.
+    """
     if not line.endswith(b"\n"):  # the sender ended, possibly in the middle of a line
         return None
     try:

@@ -68,7 +68,11 @@ class Drawing(msgspec.Struct, frozen=True):
 
 
 def draw_safely(drawing: Drawing) -> bytes | None:
-    """Return a picture as JPEG, or None if the child process fails, takes too long or returns too much."""
+    """Return a picture as JPEG, or None if the child process fails, takes more than 60 s or returns too much.
+
+    Raises:
+        StemmapError: No process can be started.
+    """
     child = BlockingChildProcess(_COMMAND, line_limit=_LINE_LIMIT)
     try:
         child.send(drawing)
@@ -80,7 +84,8 @@ def draw_safely(drawing: Drawing) -> bytes | None:
 
 
 def draw(drawing: Drawing) -> bytes:
-    """Return a picture as JPEG, at most `LARGEST_SIDE` pixels wide and high.
+    """Return a picture as JPEG, at most `LARGEST_SIDE` pixels wide and high, with its box and label if it has
+    them.
 
     Raises:
         ValueError: The picture is too large or has an unknown encoding.
@@ -118,7 +123,7 @@ def draw(drawing: Drawing) -> bytes:
 
 
 def _answer(parent: ParentConnection) -> None:
-    """Draw one picture."""
+    """Draw one picture and send it; ends the process with an error if it cannot be drawn."""
     try:
         picture = draw(parent.receive(Drawing))
     except Exception as error:  # a decoder may raise any exception on damaged data

@@ -54,8 +54,8 @@ def run_limited(work: Callable[[], object], limits: Limits, where: str) -> None:
         where: File in errors.
 
     Raises:
-        StemmapError: The function raised it.
-        SourceError: The copy exceeded a limit, or ended without an answer.
+        SourceError: The function raised a StemmapError, whose text it has; or the copy exceeded a limit, or
+            ended without an answer, as after any other exception.
     """
     if sys.platform != "linux":
         return
@@ -84,7 +84,7 @@ def run_limited(work: Callable[[], object], limits: Limits, where: str) -> None:
 
 
 def _answer(receiving: int, wall_s: float) -> bytes | None:
-    """Return what the child writes until it ends; None if it does not end in time."""
+    """Return what the child writes until it ends; None if it does not end within `wall_s` [s]."""
     answer, until_s = b"", time.monotonic() + wall_s
     while select.select([receiving], [], [], max(until_s - time.monotonic(), 0.0))[0]:
         block = os.read(receiving, 1 << 16)
@@ -95,6 +95,13 @@ def _answer(receiving: int, wall_s: float) -> bytes | None:
 
 
 def _be_child(work: Callable[[], object], limits: Limits, where: str, sending: int) -> NoReturn:
+    """Run the function in the copy with its limits, write its error as JSON (null without one), and end the
+    copy; nothing is written after exceptions other than StemmapError and MemoryError.
+
+    Args:
+        work, limits, where: As in `run_limited`.
+        sending: File descriptor of the pipe to the parent.
+    """
     import resource
 
     error: tuple[str, str, str] | None = None

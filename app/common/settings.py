@@ -75,7 +75,8 @@ class Settings:
 
     @property
     def data_folders(self) -> tuple[Path, ...]:
-        """Existing folders whose recordings and finished runs the page offers."""
+        """Existing folders whose recordings and finished runs the page offers: `recordings` and the folder
+        recordings in the data folder."""
         named = (self.recordings, self.folder and self.folder / "recordings")
         return tuple(dict.fromkeys(folder for folder in named if folder is not None and folder.is_dir()))
 
@@ -86,7 +87,7 @@ class Settings:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address or name is a loopback address."""
+    """Return whether an address or name is a loopback address; False for names other than "localhost"."""
     if host == "localhost":
         return True
     try:
@@ -138,10 +139,15 @@ class Environment(msgspec.Struct, frozen=True, rename=lambda name: f"STEMMAP_{na
 
 
 def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
-    """Return the settings from the environment variables STEMMAP_*.
+    """Return the settings from the environment variables STEMMAP_*, with defaults for those that are not set.
+    No folder is created.
+
+    Args:
+        environment: The variables; None for those of this process.
 
     Raises:
-        StemmapError: A variable has an invalid value.
+        StemmapError: A variable has an invalid value, the host is not a loopback address, or the folder of
+            recordings does not exist.
     """
     variables = os.environ if environment is None else environment
     try:

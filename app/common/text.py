@@ -28,7 +28,8 @@ def count(n: int, one: str, many: str = "") -> str:
 
 
 def value_text(value: Value) -> str:
-    """Return the value of a parameter in the syntax of `--set`, for example "0.2", "true" or "dbscan"."""
+    """Return the value of a parameter in the syntax of `--set`, for example "0.2", "true" or "dbscan". Floats
+    have six significant digits."""
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -50,7 +51,8 @@ def changed_values(name: str, parameters: Parameters) -> dict[str, Value]:
 
 
 def preset_words(name: str, parameters: Parameters) -> str:
-    """Return a description such as "preset forest" or "preset forest with clustering.eps = 0.2".
+    """Return a description such as "preset forest" or "preset forest with clustering.eps = 0.2", with at most
+    six values.
 
     Args:
         name: Name of the preset.

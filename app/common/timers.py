@@ -35,7 +35,8 @@ class Throttle(Generic[P]):
         self._call: Callable[[], None] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> None:
-        """Call now, or later with the newest arguments."""
+        """Call the function now, or later with the newest arguments if it was called too recently. Exceptions
+        of the function are raised only by a call that happens now."""
         self._call = lambda: self._function(*args, **kwargs)
         loop = asyncio.get_running_loop()
         if self._timer is None and loop.time() >= self._free_at:
@@ -65,7 +66,7 @@ class Throttle(Generic[P]):
 
 
 async def cancel(task: asyncio.Task[Any] | None) -> None:
-    """Cancel a task and wait for its end. An error of the task is logged."""
+    """Cancel a task and wait for its end; nothing for None. An error of the task is logged."""
     if task is None:
         return
     task.cancel()
@@ -101,7 +102,7 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Measure one stage."""
+        """Measure one stage inside the context, unless measurements are disabled by `aside`."""
         start, disturbances = self._clock(), self._disturbances
         try:
             yield
@@ -112,7 +113,8 @@ class Stopwatch:
 
     @contextmanager
     def whole_scan(self) -> Iterator[None]:
-        """Measure the mapping of one scan including the time between the stages."""
+        """Measure the mapping of one scan including the time between the stages; `aside` has no effect on
+        it."""
         start, disturbances = self._clock(), self._disturbances
         try:
             yield
@@ -122,7 +124,8 @@ class Stopwatch:
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Disable measurements, since the mapped scan does not belong to the run."""
+        """Disable measurements of stages inside the context, since the mapped scan does not belong to the
+        run."""
         self._aside = True
         try:
             yield

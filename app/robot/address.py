@@ -99,10 +99,11 @@ def is_live(uri: str) -> bool:
 
 
 def parse_address(uri: str) -> Address:
-    """Return the address that a URI describes.
+    """Return the address that a URI describes. Nothing is connected.
 
     Raises:
-        SourceError: The address is invalid or has an unknown option.
+        SourceError: The address is invalid or has an unknown option, a certificate file does not exist, or
+            plain DDS is not installed.
     """
     if uri.lower().startswith(DDS):
         return _dds(uri)
@@ -110,6 +111,7 @@ def parse_address(uri: str) -> Address:
 
 
 def _dds(uri: str) -> DdsAddress:
+    """Parse an address of plain DDS; errors as in `parse_address`."""
     place, _, query = uri[len(DDS) :].partition("?")
     if place:
         raise SourceError("plain DDS has no address, only options after ?", where=uri, remedy=_DDS_REMEDY)
@@ -132,6 +134,11 @@ def _dds(uri: str) -> DdsAddress:
 
 
 def _velodyne(uri: str) -> VelodyneAddress:
+    """Parse an address of a Velodyne sensor. Without a sender, only a loopback address is accepted.
+
+    Raises:
+        SourceError: The address is invalid.
+    """
     place, _, query = uri[len(VELODYNE) :].partition("?")
     host, _, port = place.rpartition(":")
     options = dict(parse_qsl(query, keep_blank_values=True))
@@ -156,6 +163,8 @@ def _velodyne(uri: str) -> VelodyneAddress:
 
 
 def _zenoh(uri: str) -> ZenohAddress:
+    """Parse an address of a Zenoh router; errors as in `parse_address`. An empty robot is none, "/" is the
+    robot without a namespace."""
     endpoint, _, query = uri[len(SCHEME) :].partition("?")
     found = _ENDPOINT.fullmatch(endpoint)
     if found is None or not 0 < int(found.group(3)) < 1 << 16:
@@ -199,6 +208,7 @@ def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
 
 
 def _domain(uri: str, options: dict[str, str]) -> int:
+    """Return the ROS domain of the options, by default 0; SourceError unless it is 0 to 232."""
     domain = options.get("domain", "0")
     if not (domain.isascii() and domain.isdigit() and int(domain) <= 232):
         raise SourceError(f"{domain!r} is not a ROS domain", where=uri, remedy="Give a number from 0 to 232.")

@@ -39,6 +39,11 @@ def idl_type(msgtype: str) -> Any:  # noqa: ANN401 - cyclonedds is an extra, and
 
 
 def _kind(described: Any) -> Any:  # noqa: ANN401 - as rosbags describes a field
+    """Return the type of a field in cyclonedds.
+
+    Args:
+        described: The field as rosbags describes it.
+    """
     from cyclonedds.idl import types
 
     node, detail = described
@@ -73,7 +78,8 @@ class Offer:
 
     @classmethod
     def of(cls, topic: str, type_name: str, *, reliable: bool, latched: bool) -> Offer | None:
-        """Return the offer of a writer; None if its topic is not a topic of ROS.
+        """Return the offer of a writer; None if its topic is not a topic of ROS, its type is not a ROS
+        message, or a name is longer than 256 characters.
 
         Args:
             topic: Name of the topic on the network.
@@ -100,7 +106,8 @@ class DdsGraph:
         self._alive: dict[str, Offer] = {}
 
     def add(self, key: str, offer: Offer | None, losses: dict[str, int]) -> bool:
-        """Add a writer that was announced; return whether the set of topics changed.
+        """Add or update a writer that was announced; return whether anything changed. Beyond MAX_ENDPOINTS
+        writers it is counted in `losses` and ignored.
 
         Args:
             key: Identifier of the writer.
@@ -120,12 +127,13 @@ class DdsGraph:
         return self._alive.pop(key, None) is not None
 
     def publishers(self) -> list[Publisher]:
-        """Return all topics that are written, each once, sorted by name."""
+        """Return all topics that are written, each once, sorted by robot and topic."""
         found = {(self._owner(offer.topic), offer.topic, offer.msgtype) for offer in self._alive.values()}
         return [Publisher(*each) for each in sorted(found)]
 
     def common(self, topic: str, msgtype: str) -> Offer | None:
-        """Return what all writers of a topic offer, None if there is no writer."""
+        """Return what all writers of a topic offer: reliable or latched only if all of them are; None if
+        there is no writer."""
         there = [o for o in self._alive.values() if (o.topic, o.msgtype) == (topic, msgtype)]
         if not there:
             return None
@@ -133,6 +141,7 @@ class DdsGraph:
         return Offer(topic, msgtype, reliable, reliable and all(offer.latched for offer in there))
 
     def _owner(self, topic: str) -> str:
+        """Return the robot of a topic: the configured one if the topic is below it, else ""."""
         return self._robot if self._robot and topic.startswith(f"/{self._robot}/") else ""
 
 
@@ -146,7 +155,8 @@ OWN_CONFIGURATION = "CYCLONEDDS_URI"
 
 
 def configuration(address: DdsAddress) -> str:
-    """Return the configuration of CycloneDDS: one interface, by default the loopback of this machine."""
+    """Return the configuration of CycloneDDS as XML: one interface, by default the loopback of this machine,
+    and the peers."""
     named = address.interface or "127.0.0.1"
     by = "address" if named[0].isdigit() else "name"
     peers = address.peers or (() if address.interface else ("127.0.0.1",))
@@ -198,7 +208,7 @@ class DdsLink(Link):
             return self._graph.publishers()
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these channels from now on."""
+        """Receive the messages of these channels from now on, in place of earlier ones."""
         self._channels = tuple(channels)
 
     def failure(self, error: Exception) -> str:
@@ -266,11 +276,13 @@ class DdsLink(Link):
             waiting.attach(readers[channel.number].ready)
 
     def _note_lost(self, channel: Channel, number: int) -> None:
+        """Count messages that the network lost; only scans are counted."""
         if channel.msgtype in SCAN_TYPES:
             with self.lock:
                 count_loss(self.losses, LOST_SCANS, number)
 
     def _take(self, reader: _Reader) -> None:
+        """Put the messages of a reader into the inbox; count an overrun if its queue was full."""
         payloads = reader.take()
         if len(payloads) >= reader.depth:
             with self.lock:
@@ -308,7 +320,14 @@ class _Sample:
 
 
 class _Reader:
-    """A DataReader of one channel; it requests earlier messages where the writers keep them (/tf_static)."""
+    """A DataReader of one channel; it requests earlier messages where the writers keep them (/tf_static).
+
+    Args:
+        participant: Participant of cyclonedds.
+        channel: The channel.
+        offer: What all writers of its topic offer.
+        lost: Called with the channel and a number of lost messages, in a thread of cyclonedds.
+    """
 
     def __init__(self, participant: Any, channel: Channel, offer: Offer, lost: Any) -> None:  # noqa: ANN401
         from cyclonedds.core import (

@@ -91,7 +91,7 @@ class Inbox:
         return len(self._scans)
 
     def begin(self, recorder: Recorder | None, fixed: Iterable[int]) -> None:
-        """Record each message from now on.
+        """Set the recorder and the channels of fixed transforms, for all messages from now on.
 
         Args:
             recorder: None records nothing.
@@ -101,7 +101,8 @@ class Inbox:
         self._recorder, self._fixed_channels = recorder, frozenset(fixed)
 
     def put(self, message: Message, *, is_scan: bool) -> None:
-        """Record and queue a message; without room, the oldest messages are skipped.
+        """Record and queue a message; without room, the oldest messages are skipped: first scans, then
+        others. It never waits.
 
         Args:
             message: The message.
@@ -121,7 +122,8 @@ class Inbox:
                 self._bytes -= self._skip(self._others, OTHERS_SKIPPED)
 
     def wants_picture(self, arrival_ns: int, size: int) -> bool:
-        """Count a picture; return whether the rate limit accepts it. Called before its bytes are copied.
+        """Count a picture; return whether the rate limit accepts it. Called before its bytes are copied. A
+        picture larger than LARGEST_PICTURE is counted in `losses` and refused.
 
         Args:
             arrival_ns: Time of arrival [ns].
@@ -167,7 +169,8 @@ class Inbox:
             return message
 
     def end(self) -> None:
-        """Stop recording. Messages that are still queued are recorded as skipped."""
+        """Stop recording. Messages that are still queued are recorded as skipped, except pictures; they stay
+        in the queue."""
         with self._lock:
             recorder, self._recorder = self._recorder, None
             if recorder is not None:
@@ -215,7 +218,7 @@ class CountingInbox(Inbox):
         self._heard: dict[int, Heard] = {}
 
     def heard(self, number: int) -> Heard:
-        """Return the count of a channel so far."""
+        """Return a copy of the count of a channel so far; no messages for an unknown channel."""
         with self._guard:
             known = self._heard.get(number, Heard())
             return Heard(known.messages, known.first_ns, known.last_ns)
@@ -296,7 +299,7 @@ class Link(ABC):
 
     @abstractmethod
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these channels from now on."""
+        """Receive the messages of these channels from now on, also after each new connection."""
 
     @abstractmethod
     def receive(self) -> None:
@@ -317,12 +320,13 @@ class Link(ABC):
         return sorted({p.robot for p in self.publishers() if p.msgtype in SCAN_TYPES})
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect; waits at most 5 s for the thread."""
         self.closing.set()
         self.thread.join(timeout=_CLOSE_S)
 
     def take(self, channel: Channel, payload: Any, size: int) -> None:  # noqa: ANN401 - bytes of a library
-        """Count a message and put it into the inbox; bytes are copied only if the inbox accepts them.
+        """Count a message and put it into the inbox; bytes are copied only if the inbox accepts them. A
+        message larger than MESSAGE_LIMIT is dropped and counted in `losses`.
 
         Args:
             channel: Channel of the message.
@@ -344,6 +348,7 @@ class Link(ABC):
                 self.inbox.put_picture(Message(channel.number, arrival_ns, bytes(payload)))
 
     def _run(self) -> None:
+        """Call `receive` until `close`, again after 1 s if it raises. Runs in `thread`."""
         while not self.closing.is_set():
             try:
                 self.receive()
@@ -353,6 +358,7 @@ class Link(ABC):
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of the text of an exception, without positions in source code."""
+    """Return the first line of the text of an exception, without positions in source code, at most 200
+    characters; the name of its class without a text."""
     first = str(error).partition("\n")[0].partition(" at ")[0].rstrip("!; ")
     return first[:200] or type(error).__name__

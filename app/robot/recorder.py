@@ -76,7 +76,8 @@ class Recorder:
         return f"recording {self.path.name}, {self._file.tell() / 1e6:.0f} MB{missing}"
 
     def begin(self, channels: Sequence[Channel], header: Mapping[str, Any], robot: str) -> None:
-        """Write the beginning of the file and start the thread.
+        """Write the beginning of the file and start the thread. A second call, and one after `close`, does
+        nothing; a disk error ends the recording, see `problem`.
 
         Args:
             channels: Channels of the robot, whose numbers messages refer to.
@@ -96,7 +97,8 @@ class Recorder:
             self._thread.start()
 
     def add(self, message: Message) -> None:
-        """Record a message of the robot. It is dropped and counted if the queue is full."""
+        """Record a message of the robot. It is dropped and counted in `losses` if the queue is full; dropped
+        after the end of the recording."""
         self._put(len(message.payload), lambda writer: writer.add(message))
 
     def skip(self, message: Message) -> None:
@@ -120,7 +122,8 @@ class Recorder:
         self._put(0, lambda writer: writer.add_parameters(revision, from_scan, values))
 
     def close(self) -> None:
-        """Write the queued messages and the index, and close the file. A file without messages is deleted."""
+        """Write the queued messages and the index, and close the file; waits at most 8 s for a slow disk. If
+        `begin` was never called, the empty file is deleted."""
         self._closing.set()
         with self._lock:
             thread = self._thread
@@ -132,6 +135,12 @@ class Recorder:
             self.path.unlink(missing_ok=True)
 
     def _put(self, size: int, work: _Work) -> None:
+        """Queue an entry; it is dropped after the end of the recording, and counted if the queue is full.
+
+        Args:
+            size: Number of bytes that count towards QUEUE_BYTES.
+            work: Writes the entry.
+        """
         with self._lock:
             if self.problem or self._closing.is_set():
                 return
@@ -142,6 +151,8 @@ class Recorder:
             self._queue.append((size, work))
 
     def _run(self, writer: LiveWriter) -> None:
+        """Write the queue until `close`, and finish the file. Runs in a thread; an error ends the recording,
+        see `problem`."""
         flushed_s = time.monotonic()
         try:
             while True:
@@ -163,6 +174,7 @@ class Recorder:
             self._file.close()
 
     def _write_queue(self, writer: LiveWriter) -> None:
+        """Write all queued entries; raises OSError of the disk."""
         with self._lock:
             entries, self._queue = self._queue, deque()
         for size, work in entries:
@@ -171,12 +183,14 @@ class Recorder:
                 self._queued_bytes -= size
 
     def _write_skipped(self, writer: LiveWriter) -> None:
+        """Write which messages were skipped since the last call."""
         with self._lock:
             skipped, self._skipped = self._skipped, {}
         if skipped:
             writer.add_skipped({self._topics[number]: times for number, times in skipped.items()})
 
     def _end_with(self, error: OSError) -> None:
+        """End the recording because of an error; what was written stays."""
         self.problem = (
             f"{error.strerror or error} ({self.path}). What was written until then is kept; mapping continues"
         )
@@ -184,7 +198,16 @@ class Recorder:
 
 
 class RawFile:
-    """A new file without a user-space buffer: the system has the bytes when `write` returns."""
+    """A new file without a user-space buffer: the system has the bytes when `write` returns. Only its owner
+    may read it.
+
+    Args:
+        path: The file.
+
+    Raises:
+        FileExistsError: It exists.
+        OSError: It cannot be created.
+    """
 
     def __init__(self, path: FilePath) -> None:
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
@@ -215,7 +238,8 @@ class RawFile:
 
 
 def _new_file(path: FilePath) -> tuple[FilePath, RawFile]:
-    """Create the file, or one with a number appended if the name is taken."""
+    """Create the file, or one with a number appended ("-2" and so on) if the name is taken; return its path
+    and the open file. OSError if it cannot be created."""
     named = path
     for k in range(2, _MAX_NUMBERED_NAMES):
         try:

@@ -77,7 +77,8 @@ class PictureStore:
         self.losses: dict[str, int] = {}
 
     def is_due(self, path: Path) -> bool:
-        """Return whether the robot has moved far enough since the last stored picture.
+        """Return whether the robot has moved STEP_M or turned TURN_RAD since the last picture; True for the
+        first one, False without a pose.
 
         Args:
             path: Path up to the present pose.
@@ -92,7 +93,8 @@ class PictureStore:
         return math.hypot(here[0] - x, here[1] - y) >= STEP_M or turned >= TURN_RAD
 
     def add(self, picture: Picture, path: Path) -> None:
-        """Store a picture.
+        """Store a picture. A picture that cannot be stored (limit, disk) is counted in `losses`; one with a
+        known time is ignored.
 
         Args:
             picture: The picture.
@@ -125,7 +127,8 @@ class PictureStore:
         return sorted(self._kept)
 
     def at(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `stamps`, each once."""
+        """Yield the pictures of some of `stamps`, each once, in the order of their times; other times are
+        ignored."""
         for stamp_ns in sorted(set(wanted_ns) & self._kept.keys()):
             empty, begin, length = self._kept[stamp_ns]
             self._file.seek(begin)
@@ -161,7 +164,7 @@ _MAP_PAUSE_S = 1.0
 
 class LiveSource:
     """Records of the messages that a robot sends from now on. They cannot be read again, but a recording of
-    them can.
+    them can. The constructor connects in the background.
 
     A thread of the source watches the robot: it chooses the topics, starts the recorder and subscribes,
     independently of the mapping.
@@ -204,11 +207,11 @@ class LiveSource:
         self._watch: threading.Thread | None = None
 
     def start(self, recorder: Recorder | None = None, *, publish: bool = False) -> None:
-        """Start to receive messages.
+        """Start to choose topics and receive messages, in a thread; returns at once.
 
         Args:
             recorder: Records every message that arrives; the source closes it.
-            publish: Whether results are published on the robot's network.
+            publish: Whether results are published on the robot's network; only over Zenoh.
         """
         self._recorder, self._publishes = recorder, publish
         self._watch = threading.Thread(target=self._watch_robot, name="live source", daemon=True)
@@ -242,7 +245,7 @@ class LiveSource:
         return {**self._link.losses, **self._inbox.losses, **recorder, **read, **kept}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records when they arrive, until `stop`.
+        """Yield records when they arrive, until `stop`; then those that the reader still holds.
 
         Args:
             start_ns: Must be None, because a live run cannot be read again.
@@ -266,7 +269,7 @@ class LiveSource:
         return None
 
     def close(self) -> None:
-        """End the recording, then disconnect, which can take seconds."""
+        """End the recording, then disconnect, which can take seconds. Stored pictures are deleted."""
         self._ending.set()
         self.end_recording()
         if self._watch is not None:
@@ -276,7 +279,8 @@ class LiveSource:
             self._kept.close()
 
     def end_recording(self) -> None:
-        """Finish the recording; may be called from any thread while another one maps."""
+        """Finish the recording; may be called from any thread while another one maps. Waits up to 8 s for the
+        disk."""
         self._inbox.end()
         if self._recorder is not None:
             self._recorder.close()
@@ -353,7 +357,9 @@ class LiveSource:
         return "" if self._recorder is None else self._recorder.status
 
     def mapped(self, frame: Frame, path: Path) -> None:
-        """Publish and record the results of a scan, and store its picture if one is due.
+        """Publish and record the results of a scan, and store its picture if one is due. Path and trees are
+        published and recorded at most once per second. Nothing happens without publishing, recording and
+        `keep_pictures`.
 
         Args:
             frame: Results of the scan.
@@ -376,7 +382,7 @@ class LiveSource:
             self._recorder.add_outputs(messages)
 
     def use_parameters(self, revision: int, from_scan: int, parameters: Parameters) -> None:
-        """Record parameters that apply from a mapped scan onwards.
+        """Record parameters that apply from a mapped scan onwards; nothing without a recording.
 
         Args:
             revision: Number of the revision.
@@ -392,6 +398,7 @@ class LiveSource:
 
     def listen(self) -> bool:
         """Process the messages that arrived before the description was known; return whether it is known now.
+        Does not wait.
 
         Raises:
             SourceError: A message cannot be read.
@@ -416,10 +423,11 @@ class LiveSource:
         return self.ready
 
     def take(self) -> list[Record]:
-        """Return the records of the next message that has any; [] if no message is queued.
+        """Return the records of the next message that has any; [] if no message is queued. Does not wait;
+        pictures are taken over in passing.
 
         Raises:
-            SourceError: A message cannot be read.
+            SourceError: A message cannot be read, or the topics of the robot cannot be used.
         """
         if self._failure is not None:
             raise self._failure
@@ -471,6 +479,8 @@ class LiveSource:
         return f"robot {self.robot}" if self.robot else "the robot"
 
     def _watch_robot(self) -> None:
+        """Choose the topics and note the presence of the robot until the source ends. Runs in a thread; its
+        errors are raised by `take`."""
         try:
             while not self._ending.wait(_POLL_S):
                 if self._choice is None:
@@ -485,7 +495,7 @@ class LiveSource:
             )
 
     def _note_presence(self, choice: Choice) -> None:
-        """Update whether the scans of the robot are still announced."""
+        """Update whether the scans of the robot are still announced, and add a notice if that changed."""
         self._version = self._link.version
         publishers = self._link.publishers()
         scan = choice.channels[0].topic
@@ -496,6 +506,12 @@ class LiveSource:
             self._there = there
 
     def _choose(self) -> None:
+        """Choose the topics once scans have been announced for `_SETTLE_S`, start the recorder and subscribe;
+        nothing before.
+
+        Raises:
+            SourceError: A topic that the user named has another type.
+        """
         choice = choose(self._link.publishers(), self._address.robot, self._topics, self.uri)
         if choice is None:
             self._seen_s = None

@@ -73,11 +73,13 @@ class Choice:
 
 
 def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], where: str) -> Choice | None:
-    """Return the topics of one robot that are read; None while no such robot publishes scans.
+    """Return the topics of one robot that are read; None while no such robot publishes scans. A role without
+    a topic has no channel.
 
     Args:
         publishers: Present publishers.
-        robot: Namespace of the robot, ROOT for none, "" for the first one by name that publishes scans.
+        robot: Namespace of the robot, ROOT for none, "" for the one with the best scan topic, see
+            `_scan_rank`.
         topics: Topic by role where the user named it.
         where: The address, for errors.
 
@@ -150,6 +152,19 @@ def _of_role(
     rank: Callable[[Publisher], tuple[object, ...]],
     where: str,
 ) -> Publisher | None:
+    """Return the publisher of a role: that of the named topic, else the first by rank; None without one.
+
+    Args:
+        there: Publishers of the robot.
+        topics: Topic by role where the user named it.
+        role: The role.
+        types: Message types of the role.
+        rank: Sort key of a publisher; the smallest is chosen.
+        where: The address, for errors.
+
+    Raises:
+        SourceError: The named topic has another type.
+    """
     named = topics.get(role)
     fitting = [p for p in there if p.msgtype in types and (named is None or p.topic == named)]
     if not fitting:
@@ -161,6 +176,8 @@ def _of_role(
 def _refuse_wrong_type(
     there: list[Publisher], topics: dict[str, str], role: str, types: tuple[str, ...], where: str
 ) -> None:
+    """Raise SourceError if the topic that the user named for a role is published with another type; arguments
+    as in `_of_role`."""
     wrong = [p for p in there if p.topic == topics.get(role) and p.msgtype not in types]
     if wrong:
         raise SourceError(
@@ -171,6 +188,7 @@ def _refuse_wrong_type(
 
 
 def _has_word(publisher: Publisher, words: tuple[str, ...]) -> bool:
+    """Return whether the name of the topic contains one of some words; case is ignored."""
     return any(word in publisher.topic.lower() for word in words)
 
 
@@ -182,11 +200,21 @@ def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
 
 
 def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:
+    """Return the sort key of an odometry topic: names of GPS, map or SLAM last, names that end in odom
+    first."""
     name = publisher.topic.lower()
     return any(word in name for word in ("gps", "map", "slam")), not name.endswith("odom"), publisher.topic
 
 
 def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | None) -> list[str]:
+    """Return messages about other robots and scan topics that could have been chosen.
+
+    Args:
+        scans: All scan topics.
+        scan: The chosen one.
+        robot: Namespace that the user named; "" for none.
+        named: Scan topic that the user named, or None.
+    """
     warnings = []
     others = sorted({p.robot or "(no namespace)" for p in scans} - {scan.robot or "(no namespace)"})
     if others and not robot:

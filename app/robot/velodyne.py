@@ -30,6 +30,7 @@ class Sweeps:
 
     def add(self, stamp_ns: int, packet: bytes) -> bytes | None:
         """Add a data packet; return the sweep that it ends as velodyne_msgs/VelodyneScan in CDR, else None.
+        The packet belongs to the next sweep. A sweep of MOST_PACKETS ends too.
 
         Args:
             stamp_ns: Time of arrival, not before that of the packet before [ns].
@@ -52,6 +53,8 @@ class Sweeps:
 
 
 def _message(packets: list[tuple[int, bytes]]) -> bytes:
+    """Return packets (time [ns], bytes) as velodyne_msgs/VelodyneScan in CDR, with the time of the last
+    one."""
     import numpy as np
 
     store: Any = standard_types("cdr")
@@ -68,6 +71,7 @@ def _message(packets: list[tuple[int, bytes]]) -> bytes:
 
 
 def _time(store: Any, stamp_ns: int) -> Any:  # noqa: ANN401
+    """Return a time [ns] as builtin_interfaces/Time."""
     return store.types["builtin_interfaces/msg/Time"](sec=stamp_ns // _SECOND, nanosec=stamp_ns % _SECOND)
 
 
@@ -118,7 +122,7 @@ class VelodyneLink(Link):
         return [Publisher("", TOPIC, VELODYNE_SCAN)] if self._there else []
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Put sweeps into the inbox from now on."""
+        """Put sweeps into the inbox from now on, under the number of the first channel."""
         self._number = channels[0].number
 
     def failure(self, error: Exception) -> str:
@@ -139,6 +143,7 @@ class VelodyneLink(Link):
                     self._take(packet, sender)
 
     def _bound(self) -> socket.socket:
+        """Return a bound UDP socket; OSError if the address or port cannot be used."""
         listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
@@ -159,6 +164,8 @@ class VelodyneLink(Link):
             self.version += 1
 
     def _take(self, packet: bytes, sender: str) -> None:
+        """Process a packet. Packets of other senders or sensors, and those that are no data packets, are
+        dropped and counted in `losses`; the first data packet decides the model of the sensor."""
         wanted = self._address.sender or "127.0.0.1"
         if sender != wanted:
             count_loss(self.losses, OTHERS)
@@ -178,6 +185,7 @@ class VelodyneLink(Link):
         self._hand_over(self._sweeps.add(self.times.now_ns(), packet))
 
     def _hand_over(self, sweep: bytes | None) -> None:
+        """Put a sweep into the inbox; nothing for None, or before `subscribe`."""
         if sweep is None or self._number is None:
             return
         self.scans += 1

@@ -25,8 +25,8 @@ _LONGEST_TOKEN = 1000
 
 def publisher_of(token: str) -> Publisher | None:
     """Return robot (the namespace), topic and message type of the liveliness token of a publisher. None for
-    tokens of other entities, without a type `<package>::msg::dds_::<name>_`, and for tokens that are too
-    long.
+    tokens of other entities, for invalid names, without a type `<package>::msg::dds_::<name>_`, and for
+    tokens that are too long.
 
     A token is `@ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>`, followed for
     an endpoint by `/<topic>/<type>/<hash>/<qos>`. A slash inside of a part is written `%`.
@@ -62,8 +62,8 @@ class RosGraph:
         self._alive: dict[str, Publisher] = {}
 
     def add(self, token: str) -> bool:
-        """Add a token; return False if there is no room. Tokens of other entities than publishers are
-        ignored."""
+        """Add a token; return False if there is no room. Known tokens, and those of other entities than
+        publishers, are ignored."""
         publisher = publisher_of(token)
         if publisher is None or token in self._alive:
             return True
@@ -73,7 +73,7 @@ class RosGraph:
         return True
 
     def remove(self, token: str) -> None:
-        """Remove a token."""
+        """Remove a token; nothing happens for an unknown one."""
         self._alive.pop(token, None)
 
     def publishers(self) -> list[Publisher]:
@@ -185,6 +185,8 @@ class ZenohLink(Link):
         return f"no connection to {self._address.endpoint}: {first_line(error)}"
 
     def _connect(self) -> None:
+        """Open the session, and subscribe to announcements and to all channels; raises the errors of
+        zenoh."""
         import zenoh
 
         config = configuration(self._address.endpoint, self._address.files)
@@ -208,6 +210,7 @@ class ZenohLink(Link):
             self.closing.wait(_WATCH_S)
 
     def _disconnect(self) -> None:
+        """Close the session; its errors are ignored."""
         with self.lock:
             session, self.session = self.session, None
         if session is not None:
@@ -215,6 +218,7 @@ class ZenohLink(Link):
                 session.close()
 
     def _note_token(self, sample: Any) -> None:  # noqa: ANN401
+        """Process the announcement or withdrawal of a publisher; without room it is counted in `losses`."""
         import zenoh
 
         with self.lock:
@@ -225,6 +229,7 @@ class ZenohLink(Link):
                 count_loss(self.losses, TOO_MANY)
 
     def _take(self, sample: Any, channel: Channel) -> None:  # noqa: ANN401
+        """Put a message into the inbox, and count the messages lost before it."""
         if sample.attachment is not None:
             reason = LOST_SCANS if channel.msgtype in SCAN_TYPES else LOST_OTHERS
             with self.lock:
@@ -286,17 +291,26 @@ class RosPublisher:
         return f"{self._prefix}/{topic}"
 
     def publish(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Publish messages in CDR by topic, see `pipeline.io.recording.outputs`."""
+        """Publish messages in CDR by topic, see `pipeline.io.recording.outputs`. It does not wait for slow
+        subscribers; KeyError for an unknown topic."""
         for topic, payload in messages_by_topic.items():
             self._publishers[topic].put(payload)
 
     def _declare(self, session: Any, token: str) -> None:  # noqa: ANN401
+        """Announce an entity by its liveliness token as long as this object exists."""
         self._tokens.append(session.liveliness().declare_token(token))
 
 
 class _Topic:
     """A published topic. Its messages have a sequence number, a time and a publisher id, as those of
-    rmw_zenoh."""
+    rmw_zenoh.
+
+    Args:
+        session: Session of zenoh.
+        key: Key of the messages.
+        token: Liveliness token, from which the publisher id is derived.
+        latched: Whether the last message is repeated for late subscribers.
+    """
 
     def __init__(self, session: Any, key: str, token: str, *, latched: bool) -> None:  # noqa: ANN401
         import zenoh

@@ -50,7 +50,7 @@ class Cursor:
         return len(self._stamps)
 
     def stamp_ns(self, index: int) -> int:
-        """Return the time of a step that was read before [ns]."""
+        """Return the time of a step that was read before [ns]; IndexError for other steps."""
         return self._stamps[index]
 
     def index_at(self, stamp_ns: int) -> int | None:
@@ -61,7 +61,8 @@ class Cursor:
         return max(0, bisect_right(self._stamps, stamp_ns) - 1)
 
     def peek(self) -> Step | None:
-        """Return the next step without advancing; None at the end of the run.
+        """Return the next step without advancing; None at the end of the run. After an error, every call
+        raises it again until `go_to`.
 
         Raises:
             SourceError: Nothing more can be read.
@@ -95,13 +96,13 @@ class Cursor:
         return step
 
     def go_to(self, index: int) -> None:
-        """Move to the position before a step.
+        """Move to the position before a step. Nothing is read if that is the present position.
 
         Args:
             index: Index of the step, at most `known`.
 
         Raises:
-            SourceError: The source does not return the same steps again.
+            SourceError: The source does not return the same steps again; `peek` then raises the same error.
         """
         if index == self._next and self._failure is None:
             return
@@ -117,6 +118,12 @@ class Cursor:
         self._next = index
 
     def _read(self, start_ns: int | None, after: SynchroniserState | None = None) -> Iterator[Step]:
+        """Return an iterator of the steps from the source.
+
+        Args:
+            start_ns: Time from which the source is read [ns]; None from its start.
+            after: State of the synchroniser before that time; None for the start.
+        """
         return steps(self._source.records(start_ns), odometry=self._odometry, after=after)
 
     def _resumed(self, index: int) -> Iterator[Step] | None:

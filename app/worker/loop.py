@@ -85,7 +85,8 @@ class WorkerLoop:
         self._at_once = 1
 
     def run(self) -> None:
-        """Execute commands and map scans until the command None."""
+        """Execute commands and map scans until the command None; then close the session. Errors of the run
+        are reported and do not end the loop."""
         self._report()
         while True:
             try:
@@ -151,7 +152,8 @@ class WorkerLoop:
         return 0.0 if stamp_ns is None else self._replay.delay(stamp_ns, self._clock())
 
     def _map(self) -> None:
-        """Do the next piece of work: part of a rerun, live messages, preparation, or a scan."""
+        """Do the next piece of work: part of a rerun, live messages, preparation, or a scan. Frames of a seek
+        are sent at most every `_GLIMPSE_S`."""
         if self._session.is_remapping:
             if self._mapped >= _SCANS_A_REMAP or not self._is_due():
                 self._mapped = 0
@@ -215,6 +217,7 @@ class WorkerLoop:
         self._report()
 
     def _report_when_due(self, now: float) -> None:
+        """Send the status if the last one is older than `_REPORT_S`."""
         if self._reported is None or now >= self._reported[1] + _REPORT_S:
             self._report()
 
@@ -227,12 +230,14 @@ class WorkerLoop:
         self._report_when_due(self._clock())
 
     def _execute(self, command: protocol.Command | protocol.Begin) -> None:
+        """Execute a command and send the status. An error sets the state "failed"."""
         self._replay.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
         self._guarded(lambda: self._carry_out(command))
         self._report()
 
     def _carry_out(self, command: protocol.Command | protocol.Begin) -> None:
+        """Execute a command; raises the errors of the session."""
         session = self._session
         match command:
             case protocol.Play():
@@ -255,6 +260,8 @@ class WorkerLoop:
                 self._begin(command)
 
     def _open(self, command: protocol.Open) -> None:
+        """Open a source as the next run, and send `Opened` once it is open. A live source is opened by its
+        first messages, see `_listen`."""
         self._run, self._requested = self._run + 1, command.uri
         opening = f"Opening {command.uri}"
         self._put(protocol.Report(protocol.Status(state="starting", detail=opening, source=command.uri)))
@@ -270,6 +277,7 @@ class WorkerLoop:
             self._send_opened(opened)
 
     def _play(self) -> None:
+        """Continue the run; a run that was opened again is announced as the next run."""
         self._held = False
         opened_again = self._session.play()
         if opened_again is not None:
@@ -277,10 +285,13 @@ class WorkerLoop:
             self._send_opened(opened_again)
 
     def _send_opened(self, opened: protocol.Opened) -> None:
+        """Send `Opened` with the number of the run; the run has to be prepared before its first scan."""
         self._prepared = self._held = False
         self._put(msgspec.structs.replace(opened, run=self._run, requested=self._requested))
 
     def _begin(self, command: protocol.Begin) -> None:
+        """Set the parameters and play or show the first scan; ignored for another run. If a person has paused
+        or an error occurred since the opening, only the parameters are set."""
         if command.run != self._run:  # another run was opened since
             return
         self._show(self._session.set_parameters(validated(command.values), command.revision))
@@ -300,6 +311,7 @@ class WorkerLoop:
         self._report()
 
     def _preparing(self) -> protocol.Status:
+        """Return the status while the mapper is prepared."""
         return replace(self._session.status(), state="starting", detail="Preparing the mapper")
 
     def compiling(self) -> None:
@@ -323,12 +335,14 @@ class WorkerLoop:
         return self._reported is not None and self._reported[0].detail == _COMPILING
 
     def _show(self, frame: Frame | None) -> None:
+        """Queue a frame with the path and the confirmation times; nothing for None or without a run."""
         run, path = self._session.run, self._session.path
         if frame is not None and run is not None and path is not None:
             confirmed_s = run.confirmed_s(frame.trees)
             self._put(protocol.Shown(self._run, self._session.time_s, frame, 0, path, confirmed_s))
 
     def _report(self) -> None:
+        """Queue the present status."""
         now = self._clock()
         if self._session.pace not in ("idle", "live") and not self._prepared:
             # Nothing plays yet: the first scan is read and the kernels are compiled before.
@@ -347,18 +361,20 @@ class WorkerLoop:
         self._send_status(status, now)
 
     def _send_status(self, status: protocol.Status, now: float) -> None:
+        """Queue a status and remember it with its time [s]."""
         self._reported = (status, now)
         self._put(protocol.Report(status))
 
     def _behind(self, status: protocol.Status, now: float) -> int:
+        """Return the number of scans that wait to be mapped, at most those that are left in the run."""
         if status.live:
             return status.scans_behind
         behind = self._replay.behind(now)
         return behind if status.scans is None else min(behind, status.scans - 1 - status.scan_index)
 
     def _guarded(self, work: Callable[[], T]) -> T | None:
-        """Return the result of `work`. After an error, return None and set the state "failed"; the process
-        continues."""
+        """Return the result of `work`. After an error, return None, set the state "failed" and send the
+        status; the process continues. Unexpected errors are printed."""
         try:
             return work()
         except StemmapError as error:
@@ -373,6 +389,7 @@ class WorkerLoop:
         return None
 
     def _fail(self, detail: str) -> None:
+        """Set the state "failed" with its reason; the run does not continue by itself."""
         self._held = True
         self._session.fail(detail)
 
@@ -400,6 +417,7 @@ def answer(session: Session, recent: RecentScans, question: protocol.Question, r
 
 
 def _answer(session: Session, recent: RecentScans, question: protocol.Question) -> protocol.Answer:
+    """Return the answer to a question; raises StemmapError if there is none. Arguments as in `answer`."""
     ticket, run = question.ticket, session.run
     match question:
         case protocol.AskCompare(sets=sets):
@@ -471,7 +489,8 @@ class ReplayClock:
         self._mapped.append((stamp_ns, now))
 
     def behind(self, now: float) -> int:
-        """Return the number of scans that are due at `now` and not mapped yet."""
+        """Return the number of scans that are due at `now` and not mapped yet, estimated from the mean period
+        of the last scans; 0 at maximum speed, without an anchor, or with fewer than two mapped scans."""
         if self.speed == 0.0 or self._anchor is None or len(self._mapped) < 2:
             return 0
         first, last = self._mapped[0][0], self._mapped[-1][0]
@@ -489,6 +508,8 @@ class ReplayClock:
         return (len(self._mapped) - 1) / spent if spent > 0 else 0.0
 
     def _due(self, stamp_ns: int) -> float:
+        """Return the time at which a scan is due [s]; RuntimeError without an anchor. The speed must not be
+        0."""
         if self._anchor is None:
             raise RuntimeError("the replay clock has no anchor")
         anchor_ns, anchor_s = self._anchor

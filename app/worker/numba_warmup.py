@@ -31,10 +31,11 @@ _POLL_S = 0.2
 
 
 def compile_ahead() -> None:
-    """Compile the kernels of the mapper in two processes, unless they are cached already. Without a second
-    core nothing is done.
+    """Compile the kernels of the mapper in two processes, unless they are cached already, and wait for them.
+    Without a second core nothing is done.
 
-    Kernels that remain uncompiled are compiled at their first call.
+    Kernels that remain uncompiled, also after errors of the processes, are compiled at their first call.
+    While another process of the user compiles, it waits for up to half an hour.
     """
     if _cores() < len(_HALVES) or is_compiled():
         return
@@ -57,10 +58,13 @@ def _cores() -> int:
 
 
 def _start(half: str) -> BlockingChildProcess:
+    """Start the process that compiles a half, one of `_HALVES`."""
     return BlockingChildProcess(python_module("app.worker.numba_warmup", half))
 
 
 def _compile() -> None:
+    """Compile both halves in processes of their own and wait for them, at most PATIENCE_S; then they are
+    ended."""
     from pipeline.jit import others_compile
 
     with contextlib.ExitStack() as stack:
@@ -105,8 +109,8 @@ _SCENE = "sim:stand?duration=1"
 
 
 def warm_up() -> None:
-    """Compile or load all kernels of the mapper by mapping one second of a simulated stand. The first time on
-    a machine this takes minutes."""
+    """Compile or load all kernels of the mapper by mapping one second of a simulated stand in this process.
+    The first time on a machine this takes minutes."""
     from pipeline.io.readers import open_source
     from pipeline.odometry.synchroniser import steps
 
@@ -185,7 +189,8 @@ def warm_tree_map() -> None:
 
 
 def _stems() -> Iterator[Step]:
-    """Return the steps of a robot that drives 0.5 m per scan between trees at distances of 3 m."""
+    """Yield the twelve steps of a robot that drives 0.5 m per scan between trees in a grid of 3 m by 1.5 to 3
+    m."""
     from pipeline.geometry.poses import Pose2
     from pipeline.types.records import Scan, Stems, Step
 

@@ -54,8 +54,9 @@ class Outbox:
         self._thread.start()
 
     def put(self, message: FromWorker) -> None:
-        """Queue a message. Of several waiting frames, or messages that replace each other, only the newest
-        one is sent; if MOST_MESSAGES wait, the oldest is dropped and an error is reported."""
+        """Queue a message without waiting. Of several waiting frames, or messages that replace each other,
+        only the newest one is sent; if MOST_MESSAGES wait, the oldest is dropped and later statuses have a
+        warning."""
         with self._changed:
             if isinstance(message, Shown):
                 self._picture = message
@@ -82,6 +83,7 @@ class Outbox:
         self._thread.join(timeout_s)
 
     def _write_all(self) -> None:
+        """Send messages until `close`, or until the reader is gone. Runs in a thread."""
         try:
             while (message := self._next()) is not None:
                 for packed in self._packed(message):
@@ -102,6 +104,8 @@ class Outbox:
             return [] if self._report is None else [self._codec.encode(self._with_refusal(self._report))]
 
     def _made_ready(self, message: FromWorker) -> FromWorker:
+        """Return a message as it is sent: a frame with only what was not sent before, a status with its
+        warning."""
         if isinstance(message, Shown):
             self._sent_at = time.monotonic()
             self._recent.keep(message.run, message.frame)
@@ -114,11 +118,13 @@ class Outbox:
         return message
 
     def _with_refusal(self, report: Report) -> Report:
+        """Return a status with the warning about dropped messages, if there is one."""
         if not self._refused:
             return report
         return Report(replace(report.status, warnings=[*report.status.warnings, self._refused]))
 
     def _next(self) -> FromWorker | None:
+        """Wait for the next message to send; None after `close`, when nothing waits."""
         with self._changed:
             while True:
                 if self._messages and (self._picture is None or not _is_standing(self._messages[0])):

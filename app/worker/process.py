@@ -81,6 +81,15 @@ def _notify_compilation() -> None:
 def _read(
     incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: threading.Event, session: Session
 ) -> None:
+    """Read commands into the queue until the stream ends; then queue None, finish a recording, and end the
+    process if the loop does not end within the grace period. Runs in a thread.
+
+    Args:
+        incoming: Stream of encoded commands.
+        commands: The queue.
+        finished: Set when the loop has ended.
+        session: The session, whose recording is finished.
+    """
     channel = to_worker()
     try:
         while (command := channel.read(incoming)) is not None:

@@ -431,7 +431,8 @@ class MessageCodec(Generic[M]):
         """Return the encoded message with its length as prefix.
 
         Raises:
-            WireError: It is larger than LARGEST_MESSAGE.
+            WireError: It is larger than LARGEST_MESSAGE, or has an array of a dtype or number of dimensions
+                that cannot be sent.
         """
         packed = bytearray(LENGTH_BYTES)
         self._encoder.encode_into(message, packed, LENGTH_BYTES)
@@ -452,10 +453,12 @@ class MessageCodec(Generic[M]):
             raise WireError(f"a message of {len(body)} bytes cannot be read: {error}") from None
 
     def read(self, stream: BinaryIO) -> M | None:
-        """Return the next message of a blocking stream; None at its end.
+        """Return the next message of a blocking stream; None at its end. A length above LARGEST_MESSAGE is
+        refused before memory is allocated.
 
         Raises:
-            WireError: The stream ends within a message, or the message is not of the declared types.
+            WireError: The stream ends within a message, or the message is too large or not of the declared
+                types.
         """
         head = _read_exactly(stream, LENGTH_BYTES)
         if not head:
@@ -498,6 +501,12 @@ def _read_exactly(stream: BinaryIO, size: int) -> bytes:
 
 
 def _to_plain(value: object) -> object:
+    """Return an array or NumPy scalar as msgpack encodes it.
+
+    Raises:
+        WireError: The array has a dtype or number of dimensions that cannot be sent.
+        NotImplementedError: The value is of another type.
+    """
     if isinstance(value, np.ndarray):
         if value.dtype.str not in _DTYPES or value.ndim > _MOST_DIMENSIONS:
             raise WireError(f"an array of {value.dtype} and {value.ndim} dimensions cannot be sent")
@@ -509,6 +518,16 @@ def _to_plain(value: object) -> object:
 
 
 def _from_plain(expected: Any, plain: object) -> object:  # noqa: ANN401 - the hook's own signature
+    """Return the received array, as a copy.
+
+    Args:
+        expected: Declared type of the array.
+        plain: Decoded msgpack.
+
+    Raises:
+        ValueError: dtype or shape differ from the declaration or from the number of bytes.
+        NotImplementedError: The declared type is not an array.
+    """
     if getattr(expected, "__origin__", None) is not np.ndarray:
         raise NotImplementedError(f"{expected} cannot be received")
     array = msgspec.convert(plain, _EncodedArray)

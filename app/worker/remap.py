@@ -46,7 +46,7 @@ class MappingRecord:
 
     def add(self, frame: Frame, start_ns: int) -> None:
         """Add the results of a scan. If the run went back, the entries of this scan and of later ones are
-        replaced.
+        replaced. A tree keeps the time of its first confirmation.
 
         Args:
             frame: Results of the scan.
@@ -97,7 +97,7 @@ class Remapping:
 
     Args:
         rerun: The rerun, with a fresh mapper.
-        start_ns: Time of the first scan.
+        start_ns: Time of the first scan [ns].
 
     Attributes:
         map: The new map, as far as it goes.
@@ -154,7 +154,8 @@ class MapComparison:
     def changes(
         self, shown: Frame, new: Frame, revision: int, time_s: float, confirmed_s: dict[int, float]
     ) -> MapChanges:
-        """Return the differences between the map before the step and the new map.
+        """Return the differences between the map before the step and the new map. The map before is the
+        present one if the step has none of this scan yet.
 
         Args:
             shown: The current scan with the present map.
@@ -176,7 +177,8 @@ _MOST_BYTES = 256 << 20
 
 
 def nbytes(state: object) -> int:
-    """Return the number of bytes of all arrays in nested dataclasses, lists and tuples."""
+    """Return the number of bytes of all arrays in nested dataclasses, lists and tuples; 0 for other
+    values."""
     if isinstance(state, np.ndarray | Genealogy | KeyframeGraph):
         return state.nbytes
     if isinstance(state, list | tuple):
@@ -221,11 +223,13 @@ class Snapshots(Generic[S]):
         )
 
     def is_due(self, scans: int) -> bool:
-        """Return whether `offer` would store a state with this number of scans."""
+        """Return whether `offer` would store a state with this number of scans: a multiple of the spacing
+        that is not stored yet."""
         return scans % self._spacing == 0 and scans not in self._states
 
     def newest(self, scans: int) -> tuple[int, S]:
-        """Return the newest state with at most this number of scans, and its number of scans."""
+        """Return the newest state with at most this number of scans (0 or more), as (number of scans,
+        state)."""
         best = max(n for n in self._states if n <= scans)
         return best, self._states[best]
 
@@ -256,8 +260,8 @@ class ParameterHistory:
         return all(known.model_dump(exclude=aside) == wanted for known in self._sets)
 
     def set_from(self, index: int, parameters: Parameters) -> bool:
-        """Set the parameters from a scan onwards. Return whether any value changes; if not, the results of
-        later scans remain valid.
+        """Set the parameters from a scan onwards, in place of all later ones. Return whether any value
+        changes; if not, the results of later scans remain valid.
 
         Args:
             index: Index of the scan.
@@ -282,7 +286,7 @@ def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Ste
     """Yield each step with its segmented scan, in order.
 
     The caller's thread reads the steps; another thread segments up to `AHEAD` scans ahead. An exception of
-    `segment` is raised when its scan is due.
+    `segment` is raised when its scan is due. If the caller stops early, scans that are not begun are dropped.
     """
     waiting: deque[tuple[Step, Future[SegmentedScan]]] = deque()
     pool = ThreadPoolExecutor(1, thread_name_prefix="segment")
@@ -299,7 +303,8 @@ def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Ste
 
 
 def segment_all(segment: Segment, steps: list[Step]) -> list[SegmentedScan]:
-    """Return the segmented scan of each step; two threads segment them."""
+    """Return the segmented scan of each step, in order; two threads segment them. An exception of `segment`
+    is raised."""
     with ThreadPoolExecutor(2, thread_name_prefix="segment") as pool:
         return list(pool.map(segment, steps))
 
@@ -372,19 +377,39 @@ def _renamed(before: Trees, after: Trees) -> list[tuple[int, int]]:
 
 
 def _came(before: Frame, trees: Trees, row: int) -> TreeChange:
+    """Return the description of a tree that only the new map has.
+
+    Args:
+        before: Last scan in the old map.
+        trees, row: Trees of the new map, and the row of the tree.
+    """
     place = trees.position[row]
     return _change("appeared", trees, row, f"before: {_why_not(before, place)}")
 
 
 def _went(trees: Trees, row: int, after: Frame) -> TreeChange:
+    """Return the description of a tree that only the old map has.
+
+    Args:
+        trees, row: Trees of the old map, and the row of the tree.
+        after: The same scan in the new map.
+    """
     return _change("vanished", trees, row, f"now: {_why_not(after, trees.position[row])}")
 
 
 def _moved(trees: Trees, row: int, distance: float) -> TreeChange:
+    """Return the description of a tree of the new map that moved by a distance [m]."""
     return _change("moved", trees, row, f"by {100 * distance:.0f} cm")
 
 
 def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: int, why: str) -> TreeChange:
+    """Return the description of a difference at the position of a tree.
+
+    Args:
+        kind: Kind of the difference.
+        trees, row: Trees of a map, and the row of the tree.
+        why: Reason, as text.
+    """
     x, y = trees.position[row]
     return TreeChange(kind, int(trees.number[row]), round(float(x), 3), round(float(y), 3), why)
 

@@ -116,11 +116,15 @@ class Run:
         return None if step is None else step.scan.stamp_ns
 
     def map_next(self, *, hurried: bool = False) -> Frame | None:
-        """Map the next scan and return its result; None at the end of the run.
+        """Map the next scan, which becomes the current one, and return its result; None at the end of the
+        run, or before a live scan arrived.
 
         Args:
             hurried: Whether to use the cached segmented scan if there is one. The frame then has no points
                 (`is_bare`).
+
+        Raises:
+            SourceError: Nothing more can be read.
         """
         step = self._cursor.take()
         if step is None:
@@ -130,8 +134,8 @@ class Run:
         return self._map_step(step, hurried=hurried)
 
     def map_again(self) -> Frame | None:
-        """Map the current scan again, from the state before it, and return its result; None without a
-        scan."""
+        """Map the current scan again, from the state before it and with the parameters in force for it, and
+        return its result; None without a scan, or after an error or a step back that is not complete."""
         if self._step is None or self._broken:
             return None
         self._map.mapper.restore(self._map.before)
@@ -163,6 +167,8 @@ class Run:
         return frames
 
     def _map_step(self, step: Step, *, hurried: bool = False) -> Frame:
+        """Map a step and make it the current scan. After an exception the mapper is broken until
+        `approach`."""
         mapper, wanted = self._map.mapper, self._map.parameters.at(step.index)
         if mapper.parameters is not wanted:
             mapper.parameters, self._cache = wanted, self._caches.of(wanted)
@@ -176,6 +182,13 @@ class Run:
         return self.frame
 
     def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> Frame:
+        """Return the result of a step, and cache its segmented scan.
+
+        Args:
+            mapper: The mapper.
+            step: The step.
+            hurried: Whether to use the cached segmented scan if there is one.
+        """
         cached = self._cache.read(step.index, step.scan.stamp_ns) if hurried else None
         self.is_bare = cached is not None
         scan = mapper.segment(step) if cached is None else cached[1]
@@ -183,8 +196,8 @@ class Run:
         return mapper.process(step, scan)
 
     def remap(self, parameters: Parameters) -> None:
-        """Begin to map the run again from its first scan, in place of a rerun that is not complete. Nothing
-        begins if the map would not change."""
+        """Begin to map the run again from its first scan, in place of a rerun that is not complete, and
+        compute the preview. Nothing begins if the map would not change. The map changes in `remap_on`."""
         self.cancel_remapping()
         if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
             return
@@ -196,6 +209,8 @@ class Run:
         )
 
     def _preview_of(self, parameters: Parameters, mapper: Mapper) -> Trees | None:
+        """Return approximate trees of the map with other parameters; None before the first scan or if the
+        mapper is broken."""
         frame, present = self.frame, self._map
         if frame is None or self._broken:
             return None
@@ -312,14 +327,15 @@ class Run:
         self.current, self._step, self._broken = scans - 1, None, False
 
     def use(self, parameters: Parameters, index: int) -> bool:
-        """Use other parameters from the scan with an index onwards. Return whether any value changes."""
+        """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
+        value changes; then states of the mapper after that scan are dropped."""
         changes = self._map.parameters.set_from(index, parameters)
         if changes:
             self._map.snapshots.forget_after(index)
         return changes
 
     def close(self) -> None:
-        """Close the source and the scan caches."""
+        """Cancel a rerun, and close the source and the scan caches."""
         self.cancel_remapping()
         self._caches.close()
         self.source.close()
@@ -342,7 +358,7 @@ def open_run(
         parameters: Parameters from the first scan onwards.
         make_mapper: Returns a new mapper.
         folder: Folder of scan caches that the next opening of the recording uses again; None deletes them
-            when the run is closed.
+            when the run is closed, as always for live runs and sources without a digest.
 
     Raises:
         SourceError: The odometry is not available for this source; the source is closed.

@@ -100,12 +100,12 @@ class Session:
 
     @property
     def path(self) -> Path | None:
-        """Path up to the current scan; None without a run, or before its first scan."""
+        """Path up to the current scan, without rows before its first scan; None without a run."""
         return self._run.path if self._run else None
 
     @property
     def time_s(self) -> float:
-        """Time of the current scan since the first scan of the run [s]."""
+        """Time of the current scan since the first scan of the run [s]; 0 before the first scan."""
         frame = self.frame
         return 0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / _NS
 
@@ -115,7 +115,8 @@ class Session:
         return self._run
 
     def next_ns(self) -> int | None:
-        """Time of the next scan [ns]; None at the end of the run."""
+        """Return the time of the next scan [ns]; None without a run, at the end of the run, or before a live
+        scan arrived."""
         return self._run.peek_ns() if self._run else None
 
     def open(
@@ -158,7 +159,8 @@ class Session:
         return self._begin(source, odometry, seed)
 
     def listen(self) -> Opened | None:
-        """Return the opened run of a live robot once its data arrive; None before and after.
+        """Return the opened run of a live robot once its data arrive, and collect its warnings; None before
+        and after, and without a live robot.
 
         Raises:
             SourceError: What it sends cannot be read.
@@ -170,6 +172,7 @@ class Session:
         return self._begin(self._robot, *self._requested[1:]) if is_heard else None
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
+        """Open a run of a source, paused before its first scan; errors as in `open_run`."""
         self._run, warnings = open_run(
             source, odometry, seed, self._parameters, self._make_mapper, self._folder
         )
@@ -178,7 +181,8 @@ class Session:
         return opened_of(self._run)
 
     def prepare(self) -> None:
-        """Prepare the first scan, which can take a minute the first time on a machine.
+        """Compile the kernels and prepare the first scan, which can take a minute the first time on a
+        machine. Nothing without a run.
 
         Raises:
             SourceError: There is no scan.
@@ -237,13 +241,14 @@ class Session:
         return opened
 
     def pause(self) -> None:
-        """Pause; while seeking, pause once the target is reached."""
+        """Pause if the run plays; while seeking, pause once the target is reached. Other states stay."""
         if self._state == "playing":
             self._state = "paused"
 
     def advance(self, scans: int) -> None:
         """Pause and seek a number of scans forward, or back if it is negative, from the sought scan if there
-        is one, else from the current one. A live run only gets a message that it cannot seek."""
+        is one, else from the current one; at most back to the first scan. A live run only gets a message that
+        it cannot seek; nothing happens without a run."""
         if self._run is None or self._is_live():
             return
         here = self._run.current if self._target.index is None else self._target.index
@@ -251,7 +256,9 @@ class Session:
         self._target.to_scan(max(0, here + scans))
 
     def seek(self, time_s: float) -> None:
-        """Seek to the last scan not later than a time; playing or pausing then continues as before."""
+        """Seek to the last scan not later than a time; a playing run then plays on, any other is paused.
+        Times are clipped to 0 to LONGEST_S; NaN and infinity are ignored. A live run only gets a message that
+        it cannot seek."""
         if self._run is None or not math.isfinite(time_s) or self._is_live():
             return
         if self._state != "playing":
@@ -297,11 +304,12 @@ class Session:
         return self._run is not None and self._run.remapped is not None and not self._target.sought
 
     def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
-        """Map a number of scans of the run again.
+        """Map a number of scans of the run again. If a scan cannot be read, the rerun ends with a warning and
+        the map stays.
 
         Returns:
-            After the last scan, the frame of the current scan in the new map and the differences; before,
-            None.
+            After the last scan, the frame of the current scan in the new map and the differences; before, and
+                without a rerun, None.
         """
         run, shown = self._run, self.frame
         if run is None or shown is None:
@@ -330,7 +338,8 @@ class Session:
         return self._run.map_with(sets)
 
     def fail(self, detail: str) -> None:
-        """Set the state of the run to failed, with the reason."""
+        """Set the state of the run to failed, with the reason; a seek and a rerun are cancelled. The run
+        stays open until `play` or `open`."""
         self._state, self._detail = "failed", detail
         self._target.forget()
         if self._run is not None:
@@ -354,7 +363,7 @@ class Session:
         return status if robot is None else with_robot(status, robot)
 
     def close(self) -> None:
-        """Close the source."""
+        """Close the run or the robot, if one is open."""
         self._leave()
 
     def end_recording(self) -> bool:
@@ -371,6 +380,7 @@ class Session:
         return self._robot is not None
 
     def _settle(self) -> None:
+        """Set the state "paused"."""
         self._state, self._detail = "paused", ""
 
     def _arrive(self, run: Run) -> Frame | None:
@@ -385,10 +395,12 @@ class Session:
         return run.map_again() if changed or run.is_bare else run.frame
 
     def _send_preview(self, run: Run) -> None:
+        """Call `on_preview` with the preview of a run, if there is one."""
         if run.preview is not None:
             self.on_preview(self._revision, run.preview)
 
     def _leave(self) -> None:
+        """Close the run or the robot and forget seek, warnings and comparison. The state stays."""
         owner = self._run or self._robot
         if owner is not None:
             owner.close()
@@ -398,6 +410,7 @@ class Session:
         self._target.forget()
 
     def _warn(self, warnings: Iterable[str]) -> None:
+        """Add warnings, each once and the newest last; only the last 20 are kept."""
         for warning in warnings:
             self._warnings.pop(warning, None)
             self._warnings[warning] = None
@@ -488,7 +501,8 @@ class SeekTarget:
         self._index, self._stamp_ns, self._under_way = index, None, False
 
     def to_time(self, run: Run, stamp_ns: int) -> None:
-        """Seek the last scan of the run not later than a time [ns]."""
+        """Seek the last scan of the run not later than a time [ns]; if that scan was not read yet, the run is
+        mapped on until it is found."""
         index = run.index_at(stamp_ns)
         if index is not None:
             self.to_scan(index)
@@ -511,7 +525,8 @@ class SeekTarget:
             run.approach(self._index)
 
     def is_at_end(self, run: Run) -> bool:
-        """Return whether the run has reached the sought scan."""
+        """Return whether the run has reached the sought scan; False without one. For a time, the following
+        scan must be known."""
         if self._index is not None:
             return run.current >= self._index
         if self._stamp_ns is None or run.current < 0:
@@ -551,7 +566,8 @@ def has_camera(description: SourceDescription) -> bool:
 
 
 def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
-    """Return the camera picture of a source that is closest to a time.
+    """Return the camera picture of a source that is closest to a time, with its camera model if that is
+    known.
 
     Args:
         source: The open source; None where no run is open.

@@ -105,12 +105,16 @@ class WorkerProcess:
         return self._process.pid if self._process else None
 
     async def start(self) -> None:
-        """Start the worker and restart it whenever it ends."""
+        """Start the worker and restart it whenever it ends. A worker that cannot be started is tried
+        again."""
         await self._spawn()
         self._task = asyncio.create_task(self._watch(), name="worker")
 
     async def send(self, command: protocol.ToWorker) -> None:
         """Send a command. Parameters, speed and source are stored and sent again after a restart.
+
+        An `Open` while another source does not finish opening kills the worker, which then opens the new
+        source. The call waits at most 5 s for the worker to read.
 
         Raises:
             WorkerBusyError: The worker does not run or accepts no commands, and this command is not sent
@@ -132,13 +136,16 @@ class WorkerProcess:
             )
 
     async def close(self) -> None:
-        """Ask the worker to end, and kill it if it does not."""
+        """Stop the supervision, ask the worker to end, and kill it if it does not within 0.7 s (10 s for a
+        live run)."""
         self._closing = True
         self._stop_opening_timer()
         await cancel(self._task)
         await self._end()
 
     async def _spawn(self) -> None:
+        """Start the process, and send it the stored parameters, speed and source. If the system cannot start
+        it, it counts as ended."""
         try:
             self._process = await asyncio.create_subprocess_exec(
                 *self._command,
@@ -173,6 +180,7 @@ class WorkerProcess:
         return True
 
     async def _watch(self) -> None:
+        """Pass on the messages of the worker and restart it whenever it ends, until the task is cancelled."""
         while True:
             reason = await self._listen()
             self._stop_opening_timer()
@@ -225,11 +233,13 @@ class WorkerProcess:
                 self._stop_opening_timer()
 
     def _give_up_opening(self) -> None:
+        """Kill the worker because the source did not finish opening in time."""
         self._opening_timer = None
         self._gave_up = True
         self._kill()
 
     def _kill_while_opening(self) -> None:
+        """Kill the worker because another source is requested; it is restarted at once."""
         self._replaced = True
         self._wanted.set()
         self._stop_opening_timer()
@@ -303,6 +313,8 @@ class WorkerProcess:
         return self._silence_limit_s if self._has_command or status.state in ("playing", "waiting") else None
 
     async def _deliver(self, message: protocol.FromWorker) -> None:
+        """Await `on_message` with a message. Its errors are logged and reported as a failure; they do not end
+        the supervision."""
         self._note_opening(message)
         if isinstance(message, protocol.Shown):
             self._ends_without_result = 0
@@ -340,10 +352,13 @@ class WorkerProcess:
         await self._wanted.wait()
 
     async def _report_failure(self, detail: str) -> None:
+        """Deliver the status "failed" with a reason."""
         source = self._open.uri if self._open else ""
         await self._deliver(protocol.Report(protocol.Status(state="failed", detail=detail, source=source)))
 
     async def _end(self) -> None:
+        """Close the standard input of the worker, wait for its end, and kill it after a grace period; nothing
+        if it does not run."""
         process, self._process = self._process, None
         if process is None:
             return
