@@ -237,6 +237,7 @@ def _run_record(
 
 
 def _range(values: Float) -> tuple[float, float]:
+    """Return the least and the greatest of some values, at least one."""
     return float(values.min()), float(values.max())
 
 

@@ -256,7 +256,13 @@ def _observed(area: SeenArea, earlier: FilePath | None) -> SeenArea:
 
 def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) -> None:
     """Write the pictures of trees to the folder, and their number to the summary of the outcome. The map is
-    complete already, so errors and Ctrl-C become warnings of the outcome."""
+    complete already, so errors and Ctrl-C become warnings of the outcome.
+
+    Args:
+        mapped: Source and map.
+        folder: Folder of the run.
+        outcome: Result for people, which is changed.
+    """
     try:
         kept, warning = keep_pictures(mapped.source, mapped.trees, mapped.path, folder)
     except (StemmapError, OSError) as error:
@@ -270,7 +276,14 @@ def _keep_pictures(mapped: _Mapped, folder: FilePath, outcome: MappingResult) ->
 
 
 def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
-    """Give the mapper the parameters in force at a scan, if a revision changed them."""
+    """Give the mapper the parameters in force at a scan, if a revision changed them; nothing before the first
+    revision.
+
+    Args:
+        plan: The run with its revisions.
+        mapper: The mapper, whose parameters may be changed.
+        scan: Index of the scan.
+    """
     in_force = [parameters for first, parameters in plan.revisions if first <= scan]
     if in_force and in_force[-1] is not mapper.parameters:
         mapper.parameters = in_force[-1]
@@ -291,8 +304,13 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
 
 
 def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunStart:
-    """Return how the run begins; loads a continued map into the mapper. The warnings of source and odometry
-    are counted."""
+    """Return how the run begins. The warnings of source and odometry are counted.
+
+    Args:
+        plan: The run.
+        mapper: A mapper before its first scan; a continued map is loaded into it.
+        chosen: Selected source of the motion.
+    """
     warned = (chosen.warning,) if chosen.warning else ()
     warnings = [*warned, *plan.source.description.warnings]
     if plan.continued is None:

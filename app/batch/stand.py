@@ -179,6 +179,7 @@ def _pair(estimate: Estimate) -> list[float | None]:
 
 
 def _finite(value: float) -> float | None:
+    """Return a number rounded to six decimals for JSON; None where not finite."""
     return round(float(value), 6) if math.isfinite(value) else None
 
 

@@ -311,18 +311,22 @@ def truth_in_doubt(e: MapScores) -> str:
 
 
 def _rate(rate: Rate) -> str:
+    """Return a rate as text, for example "9/10 (90.0 %)"."""
     return f"{rate.count}/{rate.of} ({_percent(rate.rate)})"
 
 
 def _percent(value: float | None) -> str:
+    """Return a share as text in percent; "-" for None."""
     return "-" if value is None else f"{100.0 * value:.1f} %"
 
 
 def _metres(value: float | None) -> str:
+    """Return a length [m] as text in centimetres; "-" for None."""
     return "-" if value is None else f"{100.0 * value:.1f} cm"
 
 
 def _pair(value: float | None) -> str:
+    """Return a pair error [%] as text; "-" for None."""
     return "-" if value is None else f"{value:.2f} %"
 
 

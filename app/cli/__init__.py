@@ -54,6 +54,7 @@ class _Parser(argparse.ArgumentParser):
     """Reports wrong usage in one line, with the command for help."""
 
     def error(self, message: str) -> None:  # type: ignore[override]
+        """Print wrong usage in one line and end with WRONG_USAGE (SystemExit)."""
         self.exit(WRONG_USAGE, f"{self.prog}: {message}. Help: {self.prog} --help\n")
 
 
@@ -127,6 +128,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:
     """Report unknown words of a command, with the flag nearest to the first of them as remedy.
+
+    Args:
+        unknown: The words, at least one.
+        command: Name of the command.
+        parser: Parser of the command, which knows its flags.
 
     Raises:
         UsageError: Always.

@@ -149,6 +149,7 @@ def _scans(d: SourceDescription) -> str:
 
 
 def _sensor(sensor: Sensor) -> str:
+    """Return name, rings and range error of a LiDAR as text."""
     from math import degrees
 
     rings = f", {sensor.rings} ring{'s' * (sensor.rings != 1)}" if sensor.rings else ""

@@ -348,5 +348,6 @@ class _SearchProgress:
             self._line(f"{made:,} trials in {seconds:,.0f} s: {3600.0 * made / seconds:,.0f} an hour")
 
     def _line(self, text: str) -> None:
+        """Print a line to standard error, above the bar."""
         self._tqdm.write(text, file=sys.stderr)
         sys.stderr.flush()

@@ -382,6 +382,7 @@ def _decoded(line: bytes, kind: type[T]) -> T | None:
 
 
 def _cannot_start(error: OSError) -> StemmapError:
+    """Return the error for people of a process that the system cannot start."""
     return StemmapError(
         f"no process can be started: {error.strerror}", remedy="Close other programs and try again"
     )

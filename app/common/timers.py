@@ -52,6 +52,7 @@ class Throttle(Generic[P]):
             self._timer = None
 
     def _run(self) -> None:
+        """Make the pending call, if there is one, and set the time before which no other is made."""
         self._timer = None
         call, self._call = self._call, None
         if call is None:

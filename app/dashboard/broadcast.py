@@ -103,10 +103,12 @@ class Broadcast:
         return self._path_json[2]
 
     def _next(self) -> int:
+        """Return the number of a new message, from 1 on."""
         self._count += 1
         return self._count
 
     def _wake(self) -> None:
+        """Notify all listeners that there are new messages."""
         for listener in self._listeners:
             listener.news.set()
 

@@ -183,10 +183,13 @@ _STEADY_NS = 500_000_000
 
 
 def motion(path: Path | None, from_ns: int, to_ns: int) -> Pose2:
-    """Return `T_from_to` of the base between two times [ns]; the identity if the path has fewer than two
-    poses.
+    """Return `T_from_to` of the base between two times; the identity if the path has fewer than two poses.
 
     Within the path, poses are interpolated; outside, the velocities at its end are extrapolated.
+
+    Args:
+        path: Path of the run, or None.
+        from_ns, to_ns: The times [ns].
     """
     if path is None or len(path.stamp_ns) < 2:
         return Pose2()

@@ -299,9 +299,11 @@ class Dashboard:
         self.scene.show_parameters(state.parameters, state.preset)
 
     def _broadcast_events(self) -> None:
+        """Broadcast the events of the run."""
         self.live.publish("events", self.events.as_plain())
 
     async def _send_parameters(self) -> None:
+        """Send the parameters in force to the worker."""
         state = self.parameters
         values = state.parameters.model_dump()
         await self.worker.send(protocol.SetParameters(values, state.revision, state.whole, state.step))
@@ -405,6 +407,12 @@ class Dashboard:
         self._score()
 
     def _mark_edits(self, who: str, number: int) -> None:
+        """Add an event for edits of annotations and broadcast it; nothing before the first scan.
+
+        Args:
+            who: Author of the last edit.
+            number: Number of annotations that differ.
+        """
         if self.shown is not None:
             self.events.annotated(who, number, self.shown.time_s)
             self._broadcast_events()
@@ -439,12 +447,14 @@ class Dashboard:
         await self.loop.shown(shown.time_s, self.status)
 
     def _run_state(self, shown: protocol.Shown) -> RunState:
+        """Return the state of the run for its record."""
         state = self.parameters
         return RunState(
             shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
         )
 
     def _broadcast_score(self, score: dict[str, Any] | None) -> None:
+        """Broadcast a score (None without a map) and record it."""
         self.live.publish("evaluation", score)
         self.run_recorder.scored(score)
 

@@ -112,7 +112,13 @@ class Learning:
         return {"state": self.state, "words": self.words, "learned": self.learned}
 
     def _become(self, state: str, words: str, learned: dict[str, Any] | None = None) -> None:
-        """Set state, text and result, and send them to the browsers."""
+        """Set the state and send it to the browsers.
+
+        Args:
+            state: "idle", "working", "done" or "failed".
+            words: Progress or reason, as text.
+            learned: Result; None removes it.
+        """
         self.state, self.words, self.learned = state, words, learned
         self._tell(self.as_plain())
 

@@ -127,6 +127,7 @@ def _known(found: T | None) -> T:
 
 
 def _nothing_mapped() -> NoStoryError:
+    """Return the error of a request before the first scan."""
     return NoStoryError("nothing is mapped yet", remedy="Press play, or open a run")
 
 

@@ -34,6 +34,7 @@ class TreeHistory:
         self._spacing = 1
 
     def __len__(self) -> int:
+        """Return the number of stored estimates of all trees."""
         return self._count
 
     def record(self, frame: Frame, start_ns: int) -> None:

@@ -98,7 +98,14 @@ class Frames:
         return False
 
     def _set(self, name: str, digest: str, pose: Pose2 | None, how: str) -> None:
-        """Store how the pose of a map was found, and the pose unless it is None."""
+        """Store how the pose of a map was found.
+
+        Args:
+            name: Name of the map.
+            digest: Digest of its run.
+            pose: Pose of its frame in the common one; None stores no pose.
+            how: How it was found, or why not.
+        """
         self._of[name], self._how[name] = digest, how
         if pose is not None:
             self._pose[name] = pose

@@ -112,6 +112,11 @@ class Results:
         """Store the contents of a decoded message. At most MOST_TREES trees are read; a path is thinned to
         about MOST_POSES points with the newest among them.
 
+        Args:
+            topic: One of TOPICS.
+            message: The decoded message.
+            now_s: Present time [s].
+
         Raises:
             ValueError: A number is not finite or too large; the previous contents remain.
         """

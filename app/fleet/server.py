@@ -121,7 +121,13 @@ class RemoteRobots:
 
 
 def _aged(robot: RobotReport, reported_s: float, now_s: float) -> RobotReport:
-    """Return a report of an earlier time, with its silence extended to `now_s`."""
+    """Return a report of an earlier time, with its silence extended to the present; an unknown silence stays
+    None.
+
+    Args:
+        robot: The report.
+        reported_s, now_s: Time of the report and present time, from the same origin [s].
+    """
     silence_s = None if robot.silence_s is None else robot.silence_s + now_s - reported_s
     return msgspec.structs.replace(robot, silence_s=silence_s)
 

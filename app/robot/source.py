@@ -469,13 +469,17 @@ class LiveSource:
 
     @property
     def _base(self) -> str:
+        """Name of the base frame; "" before the topics are chosen."""
         return "" if self._reader is None else self._reader.base
 
     @property
     def _offset_ns(self) -> int:
+        """Offset between the time stamps of the messages and their arrival [ns]; 0 before the topics are
+        chosen."""
         return 0 if self._reader is None else self._reader.offset_ns
 
     def _name(self) -> str:
+        """Return the name of the robot for people."""
         return f"robot {self.robot}" if self.robot else "the robot"
 
     def _watch_robot(self) -> None:

@@ -161,6 +161,8 @@ class ZenohLink(Link):
             self._subscriptions += [self._subscribe_to(channel) for channel in channels]
 
     def _subscribe_to(self, channel: Channel) -> Any:  # noqa: ANN401 - zenoh is imported where it is used
+        """Return a subscription to a channel, which requires a session; publishers of fixed transforms
+        (tf_static) repeat their last messages."""
         from zenoh import ext
 
         is_latched = channel.topic.endswith("tf_static")
@@ -329,6 +331,7 @@ class _Topic:
         )
 
     def put(self, payload: bytes) -> None:
+        """Publish a message in CDR with the next sequence number and the present time."""
         self._sequence += 1
         head = struct.pack("<qqB", self._sequence, time.time_ns(), len(self._gid))
         self._publisher.put(payload, attachment=head + self._gid)

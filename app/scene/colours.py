@@ -90,8 +90,13 @@ def by_category(numbers: NDArray[np.integer]) -> Colours:
 
 
 def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
-    """Return colours from violet (`low`) to yellow (`high`), uint8, shape (K, 3). Values outside are clipped;
-    NaN counts as `high`."""
+    """Return colours from violet to yellow, uint8, shape (K, 3). Values outside are clipped; NaN counts as
+    `high`.
+
+    Args:
+        values: shape (K,).
+        low, high: Values of violet and yellow.
+    """
     t = (np.nan_to_num(values, nan=high, posinf=high, neginf=low) - low) / max(high - low, 1e-9)
     place = np.clip(t, 0.0, 1.0) * (len(_RAMP) - 1)
     rgb = np.stack([np.interp(place, np.arange(len(_RAMP)), _RAMP[:, c]) for c in range(3)], axis=-1)
@@ -112,7 +117,12 @@ def of_points(cluster_colours: Colours, labels: NDArray[np.integer], noise: Rgb)
 
 
 def choose(first: NDArray[np.bool_], one: Rgb, other: Rgb) -> Colours:
-    """Return `one` where `first` is true, else `other`, uint8, shape (N, 3)."""
+    """Return one of two colours for each element, uint8, shape (N, 3).
+
+    Args:
+        first: Whether the element has the colour `one`, shape (N,).
+        one, other: The colours.
+    """
     return np.array([other, one], dtype=np.uint8)[first.astype(np.int64)]
 
 

@@ -133,8 +133,14 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
 
 
 def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
-    """Return the text of cluster `k`; "" if its DBH is unknown. An external stem, which has no eccentricity,
-    has its verdict."""
+    """Return the text of a cluster; "" if its DBH is unknown. An external stem, which has no eccentricity,
+    has its verdict.
+
+    Args:
+        frame: Results of the scan.
+        k: Row of the cluster.
+        label_by: One of colours.LABEL_BY except "none".
+    """
     verdict = Verdict(int(frame.clusters.verdict[k])).label
     if label_by == "verdict":
         return verdict

@@ -174,7 +174,13 @@ def tree_labels(
 
 
 def _tree_text(trees: Trees, row: int, selected: bool) -> str:
-    """Return the number of a tree; for the selected one with its DBH."""
+    """Return the number of a tree; for the selected one with its DBH.
+
+    Args:
+        trees: Trees of the map.
+        row: Row of the tree.
+        selected: Whether it is selected.
+    """
     number = int(trees.number[row])
     if not selected:
         return f"{number}"

@@ -145,8 +145,14 @@ class ScanNodes:
 
 
 def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
-    """Let clicks on the copies of a batch call `on_cluster`; the number of the copy is passed only for the
-    markers."""
+    """Let clicks on the copies of a batch call `on_cluster`.
+
+    Args:
+        batch: Receives the clicks.
+        markers: Batch whose copies are the clusters in order; only for it the number of the copy is passed
+            on.
+        on_cluster: Called in the thread of viser, see `ScanNodes`.
+    """
 
     @batch.node.on_click
     async def _(event: viser.SceneNodePointerEvent[Any]) -> None:

@@ -207,10 +207,12 @@ class Scene:
 
     @property
     def _pose(self) -> Pose2:
+        """Pose of the robot in the map; the identity before the first scan."""
         return Pose2() if self._frame is None else self._frame.estimate.T_map_base
 
     @property
     def _base_z(self) -> float:
+        """Height of the robot [m]; 0 before the first scan."""
         return 0.0 if self._frame is None else self._frame.base_z
 
     def _show_frame(self) -> None:
@@ -290,6 +292,7 @@ class Scene:
         self._cross(self._aim, name, client)
 
     def _aim(self, name: str, client: viser.ClientHandle) -> None:
+        """Turn the camera of one browser to the robot: from above for "top", else from behind."""
         self._follower.look(client, self._pose, self._base_z, from_above=name == "top")
 
     def _put_back(self) -> None:

@@ -158,4 +158,5 @@ def kept_forests() -> Forests:
 
 @cache
 def _of(folder: Path | None) -> Forests:
+    """Return the forests of a data folder, always the same object for the same folder."""
     return Forests(folder)

@@ -288,7 +288,13 @@ def _figures(figures: RunFigures) -> dict[str, Any]:
 
 
 def _is_one_move(last: Row[Any], change: Change, now: int) -> bool:
-    """Return whether a change continues the last revision: same person and parameters, within 3 s."""
+    """Return whether a change continues the last revision: same person and parameters, within 3 s.
+
+    Args:
+        last: Row of the last revision.
+        change: The change.
+        now: Time of the change [ns since 1970].
+    """
     return bool(
         last.who == change.who
         and last.changes.keys() == change.changes.keys()
@@ -314,10 +320,12 @@ def _forget_deleted(connection: Connection, before_ns: int) -> None:
 
 
 def _plain(row: Row[Any]) -> dict[str, Any]:
+    """Return a row as a dict by column name."""
     return dict(row._mapping)
 
 
 def _unknown(record: int) -> UnknownError:
+    """Return the error of a record that does not exist."""
     return UnknownError("there is no such run", where=f"run {record}", remedy="Load the list again")
 
 
@@ -479,7 +487,13 @@ class Store:
 
     def _step(self, connection: Connection, run: int, author: Author) -> int:
         """Store a new step of a browser and return its number; steps that this browser undid before can no
-        longer be redone."""
+        longer be redone.
+
+        Args:
+            connection: Connection with an open transaction.
+            run: Number of the source.
+            author: Author of the edit, with the browser.
+        """
         of_browser = (_steps.c.run == run, _steps.c.browser == author.browser)
         connection.execute(update(_steps).where(*of_browser, _steps.c.state == "undone").values(state="left"))
         values = {"browser": author.browser, "who": author.who, "at_ns": self._clock(), "state": "done"}
@@ -546,8 +560,18 @@ class Store:
     # --- back and forth --------------------------------------------------------------------------
 
     def _turn(self, run: int, author: Author, to: Literal["done", "undone"]) -> None:
-        """Undo or redo the next step of a browser; `to` is the state of the step afterwards. Errors as in
-        `undo`."""
+        """Undo or redo the next step of a browser. If another person has changed one of its annotations, none
+        changes, and the step can never be undone or redone again.
+
+        Args:
+            run: Number of the source.
+            author: Author, with the browser.
+            to: State of the step afterwards: "undone" or "done".
+
+        Raises:
+            StemmapError: There is no such step.
+            StaleError: Another person has changed an annotation since.
+        """
         with self._engine.begin() as connection:
             step = _next_step(connection, run, author, to)
             query = select(_changes).where(_changes.c.step == step).order_by(_changes.c.id)
@@ -610,10 +634,12 @@ def _next_step(connection: Connection, run: int, author: Author, to: str) -> int
 
 
 def _row(connection: Connection, id_: int) -> Row[Any]:
+    """Return the row of an annotation, also of a deleted one."""
     return connection.execute(select(_annotations).where(_annotations.c.id == id_)).one()
 
 
 def _content(row: Row[Any]) -> Content:
+    """Return the content of the row of an annotation."""
     return Content(row.x, row.y, row.kind, row.dbh)
 
 
@@ -630,6 +656,7 @@ def _inserted(connection: Connection, statement: Insert) -> int:
 
 
 def _stale(row: Row[Any]) -> StaleError:
+    """Return the error of an edit of an annotation that was changed or deleted meanwhile."""
     done = "deleted" if row.deleted else "changed"
     return StaleError(
         f"annotation {row.id} was {done} by {row.who} at {moment(row.at_ns)}",

@@ -174,8 +174,14 @@ def _fitted(figures: Float, label: Int, weight: Float, settings: ForestSettings,
 
 
 def _class_weight(weight: Float, label: Int, settings: ForestSettings) -> Float:
-    """Return weights (N,) multiplied by those of the classes: `tree` for trees, `upright` for poles and
-    persons, 1 for all others."""
+    """Return weights multiplied by those of the classes, shape (N,).
+
+    Args:
+        weight: Weights, shape (N,).
+        label: Index in CLASSES, shape (N,).
+        settings: Settings with the factors `tree` of trees and `upright` of poles and persons; it is 1 for
+            all others.
+    """
     factor = np.where(label == TREE, settings.tree, 1.0)
     factor[np.isin(label, UPRIGHT)] = settings.upright
     return weight * factor

@@ -215,6 +215,7 @@ def table_lines(learned: LearningResult) -> list[str]:
 
 
 def _cells(rates: Rates) -> list[str]:
+    """Return TA, FR, TR and FA as text."""
     return [_cell(rate) for rate in (rates.TA, rates.FR, rates.TR, rates.FA)]
 
 
@@ -225,6 +226,7 @@ def _cell(rate: Rate) -> str:
 
 
 def _row(*cells: str) -> str:
+    """Return a row of the table as text; the first cell is aligned left, the others right."""
     return "  " + cells[0].ljust(5) + "".join(cell.rjust(18) for cell in cells[1:])
 
 

@@ -140,7 +140,13 @@ def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
 
 def _accepted(figures: Float, forest: Forest, share: float) -> Bool:
     """Return which examples are accepted as trees, shape (N,): their share of votes suffices and they have
-    enough observations."""
+    enough observations.
+
+    Args:
+        figures: Features, shape (N, features).
+        forest: The forest.
+        share: Share of votes that makes a tree.
+    """
     accepted: Bool = (vote(figures, forest)[:, 0] >= share) & ~too_few(figures)
     return accepted
 

@@ -208,6 +208,7 @@ class TuneSearch:
             self._state = "done"
 
     def _fail(self, why: str) -> None:
+        """Set the state "failed" with its reason."""
         self._state, self._error = "failed", why
 
 

@@ -407,6 +407,7 @@ def _names(spec: FieldSpec, words: str) -> SearchAxis:
 
 
 def _all_choices(spec: FieldSpec) -> tuple[str | bool, ...]:
+    """Return all values of a choice; False and True for a switch."""
     return spec.choices or (False, True)
 
 
@@ -418,6 +419,7 @@ def _ends(axis: SearchAxis) -> tuple[Value, ...]:
 
 
 def _example(spec: FieldSpec) -> str:
+    """Return a parameter with its declared bounds in the syntax of `--over`."""
     return f"{spec.name}={spec.minimum:g}..{spec.maximum:g}"
 
 

@@ -144,8 +144,14 @@ def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) 
 
 
 def _row(plan: SweepPlan, answers: dict[tuple[int, int], JobResult], s: int, r: int) -> Row:
-    """Return the row of set `s` and run `r`, both from 0 on. A set that was left out, failed, or has no
-    ground truth near the path has no figures and an error."""
+    """Return the row of a set and a run. A set that was left out, failed, or has no ground truth near the
+    path has no figures and an error.
+
+    Args:
+        plan: The comparison.
+        answers: Results by number of the set and of the run.
+        s, r: Numbers of set and run, from 0 on.
+    """
     if (s, r) in plan.left_out:
         return Row(s + 1, r + 1, {}, error=plan.left_out[s, r])
     answer = answers[s, r]
@@ -350,8 +356,14 @@ def _cell(cell: object) -> str:
 
 
 def _cells(comparison: Comparison, row: Row, *, one: bool) -> list[str]:
-    """Return the cells of a row of the text table: set, parameters, run (not if there is `one` run), scores
-    and seconds. A row that failed ends with its error in place of the scores."""
+    """Return the cells of a row of the text table: set, parameters, run, scores and seconds. A row that
+    failed ends with its error in place of the scores.
+
+    Args:
+        comparison: The comparison.
+        row: The row.
+        one: Whether the comparison has one run; then there is no cell for it.
+    """
     plan = comparison.plan
     first = [str(row.set_number), words_of(plan.sets[row.set_number - 1])]
     if not one:

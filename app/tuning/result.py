@@ -325,7 +325,12 @@ def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
 
 def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str, Any]]:
     """Return a row of scores for the search runs, and one for the held-out runs if there are any, each at the
-    start and with the best set; [] before the first result."""
+    start and with the best set; [] before the first result.
+
+    Args:
+        plan: The search.
+        start, best: The start and the best trial; None before they are scored.
+    """
     if start is None or best is None:
         return []
     counts = {held_out: sum(run.held_out is held_out for run in plan.runs) for held_out in (False, True)}

@@ -119,6 +119,7 @@ class OpenDrive:
         self._source.close()
 
     def _mapper(self, parameters: Parameters) -> Mapper:
+        """Return a mapper of the source before its first scan."""
         return mapper_of(self._source.description, parameters, self._seed)
 
     def _mapped(self, mapper: Mapper, frames: Iterator[Frame], *, front_end_ran: bool) -> MappedRun:

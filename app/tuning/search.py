@@ -418,7 +418,13 @@ def search_for_page(parent: ParentConnection) -> None:
 def _search_for_page(search: Search, begin: SearchStart, parent: ParentConnection) -> None:
     """Advance a search and send its progress, at most every 0.25 s, and its result. If a message arrives
     before the start is scored, an empty `SearchMessage` is sent and there is no result. The time limit counts
-    from the scored start on."""
+    from the scored start on.
+
+    Args:
+        search: The search.
+        begin: Its request, with the earlier trials and the time limit.
+        parent: Connection to the server.
+    """
     while search.start is None:
         if parent.has_message:
             parent.send(SearchMessage())

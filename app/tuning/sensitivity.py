@@ -158,6 +158,12 @@ class Sensitivity:
         """Return a point for the page: the value with its scores, or with an error if the value contradicts
         other parameters or the job failed; {} after `leave`.
 
+        Args:
+            question: The curve.
+            value: Value of its parameter.
+            code: Digest of the code.
+            scorer: Computes the job, unless its result is known.
+
         Raises:
             StemmapError: The recording is missing, or the process has other code or ended twice.
         """

@@ -207,14 +207,17 @@ class Journal(Trials):
             raise self._unwritable(error) from None
 
     def _foreign(self) -> StemmapError:
+        """Return the error of a file that is not a journal."""
         return StemmapError("this is not the journal of a search", where=str(self._path), remedy=_OTHER_FILE)
 
     def _unwritable(self, error: OSError) -> StemmapError:
+        """Return the error for people of a file that cannot be written."""
         reason = (error.strerror or str(error)).lower()
         return StemmapError(f"the trials cannot be kept: {reason}", where=str(self._path))
 
 
 def _line(record: object) -> bytes:
+    """Return a record as a line of JSON."""
     return msgspec.json.encode(record) + b"\n"
 
 

@@ -228,6 +228,7 @@ def _worker(folder: Path | None, dashboard: Dashboard) -> WorkerProcess:
 
 
 def _scene(dashboard: Dashboard, loop: asyncio.AbstractEventLoop) -> Scene:
+    """Return the 3D scene of a dashboard; viser is imported only here."""
     from app.scene import Scene
 
     return Scene(dashboard, loop)

@@ -202,7 +202,13 @@ class Guard:
 
     def _renewing(self, scope: Scope, headers: Headers, send: Send) -> Send:
         """Return `send` with a new session cookie in the response, if the page "/" is loaded in the second
-        half of the session; else `send` itself."""
+        half of the session; else `send` itself.
+
+        Args:
+            scope: The request.
+            headers: Its headers.
+            send: Sends the response.
+        """
         if scope["path"] != "/" or not self._is_half_over(headers):
             return send
         reply = Response()

@@ -88,7 +88,13 @@ def invalid_reply(errors: Sequence[Any]) -> Response:
 
 
 def file_reply(text: str, filename: str, media_type: str = "text/csv") -> Response:
-    """Return a text that the browser saves as a file under `filename`; UTF-8, not cached."""
+    """Return a text that the browser saves as a file; UTF-8, not cached.
+
+    Args:
+        text: Contents.
+        filename: Name of the file; without quotes or characters beyond ASCII.
+        media_type: Type without the character set.
+    """
     headers = {"Content-Disposition": f'attachment; filename="{filename}"', "Cache-Control": "no-store"}
     return Response(text, 200, headers, media_type=f"{media_type}; charset=utf-8")
 

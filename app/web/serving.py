@@ -133,7 +133,14 @@ def run_server(
 
 
 def link_of(settings: Settings, port: int, token: str) -> str:
-    """Return the link that opens the page and logs in with the token."""
+    """Return the link that opens the page and logs in with the token; for a server on any address it has the
+    name of this machine.
+
+    Args:
+        settings: Settings with the host.
+        port: Port of the server.
+        token: Token of an owner or a viewer.
+    """
     return f"http://{_name(settings.host)}:{port}/?token={token}"
 
 
@@ -258,6 +265,7 @@ class LinkedServer(uvicorn.Server):
 
 
 def _has_display() -> bool:
+    """Return whether a browser can be opened; always True on macOS and Windows."""
     if sys.platform in ("darwin", "win32"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -236,6 +236,7 @@ def _shown(name: str) -> str:
 
 
 def _gigabytes(size: int) -> str:
+    """Return a size [bytes] as text in GB, or in MB below 0.1 GB."""
     return f"{size / 1e9:.1f} GB" if size >= 1e8 else f"{size / 1e6:.1f} MB"
 
 

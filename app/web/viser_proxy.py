@@ -231,8 +231,13 @@ async def _to_browser(browser: WebSocket, upstream: ClientConnection) -> None:
 
 
 async def _to_viser(browser: WebSocket, upstream: ClientConnection, looks_only: bool) -> None:
-    """Forward the allowed binary messages of the browser until one side disconnects; all others are
-    dropped."""
+    """Forward the allowed binary messages of the browser until one side disconnects; all others are dropped.
+
+    Args:
+        browser: Websocket of the browser.
+        upstream: Connection to viser.
+        looks_only: Whether only messages of the camera are allowed.
+    """
     with contextlib.suppress(ConnectionClosed):
         while (event := await browser.receive())["type"] != "websocket.disconnect":
             message = event.get("bytes")

@@ -332,6 +332,7 @@ class WorkerLoop:
 
     @property
     def _is_compiling_reported(self) -> bool:
+        """Whether the last status states that a kernel is compiled."""
         return self._reported is not None and self._reported[0].detail == _COMPILING
 
     def _show(self, frame: Frame | None) -> None:

@@ -179,8 +179,14 @@ def rows_from(path: Path, start: int) -> Path:
 
 
 def joined(old: Path | None, start: int, tail: Path) -> Path:
-    """Return a path whose rows from `start` onwards are replaced by `tail`; only `tail` without an old path
-    or with start 0."""
+    """Return a path whose rows from `start` onwards are replaced by others; only `tail` without an old path
+    or with start 0.
+
+    Args:
+        old: The path; None for none. It is not changed.
+        start: Number of its rows that stay.
+        tail: Rows that follow.
+    """
     if old is None or start == 0:
         return tail
     columns = ((getattr(old, name)[:start], getattr(tail, name)) for name in _PATH_COLUMNS)

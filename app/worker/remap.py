@@ -218,6 +218,7 @@ class Snapshots(Generic[S]):
             self._states = {n: s for n, s in self._states.items() if n % self._spacing == 0}
 
     def _are_too_many(self) -> bool:
+        """Return whether the states exceed their number or memory."""
         return (
             len(self._states) > _MOST_STATES or sum(map(self._sizes.__getitem__, self._states)) > _MOST_BYTES
         )

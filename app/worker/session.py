@@ -172,7 +172,15 @@ class Session:
         return self._begin(self._robot, *self._requested[1:]) if is_heard else None
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
-        """Open a run of a source, paused before its first scan; errors as in `open_run`."""
+        """Open a run of a source, paused before its first scan, and return its message.
+
+        Args:
+            source: The source; it is closed after an error.
+            odometry, seed: As in `SourceRequest`.
+
+        Raises:
+            SourceError: The odometry is not available for this source.
+        """
         self._run, warnings = open_run(
             source, odometry, seed, self._parameters, self._make_mapper, self._folder
         )

@@ -208,12 +208,14 @@ class WorkerProcess:
         self._restart_opening_timer()
 
     def _restart_opening_timer(self) -> None:
+        """Start the time limit of the opening from now on."""
         if self._opening_timer is not None:
             self._opening_timer.cancel()
         loop = asyncio.get_running_loop()
         self._opening_timer = loop.call_later(self._opening_limit_s, self._give_up_opening)
 
     def _stop_opening_timer(self) -> None:
+        """End the time limit: no source is being opened."""
         self._opening = ""
         if self._opening_timer is not None:
             self._opening_timer.cancel()
@@ -246,6 +248,7 @@ class WorkerProcess:
         self._kill()
 
     def _kill(self) -> None:
+        """Kill the worker, if it runs, without waiting for its end."""
         if self._process is not None:
             with contextlib.suppress(ProcessLookupError):
                 self._process.kill()

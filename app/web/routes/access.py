@@ -33,6 +33,7 @@ class ConnectionLimit:
         self._taken: Counter[Role] = Counter()
 
     def __len__(self) -> int:
+        """Return the number of connected browsers of all roles."""
         return self._taken.total()
 
     @contextmanager

@@ -38,6 +38,7 @@ class _Edit(Body):
 
     @property
     def author(self) -> Author:
+        """Author of the edit."""
         return Author(self.browser, self.who)
 
 
@@ -49,6 +50,7 @@ class _Add(_Edit):
 
     @property
     def content(self) -> Content:
+        """Content of the annotation, with the DBH in metres."""
         return Content(self.x, self.y, self.kind, None if self.dbh_cm is None else self.dbh_cm / 100.0)
 
 
@@ -191,6 +193,7 @@ async def _done(dashboard: Dashboard, edit: _Edit, payload: dict[str, Any], stat
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
+    """Return the annotations of the open run as JSON values."""
     return [row_payload(row) for row in dashboard.annotation_editor.rows]
 
 

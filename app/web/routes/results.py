@@ -177,4 +177,5 @@ def _parameters_of(dashboard: Dashboard, name: str) -> Parameters:
 
 
 def _nothing_mapped() -> Response:
+    """Return 409 for a request before the first scan."""
     return error_reply(409, "nothing is mapped yet", remedy="Press play, or open a run")
