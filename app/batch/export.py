@@ -167,7 +167,8 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
 
     Args:
         run: The run.
-        file: File with a suffix of WRITERS; its folder must exist. A Shapefile has further files beside it.
+        file: File with a suffix of WRITERS; its folder must exist. A Shapefile has further files in that
+            folder.
 
     Raises:
         StemmapError: The suffix is unknown, a package is missing, or the run lacks what the format shows.

@@ -400,7 +400,8 @@ def ground_heights(folder: FilePath, points: Float) -> Float:
 
 
 def frame_lines(frame: MapFrame) -> list[str]:
-    """Return a frame as lines for people."""
+    """Return a frame as lines for people: position, and where known its standard deviation and the residuals
+    of the control points."""
     if not frame.crs:
         return ["local coordinates: the map has no reference system"]
     lines = [

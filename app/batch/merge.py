@@ -198,7 +198,8 @@ def _correspondence(
     merged: MergedMap, b: SavedMap, shown: set[int], of_a: set[int], of_b: set[int]
 ) -> list[list[str]]:
     """Return rows of CORRESPONDENCE_COLUMNS for the confirmed trees of the merged map, by number. The cell of
-    a run in which the tree was not confirmed is empty.
+    a run in which the tree was not confirmed is empty; of several trees of b that became one tree, the last
+    is written.
 
     Args:
         merged: The merged map.

@@ -98,7 +98,7 @@ def is_loopback(host: str) -> bool:
 
 def recordings_place(settings: Settings, now_s: float) -> Path:
     """Return the path of a new recording in the data folder, for example
-    recordings/live-20260102-030405.mcap.
+    recordings/live-20260102-030405.mcap, by the time in UTC. Nothing is created.
 
     Args:
         settings: Settings of the deployment.

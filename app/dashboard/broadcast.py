@@ -133,7 +133,8 @@ class Listener:
         self._path: NDArray[np.float64] | None = None
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Yield messages as JSON without end; maps at intervals of at least `MAP_PAUSE_S`."""
+        """Yield messages as JSON without end: of each kind the newest, as soon as it changes; maps at
+        intervals of at least `MAP_PAUSE_S`, with only the rows of the path that were not sent before."""
         while True:
             await self._wait()
             self.news.clear()

@@ -84,7 +84,8 @@ class Events:
         return self._events.keys() != known or bool(passed)
 
     def remapped(self, confirmed: list[tuple[int, float]], time_s: float) -> None:
-        """Replace the tree events after the run was mapped again.
+        """Replace the events of trees and pose quality after the run was mapped again. Those later than the
+        current scan are flagged as from before the change.
 
         Args:
             confirmed: Number and confirmation time [s] of each tree.
@@ -98,7 +99,7 @@ class Events:
             self._note(f"tree {number}", Event(at, "tree", f"Tree {number} confirmed"))
 
     def warned(self, warnings: list[str], time_s: float) -> bool:
-        """Add events for new warnings; return whether there are any.
+        """Add events for warnings that were not active in the last call; return whether there are any.
 
         Args:
             warnings: All active warnings.

@@ -57,14 +57,14 @@ class Learning:
 
     async def known(self, in_force: str = PACKAGE) -> dict[str, Any]:
         """Return what a training can use, as JSON values: numbers of runs and of annotations by class, the
-        numbers that are needed, the provenance of the forest in force (None for that of the package), and the
-        state.
+        numbers that are needed, the provenance of the forest in force (None for that of the package and for
+        an unknown one), and the state.
 
         Args:
             in_force: Name of the forest in force.
 
         Raises:
-            StemmapError: The store cannot be used, or the forest cannot be read.
+            StemmapError: The store cannot be used.
         """
         in_use = await asyncio.to_thread(self._forests.provenance, in_force)
         sources = await self._store.ask(lambda store: store.annotated_sources())

@@ -132,10 +132,12 @@ class ParameterState:
         self._go_back(self._redo, self._undo, "there is no change of a parameter to do again")
 
     def reset(self, names: list[str]) -> None:
-        """Reset the named parameters, or all if the list is empty, to the values of the preset.
+        """Reset the named parameters, or all if the list is empty, to the values of the preset, as one undo
+        step.
 
         Raises:
-            ParameterError: A name is unknown.
+            StemmapError: A name is unknown, or the values contradict others or are refused by `check`;
+                nothing changes.
         """
         wanted = preset(self.preset).flat()
         unknown = [name for name in names if name not in wanted]
@@ -341,7 +343,7 @@ class ParameterSets:
         return self._sets[name].toml
 
     def named(self, name: str) -> tuple[str, Parameters]:
-        """Return the preset name and the values of a preset or a saved set.
+        """Return the preset name and the values of a preset or a saved set; a preset comes first.
 
         Raises:
             UnknownError: There is neither of this name.

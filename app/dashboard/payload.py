@@ -87,7 +87,9 @@ def health_payload(health: Health) -> dict[str, Any]:
 
 
 def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
-    """Return the clusters of the scan as columns in the map frame; unknown values are None."""
+    """Return the clusters of the scan as columns of equal length: x, y in the map [m], distance from the
+    sensor [m], label of the verdict, number of points, eccentricity and radius [cm]; unknown or infinite
+    values are None."""
     clusters = frame.clusters
     base = clusters.centre + frame.sensor_offset[:2]
     place = frame.estimate.T_map_base.apply(base)
@@ -301,8 +303,8 @@ def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
 
 
 def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the description of the clusters of a frame for the header of a binary block; arguments as in
-    `counts_of`."""
+    """Return the description of the clusters of a frame for the header of a binary block: index of the scan,
+    clusters, verdict counts, and numbers of points by stage. Arguments as in `counts_of`."""
     counts = counts_of(frame, truth, match_distance)
     return {
         "index": frame.index,

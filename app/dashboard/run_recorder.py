@@ -70,7 +70,7 @@ class _Page:
 
 class RunRecorder:
     """Writes the results of runs to the store, with a delay of some seconds and at their end. Errors of the
-    store are logged once, and the data stay pending.
+    store are logged once. Figures and map stay pending after an error; parameter changes are lost.
 
     Args:
         store: Asynchronous access to the store.
@@ -176,7 +176,8 @@ class RunRecorder:
             await asyncio.sleep(_PAUSE_S)
 
     async def _revise_soon(self, page: _Page) -> None:
-        """Write the parameter changes of the page after a pause, so that a slider costs few transactions."""
+        """Write the parameter changes of a record after a pause, so that a slider costs few transactions; the
+        record is created if necessary. Changes that the store refuses are lost."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(page.wake.wait(), _REVISE_PAUSE_S)
         if page.record is None:

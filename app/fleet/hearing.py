@@ -137,7 +137,7 @@ class Results:
                 self._zone = Zone(int(message.data)).label
 
     def report(self, now_s: float, *, alive: bool) -> RobotReport:
-        """Return state and map for the page.
+        """Return state and map for the page. Nothing is removed, also if the robot is silent.
 
         Args:
             now_s: Present time [s] from the same origin as in `take`.

@@ -400,7 +400,7 @@ def serve_fleet(
     open_browser: bool,
     viewer: bool = False,
 ) -> int:
-    """Serve until SIGINT or SIGTERM; return the exit code.
+    """Serve until SIGINT or SIGTERM; return the exit code: 0, or 1 if the server could not start.
 
     Args:
         settings: Settings of the deployment.

@@ -216,7 +216,7 @@ class DdsLink(Link):
         return f"cannot take part in DDS domain {self._address.domain}: {first_line(error)}"
 
     def receive(self) -> None:
-        """Join the domain and receive messages until `close`."""
+        """Join the domain and receive messages until `close`; the errors of cyclonedds are raised."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
         from cyclonedds.core import WaitSet
         from cyclonedds.domain import Domain, DomainParticipant
@@ -242,7 +242,7 @@ class DdsLink(Link):
         del waiting, announced, participant, domain  # in this order; that leaves the network
 
     def _note(self, announced: Any) -> None:  # noqa: ANN401
-        """Process the announcements and withdrawals of writers since the last call."""
+        """Process the next announcements and withdrawals of writers, at most 100."""
         from cyclonedds.core import InstanceState
 
         for found in announced.take(100):
@@ -255,8 +255,8 @@ class DdsLink(Link):
                 self.version += changed
 
     def _adjust(self, participant: Any, waiting: Any, readers: dict[int, _Reader]) -> None:  # noqa: ANN401
-        """Create, replace and remove readers, so that each channel has one that requests no more than all
-        writers of its topic offer.
+        """Create and replace readers, so that each channel has one that requests no more than all writers of
+        its topic offer. The reader of a topic without writers stays.
 
         Args:
             participant: Participant of cyclonedds.

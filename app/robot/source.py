@@ -474,8 +474,7 @@ class LiveSource:
 
     @property
     def _offset_ns(self) -> int:
-        """Offset between the time stamps of the messages and their arrival [ns]; 0 before the topics are
-        chosen."""
+        """Stamp minus arrival of the first scan [ns]; 0 before it is known."""
         return 0 if self._reader is None else self._reader.offset_ns
 
     def _name(self) -> str:

@@ -368,8 +368,8 @@ class GroundNode(LayerNode[viser.MeshHandle]):
         self._raster, self._low, self._cell = NOTHING, np.zeros(2), 1.0
 
     def show(self, ground: HeightMap | None) -> bool:
-        """Show a height map; None keeps the present one. Return whether the height map changed, judged by its
-        identity and not its values."""
+        """Show a height map; None keeps the present one. Return whether it is another object than the present
+        one."""
         if ground is None or ground is self._shown:
             return False
         self._shown = ground

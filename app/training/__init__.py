@@ -1,1 +1,1 @@
-"""Training: the decision trees that say what a column is, grown anew from simulated and labelled scenes."""
+"""Training of the random forest that classifies columns, from simulated, labelled and annotated scenes."""

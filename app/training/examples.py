@@ -44,8 +44,8 @@ class Examples:
 
 
 def object_numbers(examples: Sequence[Examples]) -> Int:
-    """Return a number for each example of all sets in their order, equal for all examples of one object, that
-    is of one position in one set."""
+    """Return a number from 0 on for each example of all sets in their order, int64, shape (N,), equal for all
+    examples of one object, that is of one position in one set."""
     key = [
         (scene, float(x), float(y))
         for scene, each in enumerate(examples)

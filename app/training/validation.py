@@ -118,11 +118,11 @@ def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
 
 
 def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
-    """Return the fold of each example, shape (N,). A group is in one fold, and the folds have similar shares
-    of trees.
+    """Return the fold of each example, int64, shape (N,). A group is in one fold, and the folds have similar
+    shares of trees. There are FOLDS folds, or as many as there are groups if these are fewer.
 
     Args:
-        group: Number of the group of each example, shape (N,).
+        group: Number of the group of each example, shape (N,); at least two groups.
         tree: Whether it is of a tree, shape (N,).
         thing: Number of its object, shape (N,); an object counts once, however many examples it has.
         seed: Random seed.

@@ -253,7 +253,9 @@ class Search:
     # --- one trial ---------------------------------------------------------------------------------
 
     def _next_job(self) -> tuple[_Attempt, int] | None:
-        """Return a set and the number of a run that are to be scored; None if there is nothing to do now."""
+        """Return a set and the number of a run that are to be scored, and take them from the queue; a new set
+        is suggested if no known one waits. None if there is nothing to do now: before the start is scored,
+        and when all trials are made or in progress."""
         for attempt in self._attempts:
             if attempt.waiting:
                 return attempt, attempt.waiting.popleft()

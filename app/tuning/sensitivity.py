@@ -223,7 +223,8 @@ class _ScoringProcess:
 
 
 def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
-    """Return a curve for the page.
+    """Return a curve for the page: name, all parameters (`asked_with`), number of values (`of`), points and
+    error.
 
     Args:
         question: Parameter, its values, and the other parameters.

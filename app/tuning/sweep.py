@@ -116,11 +116,12 @@ def plan_jobs(
 
 
 def _source_of(source: SourceRequest) -> SourceRequest:
-    """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with its
-    choices.
+    """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with the seed,
+    topics and mounting of the folder, the requested odometry, and topics and mounting of the request where
+    given.
 
     Raises:
-        SourceError: The map of the folder was made of several sources.
+        SourceError: The map of the folder was made of several sources, or its files are damaged.
     """
     folder = Path(source.uri)
     if not (folder / "run.json").is_file():

@@ -174,8 +174,8 @@ class DaskWorkers:
         return sorted(self._present() - set(self._doing))
 
     def give(self, worker: str, job: Job) -> None:
-        """Start a job on a worker. No other worker may take it, because the cached front-end results are on
-        this one."""
+        """Start a job on a worker, which must be free. No other worker may take it, because the cached
+        front-end results are on this one."""
         self._doing[worker] = self._client.submit(
             self._score,
             msgspec.json.encode(job),

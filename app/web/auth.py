@@ -229,8 +229,8 @@ class Guard:
         return bool(ends) and max(end or 0 for end in ends) < time.time() + SESSION_S / 2
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return the response to a wrong Host or Origin, or to a body that is too large; None if all are
-        valid."""
+        """Return the response to a wrong Host or Origin (403), or to an announced body that is too large
+        (413); None if all are valid. The Origin of GET and HEAD requests is not checked."""
         if not self._knows_host(headers):
             return error_reply(
                 403, "this server has another host name", remedy="Open the link that stemmap printed"

@@ -315,7 +315,8 @@ class WorkerLoop:
         return replace(self._session.status(), state="starting", detail="Preparing the mapper")
 
     def compiling(self) -> None:
-        """Report that the mapping waits for the compilation of a kernel; called during the compilation."""
+        """Report that the mapping waits for the compilation of a kernel; called during the compilation. The
+        status "playing" becomes "waiting"; further calls report nothing until the next status."""
         self._session.disturb()
         now = self._clock()
         if now > self._compiled_at + _COMPILES_ON_S:

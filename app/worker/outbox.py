@@ -138,7 +138,8 @@ class Outbox:
                 self._changed.wait(wait if self._picture is not None else None)
 
     def _with_new_path_only(self, shown: Shown) -> Shown:
-        """Return the frame with only the rows of the path that were not sent before."""
+        """Return the frame with only the rows of the path that were not sent before, at most MOST_POINTS
+        points, and without the ground if it was sent before."""
         old, self._sent_path = self._sent_path, shown.path
         start = 0 if old is None or shown.run != self._sent_run else rows_in_common(old, shown.path)
         picture = picture_of(shown.frame)
@@ -198,9 +199,10 @@ NOT_DRAWN = "not drawn"
 
 
 def picture_of(frame: Frame) -> Frame:
-    """Return the frame with at most MOST_POINTS raw and MOST_POINTS filtered points, selected evenly.
+    """Return the frame with at most MOST_POINTS raw and MOST_POINTS filtered points, selected evenly; the
+    frame itself if it has no more.
 
-    `counts["not drawn"]` is the number of points that were left out.
+    `counts["not drawn"]` is the number of points that were left out, if any.
     """
     raw = evenly_spaced(len(frame.raw), MOST_POINTS)
     filtered = evenly_spaced(len(frame.filtered), MOST_POINTS)

@@ -416,8 +416,14 @@ def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: i
 
 
 def _why_not(frame: Frame, place: Float) -> str:
-    """Return the reason why a map has no tree at a place, shape (2,) [m]: the class of the nearest column,
-    else the number of observations of the nearest unconfirmed tree, or that nothing was detected."""
+    """Return the reason why a map has no tree at a place, as text: the class of the nearest column unless it
+    is a tree, else the number of observations of the nearest tree, or that nothing was detected. Only what is
+    within SAME counts.
+
+    Args:
+        frame: Last scan in that map.
+        place: x, y in the map, shape (2,) [m].
+    """
     if frame.columns is not None:
         near = _nearest(frame.columns.axis[:, :2], place)
         if near >= 0:

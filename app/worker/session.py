@@ -83,8 +83,9 @@ class Session:
 
     @property
     def pace(self) -> Pace:
-        """When the next scan is mapped: immediately (while seeking), at its replay time, on arrival (live),
-        or not."""
+        """When the next scan is mapped: "hurry" immediately, while seeking; "replay" at its time; "live" on
+        arrival, also before the run of a robot is opened; "idle" not at all: paused, finished, failed, or
+        without a run."""
         if self._state == "failed" or (self._run is None and self._robot is None):
             return "idle"
         if self._robot is not None:

@@ -332,8 +332,13 @@ class WorkerProcess:
                 )
 
     async def _pause(self, reason: str) -> None:
-        """Report the end and wait before the next start, longer each time; after several ends, wait for a
-        command."""
+        """Report the end and wait before the next start, 0.2 s to 4 s; after five ends within a minute, wait
+        for `Play` or `Open`. After two ends without a result the playback speed is no longer restored,
+        because it may be the cause.
+
+        Args:
+            reason: How the process ended, for people.
+        """
         what = f"The mapping process ended ({reason})"
         if self._ends_without_result >= _SUSPICIOUS_ENDS and protocol.SetSpeed in self._settings:
             del self._settings[protocol.SetSpeed]

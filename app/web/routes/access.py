@@ -67,7 +67,7 @@ class RequestQueue:
         queue in between.
 
         Raises:
-            TooManyRequestsError: The queue is full.
+            TooManyRequestsError: `most_waiting` other requests wait already.
         """
         if self._waiting >= self._most_waiting:
             raise TooManyRequestsError("too many requests wait", remedy="Try again in some seconds")

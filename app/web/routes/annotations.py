@@ -164,7 +164,8 @@ async def export_table(dashboard: Dash) -> Response:
 
 @router.get("/annotations.geojson")
 async def export_geojson(dashboard: Dash) -> Response:
-    """Return the annotations as a FeatureCollection in the frame of the map, which it declares."""
+    """Return the annotations as a FeatureCollection of points in the frame of the map, which it declares,
+    with class, DBH [cm], author and time; no features without annotations."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
     features = [_feature(row) for row in _rows(dashboard)]

@@ -93,8 +93,8 @@ async def pairs(dashboard: Dash) -> Response:
 
 @router.get("/doubts")
 async def doubts(dashboard: Dash) -> Response:
-    """Return the votes on each tree, the most uncertain first, and the share that a tree needs; no trees
-    before the first map."""
+    """Return the share of votes that a tree needs (`needed`) and the votes on each tree (`trees`, see
+    `doubts_of`), the most uncertain first; no trees before the first map."""
     share = dashboard.parameters.parameters.classification.tree_share
     shown = dashboard.shown
     rows = [] if shown is None else await asyncio.to_thread(doubts_of, shown.frame, share)

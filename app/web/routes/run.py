@@ -274,7 +274,7 @@ def _permitted_path(name: str, settings: Settings) -> str | None:
 
 def _permitted_simulation(uri: str, settings: Settings) -> str | None:
     """Return the address of a simulated run. For a scan of a cloud, its files are replaced by their permitted
-    paths; None if one is not permitted."""
+    paths; None if one is not permitted. Other scenarios are permitted as they are."""
     name, _, query = uri.removeprefix("sim:").partition("?")
     if name != "cloud":
         return uri
