@@ -25,10 +25,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the report.
+    """Write the report to --out, in place of an existing file; return 0.
 
     Raises:
-        StemmapError: The run cannot be read, or there is no Chromium for a PDF.
+        StemmapError: A flag is wrong, the run cannot be read, there is no Chromium for a PDF, or the file
+            cannot be written.
     """
     from app.batch.report import report_page, write_report
 

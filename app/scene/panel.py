@@ -73,7 +73,8 @@ class TunePanel:
         self.show(parameters, preset_name, frozenset())
 
     def show(self, parameters: Parameters, preset_name: str, moving: frozenset[str]) -> None:
-        """Set the sliders, and flag the values that differ from the preset.
+        """Set the sliders and widen them to values beyond their declared ends, flag the values that differ
+        from the preset, and show the number of all that differ. No callback is called.
 
         Args:
             parameters, preset_name: Present values and their preset.
@@ -91,10 +92,17 @@ class TunePanel:
         self._summary.content = _summary(len(changed), preset_name)
 
     def widget(self, name: str) -> viser.GuiSliderHandle[Any]:
-        """Return the slider of a parameter, by its dotted name."""
+        """Return the slider of a parameter, by its dotted name; KeyError for one that is not in MAIN."""
         return self._widgets[name]
 
     def _add_widget(self, gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiSliderHandle[Any]:
+        """Add the slider of a parameter, whose changes by people call `on_change`.
+
+        Args:
+            gui: Panel of viser.
+            spec: Declaration of the parameter.
+            value: Initial value.
+        """
         kind = _kind(spec)
         low, high = _range(spec, value)
         step = kind(spec.step or 1) if kind is int else (spec.step or 1.0) / 10  # digits of the number box
@@ -110,31 +118,36 @@ class TunePanel:
 
 
 def _kind(spec: FieldSpec) -> type[int] | type[float]:
+    """Return the type of a numeric parameter."""
     return int if spec.kind == "int" else float
 
 
 def _range(spec: FieldSpec, value: Value) -> tuple[float, float]:
-    """Return the ends of a slider: those declared, or the value if it is beyond them."""
+    """Return the ends of a slider: those declared (0 and 1 without), or the value if it is beyond them."""
     low, high = spec.shown or (0.0, 1.0)
     kind = _kind(spec)
     return kind(min(low, float(value))), kind(max(high, float(value)))
 
 
 def _label(spec: FieldSpec, changed: bool) -> str:
+    """Return title and unit of a parameter, with a mark if its value differs from the preset."""
     unit = f" [{spec.unit}]" if spec.unit else ""
     return f"{CHANGED if changed else ''}{spec.title}{unit}"
 
 
 def _meant(spec: FieldSpec, value: Value) -> Value:
+    """Return the value of a widget as a parameter: floats are rounded to 9 decimals."""
     # A slider of step 0.01 gives 0.15000000000000002 for 0.15.
     return round(float(value), 9) if spec.kind == "float" else value
 
 
 def _preset_hint() -> str:
+    """Return names and descriptions of all presets as text."""
     return " ".join(f"{name}: {doc}." for name, (doc, _) in PRESETS.items())
 
 
 def _summary(changed: int, preset_name: str) -> str:
+    """Return the number of values that differ from the preset as Markdown."""
     if changed == 0:
         return f"As in *{preset_name}*."
     differ = "value differs" if changed == 1 else "values differ"
@@ -207,7 +220,8 @@ class PanelCommands:
         return frozenset(self._waiting)
 
     def change(self, name: str, value: Value, client: viser.ClientHandle | None) -> None:
-        """Send a value; while the server is busy, only the newest value of each parameter waits.
+        """Send a value; while the server is busy, only the newest value of each parameter waits. A refusal
+        resets the widgets and is shown in the browser of `client`.
 
         Args:
             name: Dotted name of the parameter.
@@ -220,7 +234,8 @@ class PanelCommands:
             self._start(self._send_waiting())
 
     def ask(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
-        """Run another command; a refusal is shown in the browser of `client`."""
+        """Run another command in the background; a refusal is shown in the browser of `client`, if it is
+        known."""
         self._start(self._run_command(command, client))
 
     def stop(self) -> None:
@@ -229,6 +244,7 @@ class PanelCommands:
             task.cancel()
 
     async def _send_waiting(self) -> None:
+        """Send the waiting values, those of one person and browser in one change, until none waits."""
         try:
             while self._waiting:
                 _, origin = next(iter(self._waiting.values()))
@@ -240,6 +256,8 @@ class PanelCommands:
             self._busy = False
 
     async def _run_command(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
+        """Await a command. A StemmapError resets the widgets and is shown in the browser of `client`; other
+        errors are raised."""
         try:
             await command
         except StemmapError as error:
@@ -248,6 +266,7 @@ class PanelCommands:
                 client.add_notification("Not changed", str(error), color="orange", auto_close_seconds=8.0)
 
     def _start(self, work: Awaitable[None]) -> None:
+        """Run a coroutine as a task that `stop` cancels."""
         task: asyncio.Task[None] = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

@@ -59,7 +59,8 @@ async def ask(
     question: dict[str, Any], *, patience_s: float = PATIENCE_S, command: Sequence[str] = COMMAND
 ) -> dict[str, Any]:
     """Return the answer of a child process to a question. At most two questions of an event loop are answered
-    at the same time; further ones wait, without a time limit.
+    at the same time; further ones wait, without a time limit. A path that does not exist is refused without a
+    process.
 
     Args:
         question: `ask` is a key of `QUESTIONS`, `path` the source; further values depend on the question.

@@ -20,7 +20,8 @@ class HttpProtocol(H11Protocol):
     _header_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Start the time limit, or close the connection."""
+        """Start the time limit, or abort the connection if its address has MOST_WAITING others without a
+        request."""
         super().connection_made(transport)
         waiting = (c for c in self.connections if isinstance(c, HttpProtocol) and c._header_timer is not None)
         host = self.client[0] if self.client else ""
@@ -43,9 +44,11 @@ class HttpProtocol(H11Protocol):
             self._limit_header()
 
     def _limit_header(self) -> None:
+        """Close the connection after HEADER_S, unless `_unlimit_header` is called before."""
         self._header_timer = self.loop.call_later(HEADER_S, self.transport.close)
 
     def _unlimit_header(self) -> None:
+        """End the time limit, if it runs."""
         if self._header_timer is not None:
             self._header_timer.cancel()
             self._header_timer = None

@@ -55,7 +55,7 @@ class Numbers:
     group: str
 
     def __call__(self, value: float | None, digits: int = 1) -> str:
-        """Return a number with `digits` decimals; a dash if it is unknown."""
+        """Return a number with `digits` decimals; a dash for None, NaN and infinity."""
         if value is None or not math.isfinite(value):
             return "\N{EN DASH}"
         text = f"{value:,.{digits}f}"
@@ -65,12 +65,12 @@ class Numbers:
 def report_page(
     folder: FilePath, *, language: str = "en", plots: Sequence[Plot] = (), parameters: Stand | None = None
 ) -> str:
-    """Return the report of a run as the text of one HTML file without scripts or links.
+    """Return the report of a run as the text of one HTML file without scripts or links. Nothing is written.
 
     Args:
         folder: Folder of the run.
         language: One of LANGUAGES.
-        plots: Plots in the frame of the map.
+        plots: Plots in the frame of the map; without any, only the whole observed area is reported.
         parameters: Parameters of the stand figures; None for the defaults.
 
     Raises:
@@ -115,13 +115,20 @@ def report_page(
 
 
 def _digits(estimate: Estimate) -> int:
-    """Return the number of decimals that the size of a figure deserves."""
+    """Return the number of decimals that the size of a figure deserves: 0 from 100 on and where not finite, 1
+    from 10 on, else 2."""
     size = abs(estimate.value)
     return 0 if not math.isfinite(size) or size >= 100 else 1 if size >= 10 else 2
 
 
 def tree_rows(run: ExportedRun, number: Numbers) -> list[list[str]]:
-    """Return the trees as cells: number, two coordinates, diameter, its sigma, observations, coverage."""
+    """Return the trees as cells: number, two coordinates [m], diameter and its sigma [cm], observations,
+    coverage [deg]; a dash for unknown values.
+
+    Args:
+        run: The run, in the coordinates of its files.
+        number: Format of the language.
+    """
     c = run.columns
     return [
         [
@@ -138,7 +145,7 @@ def tree_rows(run: ExportedRun, number: Numbers) -> list[list[str]]:
 
 
 def _step(length: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten up to a length."""
+    """Return the largest of 1, 2, 5 times a power of ten up to a length above 0."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(k * power for k in (1.0, 2.0, 5.0) if k * power <= length * (1 + 1e-9))
 
@@ -148,9 +155,17 @@ def stand_map(
 ) -> dict[str, Any]:
     """Return what the template draws on the map: sizes in millimetres of a page, north (or y) upwards.
 
+    Args:
+        run: The run, in the coordinates of its files.
+        whole: Stand figures of the whole observed area.
+        plots: Plots in the frame of the map.
+        texts: Texts of the language.
+        number: Format of the language.
+
     Returns:
-        width, height; `seen` and `path` (SVG path data), plots (name, path data, place of the name), trees
-        (x, y, radius, number or ""), the scale bar (length, text), and the factor 1 : scale.
+        width, height; `seen` and `path` (SVG path data; `path` is "" for a whole cloud), plots (name, path
+            data, place of the name), trees (x, y, radius, number or "" if there are more than 400, whether
+            the diameter is known), the scale bar (length, text), and the factor 1 : scale.
     """
     import shapely
 
@@ -213,8 +228,14 @@ def stand_map(
 
 
 def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dict[str, Any]:
-    """Return what the template draws of the diameter classes: bars as x, y, width, height, half error, label
-    [mm], marks of the axis, and its title."""
+    """Return what the template draws of the diameter classes: bars as x, y, width, height, ends of the error,
+    label [mm], marks of the axis, and its title. Without classes there are no bars.
+
+    Args:
+        whole: Stand figures of the whole observed area.
+        texts: Texts of the language.
+        number: Format of the language.
+    """
     classes = whole.figures["all"].classes
     width, height = 170.0, 60.0
     top = max((c.n_ha.value + c.n_ha.se for c in classes), default=0.0)
@@ -248,15 +269,17 @@ def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dic
 
 
 def write_report(page: str, file: FilePath) -> None:
-    """Write a report as HTML, or as PDF by a Chromium of this machine.
+    """Write a report as HTML, or as PDF by a Chromium of this machine, in place of an existing file. A PDF
+    takes at most two minutes.
 
     Args:
         page: Its HTML.
-        file: File .html or .pdf.
+        file: File .html or .pdf; its folder must exist.
 
     Raises:
-        StemmapError: The suffix is another one, there is no Chromium, or it failed.
-        OSError: The file cannot be written.
+        StemmapError: The suffix is another one, an HTML file cannot be written, there is no Chromium, or it
+            failed.
+        OSError: A PDF cannot be written.
     """
     suffix = file.suffix.lower()
     if suffix not in SUFFIXES:
@@ -289,7 +312,8 @@ def write_report(page: str, file: FilePath) -> None:
 
 
 def find_browser() -> str:
-    """Return the path of a Chromium or Chrome: the environment variable CHROMIUM, else one on the PATH.
+    """Return the path of a Chromium or Chrome: the environment variable CHROMIUM, a path or a name on the
+    PATH, else the first of `_BROWSERS` on the PATH. It is not started.
 
     Raises:
         StemmapError: There is none.
