@@ -202,7 +202,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
 
 
 def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the topics and the mounting that the flags give, for run.json; None if there are none."""
+    """Return the topics and the mounting that the flags give, for run.json, and that --as-live was given;
+    None if there are none of these."""
     from app.sources.request import request_of_options
 
     kept = request_of_options(arguments.source, flags.source_options(arguments)).kept_choices()

@@ -70,7 +70,8 @@ class Settings:
 
     @property
     def uploads(self) -> Path | None:
-        """Folder of uploaded recordings, or None."""
+        """Folder of uploaded recordings, which need not exist: that of the recordings, else one in the data
+        folder; None without both."""
         return self.recordings or (self.folder and self.folder / "recordings")
 
     @property

@@ -61,7 +61,7 @@ class Frames:
         return self._pose.get(name)
 
     def how(self, name: str) -> str:
-        """Return how the pose of a map was found, or why it is unknown, as text."""
+        """Return how the pose of a map was found, or why it is unknown, as text; also for unknown names."""
         why = ": too few trees" if name in self._few else ""
         return self._how.get(name, f"its frame is not known yet{why}")
 

@@ -46,7 +46,7 @@ class ArrivalTimes:
         self._last_ns = 0
 
     def now_ns(self) -> int:
-        """Return the present time [ns since 1970]; never less than an earlier result."""
+        """Return the present time [ns since 1970]; never less than an earlier result of this method."""
         return self._wall_ns + time.monotonic_ns() - self._start_ns
 
     def next_ns(self) -> int:

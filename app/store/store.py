@@ -644,7 +644,8 @@ def _content(row: Row[Any]) -> Content:
 
 
 def _key(source: str) -> str:
-    """Return the lookup key of a source; PostgreSQL index entries are limited to 2,700 bytes."""
+    """Return the lookup key of a source: itself, or the text "sha256" and its digest if it is longer than 600
+    characters, because PostgreSQL index entries are limited to 2,700 bytes."""
     return source if len(source) <= _LONGEST_KEY else f"sha256 {sha256(source.encode()).hexdigest()}"
 
 

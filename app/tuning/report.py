@@ -441,7 +441,7 @@ def page(comparison: Comparison) -> str:
 
 
 def _best(rows: list[Row]) -> dict[str, float | None]:
-    """Return the best value of each score; None if fewer than two rows have it."""
+    """Return the best value of each score; None with fewer than two rows, or if no row has it."""
     best: dict[str, float | None] = {}
     for name, _, _, _ in SHOWN:
         known = [value for row in rows if not row.error and (value := row.figures[name]) is not None]

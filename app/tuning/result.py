@@ -347,8 +347,9 @@ def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str,
 
 
 def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float | None]]:
-    """Return number and held-out score of each trial that was the best when it was made; trials without a
-    held-out score or that the goal does not accept are skipped."""
+    """Return number and held-out score of each trial that was better than all earlier ones with a held-out
+    score. Trials without one, or that the goal does not accept, are skipped; the score is None if it is
+    unknown."""
     held, best = [], float("inf")
     for trial in trials:
         if trial.held_out and trial.loss is not None and trial.loss < best and goal.is_kept(trial.loss):

@@ -502,8 +502,7 @@ class ReplayClock:
 
     @property
     def rate_hz(self) -> float:
-        """Scans mapped per second of computing time, over the last `RATE_SCANS` scans; 0 with fewer than
-        two."""
+        """Scans mapped per second of real time, over the last `RATE_SCANS` scans; 0 with fewer than two."""
         if len(self._mapped) < 2:
             return 0.0
         spent = self._mapped[-1][1] - self._mapped[0][1]

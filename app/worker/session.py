@@ -309,7 +309,7 @@ class Session:
 
     @property
     def is_remapping(self) -> bool:
-        """Whether `remap` can continue now."""
+        """Whether a rerun is in progress and can continue now, that is, no scan is sought."""
         return self._run is not None and self._run.remapped is not None and not self._target.sought
 
     def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
@@ -383,7 +383,7 @@ class Session:
         return robot is not None
 
     def _is_live(self) -> bool:
-        """Return whether the run is live and reports that seeking is not possible."""
+        """Return whether the run is live; if so, add a warning that it cannot seek."""
         if self._robot is not None:
             self._warn(["a live run cannot step or seek: open its recording"])
         return self._robot is not None

@@ -147,8 +147,8 @@ async def import_table(body: _Import, dashboard: Dash) -> Response:
 
 @router.put("/annotations/against")
 async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
-    """Choose whether the map is scored against the ground truth of the source, the annotations or both;
-    neither is changed. Return the annotations with this choice."""
+    """Choose whether the map is scored against the ground truth of the source, the annotations or both, for
+    all browsers; neither is changed. Return the annotations with this choice."""
     dashboard.annotation_editor.score_against(body.against)
     return json_reply(dashboard.annotation_editor.as_plain())
 

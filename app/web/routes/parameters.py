@@ -89,8 +89,8 @@ async def use_preset(body: _PresetName, dashboard: Dash) -> Response:
 
 @router.put("/parameters/reach")
 async def reach(body: _Reach, dashboard: Dash) -> Response:
-    """Choose whether changes apply to the whole run or from the current scan onwards; return the parameters
-    as `GET /api/parameters` does."""
+    """PUT /api/parameters/reach: choose whether changes apply to the whole run, which is then mapped again at
+    once, or from the current scan onwards; return the parameters as `GET /api/parameters` does."""
     await dashboard.reach(whole=body.whole)
     return await read(dashboard)
 

@@ -54,8 +54,9 @@ async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
 
 @router.get("/compare", dependencies=[ViewerTurn])
 async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b: _KeyInQuery) -> Response:
-    """Return two runs as JSON, "a" and "b", with the map of b in the frame of a; 404 if one does not exist.
-    The keys name runs of the store or output folders."""
+    """Return two runs as JSON, "a" and "b", with the map of b in the frame of a and the tables of
+    `app.batch.compare.compare`; 404 if one does not exist, 409 if a folder cannot be read. The keys name runs
+    of the store or output folders ("folder:NAME")."""
     first, second = await _whole(a, settings, dashboard), await _whole(b, settings, dashboard)
     same = first["source"] == second["source"] and bool(first["source"])
     return json_reply({"a": first, "b": second, **await compare(first, second, same_source=same)})

@@ -129,7 +129,8 @@ async def start_learning(request: Request, dashboard: Dash) -> Response:
 
 @router.delete("/learning")
 async def stop_learning(request: Request) -> Response:
-    """Stop the training, or discard its result, and return the progress; the decision trees in force stay."""
+    """Stop the training, or discard its result, and return the progress; the decision trees in force stay,
+    and so does the file of trained ones."""
     await _learning(request).forget()
     return json_reply(_learning(request).as_plain())
 
