@@ -146,7 +146,8 @@ def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -
 
 
 def _check_command(words: list[str]) -> None:
-    """Report a mistyped command, such as `stemmap mpa run.mcap`, as such and not as a missing file.
+    """Report a mistyped command, such as `stemmap mpa run.mcap`, as such and not as a missing file. Words
+    with a colon are addresses and not checked.
 
     Args:
         words: Words of the command line after `main` has inserted `serve`.

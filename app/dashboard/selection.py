@@ -255,7 +255,8 @@ class Selector:
             self._task.cancel()
 
     async def _if_known(self, scan: int, cluster: int) -> None:
-        """Select a cluster; if it does not exist, broadcast the message "missing"."""
+        """Select a cluster; if it does not exist, broadcast the message "missing". WorkerBusyError is raised
+        if the worker does not answer in time."""
         try:
             await self.cluster(scan, cluster)
         except NoStoryError as error:
