@@ -29,6 +29,7 @@ COMMANDS = (
     "info",
     "simulate",
     "evaluate",
+    "compare",
     "stand",
     "georeference",
     "export",

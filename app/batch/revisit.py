@@ -1,0 +1,371 @@
+"""Comparison of two visits of a stand, each a finished run or a table of trees."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import shapely
+
+from app.batch.georeference import MapFrame, read_map_frame
+from app.batch.run_folder import read_ground_area, read_run, read_seen_area
+from app.common.text import count, version
+from pipeline.config import Parameters
+from pipeline.config.stages import Stand
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.io.atomic_files import write_beside
+from pipeline.io.ground_truth import read_truth_trees
+from pipeline.io.result_files import csv_text
+from pipeline.stand.plots import within_reach
+from pipeline.stand.revisit import Comparison, VisitTrees, align_visits, compare_visits, with_known_sigma
+from pipeline.stand.seen_area import SeenArea
+from pipeline.types.records import Bool
+
+TABLE_SIGMA = 0.05  # m, of a position in a table
+BORDER = 0.5  # m; a table of trees covers their convex hull with this border
+COLUMNS = (
+    "status",
+    "tree_a",
+    "tree_b",
+    "x_m",
+    "y_m",
+    "shift_m",
+    "dbh_a_cm",
+    "dbh_b_cm",
+    "growth_cm",
+    "sigma_growth_cm",
+    "significant",
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Visit:
+    """A visit: its trees, and where it looked.
+
+    Attributes:
+        name: For messages.
+        trees: Its trees.
+        seen: Observed area of a run; None for a table.
+        frame: Reference system of its coordinates.
+        numbered: Whether its trees have numbers of their own.
+    """
+
+    name: str
+    trees: VisitTrees
+    seen: SeenArea | None
+    frame: MapFrame
+
+    def observed(self, points: Float) -> Bool:
+        """Return whether the visit looked at each position, shape (N, 2)."""
+        if self.seen is not None:
+            return self.seen.rows(points) >= 0
+        hull = shapely.MultiPoint(self.trees.position).convex_hull.buffer(BORDER)
+        inside: Bool = shapely.contains_xy(hull, *np.reshape(points, (-1, 2)).T)
+        return inside
+
+
+def read_visit(path: FilePath, *, dbh_unit: str | None = None) -> Visit:
+    """Return the visit of a run folder or of a table of trees (CSV).
+
+    Args:
+        path: The folder or the table.
+        dbh_unit: Unit of a diameter column without a unit.
+
+    Raises:
+        StemmapError: It cannot be read or has no trees.
+    """
+    if path.is_dir():
+        trees = read_run(path).trees
+        recorded = read_seen_area(path)
+        seen = read_ground_area(path) if recorded is None else within_reach(recorded, Stand())
+        sigma = np.sqrt(0.5 * np.trace(trees.covariance, axis1=1, axis2=2))
+        found = VisitTrees(trees.number, trees.position, sigma, trees.dbh, trees.dbh_sigma)
+        visit = Visit(str(path), found, seen, read_map_frame(path))
+    else:
+        table = read_truth_trees(path, dbh_unit=dbh_unit)
+        keep = np.array([kind == "tree" for kind in table.kind], np.bool_)
+        n = int(np.count_nonzero(keep))
+        numbers = _numbers(path, keep)
+        position = np.stack([table.x, table.y], axis=1)[keep]
+        unknown = np.full(n, np.nan)
+        found = VisitTrees(numbers, position, np.full(n, TABLE_SIGMA), np.asarray(table.dbh)[keep], unknown)
+        visit = Visit(str(path), found, None, MapFrame())
+    if not len(visit.trees.number):
+        raise StemmapError("there are no trees", where=str(path))
+    _check_unit(visit)
+    return visit
+
+
+def _numbers(path: FilePath, keep: Bool) -> np.ndarray:
+    """Return the column `tree` of a table if all are different whole numbers, else 1, 2, ..."""
+    import csv
+
+    with path.open(encoding="utf-8-sig", newline="") as text:
+        rows = [row for row in csv.DictReader(text) if any(row.values())]
+    try:
+        numbers = np.array([int(row["tree"]) for row in rows], np.int64)
+    except (KeyError, ValueError, TypeError):
+        numbers = np.zeros(0, np.int64)
+    if len(numbers) != len(keep) or len(np.unique(numbers)) < len(numbers):
+        numbers = np.arange(1, len(keep) + 1)
+    return numbers[keep]
+
+
+def _check_unit(visit: Visit) -> None:
+    known = visit.trees.dbh[np.isfinite(visit.trees.dbh)]
+    if len(known) and float(np.median(known)) > 3.0:
+        raise StemmapError(
+            f"the median diameter is {np.median(known):.1f} m", where=visit.name, remedy="Check its unit"
+        )
+    if len(known) and float(np.median(known)) < 0.005:
+        raise StemmapError(
+            f"the median diameter is {1000 * np.median(known):.2f} mm",
+            where=visit.name,
+            remedy="Check its unit: dbh_cm is in centimetres, dbh_m in metres",
+        )
+
+
+def compare(
+    a: Visit, b: Visit, *, same_frame: bool = False, reach: float = 1.0, dbh_sigma: float = 0.01
+) -> Comparison:
+    """Align two visits and compare their trees.
+
+    Args:
+        a, b: The earlier and the later visit.
+        same_frame: Whether their coordinates are taken as equal, without any alignment.
+        reach: Largest distance of the two positions of a tree [m].
+        dbh_sigma: Standard deviation of a diameter that has none [m].
+
+    Raises:
+        StemmapError: The stems do not agree with certainty.
+    """
+    first, second = (with_known_sigma(visit.trees, dbh_sigma) for visit in (a, b))
+    pose, stems = (Pose2(), 0) if same_frame else align_visits(first, second, Parameters().relocalisation)
+    return compare_visits(first, second, pose, reach=reach, refine=not same_frame, stems=stems)
+
+
+def rows_of(a: Visit, b: Visit, found: Comparison) -> list[dict[str, Any]]:
+    """Return one row of COLUMNS per tree, with None for unknown values; positions are in the frame of a.
+
+    The status is `same`, `moved`, `missing` (only in a, at a place that b observed), `new` (only in b, at a
+    place that a observed), or `not seen in a` and `not seen in b` where the other visit did not look.
+    """
+    place_b = found.T_a_b.apply(b.trees.position)
+    seen_by_a = a.observed(place_b)
+    seen_by_b = b.observed(found.T_a_b.inverse().apply(a.trees.position))
+    rows, pair = [], 0
+    for k, row in enumerate(found.b_of.tolist()):
+        x, y = a.trees.position[k]
+        if row < 0:
+            status = "missing" if seen_by_b[k] else "not seen in b"
+            rows.append(_row(status, a.trees.number[k], None, x, y, dbh_a=a.trees.dbh[k]))
+            continue
+        known = math.isfinite(found.growth[pair])
+        rows.append(
+            _row(
+                "moved" if found.moved[pair] else "same",
+                a.trees.number[k],
+                b.trees.number[row],
+                x,
+                y,
+                shift=found.shift[pair],
+                dbh_a=a.trees.dbh[k],
+                dbh_b=b.trees.dbh[row],
+                growth=found.growth[pair],
+                sigma=found.growth_sigma[pair],
+                significant=bool(found.significant[pair]) if known else None,
+            )
+        )
+        pair += 1
+    for row in np.setdiff1d(np.arange(len(b.trees.number)), found.b_of).tolist():
+        status = "new" if seen_by_a[row] else "not seen in a"
+        rows.append(_row(status, None, b.trees.number[row], *place_b[row], dbh_b=b.trees.dbh[row]))
+    return rows
+
+
+def _row(
+    status: str,
+    tree_a: Any,  # noqa: ANN401 - a numpy integer or None
+    tree_b: Any,  # noqa: ANN401
+    x: float,
+    y: float,
+    *,
+    shift: float = math.nan,
+    dbh_a: float = math.nan,
+    dbh_b: float = math.nan,
+    growth: float = math.nan,
+    sigma: float = math.nan,
+    significant: bool | None = None,
+) -> dict[str, Any]:
+    def number(value: float, digits: int) -> float | None:
+        return round(float(value), digits) if math.isfinite(value) else None
+
+    values = (
+        status,
+        None if tree_a is None else int(tree_a),
+        None if tree_b is None else int(tree_b),
+        number(x, 3),
+        number(y, 3),
+        number(shift, 3),
+        *(number(100.0 * v, 2) for v in (dbh_a, dbh_b, growth, sigma)),
+        significant,
+    )
+    return dict(zip(COLUMNS, values, strict=True))
+
+
+def comparison_record(a: Visit, b: Visit, found: Comparison) -> dict[str, Any]:
+    """Return the figures of a comparison as JSON values."""
+    rows = rows_of(a, b, found)
+    growth = found.growth[np.isfinite(found.growth)]
+    weight = 1.0 / np.square(found.growth_sigma[np.isfinite(found.growth)])
+    known, centre = len(growth) > 0, b.trees.position.mean(axis=0, keepdims=True)
+    return {
+        "stemmap": version(),
+        "a": a.name,
+        "b": b.name,
+        "alignment": {
+            "x_m": found.T_a_b.x,
+            "y_m": found.T_a_b.y,
+            "turn_deg": math.degrees(found.T_a_b.yaw),
+            "shift_of_centre_m": (found.T_a_b.apply(centre) - centre)[0].tolist(),
+            "stems": found.stems,
+        },
+        "trees_a": len(a.trees.number),
+        "trees_b": len(b.trees.number),
+        "counts": {s: sum(1 for r in rows if r["status"] == s) for s in _STATUS},
+        "pairs": len(found.shift),
+        "shift_rms_m": float(np.sqrt(np.mean(np.square(found.shift)))) if len(found.shift) else None,
+        "growth_mean_cm": 100.0 * float(growth.mean()) if known else None,
+        "growth_weighted_cm": 100.0 * float(weight @ growth / weight.sum()) if known else None,
+        "growth_se_cm": 100.0 * float(growth.std(ddof=1) / math.sqrt(len(growth)))
+        if len(growth) > 1
+        else None,
+        "dbh_rms_difference_cm": 100.0 * float(np.sqrt(np.mean(np.square(growth)))) if known else None,
+        "with_dbh": len(growth),
+        "significant": int(np.count_nonzero(found.significant)),
+    }
+
+
+def _standard_error(values: Float) -> float:
+    return float(values.std(ddof=1) / math.sqrt(len(values)))
+
+
+_STATUS = ("same", "moved", "missing", "new", "not seen in a", "not seen in b")
+
+
+def comparison_lines(record: dict[str, Any]) -> list[str]:
+    """Return the figures of `comparison_record` as lines for people."""
+    pose, counts = record["alignment"], record["counts"]
+    east, north = pose["shift_of_centre_m"]
+    how = f"aligned by {count(pose['stems'], 'stem')}" if pose["stems"] else "coordinates taken as equal"
+    lines = [
+        f"{record['pairs']} trees in both of {record['trees_a']} and {record['trees_b']}; {how}: shift "
+        f"{east:.2f}, {north:.2f} m, turn {pose['turn_deg']:.2f} degrees",
+        ", ".join(f"{n} {status}" for status, n in counts.items() if n),
+    ]
+    if record["shift_rms_m"] is not None:
+        lines.append(f"positions differ by {100 * record['shift_rms_m']:.1f} cm (RMS)")
+    if record["growth_mean_cm"] is not None:
+        se = record["growth_se_cm"]
+        lines.append(
+            f"diameter, b minus a: mean {record['growth_mean_cm']:+.2f} cm"
+            + (f" +- {se:.2f}" if se is not None else "")
+            + f", RMS {record['dbh_rms_difference_cm']:.2f} cm ({count(record['with_dbh'], 'tree')}), "
+            f"significant for {record['significant']}"
+        )
+    return lines
+
+
+def write_comparison(a: Visit, b: Visit, found: Comparison, folder: FilePath) -> None:
+    """Write comparison.csv, comparison.json, comparison.svg (a map) and comparison.geojson to a folder, which
+    is created if necessary.
+
+    Raises:
+        OSError: The folder cannot be written.
+    """
+    rows = rows_of(a, b, found)
+    cells = [
+        ["" if v is None else str(v).lower() if isinstance(v, bool) else str(v) for v in r.values()]
+        for r in rows
+    ]
+    texts = {
+        "comparison.csv": csv_text(COLUMNS, cells),
+        "comparison.json": json.dumps(comparison_record(a, b, found), indent=1, allow_nan=False) + "\n",
+        "comparison.geojson": _geojson(a, rows),
+        "comparison.svg": comparison_map(rows),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        with write_beside(folder / name) as partial:
+            partial.write_text(text, encoding="utf-8", newline="")
+
+
+def _geojson(a: Visit, rows: list[dict[str, Any]]) -> str:
+    place = np.array([[row["x_m"], row["y_m"]] for row in rows], np.float64).reshape(-1, 2)
+    collection: dict[str, Any] = {"type": "FeatureCollection"}
+    if a.frame.crs:
+        import pyproj
+
+        transformer = pyproj.Transformer.from_crs(a.frame.crs, 4326, always_xy=True)
+        place = np.round(np.stack(transformer.transform(*a.frame.to_crs(place).T), axis=1), 8)
+    else:
+        collection["coordinateFrame"] = {"type": "local", "unit": "m", "origin": "that of the first visit"}
+    collection["features"] = [
+        {"type": "Feature", "geometry": {"type": "Point", "coordinates": point}, "properties": row}
+        for point, row in zip(place.tolist(), rows, strict=True)
+    ]
+    return json.dumps(collection, indent=1, allow_nan=False) + "\n"
+
+
+#: Symbol of each status on the map: fill, line, text of the legend.
+_SYMBOLS = {
+    "same": ("#5f8f64", "#1e5b24"),
+    "moved": ("#e0b000", "#6b5400"),
+    "missing": ("none", "#c02020"),
+    "new": ("#2060c0", "#103060"),
+    "not seen in a": ("none", "#999"),
+    "not seen in b": ("none", "#999"),
+}
+
+
+def comparison_map(rows: list[dict[str, Any]]) -> str:
+    """Return a map of the trees by their status as SVG, with a scale bar and a legend; significant growth is
+    a filled circle with a ring."""
+    place = np.array([[row["x_m"], row["y_m"]] for row in rows], np.float64).reshape(-1, 2)
+    low, high = place.min(axis=0) - 2.0, place.max(axis=0) + 2.0
+    scale = 180.0 / max(float((high - low).max()), 1.0)
+    width, height = (high - low) * scale
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width + 45:.1f} {max(height, 45) + 10:.1f}" '
+        f'style="font:3px sans-serif"><rect width="{width:.1f}" height="{height:.1f}" fill="#fff" '
+        f'stroke="#555" stroke-width=".3"/>'
+    ]
+    for row, (x, y) in zip(rows, (place - low) * scale, strict=True):
+        fill, line = _SYMBOLS[row["status"]]
+        at = f'cx="{x:.2f}" cy="{height - y:.2f}"'
+        parts.append(f'<circle {at} r="1.3" fill="{fill}" stroke="{line}" stroke-width=".4"/>')
+        if row["significant"]:
+            parts.append(f'<circle {at} r="2.1" fill="none" stroke="{line}" stroke-width=".3"/>')
+        number = row["tree_a"] if row["tree_a"] is not None else row["tree_b"]
+        parts.append(
+            f'<text x="{x + 2.4:.2f}" y="{height - y + 1:.2f}" style="font-size:2.2px">{number}</text>'
+        )
+    for k, (status, (fill, line)) in enumerate(_SYMBOLS.items()):
+        y = 5 + 6 * k
+        n = sum(1 for row in rows if row["status"] == status)
+        parts.append(
+            f'<circle cx="{width + 4:.1f}" cy="{y}" r="1.3" fill="{fill}" stroke="{line}" stroke-width=".4"/>'
+            f'<text x="{width + 7:.1f}" y="{y + 1}">{status} ({n})</text>'
+        )
+    parts.append(
+        f'<circle cx="{width + 4:.1f}" cy="41" r="2.1" fill="none" stroke="#333" stroke-width=".3"/>'
+        f'<text x="{width + 7:.1f}" y="42">significant growth</text>'
+        f'<path d="M0 {height + 2:.1f} v2 h{5 * scale:.2f} v-2" fill="none" stroke="#111" stroke-width=".4"/>'
+        f'<text x="{5 * scale + 2:.1f}" y="{height + 5:.1f}">5 m</text></svg>\n'
+    )
+    return "".join(parts)
