@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,7 @@ STEM_HEIGHT = 2.0  # [m], drawn where no height was measured
 # Width of a label as a share of its distance from a camera BEHIND metres behind the robot: a text keeps its
 # size on the screen.
 BEHIND = 6.0  # [m]
-NUMBER_WIDTH, WORDS_WIDTH = 0.05, 0.11
+TREE_WIDTH, CLUSTER_WIDTH = 0.09, 0.11
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +85,16 @@ class LabelNodes:
         node.text, node.position, node.visible = label.text, label.place, True
 
 
+Place = tuple[float, float]
+
+
 def apart(
-    places: NDArray[np.float64], order: NDArray[np.int64], robot: NDArray[np.float64], width: float, most: int
+    places: NDArray[np.float64],
+    order: NDArray[np.int64],
+    robot: NDArray[np.float64],
+    width: float,
+    most: int,
+    taken: Sequence[Place] = (),
 ) -> list[int]:
     """Return rows of places whose labels do not overlap, in order of preference, at most `most`.
 
@@ -96,18 +104,24 @@ def apart(
         robot: Position of the robot, shape (2,) [m].
         width: Width of a label as a share of its distance.
         most: Largest number of labels, at least 1.
+        taken: Places of other labels.
     """
     kept: list[int] = []
+    used: list[Place] = list(taken)
     for row in order.tolist():
         room = width * (BEHIND + float(np.hypot(*(places[row] - robot))))
-        if all(math.dist(places[row], places[other]) >= room for other in kept):
+        place = (float(places[row, 0]), float(places[row, 1]))
+        if all(math.dist(place, other) >= room for other in used):
             kept.append(row)
+            used.append(place)
             if len(kept) == most:
                 break
     return kept
 
 
-def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Label]:
+def cluster_labels(
+    frame: Frame, numbers: np.ndarray, label_by: str, taken: Sequence[Place] = ()
+) -> list[Label]:
     """Return labels for the clusters of a scan without overlaps: trees first, then the nearest, at most
     MOST_LABELS. Clusters without a text, such as those without a circle by "DBH", have none; [] by "none".
 
@@ -115,6 +129,7 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
         frame: Results of the scan.
         numbers: Persistent number of each cluster, shape (K,).
         label_by: One of colours.LABEL_BY.
+        taken: Places of the labels of trees.
     """
     if label_by == "none":
         return []
@@ -128,7 +143,7 @@ def cluster_labels(frame: Frame, numbers: np.ndarray, label_by: str) -> list[Lab
     robot = np.array([pose.x, pose.y])
     return [
         Label(int(numbers[k]), texts[k], (float(places[k, 0]), float(places[k, 1]), float(tops[k])))
-        for k in apart(places, named, robot, WORDS_WIDTH, MOST_LABELS)
+        for k in apart(places, named, robot, CLUSTER_WIDTH, MOST_LABELS, taken)
     ]
 
 
@@ -148,7 +163,7 @@ def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
         radius = float(frame.clusters.radius[k])
         return f"{200 * radius:.0f} cm" if np.isfinite(radius) else ""
     eccentricity = float(frame.clusters.eccentricity[k])
-    return verdict if np.isnan(eccentricity) else f"e {short(eccentricity)} {verdict}"
+    return verdict if np.isnan(eccentricity) else f"λ1/λ2 {short(eccentricity)}"
 
 
 def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from app.common.arrays import first_difference
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
-from app.scene.labels import NUMBER_WIDTH, Label, LabelNodes, apart
+from app.scene.labels import TREE_WIDTH, Label, LabelNodes, Place, apart
 from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
 from pipeline.types.records import Frame, Trees, TruthTrees
@@ -21,7 +21,7 @@ Ring = tuple[float, float, float] | None
 
 TREE_HEIGHT = 2.2  # height of a drawn trunk [m]; the map has no heights of trees
 UNKNOWN_RADIUS = 0.08  # radius of a drawn trunk whose diameter is unknown [m]
-NUMBERS = 20  # trees nearest to the robot that are labelled with their number
+NUMBERS = 20  # trees nearest to the robot that are labelled with their number and DBH
 
 
 class MapNodes:
@@ -30,6 +30,9 @@ class MapNodes:
     Args:
         scene: Scene of viser to which the nodes are added.
         on_tree: Called in the thread of viser with the number of a clicked tree.
+
+    Attributes:
+        labelled: Places of the labels (x, y) [m].
     """
 
     def __init__(self, scene: viser.SceneApi, on_tree: Callable[[int], None]) -> None:
@@ -41,6 +44,7 @@ class MapNodes:
         self._labels = LabelNodes(scene, "/world/numbers", 1.0)
         self._shown: NDArray[np.float64] = np.zeros((0, 5))
         self._numbers: list[int] = []
+        self.labelled: list[Place] = []
 
         @self._trees.node.on_click
         async def _(event: viser.SceneNodePointerEvent[Any]) -> None:
@@ -80,9 +84,11 @@ class MapNodes:
         pose = frame.estimate.T_map_base
         foot = self.ground.heights(trees.position, frame.base_z)
         self._show_mark(trees, selected, ring, frame.base_z)
-        self._labels.show(
-            tree_labels(trees, np.array([pose.x, pose.y]), selected, foot) if view.layers["trees"] else []
-        )
+        robot = np.array([pose.x, pose.y])
+        named = view.layers["trees"] and view.layers["labels"]
+        labels = tree_labels(trees, robot, selected, foot) if named else []
+        self._labels.show(labels)
+        self.labelled = [label.place[:2] for label in labels]
 
     def show_truth(self, trees: TruthTrees | None) -> None:
         """Show rings at the objects of the ground truth, on the known ground; None removes them."""
@@ -169,22 +175,21 @@ def tree_labels(
                 round(float(foot[row]), 1) + TREE_HEIGHT + 0.15,
             ),
         )
-        for row in apart(trees.position, order, robot, NUMBER_WIDTH, NUMBERS)
+        for row in apart(trees.position, order, robot, TREE_WIDTH, NUMBERS)
     ]
 
 
 def _tree_text(trees: Trees, row: int, selected: bool) -> str:
-    """Return the number of a tree; for the selected one with its DBH.
+    """Return the number of a tree; with its DBH where it was measured.
 
     Args:
         trees: Trees of the map.
         row: Row of the tree.
         selected: Whether it is selected.
     """
-    number = int(trees.number[row])
+    number, dbh = int(trees.number[row]), float(trees.dbh[row])
     if not selected:
-        return f"{number}"
-    dbh = float(trees.dbh[row])
+        return f"{number}: {100 * dbh:.0f} cm" if np.isfinite(dbh) else f"{number}"
     return (
         f"tree {number}, DBH {100 * dbh:.1f} cm" if np.isfinite(dbh) else f"tree {number}, DBH not measured"
     )
@@ -394,7 +399,7 @@ class MapCloud:
         for number in range(first // BLOCK, -(-len(points) // BLOCK)):
             if number == len(self._blocks):
                 name = f"/world/gathered/{number}"
-                self._blocks.append(CloudNode(self._scene, name, 0.05, precision="float32"))
+                self._blocks.append(CloudNode(self._scene, name, 0.05))
             part = points[number * BLOCK : (number + 1) * BLOCK]
             self._blocks[number].show(part, colours.ramp(part[:, 2], LOW, HIGH))
 

@@ -1,11 +1,13 @@
 """Building blocks of the scene: meshes, batches of meshes, point clouds, lines, and the ground.
 
-Each block is sent to the browsers only when it changed.
+Each block is sent to the browsers only when it changed. All coordinates are those of the map and part of the
+content of a node: viser's client draws a new pose of a node one picture before new content, so a scan whose
+points move with a pose would be drawn away from the trees.
 """
 
 from __future__ import annotations
 
-from typing import Any, Generic, Literal, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import trimesh
@@ -15,7 +17,8 @@ from numpy.typing import NDArray
 from app.common.arrays import first_difference
 from app.scene import colours
 from app.scene.colours import Colours, Rgb
-from pipeline.types.records import HeightMap
+from pipeline.geometry.poses import Pose2
+from pipeline.types.records import Frame, HeightMap
 
 SIDES = 32  # of a circle
 
@@ -23,7 +26,6 @@ N = TypeVar("N", bound=viser.SceneNodeHandle)
 Float = NDArray[np.float64]
 Points = NDArray[np.floating]
 Mesh = tuple[NDArray[np.float32], NDArray[np.uint32]]
-Precision = Literal["float16", "float32"]
 
 
 def cylinder() -> Mesh:
@@ -40,6 +42,25 @@ def _mesh(shape: trimesh.Trimesh, moved: tuple[float, float, float]) -> Mesh:
     """Return vertices, float32, shape (V, 3), and faces, uint32, shape (F, 3), of a shape that is moved by an
     offset."""
     return (shape.vertices + moved).astype(np.float32), shape.faces.astype(np.uint32)
+
+
+def placed(points: Points, pose: Pose2, z: float) -> NDArray[np.float32]:
+    """Return points of the level base frame in the frame of the map, float32, of the same shape (..., 3) [m].
+
+    Args:
+        points: shape (..., 3) [m].
+        pose: Pose of the robot in the map.
+        z: Height of the base [m].
+    """
+    moved = np.empty(points.shape, np.float32)
+    moved[..., :2] = pose.apply(np.asarray(points[..., :2], np.float64))
+    moved[..., 2] = points[..., 2] + z
+    return moved
+
+
+def scan_in_map(frame: Frame, points: Points) -> NDArray[np.float32]:
+    """Return points of the sensor frame of a scan in the frame of the map, float32, shape (N, 3) [m]."""
+    return placed(points + frame.sensor_offset, frame.estimate.T_map_base, frame.base_z)
 
 
 def circles(
@@ -95,7 +116,7 @@ class LayerNode(Generic[N]):
 
 
 class Batch(LayerNode[viser.BatchedMeshHandle]):
-    """Upright copies of one mesh as one node, because viser is slow with a thousand nodes.
+    """Copies of one mesh as one node, because viser is slow with a thousand nodes.
 
     Args:
         scene: Scene of viser.
@@ -108,7 +129,7 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
         node = scene.add_batched_meshes_simple(
             name,
             *mesh,
-            batched_wxyzs=_upright(1),
+            batched_wxyzs=_turned(1),
             batched_positions=np.zeros((1, 3), dtype=np.float32),
             batched_scales=np.ones((1, 3), dtype=np.float32),
             batched_colors=np.zeros((1, 3), dtype=np.uint8),
@@ -119,15 +140,16 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
             **look,
         )
         super().__init__(node)
-        self.count = 0
+        self.count, self._yaw = 0, 0.0
 
-    def show(self, positions: Points, scales: Points, colours: NDArray[np.uint8]) -> None:
+    def show(self, positions: Points, scales: Points, colours: NDArray[np.uint8], yaw: float = 0.0) -> None:
         """Replace the copies; without any the node is hidden.
 
         Args:
             positions: Positions of the copies, shape (N, 3) [m].
             scales: Their sizes along x, y, z in units of the mesh, shape (N, 3).
             colours: Their colours, uint8, shape (N, 3).
+            yaw: Rotation of each copy about the vertical [rad].
 
         Raises:
             ValueError: The lengths differ.
@@ -135,8 +157,9 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
         if not len(positions) == len(scales) == len(colours):
             raise ValueError("positions, scales and colours must have the same length")
         if len(positions) > 0:
-            if len(positions) != self.count:
-                self.node.batched_wxyzs = _upright(len(positions))
+            if (len(positions), yaw) != (self.count, self._yaw):
+                self.node.batched_wxyzs = _turned(len(positions), yaw)
+                self._yaw = yaw
             self.node.batched_positions = positions.astype(np.float32)
             self.node.batched_scales = scales.astype(np.float32)
             self.node.batched_colors = colours
@@ -144,9 +167,9 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
         self._update(self.count > 0)
 
 
-def _upright(count: int) -> NDArray[np.float32]:
-    """Return identity quaternions (w, x, y, z), float32, shape (count, 4)."""
-    return np.tile(np.array([1, 0, 0, 0], dtype=np.float32), (count, 1))
+def _turned(count: int, yaw: float = 0.0) -> NDArray[np.float32]:
+    """Return quaternions (w, x, y, z) of a rotation about the vertical [rad], float32, shape (count, 4)."""
+    return np.tile(np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], dtype=np.float32), (count, 1))
 
 
 class CloudNode(LayerNode[viser.PointCloudHandle]):
@@ -156,12 +179,9 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
         scene: Scene of viser.
         name: Name of the node.
         size: Diameter of a point [m].
-        precision: Precision of the coordinates that are sent.
     """
 
-    def __init__(
-        self, scene: viser.SceneApi, name: str, size: float, *, precision: Precision = "float16"
-    ) -> None:
+    def __init__(self, scene: viser.SceneApi, name: str, size: float) -> None:
         node = scene.add_point_cloud(
             name,
             np.zeros((1, 3), dtype=np.float32),
@@ -169,7 +189,7 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
             point_size=size,
             point_shape="circle",
             point_shading="flat",
-            precision=precision,
+            precision="float32",  # 16 bits are steps of decimetres far from the origin of a large map
             visible=False,
         )
         super().__init__(node)
@@ -180,7 +200,7 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
         when it is switched on.
 
         Args:
-            points: shape (N, 3) [m] in the frame of the parent node.
+            points: shape (N, 3) [m] in the frame of the map.
             colours: One colour, or one for each point.
 
         Raises:

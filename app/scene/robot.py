@@ -8,11 +8,10 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
-from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Segments
-from app.scene.viser_server import add_posed
+from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Mesh, Segments
 from pipeline.config.stages import Obstacles
 from pipeline.geometry.poses import Pose2
-from pipeline.types.clearance import Clearance, Zone
+from pipeline.types.clearance import Zone
 from pipeline.types.records import Frame
 
 ROBOT = "/world/robot"
@@ -27,9 +26,8 @@ class RobotNodes:
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
-        self._frame = add_posed(scene, ROBOT)
-        _add_body(scene)
-        self._particles = CloudNode(scene, "/world/particles", 0.06, precision="float32")
+        self._body = [BodyNode(scene, name) for name in BODY]
+        self._particles = CloudNode(scene, "/world/particles", 0.06)
         self._path = LineNode(scene, "/world/path", colours.PATH, 0.05)
         self._odometry = LineNode(scene, "/world/odometry", colours.ODOMETRY, 0.03)
         self._dead_reckoning: list[tuple[int, float, float]] = []
@@ -47,9 +45,8 @@ class RobotNodes:
             ground: Ground with its heights; it is kept for `repaint`.
         """
         self._ground = ground
-        pose = frame.estimate.T_map_base
-        self._frame.position = (pose.x, pose.y, frame.base_z)
-        self._frame.wxyz = (np.cos(pose.yaw / 2), 0.0, 0.0, np.sin(pose.yaw / 2))
+        for part in self._body:
+            part.show(frame)
         particles = frame.estimate.particles
         self._particles.show(
             np.column_stack([particles[:, :2], np.full(len(particles), frame.base_z + 0.05)]),
@@ -87,33 +84,64 @@ class RobotNodes:
         self._dead_reckoning.append((frame.index, at.x, at.y))
 
 
-def _add_body(scene: viser.SceneApi) -> None:
-    """Add the boxes and cylinders that represent the robot, as children of its frame."""
-    scene.add_box(
-        f"{ROBOT}/body", color=colours.ROBOT, dimensions=(0.6, 0.36, 0.2), position=(0.0, 0.0, 0.24)
-    )
-    for side, y in (("left", 0.22), ("right", -0.22)):
-        scene.add_cylinder(
-            f"{ROBOT}/wheel_{side}",
-            radius=0.15,
-            height=0.08,
-            color=(40, 42, 46),
-            wxyz=(np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0),
-            position=(0.0, y, 0.15),
+def _part(mesh: Mesh, size: tuple[float, float, float], place: tuple[float, float, float]) -> Mesh:
+    vertices, faces = mesh
+    return (vertices * np.array(size) + np.array(place)).astype(np.float32), faces
+
+
+def _wheel(y: float) -> Mesh:
+    vertices, faces = _part(nodes.cylinder(), (0.15, 0.15, 0.08), (0.0, 0.0, -0.04))
+    return vertices[:, [0, 2, 1]] + np.array((0.0, y, 0.15), np.float32), faces[:, ::-1]
+
+
+# Colour and parts of the robot in its base frame, by the name of the node.
+BODY: dict[str, tuple[colours.Rgb, list[Mesh]]] = {
+    "body": (colours.ROBOT, [_part(nodes.box(), (0.6, 0.36, 0.2), (-0.3, -0.18, 0.14))]),
+    "wheels": ((40, 42, 46), [_wheel(0.22), _wheel(-0.22)]),
+    "lidar": (
+        (90, 94, 100),
+        [
+            _part(nodes.cylinder(), (0.02, 0.02, 0.3), (0.12, 0.0, 0.31)),
+            _part(nodes.cylinder(), (0.06, 0.06, 0.08), (0.12, 0.0, 0.58)),
+        ],
+    ),
+}
+
+
+class BodyNode:
+    """A part of the robot in one colour.
+
+    Args:
+        scene: Scene of viser.
+        name: Name of the part in `BODY`.
+    """
+
+    def __init__(self, scene: viser.SceneApi, name: str) -> None:
+        colour, parts = BODY[name]
+        first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+        self._vertices = np.vstack([vertices for vertices, _ in parts])
+        self._node = scene.add_mesh_simple(
+            f"{ROBOT}/{name}",
+            self._vertices,
+            np.vstack([faces + start for (_, faces), start in zip(parts, first[:-1], strict=True)]).astype(
+                np.uint32
+            ),
+            color=colour,
+            flat_shading=True,
+            cast_shadow=False,
+            receive_shadow=False,
+            visible=False,
         )
-    scene.add_cylinder(
-        f"{ROBOT}/mast", radius=0.02, height=0.3, color=(90, 94, 100), position=(0.12, 0.0, 0.46)
-    )
-    scene.add_cylinder(
-        f"{ROBOT}/lidar", radius=0.06, height=0.08, color=(30, 32, 36), position=(0.12, 0.0, 0.62)
-    )
+
+    def show(self, frame: Frame) -> None:
+        """Show the part at the pose of a scan."""
+        self._node.vertices = nodes.placed(self._vertices, frame.estimate.T_map_base, frame.base_z)
+        self._node.visible = True
 
 
 HEIGHT = 0.06  # m above the base
 PIECES = 12  # segments of a side
 RING = 0.3  # m, around the obstacle
-# Step of the drawn curvature [1/m]: smaller changes do not send the node again.
-BEND = 0.02
 OF_ZONE = {
     Zone.CLEAR: colours.PATH,
     Zone.SLOW: colours.UNCERTAIN,
@@ -125,37 +153,27 @@ OF_ZONE = {
 class WayNode(Segments):
     """The path ahead of the robot with its stop and slow zones and the nearest obstacle, as lines."""
 
-    def __init__(self, scene: viser.SceneApi, robot: str) -> None:
-        super().__init__(scene, f"{robot}/way", 3.0)
-        self._drawn: tuple[object, ...] | None = None
+    def __init__(self, scene: viser.SceneApi) -> None:
+        super().__init__(scene, f"{ROBOT}/way", 3.0)
 
-    def show_ahead(self, clearance: Clearance | None, parameters: Obstacles, visible: bool) -> None:
-        """Show the path ahead of the robot. Nothing is sent for changes below the drawn resolution, and only
-        the visibility changes while the node is hidden.
+    def show_ahead(self, frame: Frame, parameters: Obstacles, visible: bool) -> None:
+        """Show the path ahead of the robot; nothing where the frame has no clearance.
 
         Args:
-            clearance: Path ahead and obstacles at the scan; None hides the node.
+            frame: Results of the scan.
             parameters: Widths and lengths of the zones.
             visible: Whether the layer is on.
         """
+        clearance = frame.clearance
         self.visible = visible and clearance is not None
         if clearance is None or not visible:
             return
-        bend = round(clearance.curvature / BEND) * BEND
-        place = (
-            (round(clearance.x, 1), round(clearance.y, 1)) if clearance.zone in (Zone.SLOW, Zone.STOP) else ()
-        )
-        begins = round(clearance.begins, 1)
-        drawn = (clearance.zone, clearance.backward, bend, place, begins, parameters)
-        if drawn != self._drawn:
-            self._drawn = drawn
-            segments = way_lines(bend, clearance.backward, begins, parameters)
-            if place:
-                ring = nodes.circles(np.array([place]), np.array([RING]), np.array([HEIGHT]))
-                segments = np.vstack([segments, ring])
-            self.show(
-                segments, np.tile(np.array(OF_ZONE[clearance.zone], dtype=np.uint8), (len(segments), 1))
-            )
+        segments = way_lines(clearance.curvature, clearance.backward, clearance.begins, parameters)
+        if clearance.zone in (Zone.SLOW, Zone.STOP):
+            place = np.array([(clearance.x, clearance.y)])
+            segments = np.vstack([segments, nodes.circles(place, np.array([RING]), np.array([HEIGHT]))])
+        each = np.tile(np.array(OF_ZONE[clearance.zone], dtype=np.uint8), (len(segments), 1))
+        self.show(nodes.placed(segments, frame.estimate.T_map_base, frame.base_z), each)
 
 
 def way_lines(curvature: float, backward: bool, begins: float, parameters: Obstacles) -> NDArray[np.float32]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import Colours, ViewSettings
-from app.scene.labels import LabelNodes, cluster_labels, shown_height
+from app.scene.labels import LabelNodes, Place, cluster_labels, shown_height
 from app.scene.nodes import Batch, CloudNode, Float
-from app.scene.viser_server import add_posed
+from app.scene.robot import ROBOT
 from pipeline.evaluation import match
 from pipeline.types.records import Frame
 
@@ -22,29 +22,27 @@ OnCluster = Callable[[int | None, Vector, Vector], None]
 
 # Heights at the ends of the colour ramp: about those of ground and trunks of a stand [m].
 HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
+SCAN = f"{ROBOT}/scan"
+_NO_POINTS: NDArray[np.float32] = np.zeros((0, 3), np.float32)
 WIDEST_MARKER = 0.6  # [m], the radius of a thick trunk
 
 
 class ScanNodes:
-    """Nodes of the current scan, children of the frame of the robot.
-
-    The points stay in the frame of the sensor: viser sends 16-bit coordinates, which would be steps of
-    decimetres far from the origin of a large map.
+    """Nodes of the current scan.
 
     Args:
         scene: Scene of viser to which the nodes are added.
-        robot: Name of the node of the robot.
         on_cluster: Called in the thread of viser with the number of the clicked marker and the ray (origin,
             direction) in the world frame of viser.
     """
 
-    def __init__(self, scene: viser.SceneApi, robot: str, on_cluster: OnCluster) -> None:
-        self._sensor = add_posed(scene, f"{robot}/scan")
-        self._raw = CloudNode(scene, f"{robot}/scan/raw", 0.02)
-        self._filtered = CloudNode(scene, f"{robot}/scan/filtered", 0.03)
-        self._clusters = CloudNode(scene, f"{robot}/scan/clusters", 0.045)
-        self._fits = Batch(scene, f"{robot}/scan/fits", nodes.cylinder(), opacity=0.4, side="double")
-        self._markers = Batch(scene, f"{robot}/scan/markers", nodes.cylinder(), opacity=0.14)
+    def __init__(self, scene: viser.SceneApi, on_cluster: OnCluster) -> None:
+        self._raw = CloudNode(scene, f"{SCAN}/raw", 0.02)
+        self._filtered = CloudNode(scene, f"{SCAN}/filtered", 0.03)
+        self._clusters = CloudNode(scene, f"{SCAN}/clusters", 0.045)
+        self._fits = Batch(scene, f"{SCAN}/fits", nodes.cylinder(), opacity=0.4, side="double")
+        self._markers = Batch(scene, f"{SCAN}/markers", nodes.cylinder(), opacity=0.14)
+        self._points = _NO_POINTS, _NO_POINTS
         self._axes: tuple[Float, Float, Float] = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         self._labels = LabelNodes(scene, "/world/labels")
         self._cluster_numbers = ClusterNumbers()
@@ -53,35 +51,35 @@ class ScanNodes:
         for batch in (self._markers, self._fits):
             _report(batch, self._markers, on_cluster)
 
-    def show(self, frame: Frame, view: ViewSettings) -> None:
+    def show(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
         """Show a new scan.
 
         Args:
             frame: Results of the scan.
             view: Visible layers, colours and labels.
+            labelled: Places of the labels of trees, which those of clusters do not cover.
         """
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
         self._numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
-        self._sensor.position = frame.sensor_offset
+        self._points = nodes.scan_in_map(frame, frame.raw), nodes.scan_in_map(frame, frame.filtered)
         self._show_fits(frame)
         self._show_markers(frame)
-        self.repaint(frame, view)
+        self.repaint(frame, view, labelled)
 
-    def repaint(self, frame: Frame, view: ViewSettings) -> None:
+    def repaint(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
         """Show the same scan after a change of the view; arguments as in `show`."""
         self._raw.visible = view.layers["raw"]
         self._filtered.visible = view.layers["filtered"]
         self._clusters.visible = view.layers["clusters"]
         self._fits.visible = view.layers["fits"]
         self._markers.visible = view.layers["clusters"]
-        self._raw.show(frame.raw, self._ramp_or(frame.raw, view, colours.RAW))
-        self._filtered.show(frame.filtered, self._ramp_or(frame.filtered, view, colours.FILTERED))
+        raw, filtered = self._points
+        self._raw.show(raw, self._ramp_or(frame.raw, view, colours.RAW))
+        self._filtered.show(filtered, self._ramp_or(frame.filtered, view, colours.FILTERED))
         member = frame.labels >= 0
-        self._clusters.show(
-            frame.filtered[member], cluster_colours(frame, self._numbers, view.colour_by)[member]
-        )
-        shown = cluster_labels(frame, self._numbers, view.label_by) if view.layers["labels"] else []
-        self._labels.show(shown)
+        self._clusters.show(filtered[member], cluster_colours(frame, self._numbers, view.colour_by)[member])
+        named = view.layers["labels"]
+        self._labels.show(cluster_labels(frame, self._numbers, view.label_by, labelled) if named else [])
 
     def meant(self, instance: int | None, origin: Float, direction: Float) -> int | None:
         """Return the row of the cluster of the newest scan that a click hit; None if there is none, see
@@ -122,7 +120,7 @@ class ScanNodes:
         foot = clusters.centroid[rows, 2] - 0.5 * height
         radius = clusters.radius[rows]
         self._fits.show(
-            np.column_stack([clusters.centre[rows], foot]),
+            nodes.scan_in_map(frame, np.column_stack([clusters.centre[rows], foot])),
             np.column_stack([radius, radius, height]),
             colours.by_verdict(clusters.verdict[rows]),
         )
@@ -138,9 +136,8 @@ class ScanNodes:
         width = np.fmax(0.5 * np.hypot(c.extent[:, 0], c.extent[:, 1]), c.radius)
         radius = np.minimum(np.fmax(width, 0.06), WIDEST_MARKER) + 0.03
         foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
-        self._markers.show(foot, np.column_stack([radius, radius, height]), colours.by_verdict(c.verdict))
-        low = foot + frame.sensor_offset + np.array([0.0, 0.0, frame.base_z])
-        low[:, :2] = frame.estimate.T_map_base.apply(low[:, :2])
+        low = nodes.scan_in_map(frame, foot).astype(np.float64)
+        self._markers.show(low, np.column_stack([radius, radius, height]), colours.by_verdict(c.verdict))
         self._axes = (low, low + np.column_stack([np.zeros((len(height), 2)), height]), radius)
 
 
@@ -189,18 +186,18 @@ MOST_VOXELS = 20_000  # drawn; boxes are slower than points
 
 
 class VoxelNode:
-    """The occupied voxels of the voxel grid filter as boxes in the frame of the sensor."""
+    """The occupied voxels of the voxel grid filter as boxes."""
 
-    def __init__(self, scene: viser.SceneApi, sensor: str) -> None:
-        self._boxes = Batch(scene, f"{sensor}/voxels", nodes.box(), opacity=0.5)
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._boxes = Batch(scene, f"{SCAN}/voxels", nodes.box(), opacity=0.5)
         self.count = 0
 
-    def show(self, filtered: NDArray[np.float32], size: float, visible: bool) -> None:
+    def show(self, frame: Frame, size: float, visible: bool) -> None:
         """Show the voxels that contain filtered points. `count` becomes their number, 0 while nothing is
         shown; at most MOST_VOXELS are drawn.
 
         Args:
-            filtered: Points, shape (N, 3) [m].
+            frame: Results of the scan.
             size: Side of a voxel [m]; 0 shows none.
             visible: Whether the layer is on.
         """
@@ -209,11 +206,12 @@ class VoxelNode:
             self.count = 0
             self._boxes.show(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
             return
-        low = size * np.unique(np.floor(np.asarray(filtered, np.float64) / size), axis=0)
+        low = size * np.unique(np.floor(np.asarray(frame.filtered, np.float64) / size), axis=0)
         self.count = len(low)
         drawn = low[:MOST_VOXELS]
         each = np.tile(np.array([colours.VOXELS], dtype=np.uint8), (len(drawn), 1))
-        self._boxes.show(drawn, np.full((len(drawn), 3), size), each)
+        places, yaw = nodes.scan_in_map(frame, drawn), frame.estimate.T_map_base.yaw
+        self._boxes.show(places, np.full((len(drawn), 3), size), each, yaw)
 
 
 Int = NDArray[np.int64]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from app.scene.colours import ViewSettings
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
 from app.scene.panel import PanelCommands, SceneCommands, TunePanel, Value
-from app.scene.robot import ROBOT, RobotNodes, WayNode
+from app.scene.robot import RobotNodes, WayNode
 from app.scene.scan import ScanNodes, Vector, VoxelNode
 from app.scene.viser_server import add_posed, messages_sent, silenced, start_server
 from pipeline.config import Parameters, preset
@@ -186,12 +186,12 @@ class Scene:
             shadow_opacity=0.0,
         )
         self._robot = RobotNodes(scene)
-        self._scan = ScanNodes(scene, ROBOT, functools.partial(self._cross, self._on_cluster))
+        self._scan = ScanNodes(scene, functools.partial(self._cross, self._on_cluster))
         self._map = MapNodes(scene, functools.partial(self._cross, self._on_tree))
-        self._voxels = VoxelNode(scene, f"{ROBOT}/scan")
+        self._voxels = VoxelNode(scene)
         self._gathered = MapCloud(scene, self._accumulated)
         self._errors = ErrorNode(scene)
-        self._way = WayNode(scene, ROBOT)
+        self._way = WayNode(scene)
 
     def _renew(self) -> None:
         """Start another viser with the same content and stop the old one."""
@@ -224,15 +224,15 @@ class Scene:
             # First, because the other nodes use the heights of its ground.
             self._map.show(self._frame, self._selected, self._ring, self._view)
             self._robot.show(self._frame, self._path, self._view, self._map.ground)
-            self._scan.show(self._frame, self._view)
+            self._scan.show(self._frame, self._view, self._map.labelled)
             self._gathered.show(self._frame, self._view.layers["gathered"])
             self._show_more(self._frame)
 
     def _show_more(self, frame: Frame) -> None:
         """Show the layers that are computed only while they are visible."""
         size = self._parameters.filters.voxel_size
-        self._voxels.show(frame.filtered, size, self._view.layers["voxels"])
-        self._way.show_ahead(frame.clearance, self._parameters.obstacles, self._view.layers["way"])
+        self._voxels.show(frame, size, self._view.layers["voxels"])
+        self._way.show_ahead(frame, self._parameters.obstacles, self._view.layers["way"])
         if self._view.layers["errors"]:
             wanted = self._parameters.evaluation
             self._errors.show_errors(frame.trees, self._truth, self._path, wanted, self._map.ground)
@@ -246,8 +246,8 @@ class Scene:
         with self._server.atomic():
             self._follower.show(self._pose, self._base_z, self._view.follow)
             self._robot.repaint(self._view)
-            self._scan.repaint(self._frame, self._view)
             self._map.repaint(self._frame, self._selected, self._ring, self._view)
+            self._scan.repaint(self._frame, self._view, self._map.labelled)
             self._gathered.repaint(self._view.layers["gathered"])
             self._show_more(self._frame)
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from app.explain.history import TreeHistory
 from app.worker.protocol import MapChanges, TreeChange
+from app.worker.tree_numbers import SAME
 from pipeline.config import Parameters
 from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
@@ -60,6 +61,21 @@ class MappingRecord:
         self.time_s = time_s
         for number in frame.trees.number[frame.trees.confirmed].tolist():
             self.confirmed_s.setdefault(number, time_s)
+
+    def ended(self, trees: Trees) -> dict[int, tuple[float, float]]:
+        """Return the last position of each tree that was confirmed once and is not among `trees`, by its
+        number [m]."""
+        last = self.history.last_places()
+        return {n: last[n] for n in self.confirmed_s.keys() - set(trees.number.tolist()) if n in last}
+
+    def renumber(self, number_of: Mapping[int, int]) -> None:
+        """Replace the numbers of trees; trees without a new number are removed.
+
+        Args:
+            number_of: New number by old number.
+        """
+        self.history.renumber(number_of)
+        self.confirmed_s = {number_of[k]: at for k, at in self.confirmed_s.items() if k in number_of}
 
 
 @dataclass(slots=True, eq=False)
@@ -310,7 +326,6 @@ def segment_all(segment: Segment, steps: list[Step]) -> list[SegmentedScan]:
         return list(pool.map(segment, steps))
 
 
-SAME = 0.5  # largest distance of the same tree in two maps [m]
 MOVED = 0.05  # smallest reported motion [m]
 
 

@@ -7,6 +7,7 @@ mapped. It does not depend on pauses, jumps, or which states of the mapper are k
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -23,6 +24,7 @@ from app.worker.remap import (
     segment_ahead,
     segment_all,
 )
+from app.worker.tree_numbers import TreeNumbers
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
@@ -82,6 +84,7 @@ class Run:
         self._caches = ScanCaches() if caches is None else caches
         self._cache = self._caches.of(parameters)
         self._sample = Sample()
+        self._numbers = TreeNumbers()
         self._remapping: Remapping | None = None
         self._preview: Trees | None = None
 
@@ -166,16 +169,25 @@ class Run:
                 self._broken = False
         return frames
 
-    def _map_step(self, step: Step, *, hurried: bool = False) -> Frame:
-        """Map a step and make it the current scan. After an exception the mapper is broken until
-        `approach`."""
+    def _map_step(self, step: Step, *, hurried: bool = False, new_map: bool = False) -> Frame:
+        """Map a step and make it the current scan. After an exception the mapper is broken until `approach`.
+
+        Args:
+            step: The step.
+            hurried: Whether to use the cached segmented scan if there is one.
+            new_map: Whether the map of the run was replaced since the last step.
+        """
         mapper, wanted = self._map.mapper, self._map.parameters.at(step.index)
         if mapper.parameters is not wanted:
             mapper.parameters, self._cache = wanted, self._caches.of(wanted)
         self._broken = True
         with self.stopwatch.whole_scan():
-            self.frame = self._process(mapper, step, hurried=hurried)
+            frame = self._process(mapper, step, hurried=hurried)
         self._broken = False
+        if new_map:
+            record = self._map.record
+            record.renumber(self._numbers.begin_map(frame.trees, record.ended(frame.trees)))
+        self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
         self._step, self.current = step, step.index
         self._sample.offer(step)
         self._map.record.add(self.frame, self.start_ns)
@@ -269,7 +281,7 @@ class Run:
             return None
         self._remapping, self._map = None, remapping.finish()
         self._cache = self._caches.of(self._map.parameters.at(self.current))
-        return self._map_step(self._step), self._map.record.confirmed_s
+        return self._map_step(self._step, new_map=True), self._map.record.confirmed_s
 
     def parameters_at(self, index: int) -> Parameters:
         """Return the parameters with which the scan with this index was or will be mapped."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from playwright.sync_api import expect
 
@@ -164,6 +166,50 @@ SELECTION_IS_PAINTED = """() => {
   }
   return false;
 }"""
+
+
+# At each picture that the scene draws: positions of the world, of a point, a circle and the robot in it.
+PICTURES = """() => {
+  const { scene, nodeRefFromName } = window.__viserMutable;
+  window.__pictures = [];
+  const first = (name) => {
+    let found = null;
+    nodeRefFromName[name]?.traverse((node) => {
+      if (found !== null) return;
+      const matrices = node.matricesTexture;
+      if (matrices) found = (matrices._data ?? matrices.image.data).slice(12, 15).join();
+      else if (node.geometry?.attributes.position) {
+        found = node.geometry.attributes.position.array.slice(0, 3).join();
+      }
+    });
+    return found;
+  };
+  const then = scene.onBeforeRender;
+  scene.onBeforeRender = (...args) => {
+    then?.apply(scene, args);
+    const world = nodeRefFromName["/world"].matrixWorld.elements.slice(12, 15).join();
+    const scan = ["scan/raw", "scan/filtered", "scan/markers", "body"];
+    window.__pictures.push([world, ...scan.map((name) => first(`/world/robot/${name}`))]);
+  };
+}"""
+
+
+def test_everything_in_a_picture_is_of_one_scan(dashboard: Dashboard):
+    """Where one part of a picture is of a new scan, all others are."""
+    dashboard.command({"type": "seek", "time_s": 3.0})  # the robot moves there
+    dashboard.load_scene()
+    dashboard.command({"type": "play"})
+    dashboard.scene.evaluate(PICTURES)
+    dashboard.scene.wait_for_function("() => window.__pictures.length > 40", timeout=150_000)
+    pictures = dashboard.scene.evaluate("() => window.__pictures")[5:]
+    dashboard.pause()
+    news = [
+        [now is not None and now != then for now, then in zip(new, old, strict=True)]
+        for old, new in pairwise(pictures)
+    ]
+    assert sum(any(new) for new in news) >= 8, "the run plays"
+    apart = [new for new in news if any(new) and not all(new)]
+    assert apart == []
 
 
 def test_a_tree_is_found_and_selected_everywhere(dashboard: Dashboard):

@@ -39,6 +39,34 @@ function keepReconnecting() {
   frame.contentWindow.dispatchEvent(new Event("focus"));
 }
 
+// viser's client draws a new pose of a node one picture before new content that arrived with it. What follows the robot is the
+// pose of the world, and everything in it is content: so the world is drawn one picture later, with the content of its scan.
+function drawWorldWithItsContent({ __viserMutable: viser }) {
+  const { scene, nodeRefFromName } = viser;
+  if (scene.userData.isInStep) return; // the window of a frame is the same object after a reload
+  scene.userData.isInStep = true;
+  let node = null, set = null, drawn = null; // the last position set by viser, and the drawn one
+  const then = scene.onBeforeRender;
+  scene.onBeforeRender = (...args) => {
+    then?.apply(scene, args);
+    const world = nodeRefFromName["/world"];
+    if (!world) return;
+    if (world !== node) [node, set, drawn] = [world, world.position.clone(), world.position.clone()];
+    const next = set;
+    if (!world.position.equals(drawn)) set = world.position.clone();
+    if (drawn.equals(next) && world.position.equals(drawn)) return;
+    drawn = next;
+    world.position.copy(drawn);
+    world.updateMatrix();
+    world.updateMatrixWorld(true);
+  };
+}
+
+function whenBuilt(frame, act) {
+  if (frame.__viserMutable?.scene && frame.__viserMutable.nodeRefFromName) act(frame);
+  else if (frame === byId("scene").contentWindow) setTimeout(() => whenBuilt(frame, act), 200);
+}
+
 export function pressInScene(key) {
   const inner = frame.contentWindow;
   if (!frame.src || !inner) return;
@@ -53,6 +81,7 @@ export function startScene() {
     // It was loaded with the other theme, or reloads itself with its first address.
     if (frame.contentWindow.location.search.includes("darkMode") !== isDark()) return void load();
     keepReconnecting();
+    whenBuilt(frame.contentWindow, drawWorldWithItsContent);
     for (const listener of loaders) listener(frame.contentWindow);
   });
   on("theme", () => frame.src && paint());

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from app.scene import Scene
 from app.scene.nodes import MOST_CELLS, raster, surface
@@ -57,7 +58,7 @@ def test_trees_and_robot_stand_on_the_ground_and_the_surface_is_sent_once(scene:
     assert node(scene, "/world/surface").visible
     feet = node(scene, "/world/trees").batched_positions
     np.testing.assert_allclose(feet[:, 2], 0.2 * feet[:, 0], atol=0.11)
-    assert node(scene, "/world/robot").position[2] == 0.4
+    assert node(scene, "/world/robot/wheels").vertices[:, 2].min() == pytest.approx(0.4, abs=1e-6)
     assert node(scene, "/world").position[2] == -0.4
     before = scene.messages
     scene.show(dataclasses.replace(frame, ground=None), PATH[:1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -11,15 +12,28 @@ from hypothesis import strategies as st
 
 from app.scene import Scene
 from app.scene.labels import BEHIND, MOST_LABELS, Label, LabelNodes, apart, cluster_labels, short
-from tests.app.scene.frames import make_frame
+from tests.app.scene.frames import make_frame, make_trees
 
 PATH = np.zeros((1, 2))
 
 
-def test_labels_say_eccentricity_and_verdict(scene: Scene):
-    scene.show(make_frame(0), PATH)
-    assert "e 5.0 tree" in scene._scan.texts
-    assert "e ∞ too long" in scene._scan.texts
+def test_clusters_are_labelled_by_the_ratio_of_eigenvalues_and_trees_by_dbh(scene: Scene):
+    frame = make_frame(0)
+    scene.show(frame, PATH)
+    assert {"λ1/λ2 5.0", "λ1/λ2 ∞"} <= set(scene._scan.texts)
+    assert any(re.fullmatch(r"\d+: \d+ cm", text) for text in scene._map.texts)
+    scene.choose("labels", False)
+    assert scene._scan.texts == scene._map.texts == []
+
+
+def test_a_cluster_at_a_labelled_tree_has_no_label_of_its_own(scene: Scene):
+    frame = make_frame(0)
+    offset = frame.sensor_offset[:2]
+    at = frame.estimate.T_map_base.apply(frame.clusters.centroid[:, :2] + offset)
+    trees = make_trees(len(at))
+    scene.show(replace(frame, trees=replace(trees, position=at + 0.05)), PATH)
+    assert len(scene._map.texts) == len(at)
+    assert scene._scan.texts == []
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,8 @@ async def test_voxels_are_as_large_as_the_filter_has_them(scene: Scene):
     boxes = node(scene, "/world/robot/scan/voxels")
     wanted = np.unique(np.floor(frame.filtered.astype(np.float64) / 0.2), axis=0)
     assert scene.counts["voxels"] == len(wanted)
-    np.testing.assert_allclose(boxes.batched_positions, 0.2 * wanted, atol=1e-5)
+    # The pose of the frame is the origin of the map.
+    np.testing.assert_allclose(boxes.batched_positions, 0.2 * wanted + frame.sensor_offset, atol=1e-5)
     np.testing.assert_allclose(boxes.batched_scales, 0.2, atol=1e-6)
     scene.show_parameters(preset("forest").replace({"filters.voxel_size": 0.0}), "forest")
     scene.show(frame, PATH[:1])

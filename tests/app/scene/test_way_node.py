@@ -12,6 +12,7 @@ from app.scene import Scene
 from app.scene.robot import OF_ZONE, way_lines
 from pipeline.config.stages import Obstacles
 from pipeline.detection.obstacles import find_clearance
+from pipeline.geometry.poses import Pose2
 from pipeline.types.clearance import Clearance, Zone
 from tests.app.scene.frames import make_frame
 
@@ -37,7 +38,7 @@ def test_what_stands_between_the_drawn_sides_is_in_the_way(curvature: float, bac
         assert (found.zone is not Zone.CLEAR) is seen
 
 
-async def test_the_way_is_seen_and_sent_only_when_it_changes(scene: Scene):
+async def test_the_way_is_ahead_of_the_robot(scene: Scene):
     def node():
         return scene._server.scene.get_handle_by_name("/world/robot/way")
 
@@ -48,8 +49,9 @@ async def test_the_way_is_seen_and_sent_only_when_it_changes(scene: Scene):
     scene.show(replace(frame, clearance=near), PATH)
     assert node().visible
     drawn = np.array(node().points)
-    scene.show(replace(frame, clearance=replace(near, curvature=0.102, x=1.12)), PATH)
-    np.testing.assert_array_equal(node().points, drawn)
+    elsewhere = make_frame(0, pose=Pose2(2.0, 1.0, 0.0))
+    scene.show(replace(elsewhere, clearance=near), PATH)
+    np.testing.assert_allclose(node().points, drawn + np.array([2.0, 1.0, 0.0]), atol=1e-5)
     scene.show(replace(frame, clearance=Clearance(Zone.CLEAR, curvature=0.5)), PATH)
     assert len(node().points) < len(drawn), "no ring without an obstacle"
     scene.show(replace(frame, clearance=replace(near, begins=2.0)), PATH)

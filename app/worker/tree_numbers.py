@@ -1,0 +1,92 @@
+"""Numbers of trees that stay the same while the run is mapped again.
+
+A map numbers its trees in the order in which they begin, so another map of the same run has other numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.evaluation import match
+from pipeline.types.records import Trees
+
+Place = tuple[float, float]
+
+SAME = 0.5  # largest distance of the same tree in two maps [m]
+
+
+class TreeNumbers:
+    """The numbers of the trees of a run as people see them.
+
+    Those of the first map are its own. In another map, a tree that stands within SAME of a known tree has the
+    number of that tree, also if the map in between had no tree there; other trees have new numbers.
+    """
+
+    def __init__(self) -> None:
+        self._places: dict[int, Place] = {}  # last position of each confirmed tree
+        self._present: set[int] = set()  # confirmed trees of the frame that was numbered last
+        self._number_of: dict[int, int] | None = None  # by the number in the map; None for the first map
+        self._next = 1
+
+    def renumber(self, trees: Trees) -> Trees:
+        """Return the trees of a frame of the present map with their numbers."""
+        numbers = trees.number
+        if self._number_of is not None:
+            known = self._number_of
+            self._name({n: p for n, p in _places(trees, np.arange(len(numbers))).items() if n not in known})
+            numbers = np.array([known[number] for number in numbers.tolist()], dtype=np.int64)
+        confirmed = _places(replace(trees, number=numbers), np.flatnonzero(trees.confirmed))
+        self._places.update(confirmed)
+        self._present = set(confirmed)
+        self._next = max(self._next, int(numbers.max(initial=0)) + 1)
+        return replace(trees, number=numbers)
+
+    def begin_map(self, trees: Trees, ended: Mapping[int, Place]) -> dict[int, int]:
+        """Begin another map of the run.
+
+        Args:
+            trees: Its trees at the scan that was numbered last in the map before.
+            ended: Last positions of its trees that ended before this scan, by their numbers in the new map.
+
+        Returns:
+            Number of each of these trees by its number in the new map.
+        """
+        self._number_of = {}
+        self._name(_places(trees, np.flatnonzero(trees.confirmed)))
+        self._name(_places(trees, np.flatnonzero(~trees.confirmed)))
+        self._name(ended)
+        return dict(self._number_of)
+
+    def _name(self, places: Mapping[int, Place]) -> None:
+        """Give numbers to trees of the present map: those of the trees of the last frame, then those of
+        earlier trees, then new ones.
+
+        Args:
+            places: Positions of trees that have no number yet, by their numbers in the map.
+        """
+        number_of = {} if self._number_of is None else self._number_of
+        left = list(places)
+        for present in (True, False):
+            taken = set(number_of.values())
+            free = [n for n in self._places if n not in taken and (n in self._present) is present]
+            if not left or not free:
+                continue
+            found = match(_array([places[n] for n in left]), _array([self._places[n] for n in free]), SAME)
+            number_of.update({n: free[k] for n, k in zip(left, found.tolist(), strict=True) if k >= 0})
+            left = [n for n in left if n not in number_of]
+        for n in left:
+            number_of[n] = self._next
+            self._next += 1
+
+
+def _places(trees: Trees, rows: NDArray[np.int64]) -> dict[int, Place]:
+    places = [(x, y) for x, y in trees.position[rows].tolist()]
+    return dict(zip(trees.number[rows].tolist(), places, strict=True))
+
+
+def _array(places: list[Place]) -> NDArray[np.float64]:
+    return np.array(places, dtype=np.float64).reshape(-1, 2)
