@@ -16,6 +16,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground.terrain_map import CELL, COLUMNS, VIEWS, WEIGHT, corrected_tiles
 from pipeline.ground.terrain_map import SIDE as CELLS
+from pipeline.loop_closure.detection import through
 from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.mapper import Mapper
 from pipeline.slam.loop_correction import drift_of
@@ -41,6 +42,25 @@ def circle(n=300, radius=30.0, laps=1.0, turn=0.0, longer=1.0):
         motion = np.array([[longer * radius * step, 0.0, step + turn]])
         path.append(composed(path[-1][None], motion)[0])
     return np.array(path)
+
+
+def test_a_pose_through_a_local_frame_has_the_covariance_of_both():
+    T, R = (
+        Pose2(10.0, -4.0, 0.7),
+        np.array([[0.04, 0.01, 0.002], [0.01, 0.09, -0.003], [0.002, -0.003, 4e-4]]),
+    )
+    local, own = Pose2(3.0, 2.0, 0.4), np.diag([0.09, 0.01, 1e-3])
+    pose, covariance = through(T, R, local, own)
+    h = 1e-6
+
+    def joined(a, b):
+        return (Pose2(*a) @ Pose2(*b)).as_array()
+
+    a, b = T.as_array(), local.as_array()
+    np.testing.assert_allclose(pose.as_array(), joined(a, b))
+    F = np.stack([(joined(a + d, b) - joined(a, b)) / h for d in h * np.eye(3)], axis=1)
+    G = np.stack([(joined(a, b + d) - joined(a, b)) / h for d in h * np.eye(3)], axis=1)
+    np.testing.assert_allclose(covariance, F @ R @ F.T + G @ own @ G.T, atol=1e-6)
 
 
 def driven(path):

@@ -14,8 +14,9 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam import FastSlam
 from pipeline.slam.landmarks import VARIANCE_MIN, kalman_update
-from pipeline.slam.motion import compound, moved_poses, noise_of, step_variances
+from pipeline.slam.motion import compound, compounded, moved_poses, noise_of, step_variances
 from pipeline.slam.particle_maps import ROOM, own_block, take_ancestors, with_room
+from pipeline.slam.poses import composed
 from pipeline.slam.resampling import low_variance_ancestors, normalised
 from pipeline.slam.state import SlamState
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
@@ -96,6 +97,18 @@ def test_the_covariance_of_a_motion_is_the_scatter_of_drawn_motions():
     np.testing.assert_allclose(np.cov(drawn.T), covariance, atol=0.05 * covariance.max())
 
 
+def test_noise_that_differs_along_and_across_turns_with_the_motion():
+    motion, P = np.array([1.0, 2.0, 0.8]), np.diag([0.04, 0.01, 0.002])
+    step, Q = np.array([0.5, 0.2, 0.1]), np.array([[0.09, 0.01, 0.0], [0.01, 0.01, 0.0], [0.0, 0.0, 0.001]])
+    h = 1e-6
+    whole = composed(motion[None], step[None])[0]
+    F = np.stack([(composed((motion + d)[None], step[None])[0] - whole) / h for d in h * np.eye(3)], axis=1)
+    G = np.stack([(composed(motion[None], (step + d)[None])[0] - whole) / h for d in h * np.eye(3)], axis=1)
+    told, covariance = compounded(motion, P, *step, Q)
+    np.testing.assert_allclose(told, whole, atol=1e-12)
+    np.testing.assert_allclose(covariance, F @ P @ F.T + G @ Q @ G.T, atol=1e-6)
+
+
 @given(st.floats(-3, 3), st.floats(-2, 2), st.floats(-2, 2), st.floats(-1, 1))
 def test_the_motion_is_the_composition_of_poses(yaw, x, y, turn):
     start, step = Pose2(1.0, -2.0, yaw), Pose2(x, y, turn)
@@ -139,6 +152,14 @@ def test_a_landmark_is_updated_as_the_textbook_says(seed, Sigma, R):
     wanted = np.array([max(wanted_P[0, 0], VARIANCE_MIN), wanted_P[0, 1], max(wanted_P[1, 1], VARIANCE_MIN)])
     np.testing.assert_allclose(told, wanted, atol=1e-9)
     np.testing.assert_allclose(wanted_P, precision, atol=1e-9)
+
+
+@pytest.mark.parametrize("looks", [1.0, 4.0])
+def test_many_views_of_a_landmark_share_an_error_that_no_view_removes(looks):
+    m, rows = np.zeros((1, 2)), np.array([[0.3, 0.02, 0.2]])
+    for _ in range(200):
+        kalman_update(m, rows, 0, 0.0, 0.0, 0.04, 0.01, 0.09, looks)
+    np.testing.assert_allclose(rows[0, [0, 2]], [0.04 / looks, 0.09 / looks], rtol=1e-6)
 
 
 @given(covariances, covariances, st.integers(1, 400))
@@ -188,6 +209,22 @@ def test_what_could_not_be_seen_is_not_missed(hidden):
     for k in range(1, 30):
         slam.process(k, Pose2(), detections([]), free)
     assert landmarks_of(slam) == 4 * [1]
+
+
+def test_a_particle_that_misses_a_tree_loses_weight_by_the_weight_of_a_miss():
+    """The tree at (0, -7) is gone. It is in view of particle 0, and out of view of particle 1."""
+    weights = []
+    for miss_weight in (0.0, 1.0):
+        slam = fresh(
+            method="fastslam1", particles=2, resample_below=0.0, view_range=7.05, weight_power=1.0,
+            miss_weight=miss_weight,
+        )  # fmt: skip
+        for k in range(10):
+            slam.process(k, Pose2(), detections([*TREES, [0.0, -7.0]]), ALL_FREE)
+        slam.state.pose[1] = [0.0, 0.1, 0.0]
+        estimate = slam.process(10, Pose2(), detections(TREES), ALL_FREE)
+        weights.append(np.log(estimate.weights[1]) - np.log(estimate.weights[0]))
+    assert weights[1] - weights[0] == pytest.approx(1.0)
 
 
 # --- weights --------------------------------------------------------------------------------------

@@ -161,6 +161,19 @@ def test_a_loop_corrects_the_drift_of_the_way_between():
     assert off(loop.pose, true).mean() < 0.7 * off(bare.pose, true).mean()
 
 
+def test_the_covariance_of_a_loop_is_turned_into_the_axes_of_its_first_keyframe():
+    true = arc(5)
+    true[:, 2] += 0.6
+    graph = graph_of(true, np.random.default_rng(3), STEMS[:0])
+    covariance = np.array([[0.09, 0.01, 0.002], [0.01, 0.01, 0.0], [0.002, 0.0, 0.001]])
+    yaw = graph.pose[0, 2]
+    assert abs(np.sin(2.0 * yaw)) > 0.5
+    C = np.eye(3)
+    C[:2, :2] = Pose2(0.0, 0.0, yaw).rotation().T
+    edge = graph.with_loop(0, Pose2(*true[-1]), covariance).loops[-1]
+    np.testing.assert_allclose(edge.covariance, C @ covariance @ C.T, atol=1e-12)
+
+
 def test_a_loop_overrules_associations_by_the_drifted_path():
     """The path had drifted by 3 m, and its last keyframes take stems for known ones 3 m away."""
     true = arc(42, turn=2.0 * np.pi / 41.0, radius=40.0)
@@ -295,6 +308,15 @@ def test_two_keyframes_take_the_same_stems_as_far_as_both_see_them():
     distance = np.hypot(*stems[list(taken[0])].T)
     assert distance.min() < 6.0
     assert distance.max() > 12.0
+
+
+def test_the_covariance_of_a_detection_turns_with_the_pose_of_its_scan():
+    yaw = 0.7
+    view = ScanDetections(0, 0.0, np.array([4]), np.array([[3.0, 1.0]]), np.array([[0.09, 0.02, 0.01]]))
+    _, _, R = combined((view,), np.array([[0.0, 0.0, yaw]]))
+    C = Pose2(0.0, 0.0, yaw).rotation()
+    expected = C @ np.array([[0.09, 0.02], [0.02, 0.01]]) @ C.T
+    np.testing.assert_allclose(R[0], expected[[0, 0, 1], [0, 1, 1]], atol=1e-12)
 
 
 def test_detections_between_two_keyframes_are_combined_by_their_weight():
