@@ -132,10 +132,9 @@ MUTANTS = (
     ),
     Mutant(_MERGED, "wrap_angle(poses[:, 2] + T.yaw)", "wrap_angle(poses[:, 2] - T.yaw)", _MERGED_TESTS),
     Mutant(_MERGED, "b.axis[:, 2:4] @ T.rotation().T", "b.axis[:, 2:4] @ T.rotation()", _MERGED_TESTS),
-    Mutant(
-        _AUTH, "given[0].lower() in self._hosts", "given[0].lower().startswith(tuple(self._hosts))", _GUARD
-    ),
-    Mutant(_AUTH, "given[0].lower() in self._hosts", "given[0].lower().endswith(tuple(self._hosts))", _GUARD),
+    Mutant(_AUTH, "return host in self._hosts", "return host.startswith(tuple(self._hosts))", _GUARD),
+    Mutant(_AUTH, "return host in self._hosts", "return host.endswith(tuple(self._hosts))", _GUARD),
+    Mutant(_AUTH, "origins[0].lower() in (", "origins[0].lower().startswith((", _GUARD),
     Mutant(_CLOCK, "return abs(stamp_ns - message.log_ns", "return (stamp_ns - message.log_ns", _TIMES),
     Mutant(_CLOCK, "time_ns = message.log_ns + self.offset_ns", "time_ns = message.log_ns", _TIMES),
     Mutant(_CHUNKS, "further_ns += max(due_ns, *newest.values()) - time_ns", "further_ns += time_ns", _TIMES),

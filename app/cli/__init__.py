@@ -38,6 +38,7 @@ COMMANDS = (
     "train",
     "tune",
     "bench",
+    "licences",
 )
 
 DONE, FAILED, WRONG_USAGE, DONE_WITH_LOSSES = 0, 1, 2, 3

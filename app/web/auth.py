@@ -31,6 +31,8 @@ from app.web.responses import error_reply
 
 # The only route whose bodies may be as large as a recording.
 UPLOADS = "/api/uploads"
+# The only route without a token: for the supervisor of a service.
+HEALTH = "/health"
 Role = Literal["owner", "viewer"]
 #: A session lasts so long; each page load in its second half starts a new one.
 SESSION_S = 7 * 86_400
@@ -278,7 +280,8 @@ class Guard:
                 rest = [(name, value) for name, value in query if name not in ("token", "ticket")]
                 from_elsewhere = headers.get("sec-fetch-site") == "cross-site"
                 return self._welcome(role, rest, from_elsewhere=from_elsewhere)
-        if self._role(headers) is not None:
+        is_health = scope["type"] == "http" and scope["path"] == HEALTH and scope["method"] in _SAFE_METHODS
+        if is_health or self._role(headers) is not None:
             return None
         if scope["type"] == "http" and "text/html" in headers.get("accept", ""):
             return HTMLResponse(_LOGIN_PAGE, 401, {"Cache-Control": "no-store"})

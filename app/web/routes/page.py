@@ -12,8 +12,9 @@ from urllib.parse import urlsplit
 from fastapi import APIRouter, Request
 from starlette.responses import FileResponse, RedirectResponse, Response
 
-from app.web.auth import role_of, ticket
+from app.web.auth import HEALTH, role_of, ticket
 from app.web.responses import error_reply, json_reply
+from app.web.routes.access import Dash
 from app.web.viser_proxy import client_page
 from pipeline.errors import StemmapError
 
@@ -42,6 +43,13 @@ _VISER_POLICY = (
 def page(request: Request) -> Response:
     """GET /: return the dashboard."""
     return _file(request, page_folder() / "index.html", _PAGE_POLICY)
+
+
+@router.get(HEALTH)
+async def health(dashboard: Dash) -> Response:
+    """Return 200 while this process answers and the mapping process runs, else 503, without a token and
+    without further information."""
+    return json_reply({}) if dashboard.worker.pid is not None else error_reply(503, "no mapping process runs")
 
 
 @router.get("/runs")

@@ -16,7 +16,17 @@ from starlette.datastructures import Headers
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
-from app.web.auth import SESSION_S, Guard, Role, allowed_hosts, new_token, session_value, ticket, viewer_token
+from app.web.auth import (
+    HEALTH,
+    SESSION_S,
+    Guard,
+    Role,
+    allowed_hosts,
+    new_token,
+    session_value,
+    ticket,
+    viewer_token,
+)
 from tests.app.server_for_tests import (
     BEARER,
     COOKIE,
@@ -119,7 +129,7 @@ async def client() -> AsyncIterator[httpx.AsyncClient]:
 
 def test_every_route_is_in_the_matrix() -> None:
     known = {(method, path) for method, path in ROUTES} | {("WS", path) for path in SOCKETS}
-    known = known | {("GET", "/static/{path:path}")}
+    known = known | {("GET", "/static/{path:path}"), ("GET", HEALTH)}
     assert routes() == known - {("GET", "/no/such/route"), *MISSES}
 
 
@@ -142,6 +152,19 @@ async def test_nobody_without_the_token(client: httpx.AsyncClient) -> None:
             assert answer.json()["error"]["remedy"]
         wrong = await client.request(method, f"{path}?token={TOKEN}x")
         assert wrong.status_code == 401
+
+
+async def test_the_health_is_told_without_a_token_and_nothing_else_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with running() as (client, dashboard):
+        assert (await client.get(HEALTH)).status_code == 200
+        assert (await client.get(HEALTH)).content == b"{}"
+        assert (await client.get(HEALTH, headers={"Host": "evil.example"})).status_code == 403
+        assert (await client.post(HEALTH)).status_code == 401
+        assert (await client.get(f"{HEALTH}/")).status_code == 401
+        monkeypatch.setattr(dashboard.worker, "pid", None)
+        assert (await client.get(HEALTH)).status_code == 503
 
 
 @pytest.mark.parametrize("who", [COOKIE, BEARER])

@@ -104,7 +104,7 @@ def test_noise_that_differs_along_and_across_turns_with_the_motion():
     whole = composed(motion[None], step[None])[0]
     F = np.stack([(composed((motion + d)[None], step[None])[0] - whole) / h for d in h * np.eye(3)], axis=1)
     G = np.stack([(composed(motion[None], (step + d)[None])[0] - whole) / h for d in h * np.eye(3)], axis=1)
-    told, covariance = compounded(motion, P, *step, Q)
+    told, covariance = compounded(motion, P, 0.5, 0.2, 0.1, Q)
     np.testing.assert_allclose(told, whole, atol=1e-12)
     np.testing.assert_allclose(covariance, F @ P @ F.T + G @ Q @ G.T, atol=1e-6)
 
