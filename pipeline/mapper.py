@@ -434,8 +434,9 @@ class Mapper:
             estimate: Pose before the correction.
 
         Returns:
-            The corrected pose, and the correction that was applied. A loop that the graph contradicts changes
-            nothing (None), unless the robot was lost; then it is located by it.
+            The corrected pose, and the correction that was applied. A graph without solution changes nothing
+            (None), and so does a loop that the graph contradicts, unless the robot was lost; then it is
+            located by it.
         """
         slam = self._slam
         match correction:
@@ -449,7 +450,8 @@ class Mapper:
                 slam.state = replace(slam.state, recent=recent)
                 return replace(estimate, health=slam.lost(estimate)), correction
             case Smoothing():
-                self._correct_map(slam.smooth(index), estimate)
+                if not self._correct_map(slam.smooth(index), estimate):
+                    return estimate, None
                 return slam.estimate(estimate), correction
             case LoopClosure(loop=loop, stems=stems):
                 if self._correct_map(slam.close(index, loop), estimate):

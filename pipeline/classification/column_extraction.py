@@ -13,10 +13,11 @@ from pipeline.types.records import RING_FAR, Bool, Float32, Int, Int32
 
 BUCKET = 0.9  # m; radius of the neighbourhood of a column
 MARGIN = 1.2  # m around a tile in which neighbours are considered
+MOVES = 0.5  # m; a column outside of a tile may move into it by this distance when its axis is fitted
 LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m, and to 3 m, in which a column has returns
 LEAST = 3  # slices with returns
 TWIN = 0.02  # m; axes within this distance are the same
-APART = 0.3  # m; of two columns within this distance the weaker one is dropped
+APART = 0.2  # m; of two columns within this distance along x and y the weaker one is dropped
 INSIDE, RING_NEAR = 0.3, 0.45  # m around the axis
 OCTANTS = 8
 ARC = 11  # first column of the moments of an arc, see `profile`
@@ -41,7 +42,7 @@ def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Floa
         which is 0) and strength, shape (K, 5).
     """
     cells = int(np.ceil((side + 2 * MARGIN) / SIDE))
-    reach, border = int(APART / SIDE), int(MARGIN / SIDE) - 4
+    reach, border = round(APART / SIDE), round((MARGIN - MOVES) / SIDE)
     columns = np.empty((cells * cells // 4, 5))
     n = 0
     for high in (HIGH, LOW_HIGH):

@@ -30,6 +30,7 @@ from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int32, Scan, Sensor
 
 GROUND_REFLECTIVITY = 0.25
+SIGMA_MIN = 0.001  # m; the pipeline divides by the range sigma of a sensor
 
 
 @compiled
@@ -264,8 +265,7 @@ class SpinningLidar:
             rings=self.rings,
             ring_step=self.ring_step,
             azimuth_step=2.0 * np.pi / self.columns,
-            # The pipeline divides by it, so it is not 0.
-            range_sigma=max(self.range_sigma, 0.001),
+            range_sigma=max(self.range_sigma, SIGMA_MIN),
             range_max=self.range_max,
         )
 
@@ -333,8 +333,9 @@ class SolidStateLidar(SpinningLidar):
 
     @property
     def sensor(self) -> Sensor:
-        """The sensor as the pipeline describes it, without rings; the range sigma may be 0."""
-        return Sensor(f"{self.name} (simulated)", azimuth_step=0.0035, range_sigma=self.range_sigma)
+        """The sensor as the pipeline describes it, without rings; the range sigma is at least SIGMA_MIN."""
+        sigma = max(self.range_sigma, SIGMA_MIN)
+        return Sensor(f"{self.name} (simulated)", azimuth_step=0.0035, range_sigma=sigma)
 
     def at_scan(self, k: int) -> SolidStateLidar:
         """Return a copy of the sensor with the pattern of scan k: the seed `pattern` + k."""

@@ -317,7 +317,10 @@ class KeyframeGraph:
                 return None
             problem.pose = first[0]
         minimum = problem.minimum()
-        return None if minimum is None else problem.solution(*minimum)
+        try:
+            return None if minimum is None else problem.solution(*minimum)
+        except np.linalg.LinAlgError:
+            return None
 
     def _is_revisit(self, keyframe: Keyframe) -> bool:
         """Return whether a keyframe shows at least two known stems for the first time in REVISIT_DISTANCE of
@@ -413,7 +416,7 @@ class _Problem:
             weight: Weights of motions and loops, shape (E,).
 
         Raises:
-            LinAlgError: Nothing observes the newest pose.
+            LinAlgError: Nothing observes the newest pose, or the problem is singular.
         """
         end = 3 * len(x)
         conditional = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
@@ -534,9 +537,15 @@ class _Problem:
     def _marginals(self, H: Sparse) -> Float:
         """Return the covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3). It is
         computed from the normal matrix H for at most MARGINALS keyframes and interpolated linearly by row in
-        between."""
+        between.
+
+        Raises:
+            LinAlgError: H is singular.
+        """
         K = len(self.pose)
-        factors: Sparse = self._factorised(H, 0.0)
+        factors = self._factorised(H, 0.0)
+        if factors is None:
+            raise np.linalg.LinAlgError("the normal matrix is singular")
         chosen = np.unique(np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64))
         unit = np.zeros((H.shape[0], 3 * len(chosen)))
         columns = (3 * chosen[:, None] + np.arange(3)).ravel()

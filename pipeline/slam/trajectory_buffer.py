@@ -48,9 +48,10 @@ class TrajectoryBuffer:
         """Add a scan with its time [ns] and the odometry step from the scan before to it. Its sigma is
         undefined until `set_sigma`."""
         if self._length == len(self._stamp):
-            self._stamp = np.concatenate([self._stamp, np.zeros_like(self._stamp)])
-            self._sigma = np.concatenate([self._sigma, np.zeros_like(self._sigma)])
-            self._motion = np.concatenate([self._motion, np.zeros_like(self._motion)])
+            more = max(self._length, 1)
+            self._stamp = np.concatenate([self._stamp, np.zeros(more, np.int64)])
+            self._sigma = np.concatenate([self._sigma, np.zeros(more)])
+            self._motion = np.concatenate([self._motion, np.zeros((more, 3))])
         self._stamp[self._length] = stamp_ns
         self._motion[self._length] = motion.as_array()
         self._length += 1

@@ -151,6 +151,15 @@ def test_new_parameters_act_from_the_next_scan_on():
 # --- motion ---------------------------------------------------------------------------------------
 
 
+def test_a_graph_without_solution_changes_nothing(monkeypatch):
+    parts = run()[0][:10]
+    expected = fed(mapper(), parts)
+    smoothed = mapper()
+    monkeypatch.setattr(type(smoothed._slam), "is_smoothing_due", True)
+    monkeypatch.setattr(smoothed._slam, "smooth", lambda _index: None)
+    assert fed(smoothed, parts) == expected
+
+
 def _still(m, poses):
     return [m.process(Step(k, scan(1 + k * 10**8), pose)).estimate.T_map_base for k, pose in enumerate(poses)]
 

@@ -107,7 +107,7 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
 
     Integers are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit
     inferred from their size. If one time is farther than 2 s from the stamp, all are impossible; so is an
-    empty column. A floating number that is not finite counts as 0.
+    empty column. A floating number that is not finite counts as the time of the stamp.
     """
     if not len(time):
         return None
@@ -128,6 +128,7 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
         with np.errstate(over="ignore"):
             seconds = (seconds - whole / scale) * scale
             ns = np.clip(seconds * 1e9, -1e18, 1e18).astype(np.int64) - (since - whole * 10**9)
+        ns[~finite] = 0
     return ns if int(np.abs(ns).max()) <= OFFSET_LIMIT_NS else None
 
 

@@ -136,6 +136,14 @@ def test_times_since_1970_are_made_relative(unit: float):
     np.testing.assert_allclose(offset_ns, [0, 50_000_000, 100_000_000], atol=500)
 
 
+def test_a_point_without_a_time_has_that_of_the_stamp():
+    table = np.ones(3, np.dtype([*XYZ.descr, ("timestamp", "<f8")]))
+    table["timestamp"] = [STAMP_NS / 1e9 - 0.05, np.nan, STAMP_NS / 1e9 + 0.05]
+    offset_ns = decode_cloud(encode(table), STAMP_NS).offset_ns
+    assert offset_ns is not None
+    np.testing.assert_allclose(offset_ns, [-50_000_000, 0, 50_000_000], atol=500)
+
+
 def test_times_far_from_the_stamp_are_not_used():
     table = np.ones(3, np.dtype([*XYZ.descr, ("timestamp", "<f8")]))
     table["timestamp"] = [1e300, np.nan, -np.inf]

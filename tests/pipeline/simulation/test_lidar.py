@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.io.readers.simulated import open_simulated
-from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
+from pipeline.simulation.lidar import SolidStateLidar, SpinningLidar, Sweep, sweep_scene
 from pipeline.simulation.primitives import ELLIPSOID, Solids, SolidsBuilder
 from pipeline.simulation.ray_casting import GROUND, first_returns, ray_directions
 from pipeline.simulation.terrain import SimulatedTerrain
@@ -24,6 +24,11 @@ def still_pose(lidar: SpinningLidar) -> tuple[Float, Float]:
 def sweep(lidar: SpinningLidar, builder: SolidsBuilder, terrain: SimulatedTerrain = DEEP) -> Sweep:
     R, o = still_pose(lidar)
     return sweep_scene(lidar, builder.build(), terrain, R, o, 0, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("lidar", [SpinningLidar(range_sigma=0.0), SolidStateLidar(range_sigma=0.0)])
+def test_the_described_sensor_has_a_positive_range_sigma(lidar):
+    assert lidar.sensor.range_sigma > 0.0
 
 
 def only(solids: Solids, keep: Bool) -> Solids:

@@ -216,6 +216,12 @@ def test_a_part_that_nothing_connects_stays():
     assert KeyframeGraph().solve() is None
 
 
+def test_a_graph_whose_newest_pose_nothing_observes_has_no_solution():
+    graph = graph_of(arc(6), stems=STEMS[:0])
+    cut = replace(graph.keyframes[-1], covariance=np.full((3, 3), np.inf))
+    assert replace(graph, keyframes=(*graph.keyframes[:-1], cut)).solve() is None
+
+
 def test_a_keyframe_replaces_that_of_the_same_scan():
     graph = graph_of(arc(4))
     again = graph.with_keyframe(replace(graph.keyframes[-1], birth=STEMS[:0, 0].astype(int)), np.ones(3))
