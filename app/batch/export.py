@@ -6,10 +6,13 @@ The same run gives the same bytes: time stamps in the files are fixed.
 from __future__ import annotations
 
 import datetime
+import io
 import math
 import os
 import sqlite3
+import threading
 import warnings
+import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -19,8 +22,8 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.batch.georeference import MapFrame, ground_heights, read_map_frame
-from app.batch.run_folder import FinishedRun, read_run, read_terrain
+from app.batch.georeference import MapFrame, heights_at, read_map_frame
+from app.batch.run_folder import read_run, read_terrain
 from app.batch.stand import stand_of
 from app.common.extras import needed
 from app.common.text import version
@@ -30,8 +33,11 @@ from pipeline.geometry.poses import Float
 from pipeline.io.result_files import geojson
 from pipeline.stand.figures import FIGURES
 from pipeline.stand.plots import Plot
+from pipeline.types.records import Path, Trees
 
 _DATE = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
+# The libraries have settings of the process, which must not change while another thread writes.
+_WRITING = threading.Lock()
 _CELLS_MAX = 25_000_000
 TERRAIN_CELL = 0.5  # m
 CONTOUR_STEP = 0.5  # m
@@ -87,7 +93,9 @@ class ExportedRun:
     """A run in the coordinates of its files.
 
     Attributes:
-        folder, run, frame: The run.
+        uri: Its source.
+        trees: Its confirmed trees.
+        frame: Its reference system.
         place: East, north of the trees, or x, y of a local map, shape (T, 2) [m].
         columns: Values of TREE_FIELDS by name; NaN for unknown values.
         path: The path, shape (N, 2) [m].
@@ -95,8 +103,8 @@ class ExportedRun:
         terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
     """
 
-    folder: FilePath
-    run: FinishedRun
+    uri: str
+    trees: Trees
     frame: MapFrame
     place: Float
     columns: dict[str, Any]
@@ -124,8 +132,35 @@ def read_for_export(
         StemmapError: The run is damaged, or a plot cannot be used.
     """
     run, frame = read_run(folder), read_map_frame(folder)
-    trees = run.trees
-    ground = ground_heights(folder, trees.position) + frame.z
+    shapes: list[tuple[str, Any, dict[str, float]]] = []
+    if plots:
+        result = stand_of(folder, parameters or Stand(), plots)
+        for plot in result.plots:
+            f = result.figures[plot.name]
+            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": float(f.trees)}
+            figures.update({name: f.values[name].value for name in FIGURES})
+            shapes.append((plot.name, shapely.transform(plot.shape, frame.to_crs), figures))
+    return for_export(run.uri, run.trees, run.path, read_terrain(folder), frame, tuple(shapes))
+
+
+def for_export(
+    uri: str,
+    trees: Trees,
+    path: Path,
+    terrain: Float,
+    frame: MapFrame,
+    plots: tuple[tuple[str, Any, dict[str, float]], ...] = (),
+) -> ExportedRun:
+    """Return a map with its values for export.
+
+    Args:
+        uri: Source of the run.
+        trees, path: The map, see `as_written`.
+        terrain: x, y, z of its cells, shape (K, 3) [m].
+        frame: Its reference system.
+        plots: Plots in that system, with their figures by name.
+    """
+    ground = heights_at(terrain, trees.position) + frame.z
     values = (
         trees.number,
         100.0 * trees.dbh,
@@ -145,18 +180,8 @@ def read_for_export(
         field.name: v if v.dtype.kind == "i" else np.round(v, d)
         for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)
     }
-    shapes: list[tuple[str, Any, dict[str, float]]] = []
-    if plots:
-        result = stand_of(folder, parameters or Stand(), plots)
-        for plot in result.plots:
-            f = result.figures[plot.name]
-            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": float(f.trees)}
-            figures.update({name: f.values[name].value for name in FIGURES})
-            shapes.append((plot.name, shapely.transform(plot.shape, frame.to_crs), figures))
-    path = frame.to_crs(np.stack([run.path.x, run.path.y], axis=1))
-    return ExportedRun(
-        folder, run, frame, frame.to_crs(trees.position), columns, path, tuple(shapes), read_terrain(folder)
-    )
+    path_xy = frame.to_crs(np.stack([path.x, path.y], axis=1))
+    return ExportedRun(uri, trees, frame, frame.to_crs(trees.position), columns, path_xy, plots, terrain)
 
 
 def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
@@ -179,13 +204,35 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
         raise StemmapError(
             f"{file.name!r} has an unknown format", remedy=f"Formats: {', '.join(WRITERS)}, or tree-manager"
         )
-    with TemporaryDirectory(prefix=".export-", dir=file.parent) as folder:
+    with _WRITING, TemporaryDirectory(prefix=".export-", dir=file.parent) as folder:
         writer(run, FilePath(folder) / file.name)
         written = []
         for part in sorted(FilePath(folder).iterdir()):
             os.replace(part, file.parent / part.name)  # noqa: PTH105 - over an existing file, everywhere
             written.append(file.parent / part.name)
     return written
+
+
+def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
+    """Return the bytes of an exported file and its name. Several files, as of a Shapefile, are one zip
+    archive with the same bytes as the files of `export_run`.
+
+    Args:
+        run: The run.
+        suffix: One of WRITERS.
+
+    Raises:
+        StemmapError: See `export_run`.
+    """
+    with TemporaryDirectory(prefix="stemmap-export-") as folder:
+        written = export_run(run, FilePath(folder) / f"trees{suffix}")
+        if len(written) == 1:
+            return written[0].read_bytes(), written[0].name
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in written:
+                archive.writestr(zipfile.ZipInfo(file.name, _DATE.timetuple()[:6]), file.read_bytes())
+        return packed.getvalue(), f"trees_{suffix.lstrip('.')}.zip"
 
 
 def _layers(run: ExportedRun) -> dict[str, Any]:
@@ -337,7 +384,7 @@ def _write_geojson(run: ExportedRun, file: FilePath) -> None:
 
         transformer = pyproj.Transformer.from_crs(run.frame.crs, 4326, always_xy=True)
         lon_lat = np.stack(transformer.transform(*run.place.T), axis=1).reshape(-1, 2)
-    file.write_text(geojson(run.run.trees, 0, lon_lat=lon_lat), encoding="utf-8", newline="")
+    file.write_text(geojson(run.trees, 0, lon_lat=lon_lat), encoding="utf-8", newline="")
 
 
 def _write_dxf(run: ExportedRun, file: FilePath) -> None:
@@ -409,7 +456,7 @@ def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
     )
     about = {
         "program": f"stemmap {version()}",
-        "source": run.run.uri,
+        "source": run.uri,
         "coordinates": run.frame.name,
         "georeference": run.frame.how or "none",
     }
@@ -460,7 +507,7 @@ def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
     high = np.floor(place.max(axis=0) / cell) * cell + cell
     width, height = np.round((high - low) / cell).astype(int)
     if width * height > _CELLS_MAX:
-        raise SourceError("the terrain covers too large an area", where=str(run.folder))
+        raise SourceError("the terrain covers too large an area", where=run.uri)
     raster = np.full((height, width), np.nan)
     aligned = abs(math.remainder(run.frame.pose.yaw, math.tau)) < 1e-12 and len(
         np.unique(place, axis=0)
@@ -517,7 +564,7 @@ def _write_geotiff(run: ExportedRun, file: FilePath) -> None:
     tifffile = needed("tifffile", "gis", "GeoTIFF files")
     found = terrain_raster(run)
     if found is None:
-        raise StemmapError("the run has no terrain", where=str(run.folder))
+        raise StemmapError("the run has no terrain", where=run.uri)
     raster, west, north = found
     tags: list[tuple[Any, ...]] = [
         (33550, "d", 3, (TERRAIN_CELL, TERRAIN_CELL, 0.0), True),  # ModelPixelScale

@@ -336,13 +336,16 @@ def by_gnss(folder: FilePath, crs: str) -> MapFrame:
     import pyproj
 
     from app.batch.continue_map import read_saved_run
-    from pipeline.io.readers import open_source
+    from app.sources.opening import open_source
     from pipeline.io.readers.measured_poses import fit_rigid
     from pipeline.io.readers.ros import RosSource
 
     run = read_run(folder)
     source = open_source(run.uri)
-    fixes = source.fixes() if isinstance(source, RosSource) else []
+    try:
+        fixes = source.fixes() if isinstance(source, RosSource) else []
+    finally:
+        source.close()
     if not fixes:
         raise StemmapError(
             "the recording has no GNSS fixes", where=run.uri, remedy="Use --control or --by-hand"
@@ -390,13 +393,24 @@ def ground_heights(folder: FilePath, points: Float) -> Float:
     Raises:
         SourceError: terrain.csv is missing or damaged.
     """
+    return heights_at(read_terrain(folder), points)
+
+
+def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
+    """Return the height of the nearest cell of the terrain at positions in the map, shape (N,) [m]; NaN if it
+    is farther than `reach`.
+
+    Args:
+        terrain: x, y, z of its cells, shape (K, 3) [m].
+        points: Positions, shape (N, 2) [m].
+        reach: Largest distance of the cell [m].
+    """
     from scipy.spatial import cKDTree
 
-    terrain = read_terrain(folder)
     if not len(terrain):
         return np.full(len(points), np.nan)
     distance, row = cKDTree(terrain[:, :2]).query(np.reshape(points, (-1, 2)))
-    return np.where(distance <= 2.0, terrain[row, 2], np.nan)
+    return np.where(distance <= reach, terrain[row, 2], np.nan)
 
 
 def frame_lines(frame: MapFrame) -> list[str]:

@@ -22,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--to",
         metavar="FILE",
         default=TREE_MANAGER,
-        help="file .gpkg, .shp, .geojson, .dxf, .xlsx or .tif (terrain), or tree-manager (default)",
+        help="file .gpkg, .shp, .geojson, .dxf, .xlsx, .tif (terrain) or .laz (cloud); or tree-manager",
     )
     parser.add_argument(
         "--out", metavar="FOLDER", type=Path, help="new or empty folder, only for tree-manager"
@@ -63,12 +63,34 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
     file = Path(arguments.to)
+    if file.suffix.lower() in (".las", ".laz"):
+        return _cloud(arguments.run, file)
     exported = read_for_export(arguments.run, chosen_plots(arguments), stand_parameters(arguments))
     try:
         written = export_run(exported, file)
     except OSError as error:
         raise cannot_write(error, file) from None
     print(f"{len(exported.place)} trees in {exported.frame.name} coordinates: {', '.join(map(str, written))}")
+    return 0
+
+
+def _cloud(run: Path, file: Path) -> int:
+    """Write the cloud with the number of the tree of each point."""
+    from app.batch.mapped_cloud import write_cloud
+    from pipeline.io.atomic_files import write_beside
+
+    try:
+        with write_beside(file) as partial:
+            # laspy compresses by the name of the file
+            named = partial.with_name(partial.name + file.suffix.lower())
+            try:
+                points = write_cloud(run, named)
+                named.replace(partial)
+            finally:
+                named.unlink(missing_ok=True)
+    except OSError as error:
+        raise cannot_write(error, file) from None
+    print(f"{points:,} points in {file}")
     return 0
 
 

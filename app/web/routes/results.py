@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated
+from typing import Annotated, Literal
 
+import numpy as np
 from fastapi import APIRouter, Path, Query
 from starlette.responses import Response
 
@@ -25,6 +26,9 @@ from app.web.responses import (
 )
 from app.web.routes.access import Bounds, Dash, ViewerTurn
 from pipeline.config import Parameters
+from pipeline.errors import StemmapError
+from pipeline.types.records import HeightMap, Trees
+from pipeline.types.records import Path as RobotPath
 
 router = APIRouter(prefix="/api")
 
@@ -69,6 +73,41 @@ def path_table(dashboard: Dash) -> Response:
     path = dashboard.path
     rows = [] if path is None else path_rows(path, dashboard.start_ns)
     return file_reply(csv_text(PATH_COLUMNS, rows), "path.csv")
+
+
+@router.get("/export/{suffix}", dependencies=[ViewerTurn])
+async def export(
+    suffix: Literal["gpkg", "shp", "geojson", "dxf", "xlsx", "tif"], dashboard: Dash
+) -> Response:
+    """Return the map as a file for GIS, CAD or spreadsheets, in local coordinates; a Shapefile as zip
+    archive. The bytes are those of `stemmap export` for a run with the same map. 409 before the first map;
+    422 if a package is missing or the map lacks what the format shows."""
+    shown, path = dashboard.shown, dashboard.path
+    if shown is None or path is None:
+        return _nothing_mapped()
+    uri = dashboard.source.uri
+    try:
+        content, name = await asyncio.to_thread(
+            _exported, uri, shown.frame.trees, path, shown.frame.ground, dashboard.start_ns, f".{suffix}"
+        )
+    except StemmapError as error:
+        return failure_reply(422, error)
+    headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
+    return Response(content, 200, headers, media_type="application/octet-stream")
+
+
+def _exported(
+    uri: str, trees: Trees, path: RobotPath, ground: HeightMap | None, start_ns: int, suffix: str
+) -> tuple[bytes, str]:
+    """Return the bytes and the name of the exported file, see `export`."""
+    from app.batch.export import export_bytes, for_export
+    from app.batch.georeference import MapFrame
+    from app.batch.run_folder import as_written
+    from pipeline.io.result_files import terrain_rows
+
+    cells = [] if ground is None else [[float(cell) for cell in row[:3]] for row in terrain_rows(ground)]
+    terrain = np.array(cells, np.float64).reshape(-1, 3)
+    return export_bytes(for_export(uri, *as_written(trees, path, start_ns), terrain, MapFrame()), suffix)
 
 
 @router.get("/evaluation")

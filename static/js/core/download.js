@@ -16,6 +16,8 @@ const cell = (value) => {
 
 const csvText = (rows) => rows.map((row) => `${row.map(cell).join(",")}\n`).join("");
 
+export const saveBytes = (name, bytes) => save(name, new Blob([bytes]));
+
 export const saveCsv = (name, rows) => save(name, new Blob([csvText(rows)], { type: "text/csv" }));
 
 export const saveCanvas = (name, canvas) => canvas.toBlob((blob) => blob && save(name, blob), "image/png");

@@ -1,10 +1,12 @@
 // The table of trees (Table 2 of the paper): sorted by any column, filtered by the text above it.
 
+import { block } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { saveCanvas } from "../core/download.js";
+import { saveBytes, saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
+import { attempted } from "../core/problem.js";
 import { on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
@@ -108,7 +110,13 @@ function offerCsv(any) {
   if (any) csv.setAttribute("href", "/api/trees.csv");
   else csv.removeAttribute("href");
   csv.setAttribute("aria-disabled", String(!any));
+  byId("trees-export").disabled = !any;
   csv.title = any ? csvTitle : "No tree yet";
+}
+
+// The server writes the file, so that it is the same as that of `stemmap export`. A Shapefile comes as a zip archive.
+function exportAs(format) {
+  return attempted(async () => saveBytes(`trees${format === "shp" ? "_shp.zip" : `.${format}`}`, await block(`/api/export/${format}`)));
 }
 
 function emptyText(all, wanted, refused) {
@@ -122,6 +130,8 @@ export function startTable() {
   head();
   byId("find").addEventListener("input", fill);
   byId("find").title = HELP;
+  const menu = byId("trees-export");
+  menu.addEventListener("change", () => { exportAs(menu.value); menu.value = ""; });
   byId("trees-png").addEventListener("click", () => saveCanvas("trees.png", pictureOf(byId("trees"))));
   on("map truth annotations phase", throttled(fill, EVERY));
   on("tab", fill);

@@ -150,7 +150,8 @@ def test_fixes_of_the_recording_place_the_map_in_spite_of_outliers(run, capsys, 
     fixes = [Fix(start_ns + int(t), a, o, 0.5) for t, a, o in zip(path.stamp_ns, lat, lon, strict=True)]
     source = object.__new__(RosSource)
     monkeypatch.setattr(RosSource, "fixes", lambda _source: fixes)
-    monkeypatch.setattr("pipeline.io.readers.open_source", lambda _uri: source)
+    monkeypatch.setattr(RosSource, "close", lambda _source: None)
+    monkeypatch.setattr("app.sources.opening.open_source", lambda _uri: source)
     saved = SimpleNamespace(map=SimpleNamespace(stamp_ns=path.stamp_ns + start_ns))
     monkeypatch.setattr("app.batch.continue_map.read_saved_run", lambda _folder: saved)
     told = stemmap(capsys, "georeference", run, "--gnss", "--crs", "EPSG:25832")

@@ -100,6 +100,7 @@ ROUTES = [
     ("GET", "/api/trees"),
     ("GET", "/api/trees.csv"),
     ("GET", "/api/path.csv"),
+    ("GET", "/api/export/{suffix}"),
     ("GET", "/api/evaluation"),
     ("GET", "/api/pairs"),
     ("GET", "/api/story/cluster/{number}"),

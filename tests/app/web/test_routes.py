@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import tomllib
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -324,6 +326,47 @@ async def test_trees_and_path_as_json_and_tables(both: Running) -> None:
     rows = (await client.get("/api/path.csv")).text.splitlines()
     assert rows[1].startswith("0.000,0.0000")
     assert len(rows) == 4
+
+
+@pytest.mark.parametrize("suffix", ["gpkg", "shp", "geojson", "dxf", "xlsx"])
+async def test_the_export_gives_the_bytes_of_the_command(both: Running, tmp_path: Path, suffix: str) -> None:
+    from app.cli import main
+    from pipeline.config import Parameters
+    from pipeline.io.result_files import RunFiles
+
+    client, dashboard = both
+    refused = await client.get(f"/api/export/{suffix}")
+    assert (refused.status_code, "nothing is mapped" in refused.text) == (409, True)
+    await show(dashboard)
+    assert dashboard.shown is not None
+    assert dashboard.path is not None
+    source = {"uri": dashboard.source.uri, "sha256": ""}
+    run = {"source": source, "seed": 0, "parameters": Parameters().model_dump()}
+    more = {"terrain.csv": "x_m,y_m,z_m,sigma_m,views\n"}
+    folder = tmp_path / "run"
+    files = RunFiles(folder)
+    files.finish(dashboard.shown.frame.trees, dashboard.path, dashboard.start_ns, run, None, more)
+    file = tmp_path / "out" / f"trees.{suffix}"
+    file.parent.mkdir()
+    assert await asyncio.to_thread(main, ["export", str(folder), "--to", str(file)]) == 0
+    reply = await client.get(f"/api/export/{suffix}")
+    assert reply.status_code == 200
+    if suffix == "shp":
+        archive = zipfile.ZipFile(io.BytesIO(reply.content))
+        there = {name: archive.read(name) for name in archive.namelist()}
+        assert there == {part.name: part.read_bytes() for part in file.parent.iterdir()}
+    else:
+        assert reply.content == file.read_bytes()
+        assert reply.headers["content-disposition"] == f'attachment; filename="trees.{suffix}"'
+
+
+async def test_an_export_that_the_map_lacks_or_nobody_knows_is_refused(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    terrain = await client.get("/api/export/tif")
+    assert terrain.status_code == 422
+    assert "no terrain" in terrain.text
+    assert (await client.get("/api/export/exe")).status_code == 422
 
 
 async def test_pairs_have_distances_and_errors_of_matched_trees(both: Running) -> None:

@@ -1,0 +1,140 @@
+"""The cloud of a finished run as LAS or LAZ, with the number of the tree and a class per point."""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from app.batch.georeference import heights_at, read_map_frame
+from app.batch.run_folder import read_run, read_run_record, read_terrain
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.types.records import Int
+
+EVERY = 5  # scans of a drive between two that are used
+MARGIN = 0.10  # m around the trunk at breast height, for lean and roughness of the stem
+UNKNOWN_RADIUS = 0.15  # m, of a tree without a diameter
+GROUND = 0.15  # m; points this near to the terrain are ground
+_CHUNK = 1_000_000
+#: Classes of the LAS standard.
+UNCLASSIFIED, GROUND_CLASS, HIGH_VEGETATION = 1, 2, 5
+
+
+def write_cloud(folder: FilePath, file: FilePath) -> int:
+    """Write the cloud of a run; return the number of points.
+
+    A whole cloud keeps its points and coordinates. The scans of a drive are read again from the source,
+    placed by the path of the run, and thinned. Points within the radius of a trunk and MARGIN have the number
+    of the tree in the field `tree` (0 for none) and class 5; ground has class 2, the rest class 1.
+
+    Args:
+        folder: Folder of the run.
+        file: File .las or .laz.
+
+    Raises:
+        StemmapError: The source cannot be read any more, or the run continues another one.
+        OSError: The file cannot be written.
+    """
+    import laspy
+    from scipy.spatial import cKDTree
+
+    run, frame, terrain = read_run(folder), read_map_frame(folder), read_terrain(folder)
+    trees = run.trees
+    tree_of = cKDTree(trees.position) if len(trees.number) else None
+    radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh + MARGIN, UNKNOWN_RADIUS)
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.add_extra_dim(laspy.ExtraBytesParams("tree", np.uint32, "number of the tree"))
+    header.generating_software, header.system_identifier = "stemmap", "stemmap"
+    header.creation_date = datetime.date(2000, 1, 1)  # the same run gives the same bytes
+    header.scales = np.full(3, 0.001)
+    header.offsets = np.floor(np.append(frame.to_crs(np.zeros((1, 2))), frame.z))
+    if len(trees.number):
+        header.offsets = np.floor(np.append(frame.to_crs(trees.position[:1]), frame.z))
+    if frame.crs:
+        import pyproj
+
+        header.add_crs(pyproj.CRS.from_user_input(frame.crs))
+    parts = _parts_of_cloud(run.uri) if run.of_cloud else _parts_of_drive(folder)
+    written = 0
+    with laspy.open(file, "w", header=header) as writer:
+        for points in parts:
+            ground = heights_at(terrain, points[:, :2])
+            number = np.zeros(len(points), np.uint32)
+            if tree_of is not None:
+                distance, row = tree_of.query(points[:, :2])
+                inside = distance <= radius[row]
+                number[inside] = trees.number[row[inside]]
+            is_ground = np.abs(points[:, 2] - ground) <= GROUND
+            number[is_ground] = 0
+            record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+            place = frame.to_crs(points[:, :2])
+            record.x, record.y, record.z = place[:, 0], place[:, 1], points[:, 2] + frame.z
+            record.tree = number
+            kind = np.where(number > 0, HIGH_VEGETATION, UNCLASSIFIED)
+            record.classification = np.where(is_ground, GROUND_CLASS, kind).astype(np.uint8)
+            record.return_number = record.number_of_returns = np.ones(len(points), np.uint8)
+            writer.write_points(record)
+            written += len(points)
+    return written
+
+
+def _parts_of_cloud(uri: str) -> Iterator[Float]:
+    """Yield the points of a whole cloud in its own coordinates, shape (N, 3) [m]."""
+    from app.sources.opening import open_cloud
+
+    cloud = open_cloud(uri)
+    if cloud is None:
+        raise StemmapError("the cloud cannot be read any more", where=uri)
+    for part in cloud.parts():
+        yield part[:, :3].astype(np.float64) + cloud.description.offset
+
+
+def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
+    """Yield the thinned points of a drive in the frame of the map, shape (N, 3) [m]; z by the terrain of each
+    scan and the nearest known terrain of the run."""
+    from app.batch.continue_map import at_origin
+    from app.sources.opening import open_source
+    from app.sources.request import request_of_kept, with_odometry
+    from pipeline.ground.scan_ground import find_terrain
+    from pipeline.ground.terrain import height_above
+    from pipeline.inventory.cloud import Thinned
+    from pipeline.preprocessing.acquisition import acquire
+
+    run, record, terrain = read_run(folder), read_run_record(folder), read_terrain(folder)
+    if record.get("continued"):
+        raise StemmapError("a run that continues another one has no single cloud", where=str(folder))
+    odometry = str(record.get("odometry") or "auto")
+    request = request_of_kept(run.uri, odometry=odometry, seed=run.seed, choices=record.get("chosen"))
+    source, chosen = with_odometry(open_source(run.uri, request.options()), odometry)
+    thinned = Thinned(1 << 22, 0.02)
+    T_base_lidar, p = source.description.T_base_lidar, run.parameters
+    try:
+        for row, step in enumerate(at_origin(source, []).steps(source, chosen.steps, Counter())):
+            if row >= len(run.path.x):
+                break
+            if row % EVERY or step.scan.stems is not None:
+                continue
+            raw, offset = acquire(step, T_base_lidar, p.acquisition)
+            height = height_above(raw, find_terrain(raw, p.ground))
+            pose = Pose2(float(run.path.x[row]), float(run.path.y[row]), float(run.path.yaw[row]))
+            place = pose.apply(raw[:, :2].astype(np.float64) + offset[:2])
+            z = height + heights_at(terrain, place, math.inf)
+            known = np.isfinite(z)
+            values = np.column_stack([place, z, np.zeros(len(z))])[known]
+            thinned.add(np.ascontiguousarray(values, np.float32))
+    finally:
+        source.close()
+    points = thinned.points
+    if not len(points):
+        raise StemmapError("the run has no points near known ground", where=str(folder))
+    for begin in _starts(len(points)):
+        yield points[begin : begin + _CHUNK, :3].astype(np.float64)
+
+
+def _starts(n: int) -> Int:
+    return np.arange(0, n, _CHUNK)
