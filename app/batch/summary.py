@@ -141,12 +141,19 @@ class RunHealth:
 JUST_BEGUN = 20  # scans
 
 
-def health_word(frame: Frame | None) -> str:
+STILL_M = 0.1
+
+
+def health_word(frame: Frame | None, distance_m: float = math.inf) -> str:
     """Return the pose quality of a scan in one or two words: that of `Health.state`, or why it is too early.
 
     "good" means that nothing contradicts the pose. Without trees, and in the first `JUST_BEGUN` scans,
     nothing could contradict it; the result is then "no trees yet" or "just begun", and "no scan yet" for
-    None.
+    None. The pose of a sensor that has not moved is not tested either: "static".
+
+    Args:
+        frame: Results of the scan.
+        distance_m: Driven distance [m].
     """
     if frame is None:
         return "no scan yet"
@@ -154,7 +161,9 @@ def health_word(frame: Frame | None) -> str:
         return frame.health.state
     if not frame.trees.confirmed.any():
         return "no trees yet"
-    return "just begun" if frame.index < JUST_BEGUN else "good"
+    if frame.index < JUST_BEGUN:
+        return "just begun"
+    return "static" if distance_m < STILL_M else "good"
 
 
 _SAME_DRIVE = ("origin", "resume")

@@ -449,7 +449,7 @@ def _with_run(status: Status, run: Run) -> Status:
     """Return the status with the fields that the run and its source determine."""
     description = run.source.description
     losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
-    frame = run.frame
+    frame, distance_m = run.frame, round(driven(run.path)[1], 3)
     return replace(
         status,
         kind=description.kind,
@@ -460,8 +460,8 @@ def _with_run(status: Status, run: Run) -> Status:
         mapping_ms=round(run.stopwatch.scan_ms, 3),
         stage_ms={stage: round(ms, 3) for stage, ms in run.stopwatch.stage_ms.items()},
         trees=0 if frame is None else int(np.count_nonzero(frame.trees.confirmed)),
-        distance_m=round(driven(run.path)[1], 3),
-        health=health_word(frame),
+        distance_m=distance_m,
+        health=health_word(frame, distance_m),
         warnings=[*status.warnings, *losses, *([run.cache_notice] if run.cache_notice else [])],
         camera=has_camera(description),
         remapped=run.remapped,

@@ -60,7 +60,7 @@ def opened(
     chromium: Browser, link: str, width: int = 1260, height: int = 720, scene: bool = False
 ) -> Iterator[Dashboard]:
     """Open the dashboard in a new browser context and close the card of the first visit."""
-    context = chromium.new_context(viewport={"width": width, "height": height})
+    context = chromium.new_context(viewport={"width": width, "height": height}, color_scheme="dark")
     try:
         context.set_default_timeout(PATIENCE_MS)
         context.add_init_script(FEW_FRAMES)

@@ -43,7 +43,7 @@ MAP = {"trees": [], "path": [[0, 0], [1, 0]], "pose": [1, 0, 0], "common": [0, 0
 
 
 def test_a_robot_keeps_its_letter_and_colour_when_another_leaves(chromium: Browser, fleet: Server):
-    context = chromium.new_context(viewport={"width": 1280, "height": 800})
+    context = chromium.new_context(viewport={"width": 1280, "height": 800}, color_scheme="dark")
     context.set_default_timeout(PATIENCE_MS)
     told: list[WebSocketRoute] = []
     page = context.new_page()
@@ -88,7 +88,7 @@ def test_a_robot_keeps_its_letter_and_colour_when_another_leaves(chromium: Brows
 
 
 def test_two_runs_on_one_page(chromium: Browser, fleet: Server):
-    context = chromium.new_context(viewport={"width": 1280, "height": 800})
+    context = chromium.new_context(viewport={"width": 1280, "height": 800}, color_scheme="dark")
     context.set_default_timeout(PATIENCE_MS)
     with fleet as server:
         page = context.new_page()

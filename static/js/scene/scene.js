@@ -27,6 +27,7 @@ function paint() {
   const inner = frame.contentDocument;
   if (!inner) return; // an error page of the browser
   inner.documentElement.dataset.mantineColorScheme = isDark() ? "dark" : "light";
+  inner.body.style.setProperty("--mantine-color-dimmed", isDark() ? "#b3bec5" : "#55626a"); // viser's labels have a contrast of 3.3
   let node = inner.querySelector("canvas");
   while (node && !node.style.backgroundColor) node = node.parentElement;
   if (node) node.style.backgroundColor = isDark() ? "var(--mantine-color-dark-9)" : "#fff";
@@ -81,6 +82,7 @@ export function startScene() {
     // It was loaded with the other theme, or reloads itself with its first address.
     if (frame.contentWindow.location.search.includes("darkMode") !== isDark()) return void load();
     keepReconnecting();
+    paint();
     whenBuilt(frame.contentWindow, drawWorldWithItsContent);
     for (const listener of loaders) listener(frame.contentWindow);
   });

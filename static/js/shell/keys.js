@@ -1,7 +1,7 @@
 // Keyboard shortcuts, also while the scene has the focus.
 
 import { ANNOTATE_KEYS, annotateKey } from "../annotate/panel.js";
-import { byId, el } from "../core/dom.js";
+import { byId, el, recall, remember } from "../core/dom.js";
 import { capital } from "../core/format.js";
 import { edits, looksOnly } from "../core/permissions.js";
 import { advance } from "../playback/timeline.js";
@@ -33,6 +33,10 @@ function act(event, inScene) {
     return;
   }
   const target = event.target;
+  if (!byId("keys-letters").checked && event.key.length === 1 && event.key !== " " && !event.ctrlKey && !event.metaKey) {
+    if (inScene && ["f", "t", "b"].includes(event.key)) take(); // keys of viser
+    return;
+  }
   if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || tuneKey(event))) {
     take();
     return;
@@ -58,6 +62,9 @@ function sheet() {
 export function startKeys() {
   document.addEventListener("keydown", (event) => act(event, false));
   onSceneLoad((inner) => inner.addEventListener("keydown", (event) => act(event, true), { capture: true }));
+  const letters = byId("keys-letters");
+  letters.checked = recall("letters") !== "off"; // speech input types letters (WCAG 2.1.4)
+  letters.addEventListener("change", () => remember("letters", letters.checked ? "on" : "off"));
   byId("keys-button").addEventListener("click", showSheet);
   byId("keys-list").replaceChildren(...sheet().map(([keys, text]) =>
     el("div", {}, el("dt", {}, ...keys.split(" ").map((key) => el("kbd", { text: key }))), el("dd", { text: capital(text) }))));

@@ -43,7 +43,7 @@ function ofScan() {
 }
 
 // Explanations of the first states.
-const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first scans" };
+const SOON = { "no trees yet": "SLAM: odometry only", "just begun": "SLAM: first scans", static: "SLAM: the sensor has not moved" };
 
 function reason({ health }) {
   if (SOON[health]) return SOON[health];

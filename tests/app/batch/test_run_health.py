@@ -77,3 +77,9 @@ def test_nothing_is_called_good_before_there_is_a_map_that_could_be(
     confirmed = np.ones(trees, np.bool_)
     assert health_word(replace(shot, trees=replace(fakes.trees(trees), confirmed=confirmed))) == word
     assert health_word(None) == "no scan yet"
+
+
+def test_the_pose_of_a_sensor_that_has_not_moved_is_not_called_good() -> None:
+    frame = a_frame(JUST_BEGUN, Health(state="good"))
+    assert (health_word(frame, 0.02), health_word(frame, 0.5)) == ("static", "good")
+    assert health_word(a_frame(JUST_BEGUN, Health(state="lost")), 0.0) == "lost"

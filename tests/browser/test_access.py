@@ -1,0 +1,53 @@
+"""What people need who use no mouse, speech input, or the theme of their system."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import PATIENCE_MS
+from tests.browser.dashboard import SCENE, Dashboard
+from tests.browser.serving import Server
+
+
+@pytest.mark.usefixtures("calm")
+def test_single_keys_are_switched_off(dashboard: Dashboard):
+    page = dashboard.page
+    measure = page.locator("#map-measure")
+    page.locator("body").press("?")
+    page.get_by_label("Keys without Ctrl").uncheck()
+    page.keyboard.press("Escape")
+    page.locator("body").press("m")
+    expect(measure).to_have_attribute("aria-pressed", "false")
+    page.locator("body").press("Control+k")
+    expect(page.locator("#palette")).to_be_visible()
+    page.keyboard.press("Escape")
+    page.locator("#keys-button").click()
+    page.get_by_label("Keys without Ctrl").check()
+    page.keyboard.press("Escape")
+    page.locator("body").press("m")
+    expect(measure).to_have_attribute("aria-pressed", "true")
+    page.locator("body").press("m")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_the_first_theme_is_that_of_the_system_and_tab_leads_to_the_map(
+    chromium: Browser, server: Server, theme: str
+):
+    context = chromium.new_context(color_scheme=theme)  # type: ignore[arg-type]
+    context.set_default_timeout(PATIENCE_MS)
+    page = context.new_page()
+    page.route(SCENE, lambda route: route.fulfill(body="", content_type="text/html"))
+    page.goto(server.link)
+    page.locator("#welcome-on").click()
+    expect(page.locator("html")).to_have_attribute("data-theme", theme)
+    expect(page.get_by_role("heading", level=1)).to_have_count(1)
+    page.locator("body").evaluate("node => { document.activeElement?.blur(); node.scrollTop = 0; }")
+    page.keyboard.press("Tab")
+    skip = page.get_by_role("link", name="Skip to the map")
+    if not skip.evaluate("node => node === document.activeElement"):
+        skip.focus()  # the focus begins where the card of the first visit was
+    expect(skip).to_be_in_viewport()
+    page.keyboard.press("Enter")
+    expect(page.locator("#map")).to_be_focused()
+    context.close()
