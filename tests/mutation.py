@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -55,6 +56,8 @@ _GRAPH_TESTS = f"{_SLAM}/test_keyframe_graph.py -k 'turns or turned or weight'"
 _MERGED_TESTS = "tests/pipeline/io/test_merged_map.py"
 _GUARD = "tests/app/web/test_auth.py -k 'resembles or foreign or names'"
 _TIMES = "tests/pipeline/io/test_clock_steps.py"
+#: Tests that map whole runs; their mutants are in modules without kernels.
+_WITH_NUMBA = (_MERGED_TESTS,)
 
 MUTANTS = (
     Mutant(_LANDMARKS, "VARIANCE_MIN, R0 / looks)", "VARIANCE_MIN)", _UPDATE),
@@ -110,7 +113,12 @@ MUTANTS = (
         f"{_SLAM}/test_fastslam.py -k miss",
     ),
     Mutant(_SCORE, "counted[matched] = in_reach[truth_of[matched]]", "pass", _EVALUATION),
-    Mutant(_MERGED, "moved.P[:] = C @ tracks.P @ C.T", "moved.P[:] = C.T @ tracks.P @ C", _MERGED_TESTS),
+    Mutant(
+        _MERGED,
+        "moved.P[:] = C @ tracks.P @ C.T",
+        "moved.P[:] = C.T @ tracks.P @ C",
+        _MERGED_TESTS,
+    ),
     Mutant(_MERGED, "_flat(C @ full @ C.T + ", "_flat(C.T @ full @ C + ", _MERGED_TESTS),
     Mutant(
         _MERGED,
@@ -130,8 +138,18 @@ MUTANTS = (
     Mutant(
         _MERGED, "wrap_angle(other.pose[:, 2] + T.yaw)", "wrap_angle(other.pose[:, 2] - T.yaw)", _MERGED_TESTS
     ),
-    Mutant(_MERGED, "wrap_angle(poses[:, 2] + T.yaw)", "wrap_angle(poses[:, 2] - T.yaw)", _MERGED_TESTS),
-    Mutant(_MERGED, "b.axis[:, 2:4] @ T.rotation().T", "b.axis[:, 2:4] @ T.rotation()", _MERGED_TESTS),
+    Mutant(
+        _MERGED,
+        "wrap_angle(poses[:, 2] + T.yaw)",
+        "wrap_angle(poses[:, 2] - T.yaw)",
+        _MERGED_TESTS,
+    ),
+    Mutant(
+        _MERGED,
+        "b.axis[:, 2:4] @ T.rotation().T",
+        "b.axis[:, 2:4] @ T.rotation()",
+        _MERGED_TESTS,
+    ),
     Mutant(_AUTH, "return host in self._hosts", "return host.startswith(tuple(self._hosts))", _GUARD),
     Mutant(_AUTH, "return host in self._hosts", "return host.endswith(tuple(self._hosts))", _GUARD),
     Mutant(_AUTH, "origins[0].lower() in (", "origins[0].lower().startswith((", _GUARD),
@@ -174,6 +192,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=given.folder) as scratch:
         tree = Path(scratch) / "tree"
         _git("worktree", "add", "--detach", "--force", str(tree), "HEAD")
+        for kernel in (*_ROOT.glob("app/**/*.nb[ci]"), *_ROOT.glob("pipeline/**/*.nb[ci]")):
+            (tree / kernel.relative_to(_ROOT)).parent.mkdir(exist_ok=True)
+            shutil.copy2(kernel, tree / kernel.relative_to(_ROOT))
         try:
             for number, mutant in enumerate(wanted):
                 if _key(mutant) in known:
@@ -201,11 +222,11 @@ def _outcome(mutant: Mutant, tree: Path) -> str:
     text = file.read_text()
     if text.count(mutant.old) != 1:
         return "not applicable"
-    if _exit_code_unchanged(mutant.tests, tree) != 0:
+    if _exit_code_unchanged(mutant.tests, tree, mutant.tests in _WITH_NUMBA) != 0:
         return "its tests do not pass without it"
     file.write_text(text.replace(mutant.old, mutant.new))
     try:
-        return "survived" if _exit_code(mutant.tests, tree) == 0 else "killed"
+        return "survived" if _exit_code(mutant.tests, tree, mutant.tests in _WITH_NUMBA) == 0 else "killed"
     except subprocess.TimeoutExpired:
         return "killed"
     finally:
@@ -213,29 +234,21 @@ def _outcome(mutant: Mutant, tree: Path) -> str:
 
 
 @cache
-def _exit_code_unchanged(tests: str, tree: Path) -> int:
-    return _exit_code(tests, tree)
+def _exit_code_unchanged(tests: str, tree: Path, compiled: bool) -> int:
+    return _exit_code(tests, tree, compiled)
 
 
-def _exit_code(tests: str, tree: Path) -> int:
+def _exit_code(tests: str, tree: Path, compiled: bool) -> int:
     """Return the exit code of pytest: 0 if all tests pass, 5 if none is selected.
 
     Raises:
         subprocess.TimeoutExpired: It took longer than _LIMIT_S.
     """
-    words = [
-        "-n0",
-        "-x",
-        "-q",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "tests.without_numba",
-        "-W",
-        "ignore::RuntimeWarning",
-        *shlex.split(tests),
-    ]
-    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(tree)}
+    words = ["-n0", "-x", "-q", "-p", "no:cacheprovider", *shlex.split(tests)]
+    environment = {**os.environ, "PYTHONPATH": str(tree)}
+    if not compiled:
+        words = ["-p", "tests.without_numba", "-W", "ignore::RuntimeWarning", *words]
+        environment["NUMBA_DISABLE_JIT"] = "1"
     return subprocess.run(
         [sys.executable, "-m", "pytest", *words],
         cwd=tree, env=environment, capture_output=True, timeout=_LIMIT_S, check=False,

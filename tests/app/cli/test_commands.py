@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -63,7 +64,7 @@ def test_a_request_to_stop_that_came_while_kernels_were_loaded_is_one(capsys, mo
 def test_help_names_every_command(capsys):
     told = stemmap(capsys, "--help")
     assert told.code == 0
-    assert all(f"\n    {name} " in told.out for name in COMMANDS)
+    assert all(re.search(rf"\n    {name}\s", told.out) for name in COMMANDS)
 
 
 @pytest.mark.parametrize("name", COMMANDS)

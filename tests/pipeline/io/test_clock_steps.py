@@ -46,6 +46,20 @@ def test_a_clock_that_is_set_on_the_way(
         assert later == stamps[8:].tolist()
 
 
+def test_behind_a_step_the_times_go_on_in_the_clock_of_the_sensor(tmp_path: Path, opened: Opened):
+    begun_ns = 10**12  # the clock of the sensor counts from its start
+
+    def fill(author: Author, write: Write) -> None:
+        for index in range(SCANS):
+            stamp_ns = begun_ns + index * STEP_NS + (HOUR_NS if index >= CHANGE else 0)
+            log_ns = START_NS + index * STEP_NS
+            write("/points", "sensor_msgs/msg/PointCloud2", log_ns, author.cloud(stamp_ns, points_of(index)))
+
+    source = opened(write_recording("mcap", tmp_path, fill))
+    stamps = [record.stamp_ns for record in source.records()]
+    assert stamps == [begun_ns + k * STEP_NS for k in range(SCANS)]
+
+
 @pytest.mark.parametrize("kind", ["bag", "db3", "mcap"])
 def test_topics_that_were_written_one_after_the_other_are_no_step(kind: str, tmp_path: Path, opened: Opened):
     def fill(author: Author, write: Write) -> None:
