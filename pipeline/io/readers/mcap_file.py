@@ -36,6 +36,8 @@ _CHUNK_HEAD = 40
 #: Messages outside of chunks are read in runs of this many bytes.
 LOOSE_RUN = 4 << 20
 DEFINITION_LIMIT = 1 << 20
+#: A recording whose last record is whole and that has no index: the recorder was ended. Nothing is lost.
+NOT_FINISHED = "index at the end of a recording that was not finished"
 
 
 class McapFile(ChunkedFile):
@@ -123,8 +125,12 @@ class McapFile(ChunkedFile):
                 break
         if not whole:
             read = self._read_summary(at)
-            what = "bytes between damaged records" if read else "bytes at the end of a recording that was cut"
-            count_loss(self.damage, what, max((read or end) - at, 1))
+            if read:
+                count_loss(self.damage, "bytes between damaged records", read - at)
+            elif end > at:
+                count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
+            else:
+                count_loss(self.damage, NOT_FINISHED)
 
     def _read_summary(self, after: int) -> int:
         """Add the channels of the summary and the chunks after a position [bytes]; return where these chunks

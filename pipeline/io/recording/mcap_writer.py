@@ -23,7 +23,7 @@ from pipeline.io.ground_truth import ATTACHMENT, truth_json
 from pipeline.io.readers.camera import Camera, Picture
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import NAME, PARAMETERS, SKIPPED, VERSION
-from pipeline.io.readers.mcap_file import McapFile
+from pipeline.io.readers.mcap_file import NOT_FINISHED, McapFile
 from pipeline.io.readers.topics import is_fixed
 from pipeline.io.recording import messages, outputs
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor, Truth
@@ -359,4 +359,5 @@ def mend(path: Path, out: Path) -> Mended:
             if not written:
                 raise SourceError("nothing in the recording is whole", where=str(path))
             writer.finish()
+        recording.damage.pop(NOT_FINISHED, None)  # the new file has an index
         return Mended(written, {**recording.damage, **lost})

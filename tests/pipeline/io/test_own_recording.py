@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from contextlib import closing
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.records import Attachment
 from mcap.writer import CompressionType, Writer
 
@@ -16,6 +18,7 @@ from pipeline.io.ground_truth import ATTACHMENT, read_truth
 from pipeline.io.readers import Source, open_source
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.recording import write_recording
+from pipeline.io.recording.mcap_writer import mend
 from pipeline.types.records import Imu, Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 
@@ -101,6 +104,28 @@ def test_an_attachment_is_read_with_its_size_and_checksum(tmp_path: Path):
     with closing(McapFile(path)) as container:
         assert not any(isinstance(record, Attachment) for record in container.whole_records())
         assert container.damage == {"damaged attachments": 1}
+
+
+def test_a_recording_that_ends_after_a_whole_record_has_lost_nothing(tmp_path: Path):
+    path = tmp_path / "run.mcap"
+    write(path, open_source(URI))
+    content = path.read_bytes()
+    (summary,) = struct.unpack_from("<Q", content, len(content) - 8 - 20)
+    data_end = summary - 9 - 4
+    assert content[data_end] == Opcode.DATA_END
+    for length, losses in (
+        (data_end, {}),
+        (data_end - 1, None),
+        (data_end + 5, {"bytes at the end of a recording that was cut": 5}),
+    ):
+        path.write_bytes(content[:length])
+        mended = mend(path, tmp_path / "mended.mcap")
+        if losses is None:
+            assert sum(mended.losses.values()) > 1
+        else:
+            assert mended.losses == losses
+        with closing(McapFile(path)) as container:
+            assert container.damage
 
 
 @pytest.mark.parametrize(
