@@ -70,7 +70,7 @@ class _Page:
 
 class RunRecorder:
     """Writes the results of runs to the store, with a delay of some seconds and at their end. Errors of the
-    store are logged once. Figures and map stay pending after an error; parameter changes are lost.
+    store are logged once. What an error prevents stays pending.
 
     Args:
         store: Asynchronous access to the store.
@@ -113,8 +113,10 @@ class RunRecorder:
         if self._writer is not None:
             self._writer.cancel()
             self._writer = None
-        if page is not None and page.reviser is not None:
+        if page is not None and page.changes:
             page.wake.set()
+            if page.reviser is None or page.reviser.done():
+                page.reviser = self._start(self._revise_soon(page))
         if page is not None and page.dirty:
             self._start(self._write(page))
 
@@ -177,15 +179,20 @@ class RunRecorder:
 
     async def _revise_soon(self, page: _Page) -> None:
         """Write the parameter changes of a record after a pause, so that a slider costs few transactions; the
-        record is created if necessary. Changes that the store refuses are lost."""
+        record is created if necessary. Changes that the store refuses stay pending until the next change or
+        the end of the run."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(page.wake.wait(), _REVISE_PAUSE_S)
         if page.record is None:
             await self._write(page)
-        changes, page.changes = page.changes, []
         record = page.record
-        if record is not None and changes:
+        if record is None or not page.changes:
+            return
+        changes, page.changes = page.changes, []
+        try:
             await self._ask(lambda store: store.book.revise_all(record, changes))
+        except StemmapError:  # the error was logged
+            page.changes = changes + page.changes
 
     async def _write(self, page: _Page) -> None:
         """Write the best state of a record, creating the record if necessary. After an error of the store it
