@@ -23,7 +23,7 @@ from app.dashboard.events import Events
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
 from app.dashboard.run_recorder import RunRecorder, RunState
-from app.dashboard.scores import Scores, score_map
+from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
 from app.sources.inspection import check_source
 from app.sources.request import SourceRequest
@@ -34,7 +34,7 @@ from app.worker import protocol
 from app.worker.outbox import joined
 from pipeline.config import preset
 from pipeline.config.model import Value
-from pipeline.types.records import Path, Trees, TruthTrees
+from pipeline.types.records import Path, TruthTrees
 
 if TYPE_CHECKING:
     from app.scene import Scene
@@ -328,32 +328,18 @@ class Dashboard:
             case protocol.Remapped(run=run, changes=changes) if run == self._run:
                 self._remapped(changes)
             case protocol.Rough(run=run, revision=revision, trees=trees) if run == self._run:
-                await self._broadcast_preview(run, revision, trees)
-
-    async def _broadcast_preview(self, run: int, revision: int, trees: Trees) -> None:
-        """Broadcast the tree positions of a map that is being computed, with its score (None without ground
-        truth). Nothing is sent if another run was opened meanwhile.
-
-        Args:
-            run: Number of the run.
-            revision: Revision of the parameters of this map.
-            trees: Its trees.
-        """
-        score = None
-        if self.truth is not None:
-            evaluation = self.parameters.parameters.evaluation
-            score = await asyncio.to_thread(score_map, trees, self.truth, evaluation, self.path_xy)
-            if run != self._run:  # another one was opened meanwhile
-                return
-        places = np.round(trees.position, 3).tolist()
-        self.live.publish("rough", {"revision": revision, "places": places, "score": score})
+                # A preview is only roughly right, so it has no score.
+                self.live.publish(
+                    "rough", {"revision": revision, "places": np.round(trees.position, 3).tolist()}
+                )
 
     def _remapped(self, changes: protocol.MapChanges) -> None:
-        """Broadcast the differences after the run was mapped again, and renumber the selection."""
+        """Broadcast the differences after the run was mapped again, and clear the selection of
+        a tree that vanished."""
         self.live.publish("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
         self._broadcast_events()
-        self.selector.renamed(dict(changes.followed))
+        self.selector.remove({change.number for change in changes.changes if change.kind == "vanished"})
 
     async def _begin(self, opened: protocol.Opened) -> None:
         """Load the annotations of an opened source and send the worker its parameters; then it plays, except

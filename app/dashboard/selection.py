@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -238,16 +238,14 @@ class Selector:
             return kept
         return await self._client.cluster(self._newest() if scan is None else scan, cluster)
 
-    def renamed(self, numbers: Mapping[int, int]) -> None:
-        """Select the tree under its new number, or clear the selection of the tree if it does not exist any
-        more. A selected cluster stays.
+    def remove(self, trees: Collection[int]) -> None:
+        """Clear the selection of a tree that does not exist any more. A selected cluster stays.
 
         Args:
-            numbers: New number by old number.
+            trees: Numbers of the trees that vanished.
         """
-        selected = self.selection
-        if selected.tree is not None:
-            self._select(Selection(numbers.get(selected.tree), selected.cluster))
+        if self.selection.tree in trees:
+            self._select(Selection(None, self.selection.cluster))
 
     def leave(self) -> None:
         """Cancel the pending request for an explanation."""

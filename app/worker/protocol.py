@@ -343,10 +343,8 @@ class MapChanges(msgspec.Struct, frozen=True):
         time_s: Time of the last of them since the first scan [s].
         before, after: Number of trees.
         ghost: x, y [m] and DBH [m] (None where unknown) of each tree of the old map.
-        renamed: Old and new number of each tree that stayed.
-        followed: The same for the map that was shown last, if it is not the old map.
         changes: Trees that appeared, vanished or moved.
-        confirmed: New number of each tree that was confirmed, also of one that vanished later, and the time
+        confirmed: Number of each tree that was confirmed, also of one that vanished later, and the time
             of its confirmation since the first scan [s].
     """
 
@@ -356,8 +354,6 @@ class MapChanges(msgspec.Struct, frozen=True):
     before: int
     after: int
     ghost: list[tuple[float, float, float | None]]
-    renamed: list[tuple[int, int]]
-    followed: list[tuple[int, int]]
     changes: list[TreeChange]
     confirmed: list[tuple[int, float]]
 

@@ -182,7 +182,7 @@ class MapComparison:
         """
         if self._before is None or self._before.index != new.index:  # the run went on, or elsewhere
             self._before = shown
-        return changes_between(self._before, shown, new, revision, time_s, confirmed_s)
+        return changes_between(self._before, new, revision, time_s, confirmed_s)
 
 
 S = TypeVar("S")
@@ -331,7 +331,6 @@ MOVED = 0.05  # smallest reported motion [m]
 
 def changes_between(
     before: Frame,
-    shown: Frame,
     after: Frame,
     revision: int,
     time_s: float,
@@ -341,7 +340,6 @@ def changes_between(
 
     Args:
         before: Last scan in the old map.
-        shown: The same scan in the map that was shown last.
         after: The same scan in the new map.
         revision: Revision of the parameters of the new map.
         time_s: Time of the scan [s since the first scan].
@@ -351,7 +349,6 @@ def changes_between(
     old_at, new_at = before.trees.position[old], after.trees.position[new]
     old_of = match(new_at, old_at, SAME)
     stayed = [(k, int(row)) for k, row in enumerate(old_of.tolist()) if row >= 0]
-    renamed = _renamed(before.trees, after.trees)
     gone = sorted(set(range(len(old))) - {row for _, row in stayed})
     changes = [
         *(_came(before, after.trees, int(new[k])) for k, row in enumerate(old_of.tolist()) if row < 0),
@@ -373,23 +370,9 @@ def changes_between(
             (round(float(x), 3), round(float(y), 3), round(float(d), 3) if np.isfinite(d) else None)
             for (x, y), d in zip(old_at, dbh, strict=True)
         ],
-        renamed=renamed,
-        followed=renamed if shown is before else _renamed(shown.trees, after.trees),
         changes=changes,
         confirmed=sorted(confirmed_s.items(), key=lambda item: (item[1], item[0])),
     )
-
-
-def _renamed(before: Trees, after: Trees) -> list[tuple[int, int]]:
-    """Return old and new number of each confirmed tree of the new map that has one of the old map within
-    SAME."""
-    old, new = np.flatnonzero(before.confirmed), np.flatnonzero(after.confirmed)
-    old_of = match(after.position[new], before.position[old], SAME)
-    return [
-        (int(before.number[old[row]]), int(after.number[new[k]]))
-        for k, row in enumerate(old_of.tolist())
-        if row >= 0
-    ]
 
 
 def _came(before: Frame, trees: Trees, row: int) -> TreeChange:

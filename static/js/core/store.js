@@ -19,8 +19,8 @@ export const state = {
   compare: null,     // clusters of the current scan by set A and by set B, while they are compared
   measure: null,     // {from, to, fixed} while a distance is measured on the map
   events: [],        // [{t, kind, text}] in order of time
-  remapped: null,    // {revision, scans, before, after, ghost: [[x, y, dbh]], renamed, changes: [{kind, number, x, y, why}]}
-  rough: null,       // {revision, places: [[x, y]], score, ghost, changes}: preview of a re-mapping, not a score
+  remapped: null,    // {revision, scans, before, after, ghost: [[x, y, dbh]], changes: [{kind, number, x, y, why}]}
+  rough: null,       // {revision, places: [[x, y]], ghost, changes}: preview of a re-mapping, not a score
   sensitivity: null, // {name, of, points: [{value, f1, TA, TA_of, false, …} or {value, error}], asked_with, error}
   search: null,      // {state, goal, made, wanted, go_on, start, best, points, held_out, scores, importance, better, changes}
   loop: null,        // {from_s, to_s}: the part that playback repeats

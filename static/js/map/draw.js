@@ -37,11 +37,7 @@ function drawContent(pen, view, state) {
   drawClusters(pen, view, state.map?.clusters);
   for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected);
   state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0));
-  const before = new Map((state.ghost?.renamed ?? []).filter(([old, now]) => old !== now).map(([old, now]) => [now, old]));
-  drawNumbers(pen, view, trees, state.selected, {
-    first: new Set(before.keys()), robot: state.map && view.toScreen(...state.map.pose),
-    words: ({ number }) => (before.has(number) ? `${number} (was ${before.get(number)})` : String(number)),
-  });
+  drawNumbers(pen, view, trees, state.selected, { robot: state.map && view.toScreen(...state.map.pose) });
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster);
   if (state.map) drawRobot(pen, view, state.map);
   if (state.measure?.to) drawMeasure(pen, view, state.measure);
@@ -293,8 +289,8 @@ function placesOf(x, y, radius, width, height) {
   return [[x + reach, y - height / 2], [x - reach - width, y - height / 2], [x - width / 2, y - reach - height], [x - width / 2, y + reach]];
 }
 
-// The selected tree has priority, then the numbers in `first`, then the trees with the most observations.
-export function drawNumbers(pen, view, trees, selected, { radiusOf = symbolRadius, first = new Set(), words = ({ number }) => String(number), robot = null } = {}) {
+// The selected tree has priority, then the trees with the most observations.
+export function drawNumbers(pen, view, trees, selected, { radiusOf = symbolRadius, robot = null } = {}) {
   const taken = new Boxes();
   const seen = [];
   for (const tree of trees) {
@@ -305,14 +301,14 @@ export function drawNumbers(pen, view, trees, selected, { radiusOf = symbolRadiu
     taken.add([x - radius, y - radius, x + radius, y + radius]);
   }
   if (robot) taken.add([robot[0] - 9, robot[1] - 9, robot[0] + 9, robot[1] + 9]);
-  const rank = ({ number }) => (number === selected ? 0 : first.has(number) ? 1 : 2);
+  const rank = ({ number }) => (number === selected ? 0 : 1);
   seen.sort((a, b) => rank(a.tree) - rank(b.tree) || (b.tree.observations ?? 0) - (a.tree.observations ?? 0) || a.tree.number - b.tree.number);
   for (const { tree, x, y, radius } of seen) {
     const chosen = tree.number === selected;
     const size = chosen ? LARGE : SMALL;
     const font = `${chosen ? "bold " : ""}${size}px`;
     pen.font = `${font} ${colours.font}`; // for the width
-    const text = words(tree);
+    const text = String(tree.number);
     const [width, height] = [pen.measureText(text).width, size];
     const places = placesOf(x, y, radius + (chosen ? 5 : 0), width, height);
     const free = places.find(([left, top]) => taken.isFree([left, top, left + width, top + height]));

@@ -20,15 +20,11 @@ export const wholeRun = el("section", { id: "tune-whole-run", "aria-label": "The
   el("label", { title: "On: each change re-maps the run from its first scan, so that the map and its scores follow. Off: changes apply from the current scan onwards" }, box, " whole run"),
   note, progress, all);
 
-// Trees that remain under another number, as [before, now].
-const renumbered = ({ renamed }) => renamed.filter(([before, now]) => before !== now);
-
 function resultText(remapped) {
   const { after, scans, changes } = remapped;
   const number = (kind) => changes.filter((change) => change.kind === kind).length;
   const parts = Object.keys(SIGNS).map((kind) => number(kind) && `${number(kind)} ${kind}`).filter(Boolean);
-  const others = renumbered(remapped).length;
-  return `Re-mapped${endText(scans)}: ${count(after, "tree")}, ${parts.length ? parts.join(", ") : "none moved"}${others ? `; ${others} renumbered` : ""}.`;
+  return `Re-mapped${endText(scans)}: ${count(after, "tree")}, ${parts.length ? parts.join(", ") : "none moved"}.`;
 }
 
 // The re-mapping ends at the current scan; later scans are mapped when the run reaches them.
@@ -66,7 +62,7 @@ function show() {
   if (share === null) begun = null;
   box.checked = state.parameters?.whole ?? true;
   progress.hidden = share === null;
-  all.hidden = !newest || (!newest.changes.length && !renumbered(newest).length);
+  all.hidden = !newest || !newest.changes.length;
   if (share !== null) progress.value = share;
   const ghost = isTuning() ? preview ?? newest : null;
   if (state.ghost !== ghost) {
@@ -81,13 +77,8 @@ const lineOf = (kind, sign, node, why) => el("li", { "data-kind": kind }, el("b"
 const treeLink = (number, words) => el("button", { class: "link", type: "button", text: `Tree ${number}${words}`, onclick: () => select(number) });
 
 function showChanges() {
-  const { changes = [], renamed = [] } = state.remapped ?? {};
-  const was = new Map(renumbered({ renamed }).map(([before, now]) => [now, `was tree ${before}`]));
-  const moved = new Set(changes.filter(({ kind }) => kind === "moved").map(({ number }) => number));
-  const lines = [ // one per tree: a tree that moved and was renumbered has one line
-    ...changes.map(({ kind, number, why }) => lineOf(kind, SIGNS[kind], kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : treeLink(number, ` ${kind}`),
-      kind === "moved" && was.has(number) ? `${why}, ${was.get(number)}` : why)),
-    ...[...was].filter(([now]) => !moved.has(now)).map(([now, before]) => lineOf("renumbered", "#", treeLink(now, ""), before))];
+  const { changes = [] } = state.remapped ?? {};
+  const lines = changes.map(({ kind, number, why }) => lineOf(kind, SIGNS[kind], kind === "vanished" ? el("span", { text: `Tree ${number} vanished` }) : treeLink(number, ` ${kind}`), why));
   setText(folded, `${count(lines.length, "change")}`);
   list.replaceChildren(...lines.slice(0, MOST), lines.length > MOST ? el("li", { text: `and ${lines.length - MOST} more` }) : "");
   show();

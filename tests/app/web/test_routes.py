@@ -35,6 +35,7 @@ from app.worker.protocol import (
     SetSpeed,
     Shown,
     Status,
+    TreeChange,
     WorkerBusyError,
 )
 from pipeline.config import field_specs, preset
@@ -161,7 +162,7 @@ async def test_what_a_change_acts_on_is_told_to_the_worker(both: Running) -> Non
     assert (await client.put("/api/parameters/reach", json={"whole": "yes"})).status_code == 422
 
 
-async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: Running) -> None:
+async def test_a_run_that_was_mapped_again_has_its_own_marks_and_keeps_the_selection(both: Running) -> None:
     client, dashboard = both
     await show(dashboard)
     await dashboard.select_tree(2)
@@ -172,8 +173,6 @@ async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: R
         before=4,
         after=2,
         ghost=[(0.0, 1.0, None)],
-        renamed=[(3, 1), (4, 5)],  # of a map before the one that was shown last
-        followed=[(1, 1), (2, 5)],
         changes=[],
         confirmed=[(1, 0.1), (5, 0.2)],
     )
@@ -187,11 +186,12 @@ async def test_a_run_that_was_mapped_again_has_its_own_marks_and_numbers(both: R
     await dashboard.receive(Remapped(7, changes))  # of a run that was left
     assert dashboard.selector.selection.tree == 2
     await dashboard.receive(Remapped(1, changes))
-    assert dashboard.selector.selection.tree == 5
+    assert dashboard.selector.selection.tree == 2
     marks = [e for e in dashboard.events.as_plain()["events"] if e["kind"] == "tree"]
     assert [(e["t"], e["text"]) for e in marks] == [(0.1, "Tree 1 confirmed"), (0.2, "Tree 5 confirmed")]
     assert (await client.get("/api/trees")).status_code == 200
-    await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, followed=[(1, 1)])))
+    gone = [TreeChange("vanished", 2, 0.0, 0.0, "now: nothing was detected there")]
+    await dashboard.receive(Remapped(1, msgspec.structs.replace(changes, changes=gone)))
     assert dashboard.selector.selection.tree is None
 
 

@@ -240,21 +240,15 @@ def test_what_a_held_slider_changes_is_told_against_the_map_before_it_was_taken(
         session.set_parameters(parameters, revision, whole=True, step=step)
         return remapped(session)[1]
 
-    def named(renamed: list[tuple[int, int]], side: int) -> set[int]:
-        return {pair[side] for pair in renamed}
-
     none = BASE.replace({"classification.tree_share": 1.0, "tracking.hits_to_confirm": 30})
     first = told_after(FEWER, 1, 1)
-    assert first.followed == first.renamed
     second = told_after(none, 2, 1)
     third = told_after(FEWER, 3, 1)
     assert first.ghost == second.ghost == third.ghost
     assert (first.before, first.after, first.changes) == (third.before, third.after, third.changes)
     assert second.after < second.before
-    assert named(third.followed, 0) <= named(second.renamed, 1) | {c.number for c in second.changes}
     other = told_after(BASE, 4, 2)
     assert other.before == third.after
-    assert other.followed == other.renamed
 
 
 def test_a_change_from_here_on_leaves_the_map_before_it(session):
