@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import errno
 import html
+import logging
 import os
 import signal
 import socket
@@ -62,6 +63,8 @@ _PORTS_TRIED = 10
 # A small send buffer: data that waits in the kernel for a slow link is outdated when it arrives.
 _SEND_BUFFER = 128 * 1024
 _GRACE_S = 1
+# Messages of uvicorn about a client that sends no HTTP, or whose websocket is refused.
+_OF_REFUSED = ("Invalid HTTP request", "ASGI callable returned without completing handshake")
 _OF_THE_PORT = (errno.EADDRINUSE, errno.EACCES)
 _OTHER_HOST = "Give an address of this machine with --host, or omit it"
 
@@ -144,9 +147,15 @@ def link_of(settings: Settings, port: int, token: str) -> str:
     return f"http://{_name(settings.host)}:{port}/?token={token}"
 
 
+def _is_of_this_server(record: logging.LogRecord) -> bool:
+    """Return whether a message of uvicorn is about this server, and not about a request that was refused."""
+    return not record.getMessage().startswith(_OF_REFUSED)
+
+
 def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
     """Return the uvicorn configuration of the application: without access log, since the first address
     contains the token, and without compression of websockets."""
+    logging.getLogger("uvicorn.error").addFilter(_is_of_this_server)
     return uvicorn.Config(
         app,
         http=HttpProtocol,

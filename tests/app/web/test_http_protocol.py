@@ -87,3 +87,21 @@ async def test_connections_without_a_request_are_limited_per_address(monkeypatch
             assert (await client.get("/api/status")).status_code == 200
         for _, writer in held:
             writer.close()
+
+
+UPGRADE = (
+    "GET /api/live HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
+
+
+@pytest.mark.parametrize("request_text", ["GARBAGE\r\n\r\n", UPGRADE], ids=["no HTTP", "no token"])
+async def test_a_refused_client_prints_nothing(request_text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async with served() as (host, _):
+        reader, writer = await connect(host)
+        writer.write(request_text.format(host=host).encode())
+        assert (await reader.read(100)).startswith(b"HTTP/1.1 40")
+        writer.close()
+        await asyncio.sleep(0.2)
+    told = capsys.readouterr()
+    assert told.out + told.err == ""

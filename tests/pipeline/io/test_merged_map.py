@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.merged_map import merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
+from pipeline.slam.poses import composed
 from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Columns
 from tests.pipeline.test_mapper import fed, mapper, run
@@ -57,6 +58,28 @@ def test_landmarks_and_tracks_of_the_second_map_are_moved_with_their_full_covari
         track.P[:, :2, :2], expected(was.P[:, :2, :2], was.x[:, :2]), rtol=1e-2, atol=1e-5
     )
     np.testing.assert_allclose(track.shared, expected(was.shared, was.x[:, :2]), rtol=1e-2, atol=1e-5)
+
+
+def test_path_keyframes_and_columns_of_the_second_map_turn_with_it():
+    m = mapper()
+    fed(m, run()[0][:6])
+    state = SavedMap.of(m)
+    state.slam.frame.pose[:, 2] = 0.3
+    n = len(state.columns.axis)
+    lean = np.array([0.0, 0.0, 0.05, 0.02])
+    axis = np.vstack([state.columns.axis, np.pad(lean, (0, state.columns.axis.shape[1] - 4))])[-1:]
+    columns = {f.name: getattr(state.columns, f.name) for f in fields(Columns)}
+    empty = {name: np.zeros((1, *column.shape[1:]), column.dtype) for name, column in columns.items()}
+    one = replace(state, columns=Columns(**{**empty, "axis": axis}))
+    merged = merge_maps(state, one, T, COVARIANCE, 10**12, m.parameters).map
+    path = state.slam.genealogy.path(state.slam.best)
+    moved = merged.slam.genealogy.path(merged.slam.best)[len(path) :]
+    np.testing.assert_allclose(moved, composed(np.tile(T.as_array(), (len(path), 1)), path), atol=1e-9)
+    of_second = merged.slam.frame.pose[-len(state.slam.frame.serial) :]
+    np.testing.assert_allclose(of_second[:, 2], 0.3 + T.yaw)
+    assert len(merged.columns.axis) == n + 1
+    np.testing.assert_allclose(merged.columns.axis[-1, :2], [T.x, T.y])
+    np.testing.assert_allclose(merged.columns.axis[-1, 2:4], T.rotation() @ lean[2:4])
 
 
 def test_the_sides_from_which_a_tree_was_seen_turn_with_the_second_map():
