@@ -39,8 +39,8 @@ class Limits:
     @classmethod
     def for_size(cls, size: int) -> Limits:
         """Return the limits for reading a file of `size` bytes: 512 MB and twice its size of memory, 6 s and
-        1 s per 20 MB of computing time, 60 s and 1 s per 5 MB of time."""
-        return cls((512 << 20) + 2 * size, 6 + size // 20_000_000, 60.0 + size / 5_000_000)
+        1 s per 4 MB of computing time, 60 s and 1 s per 5 MB of time."""
+        return cls((512 << 20) + 2 * size, 6 + size // 4_000_000, 60.0 + size / 5_000_000)
 
 
 def run_limited(work: Callable[[], object], limits: Limits, where: str) -> None:

@@ -98,7 +98,8 @@ class DdsGraph:
     """The writers that are alive now.
 
     Args:
-        robot: Only topics below `/robot/` count; "" for all topics, as those of one robot.
+        robot: Name of the robot of the topics below `/robot/`; other topics are of no robot (""). "" for all
+            topics as those of one robot.
     """
 
     def __init__(self, robot: str) -> None:
@@ -127,7 +128,8 @@ class DdsGraph:
         return self._alive.pop(key, None) is not None
 
     def publishers(self) -> list[Publisher]:
-        """Return all topics that are written, each once, sorted by robot and topic."""
+        """Return each pair of topic and type that is written, once, sorted by robot, topic and type; see the
+        class for the robot of a topic."""
         found = {(self._owner(offer.topic), offer.topic, offer.msgtype) for offer in self._alive.values()}
         return [Publisher(*each) for each in sorted(found)]
 

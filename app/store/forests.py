@@ -124,6 +124,10 @@ class Forests:
         """Store a forest in the data folder under its name, and return the name; a file of that name is
         replaced.
 
+        Args:
+            data: JSON of a forest as `learn` returns it; it is not validated. Its name is computed from the
+                classes and decision trees, see `name_of`.
+
         Raises:
             StemmapError: There is no data folder, or it cannot be written.
         """

@@ -138,7 +138,9 @@ class WorkerLoop:
         return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
-        """Return the time until the next scan is due [s]; None if only a command can start work."""
+        """Return the time until the next scan is due [s]: 0 while a rerun works or a scan is overdue, the
+        interval `_LISTEN_S` for a live run without a queued scan, and None if only a command can start work.
+        An error of the source sets the state to "failed" and is reported."""
         pace = self._session.pace
         if self._session.is_remapping:
             return 0.0

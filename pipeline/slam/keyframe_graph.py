@@ -272,9 +272,11 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
 
     def thinned(self) -> KeyframeGraph:
-        """Return the graph without every second keyframe. Motions are compounded, and the next keyframe takes
-        the detections at the present relative pose. The ends of loops and the newest keyframe stay. A motion
-        over a keyframe without odometry has infinite covariance."""
+        """Return the graph without every second keyframe. The ends of loops and the newest keyframe stay.
+
+        Motions are compounded; over a keyframe without odometry the covariance is infinite. The next keyframe
+        takes the detections of a dropped one at the present relative pose, combined by landmark and at most
+        STEMS_MAX of them; without odometry between both they are lost."""
         ends = {scan for loop in self.loops for scan in loop.scans} | {self.newest_scan}
         rows, kept = list[int](), list[Keyframe]()
         motion, covariance = np.zeros(3), np.zeros((3, 3))

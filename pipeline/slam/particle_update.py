@@ -101,8 +101,9 @@ def near_for(landmarks: int) -> Near:
 
 @compiled
 def predict(pose: Float, motion: Float, covariance: Float, noise: Float, use_proposal: bool) -> Float:
-    """Return the poses after a motion, shape (P, 3). With `use_proposal` each pose is only moved; otherwise
-    it is drawn from the Gaussian about the moved pose.
+    """Return the poses after a motion, shape (P, 3). With `use_proposal` each pose is only moved, and
+    its yaw is not wrapped; otherwise it is drawn from the Gaussian about the moved pose, with a yaw in [-pi,
+    pi).
 
     Args:
         pose: x, y [m], yaw [rad] of each particle, shape (P, 3); unchanged.

@@ -183,8 +183,9 @@ class Tracker:
     def _follow(
         self, stamp_ns: int, estimate: PoseEstimate, landmarks: Landmarks, gate: float, distance_max: float
     ) -> ScanPose:
-        """Assign the trees to the landmarks, remove trees without landmark and tree column, and return the
-        pose of the robot, which is stored as that of the last scan.
+        """Assign the trees to the landmarks, and return the pose of the robot, which is stored as that of the
+        last scan. Trees whose landmarks were merged are joined: the older one stays and gets the data of
+        both. Trees that have neither a landmark nor a tree column are removed.
 
         Args:
             stamp_ns: Time of the scan [ns].

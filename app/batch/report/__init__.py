@@ -228,8 +228,12 @@ def stand_map(
 
 
 def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dict[str, Any]:
-    """Return what the template draws of the diameter classes: bars as x, y, width, height, ends of the error,
-    label [mm], marks of the axis, and its title. Without classes there are no bars.
+    """Return what the template draws of the diameter classes, without bars if there are no classes.
+
+    Coordinates are in mm. Keys: `width` and `height` of the drawing; `bars`, each with x, y, width, height,
+    middle, edge, high and low (plus and minus one standard error, at least 0) and `label`, the lower limit of
+    the class [cm] as text; `last`, the upper limit of the last class; `marks` of the axis as y and text; and
+    `title`.
 
     Args:
         whole: Stand figures of the whole observed area.

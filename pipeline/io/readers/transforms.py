@@ -19,7 +19,8 @@ FARTHEST = 1e9
 
 
 class TransformTree:
-    """Fixed transforms between frames; frames are compared without a leading slash."""
+    """Fixed transforms between frames. Names are compared as they are: `frame_name` removes leading slashes
+    before."""
 
     def __init__(self) -> None:
         """Create a tree without transforms."""
@@ -104,8 +105,9 @@ class Extrinsics:
 
     def read(self, fixed: frozenset[int], moving: frozenset[int]) -> None:
         """Add the transforms of the first messages of some channels to `tree`, and set `odometry_link`.
-        Moving channels contribute only transforms that do not change; fixed ones replace them. Damaged
-        messages are ignored.
+        Moving channels contribute only transforms that do not change and do not begin at a world frame; fixed
+        ones replace them. Damaged messages are ignored. `odometry_link` stays None without a moving transform
+        of an odometry in the first MOVING_MESSAGES messages.
 
         Args:
             fixed, moving: Numbers of the channels of fixed and of moving transforms.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 from typing import Any
+from unittest.mock import AsyncMock
 
 import httpx
 import msgspec
@@ -41,6 +42,7 @@ async def play(
     truth: TruthTrees | None = TRUTH,
 ) -> None:
     """A run is opened and shown up to a scan; its record is written when this returns."""
+    dashboard.check_source = AsyncMock()  # the sources exist only here
     await dashboard.open(wanted or Open(uri))
     await dashboard.receive(opened(uri, truth=truth, run=run))
     await show(dashboard, scan, n_trees, run)
@@ -111,6 +113,7 @@ async def test_what_the_database_refused_is_written_when_it_answers_again(
 async def test_a_run_that_showed_nothing_leaves_no_record(both: Running) -> None:
     client, dashboard = both
     await dashboard.receive(opened())
+    dashboard.check_source = AsyncMock()
     await dashboard.open(Open("other:"))
     assert await runs(client) == []
 
@@ -319,10 +322,10 @@ async def test_a_reader_that_dies_or_hangs_is_an_error_for_people() -> None:
 
     dies = (sys.executable, "-c", "import os; os.abort()")
     with pytest.raises(SourceError, match="ended without an answer"):
-        await inspection.ask({"ask": "recording", "path": "x"}, command=dies)
+        await inspection.ask({"ask": "recording", "path": __file__}, command=dies)
     hangs = (sys.executable, "-c", "import threading; threading.Event().wait()")
     with pytest.raises(inspection.TookTooLongError):
-        await inspection.ask({"ask": "recording", "path": "x"}, command=hangs, patience_s=0.2)
+        await inspection.ask({"ask": "recording", "path": __file__}, command=hangs, patience_s=0.2)
     with pytest.raises(SourceError, match="no such file"):
         await inspection.ask({"ask": "recording", "path": "/no/such.mcap"})
 
