@@ -206,7 +206,8 @@ class Mapper:
 
     @property
     def height_map(self) -> HeightMap:
-        """The terrain map so far."""
+        """The terrain map of all tiles so far: copies that are made at each access, in a time that grows with
+        the map."""
         return self._terrain.record()
 
     @property

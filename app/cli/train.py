@@ -245,7 +245,8 @@ def _chosen(store: Store, names: list[str]) -> list[AnnotatedRun]:
 
     Args:
         store: The store.
-        names: Digest, URI, path or name of each run; empty for all.
+        names: Digest, URI, path or file name of each run; empty for all. A file name that several runs share
+            stands for one of them.
 
     Raises:
         UsageError: A name is unknown.

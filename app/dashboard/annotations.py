@@ -43,7 +43,8 @@ def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Agains
 
 
 def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> Counted:
-    """Return which ground truth is used for the scores; arguments as in `truth_of`.
+    """Return which ground truth is used for the scores: "source" (chosen by `against` "own"), "annotations",
+    "both" or "none"; arguments as in `truth_of`.
 
     "none" is returned if the chosen ground truth does not exist, except that without ground truth of the
     source "both" uses the annotations, and without annotations the source.

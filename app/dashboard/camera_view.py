@@ -163,8 +163,9 @@ def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]
 
 
 def _box(camera: Camera, points: Float) -> dict[str, float] | None:
-    """Return the box around points of the base frame, shape (N, 3) [m], as shares of the size of the picture,
-    clipped to it; None if it is not in view or a point is nearer than NEAREST to the camera plane."""
+    """Return the box around points of the base frame, shape (N, 3), N >= 1 [m], as "left", "top", "width" and
+    "height", shares of the size of the picture, clipped to it; None if it is not in view or a point is nearer
+    than NEAREST to the camera plane."""
     pixels, depth = camera.project(points)
     if not (depth > NEAREST).all():
         return None

@@ -143,7 +143,8 @@ class VelodyneLink(Link):
                     self._take(packet, sender)
 
     def _bound(self) -> socket.socket:
-        """Return a bound UDP socket; OSError if the address or port cannot be used."""
+        """Return a bound UDP socket, whose reads raise TimeoutError after _WAIT_S; OSError if the address or
+        port cannot be used."""
         listening = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)

@@ -15,7 +15,7 @@ from app.scene.colours import ViewSettings
 from app.scene.labels import TREE_WIDTH, Label, LabelNodes, Place, apart
 from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
-from pipeline.types.records import Frame, Trees, TruthTrees
+from pipeline.types.records import HIDDEN, Frame, Trees, TruthTrees
 
 Ring = tuple[float, float, float] | None
 
@@ -251,7 +251,8 @@ def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> 
     trees, shape (K, 2), and false trees, shape (F, 2), all in metres.
 
     Args:
-        trees: The map; confirmed trees count.
+        trees: The map; confirmed trees count. One that is matched with another object is false, and one that
+            is matched with a HIDDEN tree neither right nor false, as in the scores.
         truth: Ground truth.
         path: Positions of the robot, shape (N, 2) [m], N >= 1. Only trees within reach of it count as missed
             or false; matched trees may be farther away.
@@ -259,16 +260,19 @@ def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> 
     """
     from scipy.spatial import cKDTree
 
-    from pipeline.evaluation.matching import matched_rows
+    from pipeline.evaluation.matching import match
 
-    true = np.column_stack([truth.x, truth.y])
-    rows, truth_of = matched_rows(trees, truth, wanted.match_distance)
-    offsets = np.stack([true[truth_of], trees.position[rows]], axis=1)
+    true, kind = np.column_stack([truth.x, truth.y]), np.array(truth.kind, np.str_)
+    confirmed = np.flatnonzero(trees.confirmed)
+    truth_of = match(trees.position[confirmed], true, wanted.match_distance)
+    rows, truth_of = confirmed[truth_of >= 0], truth_of[truth_of >= 0]
+    is_tree = kind[truth_of] == "tree"
+    offsets = np.stack([true[truth_of[is_tree]], trees.position[rows[is_tree]]], axis=1)
     way = cKDTree(path)
-    missed = np.array([kind == "tree" for kind in truth.kind], np.bool_)
+    missed = kind == "tree"
     missed[truth_of] = False
     false = trees.confirmed.copy()
-    false[rows] = False
+    false[rows[is_tree | (kind[truth_of] == HIDDEN)]] = False
     left_out, wrong = true[missed], trees.position[false]
     return offsets, left_out[_near(way, left_out, wanted.reach)], wrong[_near(way, wrong, wanted.reach)]
 
@@ -391,7 +395,8 @@ class MapCloud:
             block.visible = visible and number * BLOCK < len(self._sent)
 
     def _send(self, points: NDArray[np.float32]) -> None:
-        """Send the blocks of points, shape (N, 3) [m], from the first that changed on."""
+        """Send the blocks of points, shape (N, 3) [m], from the first that changed on. Blocks beyond the last
+        point keep their content; `repaint` hides them. The array is kept and must not change afterwards."""
         first = first_difference(self._sent, points)
         if first == len(points) == len(self._sent):
             return

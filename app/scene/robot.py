@@ -177,8 +177,8 @@ class WayNode(Segments):
 
 
 def way_lines(curvature: float, backward: bool, begins: float, parameters: Obstacles) -> NDArray[np.float32]:
-    """Return both sides of the path ahead and a line at the end of each zone, in the level base frame, as
-    segments of shape (S, 2, 3) [m].
+    """Return both sides of the path ahead, and lines across it at its beginning and at the end of each zone,
+    in the level base frame, as segments of shape (S, 2, 3) [m].
 
     Args:
         curvature: Curvature of the path [1/m], positive to the left.

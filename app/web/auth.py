@@ -181,9 +181,11 @@ class Guard:
         self.cookie = f"stemmap_{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse the request, or call the application with the role and user of the caller, a limited body,
-        and a renewed session where it is due. Events other than requests and websockets are passed on
-        unchecked."""
+        """Refuse the request; answer a link with a valid token or ticket by a redirect that sets the session
+        cookie, which uses the ticket up; or call the application with the role of the caller in
+        `scope["state"]["role"]` (None for a health check without a session) and the user in `current_user`, a
+        limited body, and a renewed session where it is due. Events other than requests and websockets are
+        passed on unchecked."""
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return

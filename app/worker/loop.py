@@ -109,7 +109,8 @@ class WorkerLoop:
         successive parameter changes (a slider drag) the last one is returned.
 
         Raises:
-            queue.Empty: A scan is due.
+            queue.Empty: Work is due (see `_map`): a scan, a part of a rerun, the preparation, or listening in
+                a live run.
         """
         if not self._taken:
             self._taken.append(self._await_command())

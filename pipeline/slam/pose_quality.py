@@ -61,7 +61,8 @@ def pose_health(
 
 def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) -> tuple[HealthState, str]:
     """Return the state and the message of its reason, which is empty for a good pose. The first rule that
-    applies decides; `sigma_xy` is in metres. NaN counts as uncertain and gives "lost"."""
+    applies decides; `sigma_xy` is in metres. NaN counts as uncertain and gives "lost". `doubt` is the reason
+    to doubt the odometry, "" for none; it gives "weak" unless the trees determine the motion reliably."""
     if not sigma_xy <= SIGMA_WEAK:
         return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than the distance between trees"
     if is_lost(recent):

@@ -201,7 +201,8 @@ class PcapSource(FileSource):
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
-        """Index the packets of the file and group them to sweeps."""
+        """Index the packets of the file and group them to sweeps. Only packets of the sender and model with
+        the most packets are used; the others are counted in `losses`. The file stays open until `close`."""
         super().__init__()
         self._path = path
         packets, self._damage = find_packets(path)
