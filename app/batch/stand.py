@@ -218,8 +218,6 @@ def stand_summary(result: StandResult) -> list[str]:
     of = count(len(result.figures), "plot") if result.figures.keys() != {ALL} else "whole observed area"
     least = f"{100.0 * result.parameters.dbh_min:g} cm"
     part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
-    least = f"{100.0 * result.parameters.dbh_min:g} cm"
-    part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
     lines = [
         f"{of}: {count(trees, 'tree')} from {least} on {seen:,.0f} m2 observed{part}, "
         f"coordinates {result.frame.name}"
