@@ -32,7 +32,7 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import geojson
 from pipeline.stand.figures import FIGURES
-from pipeline.stand.plots import Plot
+from pipeline.stand.plots import SamplePlot
 from pipeline.types.records import Path, Trees
 
 _DATE = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
@@ -119,7 +119,7 @@ class ExportedRun:
 
 
 def read_for_export(
-    folder: FilePath, plots: Sequence[Plot] = (), parameters: Stand | None = None
+    folder: FilePath, plots: Sequence[SamplePlot] = (), parameters: Stand | None = None
 ) -> ExportedRun:
     """Return a run with its values for export.
 

@@ -14,7 +14,6 @@ from app.batch.georeference import heights_at, read_map_frame
 from app.batch.run_folder import read_run, read_run_record, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.types.records import Int
 
 EVERY = 5  # scans of a drive between two that are used
 MARGIN = 0.10  # m around the trunk at breast height, for lean and roughness of the stem
@@ -132,9 +131,5 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     points = thinned.points
     if not len(points):
         raise StemmapError("the run has no points near known ground", where=str(folder))
-    for begin in _starts(len(points)):
+    for begin in range(0, len(points), _CHUNK):
         yield points[begin : begin + _CHUNK, :3].astype(np.float64)
-
-
-def _starts(n: int) -> Int:
-    return np.arange(0, n, _CHUNK)

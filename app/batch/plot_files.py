@@ -11,7 +11,7 @@ import shapely
 from app.batch.georeference import LOCAL, MapFrame, read_map_frame
 from app.common.extras import needed
 from pipeline.errors import SourceError, StemmapError
-from pipeline.stand.plots import PLOTS_MAX, Plot, checked
+from pipeline.stand.plots import PLOTS_MAX, SamplePlot, checked
 
 LARGEST_FILE = 64 << 20
 SUFFIXES = (".gpkg", ".shp", ".geojson", ".json")
@@ -19,7 +19,7 @@ _NAMES = ("name", "plot", "plot_id", "plotid", "id", "nr", "number")
 _RADII = ("radius_m", "radius", "r_m")
 
 
-def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list[Plot]:
+def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list[SamplePlot]:
     """Return the plots of a file in the frame of the map of a run.
 
     Polygons are plots; points are circles if a column `radius_m` (or `radius`, `r_m`) gives their radius.
@@ -62,7 +62,7 @@ def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list
 
             plots.append(circle(name, shape.x, shape.y, float(table[radius].iloc[k])))
         else:
-            plots.append(checked(Plot(name, shape)))
+            plots.append(checked(SamplePlot(name, shape)))
     return plots
 
 

@@ -22,7 +22,7 @@ from pipeline.io.atomic_files import write_beside
 from pipeline.io.ground_truth import read_truth_trees
 from pipeline.io.result_files import csv_text
 from pipeline.stand.plots import within_reach
-from pipeline.stand.revisit import Comparison, VisitTrees, align_visits, compare_visits, with_known_sigma
+from pipeline.stand.revisit import VisitComparison, VisitTrees, align_visits, compare_visits, with_known_sigma
 from pipeline.stand.seen_area import SeenArea
 from pipeline.types.records import Bool
 
@@ -132,7 +132,7 @@ def _check_unit(visit: Visit) -> None:
 
 def compare(
     a: Visit, b: Visit, *, same_frame: bool = False, reach: float = 1.0, dbh_sigma: float = 0.01
-) -> Comparison:
+) -> VisitComparison:
     """Align two visits and compare their trees.
 
     Args:
@@ -149,7 +149,7 @@ def compare(
     return compare_visits(first, second, pose, reach=reach, refine=not same_frame, stems=stems)
 
 
-def rows_of(a: Visit, b: Visit, found: Comparison) -> list[dict[str, Any]]:
+def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
     """Return one row of COLUMNS per tree, with None for unknown values; positions are in the frame of a.
 
     The status is `same`, `moved`, `missing` (only in a, at a place that b observed), `new` (only in b, at a
@@ -218,7 +218,7 @@ def _row(
     return dict(zip(COLUMNS, values, strict=True))
 
 
-def comparison_record(a: Visit, b: Visit, found: Comparison) -> dict[str, Any]:
+def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, Any]:
     """Return the figures of a comparison as JSON values."""
     rows = rows_of(a, b, found)
     growth = found.growth[np.isfinite(found.growth)]
@@ -281,7 +281,7 @@ def comparison_lines(record: dict[str, Any]) -> list[str]:
     return lines
 
 
-def write_comparison(a: Visit, b: Visit, found: Comparison, folder: FilePath) -> None:
+def write_comparison(a: Visit, b: Visit, found: VisitComparison, folder: FilePath) -> None:
     """Write comparison.csv, comparison.json, comparison.svg (a map) and comparison.geojson to a folder, which
     is created if necessary.
 

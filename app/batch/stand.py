@@ -19,7 +19,7 @@ from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
 from pipeline.io.result_files import csv_text
 from pipeline.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
-from pipeline.stand.plots import Plot, detection_function, figures_of, seen_plot, within_reach
+from pipeline.stand.plots import SamplePlot, detection_function, figures_of, seen_plot, within_reach
 from pipeline.stand.seen_area import SeenArea
 
 ALL = "all"
@@ -46,7 +46,7 @@ class StandResult:
     frame: MapFrame
     trees: PlotTrees
     parameters: Stand
-    plots: Sequence[Plot]
+    plots: Sequence[SamplePlot]
     seen: SeenArea
     figures: dict[str, StandFigures]
     total: dict[str, Estimate]
@@ -54,7 +54,7 @@ class StandResult:
     warnings: tuple[str, ...]
 
 
-def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[Plot] = ()) -> StandResult:
+def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = ()) -> StandResult:
     """Return the stand figures of a finished run. Nothing is written.
 
     Args:

@@ -12,7 +12,7 @@ from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from pipeline.config.stages import Stand
-    from pipeline.stand.plots import Plot
+    from pipeline.stand.plots import SamplePlot
 
 HELP = "stems and basal area per hectare, diameters and density of a mapped run"
 
@@ -114,7 +114,7 @@ def stand_parameters(arguments: argparse.Namespace) -> Stand:
         ) from None
 
 
-def chosen_plots(arguments: argparse.Namespace) -> list[Plot]:
+def chosen_plots(arguments: argparse.Namespace) -> list[SamplePlot]:
     """Return the plots that the flags define, in the frame of the map: those of --plots, then circles and
     rectangles, then those along the path. [] without such flags.
 
@@ -126,7 +126,7 @@ def chosen_plots(arguments: argparse.Namespace) -> list[Plot]:
     from app.batch.run_folder import read_run
     from pipeline.stand.plots import along, circle, rectangle
 
-    plots: list[Plot] = []
+    plots: list[SamplePlot] = []
     if arguments.plots is not None:
         from app.batch.plot_files import read_plots
 

@@ -23,7 +23,7 @@ _DAMAGED = "The file is damaged, or this is a fault in stemmap"
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ProcessLimits:
     """Limits of a child process.
 
     Attributes:
@@ -37,13 +37,13 @@ class Limits:
     wall_s: float
 
     @classmethod
-    def for_size(cls, size: int) -> Limits:
+    def for_size(cls, size: int) -> ProcessLimits:
         """Return the limits for reading a file of `size` bytes: 512 MB and twice its size of memory, 6 s and
         1 s per 4 MB of computing time, 60 s and 1 s per 5 MB of time."""
         return cls((512 << 20) + 2 * size, 6 + size // 4_000_000, 60.0 + size / 5_000_000)
 
 
-def run_limited(work: Callable[[], object], limits: Limits, where: str) -> None:
+def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -> None:
     """Run a function in a copy of this process, which is killed at its limits; its result is discarded.
 
     The copy has only the calling thread: the function must not wait for other threads. It is available on
@@ -95,7 +95,7 @@ def _answer(receiving: int, wall_s: float) -> bytes | None:
     return None
 
 
-def _be_child(work: Callable[[], object], limits: Limits, where: str, sending: int) -> NoReturn:
+def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sending: int) -> NoReturn:
     """Run the function in the copy with its limits, write its error as JSON (null without one), and end the
     copy; nothing is written after exceptions other than StemmapError and MemoryError.
 

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
-from app.common.limited_process import Limits, run_limited
+from app.common.limited_process import ProcessLimits, run_limited
 from pipeline.inventory.cloud import WholeCloud
 from pipeline.io.readers import Source, SourceOptions, clouds
 from pipeline.io.readers import open_source as _open_source
@@ -45,7 +45,7 @@ def _check(opening: Callable[[], object], uri: str) -> None:
     SourceError if it fails or exceeds its limits."""
     size = _size(uri)
     if size is not None:
-        run_limited(opening, Limits.for_size(size), uri)
+        run_limited(opening, ProcessLimits.for_size(size), uri)
 
 
 def _size(uri: str) -> int | None:

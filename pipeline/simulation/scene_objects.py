@@ -181,7 +181,7 @@ def add_undergrowth(scene: SceneBuilder, x: float, y: float) -> None:
 
 
 def person(owner: int, stride: float = 0.0) -> Solids:
-    """Return the shapes of a person of 1.74 m at the origin who looks along x.
+    """Return the shapes of a person of 1.74 m at the origin with the heading along x.
 
     Args:
         owner: Number of the object.

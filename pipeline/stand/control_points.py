@@ -52,7 +52,7 @@ def fit_control_points(
         point_sigma: Expected standard deviation of a coordinate [m]. Larger residuals are refused.
 
     Raises:
-        StemmapError: There are fewer than two points, they lie at one place, or they contradict one another:
+        StemmapError: There are fewer than two points, they are at one place, or they contradict one another:
             in their scale, the order of their axes, or their residuals. The message names the cause.
     """
     n = len(local)
@@ -64,7 +64,7 @@ def fit_control_points(
     spread_a, spread_b = (float(np.sqrt(np.square(v).sum(axis=1).mean())) for v in (a, b))
     if min(spread_a, spread_b) < SPREAD_MIN:
         raise StemmapError(
-            "the control points lie at one place", remedy="Give points that are far from one another"
+            "the control points are at one place", remedy="Give points that are far from one another"
         )
     fit = fit_rigid_pairs(local, known)
     allowed = 0.5 if point_sigma is None else CONTRADICTION * point_sigma

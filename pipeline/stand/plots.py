@@ -25,7 +25,7 @@ _SAMPLES = 4  # along each side of a cell
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plot:
+class SamplePlot:
     """A plot.
 
     Attributes:
@@ -43,7 +43,7 @@ class Plot:
         return inside
 
 
-def circle(name: str, x: float, y: float, radius: float) -> Plot:
+def circle(name: str, x: float, y: float, radius: float) -> SamplePlot:
     """Return a circle with the exact area of its radius [m].
 
     Raises:
@@ -52,10 +52,10 @@ def circle(name: str, x: float, y: float, radius: float) -> Plot:
     # A regular polygon inside of the circle is smaller than it; its corners are moved outwards.
     k = 4 * _ARC
     larger = radius * math.sqrt(2.0 * math.pi / (k * math.sin(2.0 * math.pi / k)))
-    return checked(Plot(name, shapely.Point(x, y).buffer(max(larger, 0.0), quad_segs=_ARC)))
+    return checked(SamplePlot(name, shapely.Point(x, y).buffer(max(larger, 0.0), quad_segs=_ARC)))
 
 
-def rectangle(name: str, x: float, y: float, length: float, width: float, turn: float = 0.0) -> Plot:
+def rectangle(name: str, x: float, y: float, length: float, width: float, turn: float = 0.0) -> SamplePlot:
     """Return a rectangle.
 
     Args:
@@ -69,10 +69,10 @@ def rectangle(name: str, x: float, y: float, length: float, width: float, turn: 
     """
     corners = 0.5 * np.array([[-length, -width], [length, -width], [length, width], [-length, width]])
     c, s = math.cos(turn), math.sin(turn)
-    return checked(Plot(name, shapely.Polygon(corners @ np.array([[c, s], [-s, c]]) + [x, y])))
+    return checked(SamplePlot(name, shapely.Polygon(corners @ np.array([[c, s], [-s, c]]) + [x, y])))
 
 
-def checked(plot: Plot) -> Plot:
+def checked(plot: SamplePlot) -> SamplePlot:
     """Return a plot that can be used.
 
     Raises:
@@ -95,7 +95,7 @@ def checked(plot: Plot) -> Plot:
     return plot
 
 
-def along(path: Float, every: float, radius: float) -> list[Plot]:
+def along(path: Float, every: float, radius: float) -> list[SamplePlot]:
     """Return circles "path 1", "path 2", ... along a path, the first at half the distance between two.
 
     Args:
@@ -119,14 +119,14 @@ def along(path: Float, every: float, radius: float) -> list[Plot]:
     return [circle(f"path {k + 1}", x, y, radius) for k, (x, y) in enumerate(places.tolist())]
 
 
-def seen_plot(name: str, seen: SeenArea) -> Plot:
+def seen_plot(name: str, seen: SeenArea) -> SamplePlot:
     """Return the whole observed area as a plot.
 
     Raises:
         StemmapError: Nothing was observed.
     """
     low = seen.place * seen.cell
-    return checked(Plot(name, shapely.union_all(shapely.box(*low.T, *(low + seen.cell).T))))
+    return checked(SamplePlot(name, shapely.union_all(shapely.box(*low.T, *(low + seen.cell).T))))
 
 
 def within_reach(seen: SeenArea, parameters: Stand) -> SeenArea:
@@ -146,7 +146,7 @@ def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> D
 
 
 def figures_of(
-    plots: Sequence[Plot], trees: PlotTrees, seen: SeenArea, parameters: Stand
+    plots: Sequence[SamplePlot], trees: PlotTrees, seen: SeenArea, parameters: Stand
 ) -> dict[str, StandFigures]:
     """Return the figures of each plot by its name.
 

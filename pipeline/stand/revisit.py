@@ -42,7 +42,7 @@ class VisitTrees:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class VisitComparison:
     """Two visits, a the earlier one.
 
     Attributes:
@@ -95,7 +95,7 @@ def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tu
 
 def compare_visits(
     a: VisitTrees, b: VisitTrees, T_a_b: Pose2, *, reach: float, refine: bool, stems: int = 0
-) -> Comparison:
+) -> VisitComparison:
     """Pair the trees of two visits and compare them.
 
     Args:
@@ -103,7 +103,7 @@ def compare_visits(
         T_a_b: Pose of the frame of b in that of a.
         reach: Largest distance of a pair [m].
         refine: Whether the pose is fitted again to all pairs.
-        stems: See `Comparison`.
+        stems: See `VisitComparison`.
     """
     for _ in range(_ROUNDS if refine else 0):
         rows_a, rows_b = _pairs(match(a.position, T_a_b.apply(b.position), reach))
@@ -122,7 +122,9 @@ def compare_visits(
     typical = float(np.median(shift)) / 1.177 if len(shift) else 0.0
     own = np.hypot(a.sigma[rows_a], b.sigma[rows_b])
     limit = np.maximum(MOVED_SIGMAS * np.maximum(typical, own), MOVED_MIN)
-    return Comparison(T_a_b, b_of, stems, shift, growth, sigma, _significant(growth, sigma), shift > limit)
+    return VisitComparison(
+        T_a_b, b_of, stems, shift, growth, sigma, _significant(growth, sigma), shift > limit
+    )
 
 
 def _pairs(b_of: Int) -> tuple[Int, Int]:

@@ -278,7 +278,7 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     for k in range(trees.shape[0]):
         t, c = at[k], trees[k]
         if t < 0 or tracks.hits[t] == 0:
-            stem = _stem_beside(tracks, cells, scale, axis[c, 0], axis[c, 1], fewest)
+            stem = _detected_stem_near(tracks, cells, scale, axis[c, 0], axis[c, 1], fewest)
             t = stem if stem >= 0 else t
         if t < 0:
             new[n] = c
@@ -292,7 +292,7 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
 
 
 @compiled_within
-def _stem_beside(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
+def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
     """Return the row of the track with most detections within RING_FAR of an axis x, y [m]; -1 for none. It
     has at least `fewest` detections, and is a tree or a candidate: without class, or of a class by votes for
     which roundness is evidence against (see `AT_ROUND`)."""

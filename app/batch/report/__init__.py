@@ -25,7 +25,7 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import write_beside
 from pipeline.stand.figures import FIGURES, Estimate
-from pipeline.stand.plots import Plot
+from pipeline.stand.plots import SamplePlot
 
 LANGUAGES = ("en", "de")
 SUFFIXES = (".html", ".pdf")
@@ -63,7 +63,11 @@ class Numbers:
 
 
 def report_page(
-    folder: FilePath, *, language: str = "en", plots: Sequence[Plot] = (), parameters: Stand | None = None
+    folder: FilePath,
+    *,
+    language: str = "en",
+    plots: Sequence[SamplePlot] = (),
+    parameters: Stand | None = None,
 ) -> str:
     """Return the report of a run as the text of one HTML file without scripts or links. Nothing is written.
 
@@ -151,7 +155,7 @@ def _step(length: float) -> float:
 
 
 def stand_map(
-    run: ExportedRun, whole: StandResult, plots: Sequence[Plot], texts: dict[str, str], number: Numbers
+    run: ExportedRun, whole: StandResult, plots: Sequence[SamplePlot], texts: dict[str, str], number: Numbers
 ) -> dict[str, Any]:
     """Return what the template draws on the map: sizes in millimetres of a page, north (or y) upwards.
 

@@ -62,9 +62,9 @@ def rows(folder):
 
 
 def test_growth_new_missing_and_moved_trees_are_found_in_another_frame(visits, tmp_path, capsys):
-    told = stemmap(capsys, "compare", *visits, "--out", tmp_path / "out")
-    assert told.code == 0, told.err
-    assert "59 trees in both of 60 and 60; aligned by" in told.out
+    result = stemmap(capsys, "compare", *visits, "--out", tmp_path / "out")
+    assert result.code == 0, result.err
+    assert "59 trees in both of 60 and 60; aligned by" in result.out
     table = rows(tmp_path / "out")
     by_a = {row["tree_a"]: row for row in table}
     assert (by_a["21"]["status"], by_a["21"]["tree_b"]) in {("missing", ""), ("not seen in b", "")}
@@ -95,9 +95,9 @@ def test_the_map_and_the_files_show_every_tree(visits, tmp_path, capsys):
 
 
 def test_the_same_run_twice_has_no_change(visits, tmp_path, capsys):
-    told = stemmap(capsys, "compare", visits[0], visits[0], "--same-frame", "--out", tmp_path / "out")
-    assert "60 same" in told.out
-    assert "significant for 0" in told.out
+    result = stemmap(capsys, "compare", visits[0], visits[0], "--same-frame", "--out", tmp_path / "out")
+    assert "60 same" in result.out
+    assert "significant for 0" in result.out
     assert {row["significant"] for row in rows(tmp_path / "out")} == {"false"}
 
 
@@ -109,8 +109,8 @@ def test_only_what_the_other_visit_looked_at_is_missing(visits, tmp_path, capsys
         f"{x:.3f},{y:.3f},{100 * d:.1f}" for (x, y), d in zip(a.position[half], a.dbh[half], strict=True)
     ]
     table.write_text("\n".join(["x_m,y_m,dbh_cm", *lines]))
-    told = stemmap(capsys, "compare", visits[0], table, "--out", tmp_path / "out")
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "compare", visits[0], table, "--out", tmp_path / "out")
+    assert result.code == 0, result.err
     by_status: dict[str, list[float]] = {}
     for row in rows(tmp_path / "out"):
         by_status.setdefault(row["status"], []).append(float(row["x_m"]))
@@ -128,8 +128,8 @@ def test_a_real_survey_and_a_lidar_map_are_aligned_without_hints(shared_data, tm
     table = tmp_path / "lidar.csv"
     lines = [f"{x},{y},{row['dbh_m']}" for (x, y), row in zip(place, lidar, strict=True)]
     table.write_text("\n".join(["x_m,y_m,dbh_m", *lines]))
-    told = stemmap(capsys, "compare", field, table, "--out", tmp_path / "out")
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "compare", field, table, "--out", tmp_path / "out")
+    assert result.code == 0, result.err
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert (record["trees_a"], record["trees_b"]) == (62, 93)
     assert record["pairs"] >= 57
@@ -138,7 +138,7 @@ def test_a_real_survey_and_a_lidar_map_are_aligned_without_hints(shared_data, tm
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("x_m,y_m,dbh_cm\n", "no trees"),
         ("x_m,y_m,dbh_m\n1,2,30\n3,4,25\n", "median diameter is 27.5 m"),
@@ -148,10 +148,10 @@ def test_a_real_survey_and_a_lidar_map_are_aligned_without_hints(shared_data, tm
         ("a,b\n1,2\n", "x"),
     ],
 )
-def test_tables_that_cannot_be_compared_are_refused(visits, tmp_path, capsys, text, says):
+def test_tables_that_cannot_be_compared_are_refused(visits, tmp_path, capsys, text, message):
     table = tmp_path / "t.csv"
     table.write_text(text)
-    stemmap(capsys, "compare", visits[0], table).refused(1, says)
+    stemmap(capsys, "compare", visits[0], table).refused(1, message)
 
 
 def test_noise_alone_is_rarely_called_growth():

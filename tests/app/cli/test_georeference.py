@@ -47,16 +47,16 @@ def control(file, run, numbers, columns=("tree", "easting", "northing"), off=0.0
 @pytest.mark.parametrize("columns", [("tree", "easting", "northing"), ("tree", "lon", "lat")])
 def test_control_points_at_trees_place_the_map(run, tmp_path, capsys, columns):
     file = control(tmp_path / "points.csv", run, (1, 10, 91, 100), columns)
-    told = stemmap(capsys, "georeference", run, "--control", file, "--crs", "EPSG:25832")
-    assert told.code == 0, told.err
-    assert "EPSG:25832: origin at 500000.000, 5300000.000 m" in told.out
-    assert told.out.count("residual") == 4
+    result = stemmap(capsys, "georeference", run, "--control", file, "--crs", "EPSG:25832")
+    assert result.code == 0, result.err
+    assert "EPSG:25832: origin at 500000.000, 5300000.000 m" in result.out
+    assert result.out.count("residual") == 4
     frame = read_map_frame(run)
     point = np.array([[3.0, 4.0]])
     assert np.abs(frame.to_crs(point) - TRUE.apply(point)).max() < 1e-3
     assert np.abs(frame.to_map(frame.to_crs(point)) - point).max() < 1e-6
     again = stemmap(capsys, "georeference", run)
-    assert again.out == told.out
+    assert again.out == result.out
 
 
 def test_heights_of_control_points_give_the_height_of_the_map(run, tmp_path, capsys):
@@ -84,7 +84,7 @@ def test_plots_of_the_country_are_moved_into_the_map(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("text", "says"),
+    ("text", "message"),
     [
         ("", "header"),
         ("tree,easting\n1,2\n", "header"),
@@ -97,17 +97,17 @@ def test_plots_of_the_country_are_moved_into_the_map(run, tmp_path, capsys):
         ("tree,easting,northing\n1,nan,5300000\n", "not a number"),
     ],
 )
-def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, says):
+def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, message):
     file = tmp_path / "points.csv"
     file.write_text(text)
-    told = stemmap(capsys, "georeference", run, "--control", file, "--crs", "EPSG:25832")
-    told.refused(1)
-    assert any(word in told.err for word in says.split("|")), told.err
+    result = stemmap(capsys, "georeference", run, "--control", file, "--crs", "EPSG:25832")
+    result.refused(1)
+    assert any(word in result.err for word in message.split("|")), result.err
     assert not (run / "georeference.json").exists()
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "says"),
+    ("words", "code", "message"),
     [
         (["--by-hand", "500000,5300000,0"], 2, "--crs is missing"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:1"], 1, "not a coordinate reference system"),
@@ -118,9 +118,9 @@ def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, say
         (["--gnss", "--crs", "EPSG:25832"], 1, "no GNSS fixes"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_line(run, capsys, words, code, says):
-    told = stemmap(capsys, "georeference", run, *words)
-    told.refused(code, says)
+def test_what_does_not_fit_is_refused_in_one_line(run, capsys, words, code, message):
+    result = stemmap(capsys, "georeference", run, *words)
+    result.refused(code, message)
 
 
 def test_removing_makes_the_map_local(run, capsys):
@@ -154,9 +154,9 @@ def test_fixes_of_the_recording_place_the_map_in_spite_of_outliers(run, capsys, 
     monkeypatch.setattr("app.sources.opening.open_source", lambda _uri: source)
     saved = SimpleNamespace(map=SimpleNamespace(stamp_ns=path.stamp_ns + start_ns))
     monkeypatch.setattr("app.batch.continue_map.read_saved_run", lambda _folder: saved)
-    told = stemmap(capsys, "georeference", run, "--gnss", "--crs", "EPSG:25832")
-    assert told.code == 0, told.err
-    used = re.search(r"by (\d+) of 41 GNSS fixes", told.out)
+    result = stemmap(capsys, "georeference", run, "--gnss", "--crs", "EPSG:25832")
+    assert result.code == 0, result.err
+    used = re.search(r"by (\d+) of 41 GNSS fixes", result.out)
     assert used is not None
     assert 30 <= int(used[1]) <= 36  # five are reflections
     frame = read_map_frame(run)

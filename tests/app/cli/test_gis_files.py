@@ -47,9 +47,9 @@ def runs(tmp_path_factory):
 
 def exported(capsys, run, file):
     """Export a run with plots; the file."""
-    told = stemmap(capsys, "export", run, "--to", file, *PLOTS)
-    assert told.code == 0, told.err
-    assert "100 trees in" in told.out
+    result = stemmap(capsys, "export", run, "--to", file, *PLOTS)
+    assert result.code == 0, result.err
+    assert "100 trees in" in result.out
     return file
 
 
@@ -197,16 +197,16 @@ def test_the_terrain_is_a_raster_in_its_place(runs, tmp_path, capsys, name):
 
 
 @pytest.mark.parametrize(
-    ("to", "code", "says"),
+    ("to", "code", "message"),
     [
         ("trees.kml", 1, ".gpkg, .shp"),
         ("missing/trees.gpkg", 1, "cannot write"),
         ("tree-manager", 2, "--out"),
     ],
 )
-def test_what_cannot_be_written_is_refused(runs, capsys, tmp_path, monkeypatch, to, code, says):
+def test_what_cannot_be_written_is_refused(runs, capsys, tmp_path, monkeypatch, to, code, message):
     monkeypatch.chdir(tmp_path)
-    stemmap(capsys, "export", runs["local"], "--to", to).refused(code, says)
+    stemmap(capsys, "export", runs["local"], "--to", to).refused(code, message)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -221,14 +221,14 @@ def test_a_missing_package_is_named_with_its_extra(runs, capsys, tmp_path, monke
         return real(name, package)
 
     monkeypatch.setattr(importlib, "import_module", without)
-    told = stemmap(capsys, "export", runs["local"], "--to", tmp_path / "x.xlsx")
-    told.refused(1, "xlsxwriter", "stemmap[gis]")
+    result = stemmap(capsys, "export", runs["local"], "--to", tmp_path / "x.xlsx")
+    result.refused(1, "xlsxwriter", "stemmap[gis]")
 
 
 def test_a_cloud_with_a_reference_system_keeps_it(tmp_path, capsys):
     run = grid_run(tmp_path / "cloud", cloud_crs="EPSG:25832", seen=False)
-    told = stemmap(capsys, "export", run, "--to", tmp_path / "x.gpkg")
-    assert "100 trees in EPSG:25832" in told.out
+    result = stemmap(capsys, "export", run, "--to", tmp_path / "x.gpkg")
+    assert "100 trees in EPSG:25832" in result.out
     with fiona.open(tmp_path / "x.gpkg", layer="trees") as table:
         assert pyproj.CRS.from_wkt(table.crs_wkt).to_epsg() == 25832
         assert len(table) == 100

@@ -14,10 +14,10 @@ def test_the_cloud_of_a_drive_has_its_trees_and_its_ground(tmp_path, capsys):
     run = tmp_path / "run"
     assert stemmap(capsys, "map", "sim:stand?duration=6", "--out", run).code == 0
     stemmap(capsys, "georeference", run, "--by-hand", "500000,5300000,90,400", "--crs", "EPSG:25832")
-    told = stemmap(capsys, "export", run, "--to", tmp_path / "cloud.laz")
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "export", run, "--to", tmp_path / "cloud.laz")
+    assert result.code == 0, result.err
     cloud = laspy.read(tmp_path / "cloud.laz")
-    assert f"{len(cloud.points):,} points" in told.out
+    assert f"{len(cloud.points):,} points" in result.out
     assert cloud.header.parse_crs().to_epsg() == 25832
     place = np.stack([cloud.y - 5300000, -(cloud.x - 500000)], axis=1)  # the map is turned by 90 degrees
     trees = read_run(run).trees
@@ -49,8 +49,8 @@ def test_a_whole_cloud_keeps_its_points(tmp_path, capsys):
     points = np.concatenate([np.stack([x, y, random.normal(0, 0.01, 20000)], axis=1), trunk])
     np.save(tmp_path / "plot.npy", points.astype(np.float32))
     assert stemmap(capsys, "map", tmp_path / "plot.npy", "--out", tmp_path / "run").code == 0
-    told = stemmap(capsys, "export", tmp_path / "run", "--to", tmp_path / "cloud.las")
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "export", tmp_path / "run", "--to", tmp_path / "cloud.las")
+    assert result.code == 0, result.err
     cloud = laspy.read(tmp_path / "cloud.las")
     assert len(cloud.points) == len(points)
     np.testing.assert_allclose(np.stack([cloud.x, cloud.y, cloud.z], axis=1), points, atol=0.001)
@@ -67,6 +67,6 @@ def test_a_source_that_is_gone_or_a_folder_that_is_not_there_is_one_line(tmp_pat
     run = grid_run(tmp_path / "run")
     record = (run / "run.json").read_text().replace("sim:stand", "gone.mcap")
     (run / "run.json").write_text(record)
-    told = stemmap(capsys, "export", run, "--to", tmp_path / name)
-    told.refused(1)
+    result = stemmap(capsys, "export", run, "--to", tmp_path / name)
+    result.refused(1)
     assert not (tmp_path / "cloud.laz").exists()

@@ -43,8 +43,8 @@ def run(tmp_path_factory):
 
 def page_of(capsys, run, file, words=()):
     """The text of a report."""
-    told = stemmap(capsys, "report", run, "--out", file, *words)
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "report", run, "--out", file, *words)
+    assert result.code == 0, result.err
     return file.read_text(encoding="utf-8")
 
 
@@ -144,22 +144,22 @@ def test_numbers_are_those_of_the_language():
 
 
 @pytest.mark.parametrize(
-    ("words", "code", "says"),
+    ("words", "code", "message"),
     [
         (["--out", "r.txt"], 1, ".html or .pdf"),
         (["--out", "r.html", "--language", "fr"], 1, "Languages: en, de"),
         (["--out", "missing/r.html"], 1, "no such folder"),
     ],
 )
-def test_what_cannot_be_written_is_refused(run, tmp_path, capsys, monkeypatch, words, code, says):
+def test_what_cannot_be_written_is_refused(run, tmp_path, capsys, monkeypatch, words, code, message):
     monkeypatch.chdir(tmp_path)
-    stemmap(capsys, "report", run, *words).refused(code, says)
+    stemmap(capsys, "report", run, *words).refused(code, message)
 
 
 def test_a_pdf_without_a_browser_says_what_to_do(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("CHROMIUM", "/nowhere/chrome")
-    told = stemmap(capsys, "report", run, "--out", tmp_path / "r.pdf")
-    told.refused(1, "/nowhere/chrome is not there", "CHROMIUM=")
+    result = stemmap(capsys, "report", run, "--out", tmp_path / "r.pdf")
+    result.refused(1, "/nowhere/chrome is not there", "CHROMIUM=")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -168,8 +168,8 @@ def test_a_pdf_has_pages_and_leaves_nothing_else(run, tmp_path, capsys):
     if not Path(os.environ.get("CHROMIUM", "/usr/bin/chromium")).exists():
         pytest.skip("no Chromium")
     assert find_browser()
-    told = stemmap(capsys, "report", run, "--out", tmp_path / "r.pdf", "--language", "de")
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "report", run, "--out", tmp_path / "r.pdf", "--language", "de")
+    assert result.code == 0, result.err
     content = (tmp_path / "r.pdf").read_bytes()
     assert content.startswith(b"%PDF")
     assert len(re.findall(rb"/Type\s*/Page\b", content)) >= 4

@@ -29,9 +29,9 @@ def table(file):
 
 
 def test_the_whole_observed_area_is_a_plot_by_default(run, tmp_path, capsys):
-    told = stemmap(capsys, "stand", run, "--out", tmp_path / "out")
-    assert (told.code, told.err) == (0, "")
-    assert "100 trees from 7 cm on 400 m2 observed, coordinates local" in told.out
+    result = stemmap(capsys, "stand", run, "--out", tmp_path / "out")
+    assert (result.code, result.err) == (0, "")
+    assert "100 trees from 7 cm on 400 m2 observed, coordinates local" in result.out
     row = table(tmp_path / "out" / "stand.csv")["all"]
     assert float(row["n_ha"]) == pytest.approx(2500.0)
     assert float(row["g_ha"]) == pytest.approx(2500 * math.pi / 4 * 0.04)
@@ -46,8 +46,8 @@ def test_the_whole_observed_area_is_a_plot_by_default(run, tmp_path, capsys):
 
 def test_plots_have_rows_of_their_own_and_a_mean(run, tmp_path, capsys):
     words = ["--circle", "10,10,5.641896", "--rectangle", "10,10,9,9", "--along", "9", "--radius", "4"]
-    told = stemmap(capsys, "stand", run, *words, "--out", tmp_path / "out")
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "stand", run, *words, "--out", tmp_path / "out")
+    assert result.code == 0, result.err
     rows = table(tmp_path / "out" / "stand.csv")
     assert list(rows) == ["1", "2", "path 1", "path 2", "path 3", "mean"]
     assert float(rows["1"]["area_m2"]) == pytest.approx(100.0, abs=0.01)
@@ -71,8 +71,8 @@ def written(folder, name, shapes, names=("a", "b"), crs=None, columns=None):
 @pytest.mark.parametrize("name", ["plots.gpkg", "plots.shp", "plots.geojson"])
 def test_plots_of_a_file_in_the_frame_of_the_map(run, tmp_path, capsys, name):
     file = written(tmp_path, name, [shapely.box(0, 0, 10, 10), shapely.box(10, 0, 20, 20)])
-    told = stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local", "--out", tmp_path / "out")
-    assert told.code == 0, told.err
+    result = stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local", "--out", tmp_path / "out")
+    assert result.code == 0, result.err
     rows = table(tmp_path / "out" / "stand.csv")
     assert [rows[n]["trees"] for n in ("a", "b")] == ["25", "50"]
 
@@ -89,7 +89,7 @@ def test_points_with_a_radius_are_circles(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (["--circle", "500,500,5"], "outside of what the run observed"),
         (["--circle", "10,10,0"], "area of 0"),
@@ -101,20 +101,20 @@ def test_points_with_a_radius_are_circles(run, tmp_path, capsys):
         (["--plots", "plots.txt"], ".gpkg, .shp or .geojson"),
     ],
 )
-def test_plots_that_cannot_be_used_are_refused(run, capsys, words, says):
-    stemmap(capsys, "stand", run, *words).refused(1, says)
+def test_plots_that_cannot_be_used_are_refused(run, capsys, words, message):
+    stemmap(capsys, "stand", run, *words).refused(1, message)
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (["--dbh-min", "7"], "--dbh-min 7"),
         (["--reach", "far"], "--reach"),
         (["--correction", "x"], "--correction"),
     ],
 )
-def test_parameters_out_of_bounds_are_refused(run, capsys, words, says):
-    stemmap(capsys, "stand", run, *words).refused(2, says)
+def test_parameters_out_of_bounds_are_refused(run, capsys, words, message):
+    stemmap(capsys, "stand", run, *words).refused(2, message)
 
 
 def test_plots_in_a_country_s_coordinates_need_a_georeference(run, tmp_path, capsys):
@@ -130,10 +130,10 @@ def test_plots_in_a_country_s_coordinates_need_a_georeference(run, tmp_path, cap
 def test_damaged_files_of_plots_end_with_one_line(run, tmp_path, capsys, text, suffix):
     file = tmp_path / f"plots.{suffix}"
     file.write_text(text)
-    told = stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local")
-    assert told.code == 1
-    assert told.err.startswith("stemmap: ")
-    assert "Traceback" not in told.err
+    result = stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local")
+    assert result.code == 1
+    assert result.err.startswith("stemmap: ")
+    assert "Traceback" not in result.err
 
 
 def test_few_trees_and_empty_plots_are_warnings(run, capsys):
@@ -162,10 +162,10 @@ def test_diameters_in_another_unit_are_noticed(tmp_path, capsys):
 
 def test_a_run_without_a_record_of_what_was_seen_uses_the_ground(tmp_path, capsys):
     run = grid_run(tmp_path / "old", seen=False)
-    told = stemmap(capsys, "stand", run)
-    assert told.code == 3
-    assert "no record of what was observed; cells with ground returns are used" in told.err
-    assert "100 trees" in told.out
+    result = stemmap(capsys, "stand", run)
+    assert result.code == 3
+    assert "no record of what was observed; cells with ground returns are used" in result.err
+    assert "100 trees" in result.out
 
 
 def test_trees_far_from_every_view_are_corrected_for_detection(tmp_path, capsys):

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from app.common.limited_process import Limits, run_limited
+from app.common.limited_process import ProcessLimits, run_limited
 from pipeline.errors import SourceError
 
 DESCRIPTORS = Path("/proc/self/fd")
-ROOMY = Limits(memory=1 << 30, cpu_s=20, wall_s=60.0)
+ROOMY = ProcessLimits(memory=1 << 30, cpu_s=20, wall_s=60.0)
 
 
 def endless_query() -> None:
@@ -39,9 +39,9 @@ def test_its_error_arrives_whole():
 @pytest.mark.parametrize(
     ("work", "limits", "says"),
     [
-        (endless_query, Limits(1 << 30, 1, 60.0), "too long"),
-        (lambda: time.sleep(60), Limits(1 << 30, 20, 0.2), "too long"),
-        (lambda: bytearray(400 << 20), Limits(100 << 20, 20, 60.0), "more memory"),
+        (endless_query, ProcessLimits(1 << 30, 1, 60.0), "too long"),
+        (lambda: time.sleep(60), ProcessLimits(1 << 30, 20, 0.2), "too long"),
+        (lambda: bytearray(400 << 20), ProcessLimits(100 << 20, 20, 60.0), "more memory"),
         (os.abort, ROOMY, "without an answer"),
         (lambda: 1 / 0, ROOMY, "without an answer"),
     ],
@@ -58,14 +58,14 @@ def test_what_exceeds_a_limit_or_ends_is_an_error_with_the_file(work, limits, sa
 def test_nothing_of_the_copy_remains():
     descriptors = len(list(DESCRIPTORS.iterdir()))
     with pytest.raises(SourceError):
-        run_limited(lambda: time.sleep(60), Limits(1 << 30, 20, 0.1), "x.mcap")
+        run_limited(lambda: time.sleep(60), ProcessLimits(1 << 30, 20, 0.1), "x.mcap")
     with pytest.raises(ChildProcessError):
         os.waitpid(-1, os.WNOHANG)
     assert len(list(DESCRIPTORS.iterdir())) == descriptors
 
 
 def test_limits_grow_with_the_file():
-    small, large = Limits.for_size(10_000), Limits.for_size(4_000_000_000)
+    small, large = ProcessLimits.for_size(10_000), ProcessLimits.for_size(4_000_000_000)
     assert small.memory < 1 << 30
     assert small.cpu_s <= 10
     assert large.memory > 8_000_000_000

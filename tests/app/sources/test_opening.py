@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from app.cli import main
-from app.common.limited_process import Limits
+from app.common.limited_process import ProcessLimits
 from app.robot.source import open_any
 from app.sources.opening import open_source
 from pipeline.errors import SourceError
@@ -81,8 +81,8 @@ def _interior(child: int, cells: int = 400) -> bytes:
 @pytest.fixture
 def little_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Allow a second of computing time for any file."""
-    limits = Limits(512 << 20, 1, 60.0)
-    monkeypatch.setattr("app.sources.opening.Limits.for_size", lambda _size: limits)
+    limits = ProcessLimits(512 << 20, 1, 60.0)
+    monkeypatch.setattr("app.sources.opening.ProcessLimits.for_size", lambda _size: limits)
 
 
 @pytest.mark.usefixtures("little_time")
@@ -108,11 +108,11 @@ def test_the_command_line_refuses_it_in_one_line(tmp_path: Path, capsys: pytest.
 def test_a_folder_is_as_large_as_what_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     sizes: list[int] = []
 
-    def limits(size: int) -> Limits:
+    def limits(size: int) -> ProcessLimits:
         sizes.append(size)
-        return Limits(512 << 20, 10, 60.0)
+        return ProcessLimits(512 << 20, 10, 60.0)
 
-    monkeypatch.setattr("app.sources.opening.Limits.for_size", limits)
+    monkeypatch.setattr("app.sources.opening.ProcessLimits.for_size", limits)
     (tmp_path / "velodyne").mkdir()
     (tmp_path / "velodyne" / "0.bin").write_bytes(bytes(1000))
     (tmp_path / "notes.txt").write_bytes(bytes(234))

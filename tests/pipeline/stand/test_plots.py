@@ -15,7 +15,16 @@ from pipeline.detection.free_space import BINS
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.stand.figures import PlotTrees
-from pipeline.stand.plots import Plot, along, checked, circle, figures_of, rectangle, seen_plot, within_reach
+from pipeline.stand.plots import (
+    SamplePlot,
+    along,
+    checked,
+    circle,
+    figures_of,
+    rectangle,
+    seen_plot,
+    within_reach,
+)
 from pipeline.stand.seen_area import CELL, SeenArea, SeenRecorder
 from pipeline.types.records import Path
 
@@ -73,7 +82,7 @@ def test_circles_lie_along_the_path():
 )
 def test_what_is_no_area_is_refused(shape, text):
     with pytest.raises(StemmapError, match=text):
-        checked(Plot("p", shape))
+        checked(SamplePlot("p", shape))
 
 
 def test_a_scan_observes_up_to_its_free_range_and_not_behind_a_stem():
