@@ -39,7 +39,7 @@ from pipeline.inventory.stem_model import (
 )
 from pipeline.inventory.stem_tracing import CLASSES, chain, find_upright, follow
 from pipeline.inventory.terrain_raster import LowestReturns, TerrainRaster, heights_above
-from pipeline.types.records import Float32, Int32, Trees, Verdict
+from pipeline.types.records import Float32, Int, Int32, Trees, Verdict
 
 MOST_RASTER = 96 << 20  # bytes
 COARSE = 0.04  # m; coarser thinning makes diameters less precise
@@ -122,6 +122,7 @@ def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = pack
     fits = follow(slices, circles, number, stems, max(r_min, 0.02), r_max)
     height = middles(slices)
     figures = describe_stems(fits, height)
+    _place_by_circles(figures, circles, number)
     verdict = classify_stems(figures, r_min, r_max)
     kept = ~is_repeated(figures, verdict)
     fits, figures, verdict = fits[kept], figures[kept], verdict[kept]
@@ -188,6 +189,18 @@ def find_ground(
         near.add(np.column_stack([part[chosen], above[chosen]]))
     counts = {"read": extent.points, "apart from the plot": extent.apart, "below the ground": below}
     return ground, near, counts
+
+
+def _place_by_circles(figures: Float, circles: Float, number: Int) -> None:
+    """Set the positions of stems without a model to the means of their circles, in place.
+
+    Args:
+        figures: Models of the stems, shape (K, COLUMNS).
+        circles: Result of `find_circles`.
+        number: Stem of each circle, see `chain`.
+    """
+    for stem in np.flatnonzero(np.isnan(figures[:, X])):
+        figures[stem, [X, Y]] = circles[number == stem, :2].mean(axis=0)
 
 
 def _reject_other_objects(figures: Float, verdict: Int32, places: Float, share: Float) -> None:

@@ -151,18 +151,17 @@ def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
 
 def is_repeated(stems: Float, verdict: Int32) -> Bool:
     """Return which stems are duplicates, shape (K,): of stems at the same place, the trees come first, then
-    those with more slices, then the earlier ones; the others are repeated. Stems without a model (NaN) count
-    as one place.
+    those with more slices, then the earlier ones; the others are repeated. A stem whose position is unknown
+    (NaN) is not repeated.
 
     Args:
-        stems: Result of `describe_stems`, shape (K, COLUMNS).
+        stems: Result of `describe_stems`, shape (K, COLUMNS); where there is no model, X and Y may be known.
         verdict: Result of `classify_stems`, shape (K,).
     """
-    if len(stems) == 0:
-        return np.zeros(0, np.bool_)
     order = np.lexsort((np.arange(len(stems)), -stems[:, SLICES], verdict != Verdict.TREE))
+    order = order[np.isfinite(stems[order, X])]
     again = np.zeros(len(stems), np.bool_)
-    again[order] = _again(np.nan_to_num(stems[order], nan=1e9), verdict[order] == Verdict.TREE)
+    again[order] = _again(np.nan_to_num(stems[order]), verdict[order] == Verdict.TREE)
     return again
 
 

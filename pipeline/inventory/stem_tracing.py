@@ -284,7 +284,6 @@ def lines(height: Float, value: Float, weight: Float) -> tuple[float, float, flo
 
 TWICE = 0.3  # m; columns within this distance are one
 OFTEN = 50.0  # number of scans in which a column counts as present
-MOST_VOXELS = 1 << 20
 
 
 def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
@@ -292,7 +291,7 @@ def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
 
     A whole cloud is treated as if a robot had seen it from everywhere: each position was visible up to the
     height in which stems are traced, and no column was ever absent. Of columns within TWICE of each other the
-    strongest is kept. Of a cloud with more than MOST_VOXELS voxels, only a part is searched.
+    strongest is kept.
 
     Args:
         points: x, y, z, height above the ground [m], shape (N, 4); may be empty.
@@ -303,7 +302,8 @@ def find_upright(points: Float32, forest: Forest) -> tuple[Float, Float]:
         order of CLASSES, shape (K, 6).
     """
     memory = VoxelMap.empty()
-    memory.add(np.ascontiguousarray(points[:, [0, 1, 3]]), 0, MOST_VOXELS)
+    room = 1 << max(len(points) - 1, 0).bit_length()  # a full map would forget voxels; there is one per point
+    memory.add(np.ascontiguousarray(points[:, [0, 1, 3]]), 0, room)
     axes, figures = [np.zeros((0, 5))], [np.zeros((0, COUNT))]
     for tile in memory.due_tiles(1.0):
         mean, returns = memory.around(tile, MARGIN)
