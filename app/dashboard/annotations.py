@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.store.async_store import AsyncStore
-from app.store.records import Annotation, Content, StaleError, as_truth
+from app.store.records import SKIPPED, Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
 
@@ -140,7 +140,8 @@ class AnnotationEditor:
 
     Attributes:
         run: Number of the run in the store, None while none is open.
-        rows: The annotations of the run.
+        rows: The annotations of the run that state something, which are all that are not in `skipped`.
+        skipped: The annotations of trees about which a person did not decide.
         truth: Ground truth against which the map is scored.
         against: Choice of the ground truth, see `truth_of`.
         problem: Reason why nothing can be annotated; empty otherwise.
@@ -152,6 +153,7 @@ class AnnotationEditor:
     def __init__(self, store: AsyncStore) -> None:
         self.run: int | None = None
         self.rows: list[Annotation] = []
+        self.skipped: list[Annotation] = []
         self.truth: TruthTrees | None = None
         self.against: Against = "both"
         self.problem = ""
@@ -173,10 +175,10 @@ class AnnotationEditor:
         """
         self.leave()
 
-        def work(store: Store) -> tuple[int, list[Annotation], TruthTrees | None]:
+        def work(store: Store) -> tuple[int, _Rows, TruthTrees | None]:
             run = store.open_run(source, uri, Path(uri).name[:200] or uri[:200])
-            rows = store.annotations(run)
-            return run, rows, truth_of(own, rows, "both")
+            rows = _rows_of(store, run)
+            return run, rows, truth_of(own, rows[0], "both")
 
         self._own = self.truth = own
         generation = self._generation
@@ -184,7 +186,7 @@ class AnnotationEditor:
             run, rows, truth = await self._store.ask(work)
             if generation != self._generation:  # another run was opened meanwhile
                 return
-            self.run, self.rows = run, rows
+            self.run, (self.rows, self.skipped) = run, rows
             # The choice may have changed meanwhile.
             self.truth = truth if self.against == "both" else truth_of(own, self.rows, self.against)
             self.problem = ""
@@ -199,7 +201,8 @@ class AnnotationEditor:
         """Forget the annotations and the choice of the ground truth, because the run was closed; the store
         does not change."""
         self._generation += 1
-        self.run, self.rows, self.truth, self._own, self.against = None, [], None, None, "both"
+        self.run, self.truth, self._own, self.against = None, None, None, "both"
+        self.rows, self.skipped = [], []
 
     def score_against(self, against: Against) -> None:
         """Choose the ground truth for the scores, see `truth_of`, and call `changed`. No annotation
@@ -230,19 +233,19 @@ class AnnotationEditor:
             )
         own, against, generation = self._own, self.against, self._generation
 
-        def work(store: Store) -> tuple[T | StaleError, list[Annotation], TruthTrees | None]:
+        def work(store: Store) -> tuple[T | StaleError, _Rows, TruthTrees | None]:
             done: T | StaleError
             try:
                 done = function(store)
             except StaleError as error:  # the current state is shown to the person
                 done = error
-            rows = store.annotations(run)
-            return done, rows, truth_of(own, rows, against)
+            rows = _rows_of(store, run)
+            return done, rows, truth_of(own, rows[0], against)
 
-        done, rows, truth = await self._store.ask(work)
+        done, (rows, skipped), truth = await self._store.ask(work)
         if generation == self._generation:  # else another run was opened meanwhile
             who, number = _edits(self.rows, rows)
-            self.rows = rows
+            self.rows, self.skipped = rows, skipped
             self.truth = truth if against == self.against else truth_of(own, rows, self.against)
             self.serial += 1
             self.changed()
@@ -273,7 +276,20 @@ class AnnotationEditor:
             "contradicting": contradicting(self._own, self.rows),
             "same_thing_m": SAME_THING,
             "trees": [row_payload(row) for row in self.rows],
+            "skipped": [row_payload(row) for row in self.skipped],
         }
+
+
+_Rows = tuple[list[Annotation], list[Annotation]]
+
+
+def _rows_of(store: Store, run: int) -> _Rows:
+    """Return the annotations of a run that state something, and those of skipped trees."""
+    rows = store.annotations(run)
+    return (
+        [row for row in rows if row.content.kind != SKIPPED],
+        [row for row in rows if row.content.kind == SKIPPED],
+    )
 
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:

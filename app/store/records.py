@@ -14,6 +14,9 @@ from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
 
 KINDS = ("tree", "pole", "person", "bush", "other")
+# Class of an annotation of a tree about which a person did not decide. It states nothing, so it is no
+# ground truth, but it is stored, undone and shared like the others.
+SKIPPED = "skipped"
 MOST_ANNOTATIONS = 5000
 
 
@@ -34,7 +37,7 @@ class Content:
 
     Attributes:
         x, y: Position [m].
-        kind: Class, one of KINDS.
+        kind: Class, one of KINDS, or SKIPPED.
         dbh: Diameter at breast height [m], None if not measured.
     """
 

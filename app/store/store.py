@@ -30,6 +30,7 @@ from app.store.database import uploads as _uploads
 from app.store.records import (
     MOST_ANNOTATIONS,
     MOST_SETS,
+    SKIPPED,
     Annotation,
     Author,
     Change,
@@ -383,13 +384,13 @@ class Store:
         return [Annotation(row.id, _content(row), row.who, row.at_ns, row.version) for row in rows]
 
     def annotated_sources(self) -> list[AnnotatedSource]:
-        """Return all sources with annotations, in the order in which they were first opened, and how each was
-        mapped last."""
+        """Return all sources with annotations other than SKIPPED, in the order in which they were first
+        opened, and how each was mapped last."""
         a = _annotations.c
-        query = select(a.run, a.x, a.y, a.kind, a.dbh).where(a.deleted.is_(False)).order_by(a.id)
+        query = select(a.run, a.x, a.y, a.kind, a.dbh).where(a.deleted.is_(False), a.kind != SKIPPED)
         with self._engine.begin() as connection:
             contents: dict[int, list[Content]] = {}
-            for row in connection.execute(query):
+            for row in connection.execute(query.order_by(a.id)):
                 contents.setdefault(row.run, []).append(Content(row.x, row.y, row.kind, row.dbh))
             runs = select(_runs).where(_runs.c.id.in_(contents)).order_by(_runs.c.id)
             return [

@@ -299,8 +299,8 @@ RESET = """async () => {
     headers: { "Content-Type": "application/json" } });
   await send("POST", "/api/loop", { from_s: null, to_s: null });
   await send("POST", "/api/command", { type: "set_speed", factor: 1 });
-  const { run, trees } = await (await fetch("/api/annotations")).json();
-  for (const { id, version } of trees)
+  const { run, trees, skipped } = await (await fetch("/api/annotations")).json();
+  for (const { id, version } of [...trees, ...skipped])
     await send("DELETE", `/api/annotations/${id}`, { run, version, browser: "c".repeat(32), who: "reset" });
 }"""
 

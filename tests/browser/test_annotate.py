@@ -182,6 +182,49 @@ def test_keys_work_after_a_click_on_next(person: Dashboard):
     expect(page.locator("#annotate-next")).to_be_focused()  # who walks by Tab stays among the buttons
 
 
+def test_skipped_trees_are_stored_come_last_and_are_listed_by_their_state(person: Dashboard):
+    page = person.page
+    canvas = page.locator("#map")
+    hint = page.locator("#annotate-hint")
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    first, second, third = doubted(person)[:3]
+    for tree in (first, second):
+        canvas.press("s")
+        expect(hint).to_contain_text(f"Tree {tree['number']}, detected in")
+    canvas.press("s")
+    expect(page.locator("#annotate-skipped")).to_have_text("2 skipped")
+    person.until_server("/api/annotations", "it.skipped.length === 2 && it.trees.length === 0")
+    expect(page.locator("#annotations tbody tr")).to_have_count(0)  # a skip states nothing
+    unreviewed = "import('/static/js/annotate/annotations.js').then(it => it.unreviewed().map(t => t.number))"
+    order = page.evaluate(f"() => {unreviewed}")
+    assert (order[0], order[-2:]) == (third["number"], [first["number"], second["number"]])
+
+    # The table marks and lists them; who returns to one and decides replaces the skip.
+    page.locator("#annotate-skipped").click()
+    listed = page.locator("#trees tbody tr")
+    expect(listed).to_have_count(2)
+    mine = listed.and_(page.locator(f"[data-tree='{first['number']}']"))
+    expect(mine.locator("td").first).to_have_text(f"{first['number']} ↷")
+    mine.click()
+    person.tab("Annotate")
+    canvas.press("y")
+    expect(page.locator("#annotate-confirmed")).to_have_text("1 confirmed")
+    expect(page.locator("#annotate-skipped")).to_have_text("1 skipped")
+    row = page.locator("#annotations tbody tr")
+    expect(row.locator("td").first).to_have_text(str(first["number"]))
+    canvas.press("Control+z")
+    expect(page.locator("#annotate-skipped")).to_have_text("2 skipped")
+    expect(row).to_have_count(0)
+
+    # Tab is no key of the review: it moves the focus out of the panel.
+    page.locator("#annotate-add").focus()
+    for _ in range(3):
+        page.keyboard.press("Tab")
+    assert page.evaluate("() => document.activeElement.id") != "annotate-add"
+    person.until_server("/api/annotations", "it.skipped.length === 2")
+    assert person.errors == []
+
+
 def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
     person: Dashboard, chromium: Browser, server: Server
 ):

@@ -45,7 +45,7 @@ class _Edit(Body):
 class _Add(_Edit):
     x: _Metres
     y: _Metres
-    kind: Literal["tree", "pole", "person", "bush", "other"] = "tree"
+    kind: Literal["tree", "pole", "person", "bush", "other", "skipped"] = "tree"
     dbh_cm: Annotated[float, Field(gt=0.0, le=100.0 * _LARGEST_DBH_M)] | None = None
 
     @property
@@ -88,8 +88,9 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 
 @router.post("/annotations")
 async def add(body: _Add, dashboard: Dash) -> Response:
-    """Add an annotation; return its number and the numbers of edits that can be undone and repeated, with
-    201. 409 if another run was opened meanwhile or nothing can be annotated."""
+    """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
+    and not exported); return its number and the numbers of edits that can be undone and repeated, with 201.
+    409 if another run was opened meanwhile or nothing can be annotated."""
     (added,) = await dashboard.annotation_editor.edit(
         body.run, lambda store: store.add(body.run, body.author, [body.content])
     )

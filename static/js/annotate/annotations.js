@@ -14,6 +14,8 @@ const NUDGE_WAIT = 400; // [ms] of quiet after which nudges become one edit
 const PATIENCE = 3000; // [ms] until an accepted edit must have come back
 const VOTES_EVERY = 2000; // [ms] between two requests for the votes
 export const KINDS = ["tree", "pole", "person", "bush", "other"];
+const SKIPPED = "skipped"; // class of an annotation that states nothing
+export const STATES = ["open", "confirmed", "rejected", "skipped"]; // of a found tree in the review
 export const NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .@-]{0,39}$/u;
 
 export const draft = {
@@ -28,12 +30,12 @@ export const draft = {
 };
 const NO_VOTES = { needed: 0, of: new Map(), known: false };
 let votes = NO_VOTES; // of the decision trees for each found tree, by its number
-let skipped = []; // numbers of skipped trees, the one skipped last at the end
 const versions = new Map(); // "id:version" of a row as it was shown, to the version that an own edit made of it
 let last = Promise.resolve(), nudging = 0;
 
 export const annotating = () => visible("annotate");
 export const rows = () => state.annotations?.trees ?? [];
+const skips = () => state.annotations?.skipped ?? [];
 export const rowOf = (id) => rows().find((row) => row.id === id) ?? null;
 export const news = () => changed("annotating");
 
@@ -94,6 +96,9 @@ export function add(content) {
   });
 }
 
+// An annotation, also that of a skipped tree.
+const storedRow = (id) => [...rows(), ...skips()].find((row) => row.id === id) ?? null;
+
 // The version of a row as the person saw it, or a later one if only their own edits came between.
 function latest({ id, version }) {
   let now = version;
@@ -104,10 +109,10 @@ function latest({ id, version }) {
 export function change(row, fields) {
   return edit(async () => {
     const version = latest(row);
-    const { x, y, kind, dbh_cm } = { ...row, ...(version === row.version ? {} : rowOf(row.id)), ...fields };
+    const { x, y, kind, dbh_cm } = { ...row, ...(version === row.version ? {} : storedRow(row.id)), ...fields };
     const done = await call("PATCH", `/${row.id}`, { version, x, y, kind, dbh_cm });
     await arrived(done.serial);
-    const now = rowOf(row.id)?.version ?? version;
+    const now = storedRow(row.id)?.version ?? version;
     if (now !== version) versions.set(`${row.id}:${version}`, now);
     return done;
   });
@@ -124,7 +129,32 @@ export const importTable = (table, unit) => edit(() => call("POST", "/import", {
 
 // --- review of the found trees -------------------------------------------------------------------------------
 
-const annotationOf = (tree) => nearest(rows(), (row) => distance(row, tree), state.annotations?.same_thing_m ?? 0.5);
+// {ofTree, treeOf}: the annotation of each found tree by its number, and the number of the tree of each annotation by its id.
+// An annotation belongs to the found tree that is nearest to it; where a tree has several, those that state something count.
+const pairs = { map: null, annotations: null, ofTree: new Map(), treeOf: new Map() };
+
+function paired() {
+  if (pairs.map === state.map && pairs.annotations === state.annotations) return pairs;
+  Object.assign(pairs, { map: state.map, annotations: state.annotations, ofTree: new Map(), treeOf: new Map() });
+  for (const row of [...skips(), ...rows()]) {
+    const tree = nearest(trees(), (each) => distance(row, each), state.annotations.same_thing_m);
+    if (!tree) continue;
+    pairs.treeOf.set(row.id, tree.number);
+    const other = pairs.ofTree.get(tree.number);
+    if (!other || other.kind === SKIPPED || distance(row, tree) < distance(other, tree)) pairs.ofTree.set(tree.number, row);
+  }
+  return pairs;
+}
+
+const annotationOf = (tree) => paired().ofTree.get(tree.number) ?? null;
+export const treeNumberOf = (row) => paired().treeOf.get(row.id) ?? null;
+
+// One of STATES.
+export function reviewOf(tree) {
+  const row = annotationOf(tree);
+  if (!row) return "open";
+  return row.kind === SKIPPED ? SKIPPED : row.kind === "tree" ? "confirmed" : "rejected";
+}
 
 // How far the votes for a tree are from the share that is needed; the smaller, the more doubtful is the tree.
 function margin({ number }) {
@@ -134,11 +164,14 @@ function margin({ number }) {
 
 const compared = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
 
-// Found trees without annotation: those skipped last, else the most doubtful first, then the least often observed.
-export const unreviewed = () => trees().filter((tree) => !annotationOf(tree)).sort((a, b) =>
-  skipped.indexOf(a.number) - skipped.indexOf(b.number) || compared(margin(a), margin(b)) || a.observations - b.observations || a.number - b.number);
+const skippedAt = (tree) => annotationOf(tree)?.at_s ?? 0; // 0: open
 
-export const isReviewed = (tree) => annotationOf(tree) !== null;
+// Found trees that nobody decided on: the open ones first, of these the most doubtful, then the least often observed; then the
+// skipped ones in the order in which they were skipped.
+export const unreviewed = () => trees().filter((tree) => !isReviewed(tree)).sort((a, b) =>
+  skippedAt(a) - skippedAt(b) || compared(margin(a), margin(b)) || a.observations - b.observations || a.number - b.number);
+
+export const isReviewed = (tree) => (annotationOf(tree)?.kind ?? SKIPPED) !== SKIPPED;
 
 export function votesText({ number }) {
   const of = votes.of.get(number);
@@ -161,18 +194,28 @@ export async function review(kind) {
     return news();
   }
   const row = annotationOf(tree);
-  if (row) await change(row, { kind });
+  if (row) await change(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind } : { kind });
   else await add({ x: tree.x, y: tree.y, kind });
   if (!draft.error && state.selected === tree.number) await next();
 }
 
-// Selects the most doubtful tree without annotation other than the selected one, which counts as skipped. The order needs the
-// votes: a key pressed before they have arrived waits for them.
-export async function next() {
+// Marks the selected tree as skipped if it is open, then goes to the next one.
+export async function skip() {
+  const tree = selectedTree();
+  if (tree && reviewOf(tree) === "open") {
+    await edit(() => call("POST", "", { x: tree.x, y: tree.y, kind: SKIPPED, dbh_cm: null }));
+    if (draft.error || state.selected !== tree.number) return;
+  }
+  await next();
+}
+
+// Selects the most doubtful open tree other than the selected one; without one, the skipped tree that follows the selected one.
+// The order needs the votes: a key pressed before they have arrived waits for them.
+async function next() {
   if (!votes.known) await updateVotes.now();
   const left = unreviewed();
-  if (left.some(({ number }) => number === state.selected)) skipped = [...skipped.filter((number) => number !== state.selected), state.selected];
-  const [tree = null] = unreviewed().filter(({ number }) => number !== state.selected || left.length === 1);
+  const open = left.find((each) => each.number !== state.selected && reviewOf(each) === "open");
+  const tree = open ?? left[(left.findIndex(({ number }) => number === state.selected) + 1) % left.length];
   draft.chosen = null;
   if (tree) select(tree.number);
   draft.look = tree;
@@ -244,13 +287,12 @@ export function startAnnotating() {
       run = state.annotations.run;
       Object.assign(draft, { moved: null, error: "" });
       versions.clear();
-      skipped = [];
       votes = NO_VOTES;
       updateUndo();
     }
     news();
   });
-  on("remapped", () => { skipped = []; votes = NO_VOTES; }); // numbers may belong to other trees now
+  on("remapped", () => { votes = NO_VOTES; }); // numbers may belong to other trees now
   on("map tab", () => { if (annotating()) updateVotes(); });
   on("tab", () => annotating() || !draft.adding || toggleAdding(false));
 }

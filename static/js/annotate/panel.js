@@ -1,11 +1,12 @@
 // The tab Annotate: review of the found trees, the list of annotations, and the keys of the tab.
 
-import { byId, el, setText } from "../core/dom.js";
-import { count, dbhText, fixed, seenText } from "../core/format.js";
+import { button, byId, el, setText } from "../core/dom.js";
+import { count, dbhText, fixed, NONE, seenText } from "../core/format.js";
 import { on, selectedTree, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
-import { annotating, callMe, change, choose, contradictionText, draft, importTable, KINDS, myName, NAME, next, nudge, redo, remove, review, rowOf, rows, scoreAgainst, toggleAdding, truthText, undo, unreviewed, votesText } from "./annotations.js";
+import { showTrees } from "../trees/table.js";
+import { annotating, callMe, change, choose, contradictionText, draft, importTable, KINDS, myName, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, undo, unreviewed, votesText } from "./annotations.js";
 import { learnSection, startLearning } from "./learning.js";
 
 const AGAINST = { both: "its ground truth and annotations", own: "its ground truth only", annotations: "annotations only" };
@@ -14,8 +15,6 @@ const LARGEST_TABLE = 900_000; // [bytes]
 const LARGEST_DBH = 1000; // [cm]
 const lines = new Map(); // rows of the table by the id of the annotation
 let imported = ""; // result of the last import
-
-const button = (id, text, title, onclick) => el("button", { id, class: "small", text, title, onclick });
 
 function build() {
   const kind = el("select", { id: "annotate-kind", "aria-label": "Class of a rejected tree", onchange: () => { draft.kind = kind.value; } },
@@ -37,11 +36,13 @@ function build() {
     el("div", { class: "annotate-head" },
       el("p", { id: "annotate-count", class: "annotate-count" }),
       button("annotate-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
+    el("div", { id: "annotate-states", class: "annotate-tools", role: "group", "aria-label": "Found trees by review state" }, ...STATES.map((each) =>
+      button(`annotate-${each}`, each, `List the ${each} trees`, () => showTrees(each), "quiet small"))),
     el("p", { id: "annotate-hint", class: "note dim", role: "status" }),
     el("div", { class: "annotate-tools" },
       button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree")),
       button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class on the right (N)", () => review(draft.kind)), el("label", { class: "annotate-as" }, "it is a ", kind),
-      button("annotate-next", "Next (S)", "Skip this tree: select the next found tree without annotation, the most doubtful first (S)", next),
+      button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip),
       button("annotate-add", "Add (A)", "Add trees by clicks on the map (A)", () => toggleAdding())),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
     el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
@@ -50,7 +51,7 @@ function build() {
       el("p", { id: "annotate-warned", class: "note warned", role: "status" })),
     el("div", { class: "annotate-list" },
       el("table", { id: "annotations", class: "plain" }, el("thead", {}, el("tr", {},
-        ...["class", "DBH cm", "x m", "y m", "by", ""].map((text) => el("th", { scope: "col", text })))), el("tbody"))),
+        ...["tree", "class", "DBH cm", "x m", "y m", "by", ""].map((text) => el("th", { scope: "col", text })))), el("tbody"))),
     el("div", { class: "annotate-files" },
       el("label", {}, "Your name ", name),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,
@@ -74,7 +75,7 @@ function lineOf(row) {
     ...KINDS.map((each) => el("option", { value: each, text: each })));
   const dbh = el("input", { type: "text", inputmode: "decimal", "aria-label": `DBH of annotation ${row.id} in cm`, placeholder: "–", onchange: () => takeDbh(line, dbh) });
   const gone = el("button", { class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete annotation ${row.id}`, onclick: (event) => { event.stopPropagation(); remove(line.row); } });
-  const cells = [el("td", {}, kind), el("td", {}, dbh), el("td"), el("td"), el("td", { class: "annotate-who" }), el("td", {}, gone)];
+  const cells = [el("td"), el("td", {}, kind), el("td", {}, dbh), el("td"), el("td"), el("td", { class: "annotate-who" }), el("td", {}, gone)];
   const line = { row, kind, dbh, node: el("tr", { "data-annotation": row.id, onclick: () => choose(row.id) }, ...cells) };
   return line;
 }
@@ -96,8 +97,9 @@ function show(line, row) {
     line.kind.value = row.kind;
     line.dbh.value = row.dbh_cm === null ? "" : String(row.dbh_cm);
   }
-  const [, , x, y, who] = line.node.cells;
+  const [tree, , , x, y, who] = line.node.cells;
   const place = draft.moved?.id === row.id ? draft.moved : row;
+  setText(tree, String(treeNumberOf(row) ?? NONE));
   setText(x, fixed(place.x, 2));
   setText(y, fixed(place.y, 2));
   setText(who, row.who);
@@ -109,18 +111,20 @@ function fill() {
   if (!visible("annotate")) return;
   const problem = state.annotations?.problem || "";
   const found = trees().length, left = unreviewed();
-  const reviewing = left.find(({ number }) => number === state.selected);
+  const selected = selectedTree();
   setText(byId("annotate-count"), state.map ? `${found - left.length} of ${found} found trees reviewed, ${left.length} left` : "Nothing mapped yet");
   byId("annotate-undo").disabled = !draft.undo;
   byId("annotate-redo").disabled = !draft.redo;
   for (const id of ["add", "import"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !state.annotations?.run;
-  for (const id of ["yes", "no"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !selectedTree();
+  for (const id of ["yes", "no"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !selected;
   byId("annotate-next").disabled = !left.length;
-  setText(byId("annotate-next"), reviewing ? "Skip (S)" : "Next (S)");
+  setText(byId("annotate-next"), selected && reviewOf(selected) === "open" ? "Skip (S)" : "Next (S)");
+  const states = trees().map(reviewOf);
+  for (const each of STATES) setText(byId(`annotate-${each}`), `${states.filter((one) => one === each).length} ${each}`);
   byId("annotate-add").setAttribute("aria-pressed", String(draft.adding));
   byId("annotate-error").hidden = !(draft.error || problem);
   setText(byId("annotate-error"), problem || draft.error);
-  setText(byId("annotate-hint"), hint(reviewing));
+  setText(byId("annotate-hint"), hint(selected && left.includes(selected) ? selected : null));
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), contradictionText());
@@ -195,7 +199,7 @@ function keyOfTab({ key }) {
   if (key === "a") toggleAdding();
   else if (key === "y") review("tree");
   else if (key === "n") review(draft.kind);
-  else if (key === "s") next();
+  else if (key === "s") skip();
   else if (key === "Escape" && draft.adding) toggleAdding(false);
   else return false;
   return true;

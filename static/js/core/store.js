@@ -8,7 +8,7 @@ export const state = {
   odometry: [],      // [x, y] by scan index; holes where the page was not connected
   truth: null,       // ground truth trees
   evaluation: null,  // the map scored against the ground truth
-  annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}]}
+  annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}], skipped: likewise}
   learning: null,    // {state, words, learned}: decision trees being trained from annotations
   parameters: null,  // {preset, set, revision, undo, redo, values, changed}
   sets: null,        // {sets: [{name, who, at_s}]}: saved sets of parameters

@@ -1,6 +1,6 @@
 // All actions of the dashboard in one table; the keys, the list of shortcuts and the palette are made from it.
 
-import { annotating, draft, next, redo as redoEdit, toggleAdding, review, undo as undoEdit } from "../annotate/annotations.js";
+import { annotating, draft, redo as redoEdit, skip, toggleAdding, review, undo as undoEdit } from "../annotate/annotations.js";
 import { byId } from "../core/dom.js";
 import { select } from "../core/live_feed.js";
 import { edits } from "../core/permissions.js";
@@ -67,7 +67,7 @@ export const ACTIONS = [
   ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv")],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
   ["Annotate: add trees by clicks on the map", "", "", inAnnotate(() => toggleAdding(true))],
-  ["Annotate: next tree to review", "", "", inAnnotate(next)],
+  ["Annotate: skip to the next tree to review", "", "", inAnnotate(skip)],
   ["Annotate: the selected tree is a tree", "", "", inAnnotate(() => review("tree"))],
   ["Annotate: the selected tree is not a tree", "", "", inAnnotate(() => review(draft.kind))],
   ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: redo your last edit", "", "", inAnnotate(redoEdit)],

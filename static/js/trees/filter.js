@@ -1,10 +1,10 @@
 // The filter above the table of trees: a number, ranges of columns, or the class in the ground truth.
 
-import { isReviewed, KINDS } from "../annotate/annotations.js";
+import { isReviewed, KINDS, reviewOf, STATES } from "../annotate/annotations.js";
 import { distance, nearest } from "../core/nearest.js";
 import { state } from "../core/store.js";
 
-export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, seen > 50, ± < 5, e < 10, x -5..5; reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
+export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, seen > 50, ± < 5, e < 10, x -5..5; review state: open, confirmed, rejected, skipped, reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
 
 export const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2)); // of the position [cm]
 
@@ -44,6 +44,10 @@ function firstCondition(text) {
   if ((match = /^(un)?(?:reviewed|judged)\b/i.exec(text))) {
     const wanted = !match[1];
     return [match[0], (tree) => isReviewed(tree) === wanted];
+  }
+  if ((match = new RegExp(`^(${STATES.join("|")})\\b`, "i").exec(text))) {
+    const wanted = match[1].toLowerCase();
+    return [match[0], (tree) => reviewOf(tree) === wanted];
   }
   if ((match = new RegExp(`^(${KINDS.join("|")}|none)\\b`, "i").exec(text))) {
     const kind = match[1].toLowerCase();

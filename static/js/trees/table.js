@@ -1,5 +1,6 @@
 // The table of trees (Table 2 of the paper): sorted by any column, filtered by the text above it.
 
+import { reviewOf } from "../annotate/annotations.js";
 import { block } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { saveBytes, saveCanvas } from "../core/download.js";
@@ -11,14 +12,16 @@ import { on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
 import { openStory } from "../explain/story.js";
-import { visible } from "../shell/tabs.js";
+import { openTab, visible } from "../shell/tabs.js";
 import { filterOf, HELP, sigma } from "./filter.js";
 
 const EVERY = 400; // [ms] between two updates
 
+const MARKS = { open: "", confirmed: " ✓", rejected: " ✕", skipped: " ↷" };
+
 // key, title, tooltip, text, value for sorting
 const COLUMNS = [
-  ["number", "tree", "Number of the tree", (t) => String(t.number), (t) => t.number],
+  ["number", "tree", "Number of the tree; ✓ confirmed, ✕ rejected, ↷ skipped in the review", (t) => `${t.number}${MARKS[reviewOf(t)]}`, (t) => t.number],
   ["x", "x m", "Along the first heading, from the start", (t) => fixed(t.x, 2), (t) => t.x],
   ["y", "y m", "To the left of the first heading, from the start", (t) => fixed(t.y, 2), (t) => t.y],
   ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
@@ -124,6 +127,14 @@ function emptyText(all, wanted, refused) {
   if (all) return `No tree matches “${wanted}”.`;
   return state.map ? "No tree yet. A tree is listed once enough scans have detected it. The tab Clusters shows the verdict on each cluster."
     : nothingYet();
+}
+
+// Lists the trees for which a condition holds, see `HELP`.
+export function showTrees(condition) {
+  openTab("trees");
+  byId("find").value = condition;
+  byId("find").focus();
+  fill();
 }
 
 export function startTable() {

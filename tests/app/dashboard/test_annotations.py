@@ -95,6 +95,39 @@ async def test_a_tree_is_added_changed_deleted_and_all_is_undone(both: Running) 
     assert [r["kind"] for r in await rows(client)] == ["tree"]
 
 
+async def test_a_skipped_tree_is_stored_and_undone_but_is_no_ground_truth(tmp_path: Path) -> None:
+    async with running(Settings(folder=tmp_path)) as (client, dashboard):
+        client.headers.update(BEARER)
+        edited: list[tuple[str, int]] = []
+        dashboard.annotation_editor.edited = lambda who, number: edited.append((who, number))
+        await show(dashboard)
+        number = (await edit(client, "POST", x=1.0, y=2.0, kind="skipped")).json()["id"]
+        answer = (await client.get("/api/annotations")).json()
+        assert (answer["trees"], answer["used"]) == ([], "none")
+        assert [(row["id"], row["x"], row["kind"]) for row in answer["skipped"]] == [(number, 1.0, "skipped")]
+        assert dashboard.annotation_editor.truth is None
+        assert edited == []
+        assert len((await client.get("/api/annotations.csv")).text.splitlines()) == 1
+        assert await dashboard.store.ask(lambda store: store.annotated_sources()) == []
+
+        # Deciding later replaces the skip; one undo brings it back, the next one removes it.
+        await edit(client, "PATCH", f"/{number}", version=1, x=1.0, y=2.0, kind="tree")
+        assert [row["kind"] for row in await rows(client)] == ["tree"]
+        assert edited == [("Ann", 1)]
+        for expected in (["skipped"], []):
+            await edit(client, "POST", "/undo")
+            answer = (await client.get("/api/annotations")).json()
+            assert [row["kind"] for row in answer["skipped"]] == expected
+            assert answer["trees"] == []
+        await edit(client, "POST", "/redo")
+    async with running(Settings(folder=tmp_path)) as (client, dashboard):
+        client.headers.update(BEARER)
+        await show(dashboard)
+        assert [row["who"] for row in (await client.get("/api/annotations")).json()["skipped"]] == ["Ann"]
+        await dashboard.receive(opened(uri="other.mcap"))
+        assert (await client.get("/api/annotations")).json()["skipped"] == []
+
+
 async def test_a_stale_edit_is_refused_and_says_who_changed_it_when(both: Running) -> None:
     client, _ = both
     number = (await edit(client, "POST", x=0.0, y=0.0)).json()["id"]

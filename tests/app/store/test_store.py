@@ -29,7 +29,7 @@ contents = st.builds(
     Content,
     x=st.floats(-50, 50),
     y=st.floats(-50, 50),
-    kind=st.sampled_from(("tree", "pole", "other")),
+    kind=st.sampled_from(("tree", "pole", "other", "skipped")),
     dbh=st.none() | st.floats(0.01, 2.0),
 )
 
