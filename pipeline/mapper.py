@@ -200,8 +200,8 @@ class Mapper:
 
     @property
     def path(self) -> Path:
-        """The path of the best particle so far, one row per scan. A new scan may change earlier rows. The
-        arrays are copies."""
+        """The estimated path so far, one row per scan. A correction changes earlier rows. The arrays are
+        copies."""
         return self._path.columns(self._slam.path())
 
     @property
@@ -419,9 +419,9 @@ class Mapper:
     def _history(self, estimate: PoseEstimate) -> detection.RunHistory:
         """Return path and map for the search of loops, with the pose at the newest scan."""
         return detection.RunHistory(
-            self._path.stamp_ns, self._slam.path(), self._tracker.trees(), self._slam.begun_since, estimate,
-            noise_of(self._parameters.slam), self._path.motion, self._placed, self._closed,
-            self._slam.state.places.contradicted,
+            self._path.stamp_ns, self._slam.path(), self._tracker.trees(), self._slam.begun_since,
+            self._slam.best_pose, estimate, noise_of(self._parameters.slam), self._path.motion,
+            self._placed, self._closed, self._slam.state.places.contradicted,
         )  # fmt: skip
 
     def _apply(

@@ -147,7 +147,7 @@ def _joined(
 def _path(merged: MergedMap) -> Path:
     """Return the path of a merged map, that of a first."""
     m = merged.map
-    poses = m.slam.genealogy.path(m.slam.best)
+    poses = m.slam.path.poses()
     return Path(m.stamp_ns, poses[:, 0], poses[:, 1], poses[:, 2], m.sigma_xy)
 
 

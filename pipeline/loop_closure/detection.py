@@ -48,6 +48,7 @@ class RunHistory:
         path: x, y [m], yaw [rad] at each scan, shape (N, 3).
         trees: The trees of the map.
         begun_since: Returns the landmarks that were begun at a scan or later, see FastSlam.begun_since.
+        T_map_particle: Pose of the particle with these landmarks at the newest scan.
         estimate: Pose at the newest scan.
         noise: Noise of the odometry.
         motion: x, y [m], yaw [rad] by odometry from the scan before to each scan, shape (N, 3).
@@ -61,6 +62,7 @@ class RunHistory:
     path: Float
     trees: Trees
     begun_since: Callable[[int], tuple[Float, Float]]
+    T_map_particle: Pose2
     estimate: PoseEstimate
     noise: Noise
     motion: Float
@@ -109,7 +111,7 @@ def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
     lately = max(int(np.searchsorted(way, way[-1] - LATELY)), run.placed)
     if lately == 0:
         return None
-    here = run.path[-1, :2]
+    here = run.T_map_particle.as_array()[:2]
     place, covariance = run.begun_since(lately)
     near = np.hypot(*(place - here).T) < REACH
     if np.count_nonzero(near) < parameters.stems_min:
@@ -132,8 +134,7 @@ def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
     )
     if match.pose is None:
         return None
-    pose = Pose2(*(float(value) for value in run.path[-1]))
-    T, R = through(match.pose, match.covariance, pose, OWN)
+    T, R = through(match.pose, match.covariance, run.T_map_particle, OWN)
     return loop_to(run, trees.number[rows[match.reference]], T, R, len(run.path) - 1)
 
 

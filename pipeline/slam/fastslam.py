@@ -31,7 +31,7 @@ from pipeline.slam.loop_correction import (
 )
 from pipeline.slam.measurement_update import against_slip, estimated, use_scan
 from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrapped
-from pipeline.slam.particle_ancestry import Genealogy
+from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
 from pipeline.slam.particle_maps import known_near, shared_map, take_ancestors
 from pipeline.slam.particle_update import Rules
 from pipeline.slam.places import ODDS, PlaceStates, agreement
@@ -128,7 +128,8 @@ class FastSlam:
             state = replace(state, best=best_after_resampling(state.best, ancestors, weights), shared=shared)
             state.log_weight[:] = 0.0
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
-        self.state = state = replace(state, genealogy=genealogy, frame=frame)
+        path = state.path.with_pose(estimate.T_map_base.as_array())
+        self.state = state = replace(state, genealogy=genealogy, path=path, frame=frame)
         health = pose_health(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
@@ -224,8 +225,8 @@ class FastSlam:
             The correction; None if the graph has no solution, or if it gives the loop a weight below
             LOOP_WEIGHT_MIN. The state is unchanged then.
         """
-        state, path = self.state, self.path()
-        graph = state.graph
+        state, graph = self.state, self.state.graph
+        path = state.genealogy.path(state.best)
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
@@ -257,11 +258,12 @@ class FastSlam:
             covariance: Covariance of the pose of the particles, shape (3, 3).
             names: Landmarks that are joined; see `joined`. None for none.
         """
-        before, path = self.state, self.path()
+        before = self.state
+        path = before.genealogy.path(before.best)  # continuous, and that of the landmarks
         best = before.map_of(before.best)
         moved = corrected_landmarks(best, graph, solution, path)
         after = corrected_path(path, graph, solution)
-        correction = PathCorrection(path, after)
+        correction = PathCorrection(self.path(), after)
         self._put(index, Pose2(*after[-1].tolist()), covariance)
         particles = len(self.state.pose)
         frame = before.frame.corrected(correction, _at_scans(solution.covariance, graph, len(path)))
@@ -270,6 +272,7 @@ class FastSlam:
             maps=shared_map(particles, moved if names is None else joined(moved, *names)),
             places=before.places if names is None else before.places.with_seen(before.distance, names[1]),
             genealogy=Genealogy.of_path(after, particles),
+            path=EstimatedPath.of(after),
             recent=before.recent,
             frame=frame.without_hidden(),
             graph=graph.solved_by(solution),
@@ -305,9 +308,14 @@ class FastSlam:
         self.state = replace(self.state, recent=RunningStatistics(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
-        """Return the path of the best particle: x, y [m], yaw [rad] at each processed scan, shape (N, 3), (0,
-        3) before the first one. `place` does not change it. Recent poses have the resolution of float32."""
-        return self.state.genealogy.path(self.state.best)
+        """Return the estimated pose of each processed scan with all later corrections of the path, x, y [m],
+        yaw [rad], shape (N, 3), a copy. `place` does not change it."""
+        return self.state.path.poses()
+
+    @property
+    def best_pose(self) -> Pose2:
+        """Pose of the best particle at the last used scan, with respect to which its landmarks are known."""
+        return Pose2(*self.state.pose[self.state.best].tolist())
 
     def landmarks(self) -> Landmarks:
         """Return all landmarks of the best particle, those with few hits and in inactive places as well, with

@@ -1,4 +1,4 @@
-"""Ancestry of the particles: the path of each particle.
+"""Ancestry of the particles, with the path of each particle, and the path of the estimates.
 
 Each scan stores the poses of all particles and, if it resampled, the ancestor of each particle. The path of a
 particle follows its ancestors back to the first scan, so later scans select among the paths. The distant past
@@ -8,7 +8,7 @@ keeps the poses of one particle only, which bounds the memory.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -19,6 +19,51 @@ from pipeline.types.records import Float32, Int
 RECENT_POSES = 300_000  # poses of all particles that are kept, so that later scans can select among them
 BLOCK = 512  # scans that are reduced to the path of one particle at once
 FOUNDED = 50  # scans between two counts of the distinct ancestors
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EstimatedPath:
+    """The estimated pose of each scan. The record is immutable; a longer path shares the blocks of a shorter
+    one.
+
+    The path of one particle is one sample of the posterior: its map may be turned about the first pose by the
+    whole uncertainty of the heading there. The estimate is the mean of the posterior, and trees, columns and
+    terrain are mapped at it.
+
+    Attributes:
+        blocks: float64, shape (BLOCK, 3) each: x, y [m], yaw [rad], oldest first.
+        newest: The scans after them, fewer than BLOCK, shape (N, 3).
+    """
+
+    blocks: tuple[Float, ...] = ()
+    newest: Float = field(default_factory=lambda: np.zeros((0, 3)))
+
+    @classmethod
+    def of(cls, poses: Float) -> EstimatedPath:
+        """Return the path with these poses, shape (N, 3), which are copied."""
+        whole = len(poses) // BLOCK * BLOCK
+        blocks = tuple(poses[k : k + BLOCK].copy() for k in range(0, whole, BLOCK))
+        return cls(blocks, poses[whole:].copy())
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        return BLOCK * len(self.blocks) + len(self.newest)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the poses [bytes]."""
+        return len(self) * 3 * self.newest.itemsize
+
+    def with_pose(self, pose: Float) -> EstimatedPath:
+        """Return the path with the pose of one more scan, shape (3,)."""
+        newest = np.concatenate([self.newest, pose[None]])
+        if len(newest) < BLOCK:
+            return EstimatedPath(self.blocks, newest)
+        return EstimatedPath((*self.blocks, newest), np.zeros((0, 3)))
+
+    def poses(self) -> Float:
+        """Return the poses of all scans as a copy, shape (N, 3)."""
+        return np.concatenate([*self.blocks, self.newest])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,7 +10,7 @@ from pipeline.geometry.poses import Float
 from pipeline.io.checkpoints.codec import ADDED, NOT_SAVED
 from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import KeyframeGraph, ScanDetections
-from pipeline.slam.particle_ancestry import Genealogy
+from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
 from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.places import Places
 from pipeline.slam.resampling import normalised
@@ -30,8 +30,9 @@ class SlamState:
         motion_covariance: Covariance of `motion`, shape (3, 3).
         since_update: Distance driven since then, with 1 m per radian of turn [m].
         detections: Number of detections in all scans so far; the next detection gets this birth number.
-        best: Row of the best particle, whose map and path are reported.
+        best: Row of the best particle, whose map is reported.
         genealogy: Ancestors of the particles and their paths.
+        path: Estimated pose of each scan. States of an earlier version have the path of the best particle.
         recent: Running statistics, from which the quality of the pose is derived.
         frame: Lower bound of the pose covariance in the frame of the map.
         graph: Graph of keyframes and landmarks.
@@ -53,6 +54,10 @@ class SlamState:
     detections: int = 0
     best: int = 0
     genealogy: Genealogy = field(default_factory=Genealogy)
+    path: EstimatedPath = field(
+        default_factory=EstimatedPath,
+        metadata={ADDED: lambda parts: EstimatedPath.of(parts["genealogy"].path(parts["best"]))},
+    )
     recent: RunningStatistics = field(default_factory=RunningStatistics)
     frame: FrameUncertainty = field(default_factory=FrameUncertainty)
     graph: KeyframeGraph = field(default_factory=KeyframeGraph, metadata={ADDED: None})

@@ -16,7 +16,7 @@ from pipeline.slam import SlamState
 from pipeline.slam.association import associate
 from pipeline.slam.frame_uncertainty import FrameUncertainty, transported_covariance
 from pipeline.slam.keyframe_graph import KeyframeGraph
-from pipeline.slam.particle_ancestry import Genealogy
+from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
 from pipeline.slam.particle_maps import MapColumns, shared_map
 from pipeline.slam.places import Places
 from pipeline.tracking.observation import SECTORS
@@ -82,7 +82,7 @@ def merge_maps(
     both.verdict[matched[hidden]] = -1  # a tree that one of the runs confirmed by its hits stays confirmed
     both.number[len(a.tracks) :] = number_of
     tracks = both.take(np.concatenate([np.ones(len(a.tracks), np.bool_), fresh]))
-    path = np.concatenate([a.slam.genealogy.path(a.slam.best), _moved_path(b, T_a_b)])
+    path = np.concatenate([a.slam.path.poses(), _moved_path(b, T_a_b)])
     merged = replace(
         a,
         slam=_slam(a.slam, b.slam, T_a_b, covariance, path, parameters.slam.distance_max),
@@ -137,7 +137,7 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
 def _moved_path(b: SavedMap, T: Pose2) -> Float:
     """Return the path of a map in another frame, x, y [m], yaw [rad], shape (N, 3); T is the pose of its
     frame in the new one."""
-    poses = b.slam.genealogy.path(b.slam.best)
+    poses = b.slam.path.poses()
     return np.column_stack([T.apply(poses[:, :2]), wrap_angle(poses[:, 2] + T.yaw)])
 
 
@@ -170,6 +170,7 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
         maps=shared_map(P, landmarks),
         detections=a.detections + b.detections,
         genealogy=Genealogy.of_path(path, P),
+        path=EstimatedPath.of(path),
         graph=KeyframeGraph(),  # no odometry connects the two runs
         places=Places(),  # all landmarks are active
         since_keyframe=(),

@@ -150,8 +150,12 @@ def _check_slam(slam: SlamState) -> None:
         if not fits or generation.pose.shape != (size, 3):
             raise ValueError("the particles have another past")
         after = size
-    if any(block.shape != (BLOCK, 3) for block in past.settled):
+    blocks = (*past.settled, *slam.path.blocks)
+    if any(b.shape != (BLOCK, 3) for b in blocks) or slam.path.newest.shape != (len(past) % BLOCK, 3):
         raise ValueError("the path has other columns")
+    if len(slam.path) != len(past):
+        raise ValueError("the path is not that of the particles")
+    _check_finite(slam.path.poses())
     if past.founders is not None and any(len(f) != P or not _within(f, 1 << 20) for f in past.founders):
         raise ValueError("the particles have other founders")
     _check_frame(slam.frame, len(past))

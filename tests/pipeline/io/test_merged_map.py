@@ -72,8 +72,8 @@ def test_path_keyframes_and_columns_of_the_second_map_turn_with_it():
     empty = {name: np.zeros((1, *column.shape[1:]), column.dtype) for name, column in columns.items()}
     one = replace(state, columns=Columns(**{**empty, "axis": axis}))
     merged = merge_maps(state, one, T, COVARIANCE, 10**12, m.parameters).map
-    path = state.slam.genealogy.path(state.slam.best)
-    moved = merged.slam.genealogy.path(merged.slam.best)[len(path) :]
+    path = state.slam.path.poses()
+    moved = merged.slam.path.poses()[len(path) :]
     np.testing.assert_allclose(moved, composed(np.tile(T.as_array(), (len(path), 1)), path), atol=1e-9)
     of_second = merged.slam.frame.pose[-len(state.slam.frame.serial) :]
     np.testing.assert_allclose(of_second[:, 2], 0.3 + T.yaw)

@@ -44,7 +44,8 @@ def mapped(path, motion, known, placed=0):
     n = np.zeros(0)
     estimate = PoseEstimate(Pose2(*path[-1]), SURE, path[-1:], np.ones(1), 1.0, n.reshape(0, 2), False)
     none = lambda _: (n.reshape(0, 2), n.reshape(0, 3))  # noqa: E731
-    return RunHistory(np.arange(len(path)), path, known, none, estimate, NOISE, motion, placed)
+    pose = Pose2(*path[-1])
+    return RunHistory(np.arange(len(path)), path, known, none, pose, estimate, NOISE, motion, placed)
 
 
 # --- what was driven ------------------------------------------------------------------------------

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose2
-from pipeline.slam.particle_ancestry import BLOCK, RECENT_POSES, Genealogy
+from pipeline.slam.particle_ancestry import BLOCK, RECENT_POSES, EstimatedPath, Genealogy
 from tests.pipeline.strategies import seeds
 
 
@@ -77,3 +78,25 @@ def test_the_mean_motion_reaches_back_before_the_scans_with_ancestors():
     path = np.column_stack([0.1 * np.arange(BLOCK + 40), np.zeros(BLOCK + 40), np.zeros(BLOCK + 40)])
     mean = Genealogy.of_path(path, 3).mean_motion_from(np.array([BLOCK - 10, BLOCK + 30]), np.full(3, 1 / 3))
     np.testing.assert_allclose(mean[:, 0], [-4.9, -0.9], atol=1e-4)
+
+
+@pytest.mark.parametrize("scans", [0, 1, BLOCK - 1, BLOCK, BLOCK + 1, 2 * BLOCK + 7])
+def test_an_estimated_path_contains_each_pose_once_and_in_order(scans: int) -> None:
+    poses = np.random.default_rng(scans).normal(size=(scans, 3))
+    path = EstimatedPath()
+    for pose in poses:
+        path = path.with_pose(pose)
+    at_once = EstimatedPath.of(poses)
+    assert len(path) == len(at_once) == scans
+    assert path.nbytes == poses.nbytes
+    np.testing.assert_array_equal(path.poses(), poses)
+    np.testing.assert_array_equal(at_once.poses(), poses)
+    assert [b.shape for b in path.blocks] == [b.shape for b in at_once.blocks]
+
+
+def test_a_longer_path_leaves_the_shorter_one_unchanged() -> None:
+    poses = np.random.default_rng(1).normal(size=(BLOCK, 3))
+    short = EstimatedPath.of(poses[:-1])
+    whole = short.with_pose(poses[-1])
+    np.testing.assert_array_equal(short.poses(), poses[:-1])
+    np.testing.assert_array_equal(whole.poses(), poses)
