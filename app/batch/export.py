@@ -70,6 +70,9 @@ TREE_FIELDS = (
     Field("observations", "obs", "", "number of scans with a detection of the tree"),
     Field("coverage_deg", "cover_deg", "deg", "part of the circumference that was observed"),
     Field("eccentricity", "eccentr", "", "ratio of the eigenvalues of the points of a scan"),
+    Field("height_m", "height_m", "m", "height of the tree; empty where its top is not seen"),
+    Field("sigma_height_m", "sh_m", "m", "standard deviation of the height"),
+    Field("lean_deg", "lean_deg", "deg", "angle of the stem from the vertical"),
 )
 #: Names of the figures of a plot in a Shapefile.
 PLOT_SHORT = {
@@ -161,6 +164,7 @@ def for_export(
         plots: Plots in that system, with their figures by name.
     """
     ground = heights_at(terrain, trees.position) + frame.z
+    unknown = np.full(len(trees.number), np.nan)
     values = (
         trees.number,
         100.0 * trees.dbh,
@@ -174,8 +178,11 @@ def for_export(
         trees.observations,
         np.where(trees.coverage > 0.0, np.degrees(trees.coverage), np.nan),
         trees.eccentricity,
+        unknown if trees.height is None else trees.height,
+        unknown if trees.height_sigma is None else trees.height_sigma,
+        unknown if trees.lean is None else np.degrees(trees.lean),
     )
-    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3)
+    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 1)
     columns = {
         field.name: v if v.dtype.kind == "i" else np.round(v, d)
         for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)

@@ -29,6 +29,7 @@ from pipeline.evaluation import MapScores, evaluate
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED, is_held
 from pipeline.io.result_files import (
+    NEW_TREE_COLUMNS,
     PATH_COLUMNS,
     ROWS,
     SEEN_COLUMNS,
@@ -222,7 +223,8 @@ def _text(file: FilePath) -> str:
 
 
 def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
-    """Return the columns of a CSV file by name; an empty cell is NaN.
+    """Return the columns of a CSV file by name; an empty cell is NaN, also in NEW_TREE_COLUMNS that the file
+    does not have.
 
     Args:
         file: The file.
@@ -233,12 +235,15 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
             is empty.
     """
     rows = list(csv.reader(_text(file).splitlines()))
-    if not rows or tuple(rows[0]) != names:
+    missing = tuple(name for name in NEW_TREE_COLUMNS if name in names and rows and name not in rows[0])
+    known = tuple(name for name in names if name not in missing)
+    if not rows or tuple(rows[0]) != known:
         raise SourceError(f"the columns are not {', '.join(names)}", where=str(file))
     try:
-        columns = _table(rows[1:], names)
+        columns = _table(rows[1:], known)
     except ValueError:
         raise SourceError("a row is damaged", where=str(file), remedy="Map the run again") from None
+    columns.update({name: np.full(len(rows) - 1, math.nan) for name in missing})
     for name in _NEVER_EMPTY.intersection(names):
         if not np.all(np.isfinite(columns[name])):
             raise SourceError(f"a cell of {name} is empty", where=str(file), remedy="Map the run again")
@@ -283,6 +288,9 @@ def _trees(c: dict[str, Float]) -> Trees:
         first_seen_ns=_stamps(c["first_seen_s"]),
         last_seen_ns=_stamps(c["last_seen_s"]),
         confirmed=np.ones(n, np.bool_),
+        height=c["height_m"],
+        height_sigma=c["sigma_height_m"],
+        lean=np.radians(c["lean_deg"]),
     )
 
 

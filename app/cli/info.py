@@ -203,7 +203,7 @@ def _cloud_lines(d: CloudDescription) -> list[str]:
         *(f"warning: {text}" for text in d.warnings),
         "",
         f"map it:        {command} map {uri} --out out",
-        f"drive through: {command} {uri}   (a simulated robot; `sim:cloud?file=` takes options)",
+        f"drive through: {command} 'sim:cloud?file={uri}'   (a simulated robot)",
     ]
 
 

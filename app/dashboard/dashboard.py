@@ -108,6 +108,20 @@ class Dashboard:
         """Time of the first scan of the run [ns]; 0 before a scan is shown."""
         return 0 if self.shown is None else self.shown.frame.stamp_ns - round(self.shown.time_s * 1e9)
 
+    @property
+    def offset(self) -> tuple[float, float]:
+        """Offset x, y of the frame of the map in the coordinates of the file of a whole cloud; (0, 0) for a
+        run of scans [m]."""
+        cloud = self.status.cloud
+        return (0.0, 0.0) if cloud is None else cloud.offset[:2]
+
+    @property
+    def file_truth(self) -> TruthTrees | None:
+        """Ground truth with annotations in the coordinates of the file, see `offset`; None where none is
+        known."""
+        (x, y), truth = self.offset, self.truth
+        return None if truth is None else replace(truth, x=truth.x + x, y=truth.y + y)
+
     async def start(self, source: SourceRequest) -> None:
         """Start the worker and open a source, which plays as soon as it is open."""
         await self.sets.load()
@@ -271,7 +285,7 @@ class Dashboard:
                 the reason.
         """
         state = self.parameters.parameters
-        self.sensitivity.ask(question_of(self.source, self.digest, self.truth, state, name, values))
+        self.sensitivity.ask(question_of(self.source, self.digest, self.file_truth, state, name, values))
 
     async def select_tree(self, number: int | None) -> None:
         """Select a tree in all views by its number; None clears the selection."""
@@ -409,6 +423,9 @@ class Dashboard:
         if shown.run != self._run:  # of a run that was left
             return
         number = self._opens
+        if self.shown is None:
+            self.scene.suit(cloud=shown.frame.of_cloud)
+            self.live.publish("view", self.scene.view)
         self.path = joined(self.path, shown.path_start, shown.path)
         if shown.frame.ground is None and self.shown is not None:
             # The ground is sent only when it changes; the scene may not have drawn the earlier frame.

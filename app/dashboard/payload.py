@@ -105,14 +105,16 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 
 def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
-    """Return the confirmed trees of a table as dicts for the page. Unknown diameters, eccentricities and
-    coverages are None.
+    """Return the confirmed trees of a table as dicts for the page. Unknown diameters, eccentricities,
+    coverages, heights and leans are None.
 
     Args:
         trees: The table.
         start_ns: Time of the first scan, from which the seconds count [ns].
     """
     keep = np.flatnonzero(trees.confirmed)
+    unknown = np.full(len(trees.number), np.nan)
+    lean = unknown if trees.lean is None else np.degrees(trees.lean)
     columns: dict[str, Sequence[Any]] = {
         "number": trees.number[keep].tolist(),
         "x": _rounded(trees.position[keep, 0]),
@@ -125,6 +127,9 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
         "coverage_deg": _finite(np.degrees(trees.coverage[keep])),
         "first_seen_s": _rounded((trees.first_seen_ns[keep] - start_ns) / _NS),
         "last_seen_s": _rounded((trees.last_seen_ns[keep] - start_ns) / _NS),
+        "height_m": _finite((unknown if trees.height is None else trees.height)[keep]),
+        "sigma_height_m": _finite((unknown if trees.height_sigma is None else trees.height_sigma)[keep]),
+        "lean_deg": _finite(lean[keep]),
     }
     return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 

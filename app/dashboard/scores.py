@@ -94,9 +94,9 @@ def score_map(trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: 
         trees: The map.
         truth: Ground truth.
         parameters: Distances of a match and of the ground truth from the path.
-        path_xy: Path, shape (N, 2) [m].
+        path_xy: Path, shape (N, 2) [m]; empty for a whole cloud, of which all true trees count.
     """
-    return score_payload(evaluate(trees, truth, parameters, path_xy))
+    return score_payload(evaluate(trees, truth, parameters, path_xy if len(path_xy) else None))
 
 
 def score_payload(score: MapScores) -> dict[str, Any]:

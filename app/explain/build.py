@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.common.arrays import evenly_spaced
+from app.explain.cloud import check_results, cloud_cluster_story, cloud_tree_story
 from app.explain.history import half_axes
 from app.explain.records import CheckResult, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
 from app.store.forests import kept_forests
+from app.worker.inventory_run import InventoryRun
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import (
     CLASSES,
@@ -19,14 +21,14 @@ from pipeline.classification.forest import (
     standard_forest,
     tree_in_free_air,
 )
-from pipeline.config import Parameters, field_specs
+from pipeline.config import Parameters
 from pipeline.detection.cylinder_fit import StemFit, fit_one
 from pipeline.detection.verdicts import checks
 from pipeline.errors import StemmapError
 from pipeline.types.records import Clusters, Frame, Sensor, Verdict
 
 if TYPE_CHECKING:
-    from app.worker.run import Run
+    from app.worker.session import AnyRun
 
 Float = NDArray[np.float64]
 
@@ -49,7 +51,7 @@ def warm_up(sensor: Sensor) -> None:
     feature_effects(np.zeros(len(NAMES)), standard_forest(sensor.rings > 0), Verdict.TREE)
 
 
-def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
+def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStory:
     """Return the explanation of a cluster of a recent scan.
 
     Args:
@@ -62,6 +64,8 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
     """
     if run is None or not 0 <= cluster < len(frame.clusters.size):
         raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
+    if isinstance(run, InventoryRun):
+        return cloud_cluster_story(run, cluster)
     parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     points = frame.filtered[frame.labels == cluster].astype(np.float64)
@@ -93,7 +97,7 @@ def cluster_story(run: Run | None, frame: Frame, cluster: int) -> ClusterStory:
     )
 
 
-def tree_story(run: Run | None, number: int) -> TreeStory:
+def tree_story(run: AnyRun | None, number: int) -> TreeStory:
     """Return the explanation of a tree after the newest scan.
 
     Args:
@@ -103,6 +107,8 @@ def tree_story(run: Run | None, number: int) -> TreeStory:
     Raises:
         StemmapError: No run is open, no scan was mapped, or there is no such tree at this time.
     """
+    if isinstance(run, InventoryRun):
+        return cloud_tree_story(run, number)
     frame = run.frame if run else None
     rows = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
     if run is None or frame is None or not len(rows):
@@ -144,23 +150,9 @@ def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[Chec
         row: Row of the cluster.
         parameters: Parameters with which the scan was mapped.
     """
-    titles = {spec.name: spec.title for spec in field_specs()}
     if np.isnan(clusters.eccentricity[row]):  # an external stem
         return []
-    return [
-        CheckResult(
-            figure=check.figure,
-            unit=check.unit,
-            value=float(check.value[row]),
-            relation=check.relation,
-            limit=check.limit,
-            parameter=check.parameter,
-            title=titles.get(check.parameter, ""),
-            fails=bool(check.fails[row]),
-            verdict=check.verdict.label,
-        )
-        for check in checks(clusters, parameters.detection)
-    ]
+    return check_results(checks(clusters, parameters.detection), row)
 
 
 def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor) -> ColumnStory | None:

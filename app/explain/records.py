@@ -6,6 +6,8 @@ the browser.
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 
 
@@ -90,6 +92,28 @@ class ColumnStory(msgspec.Struct, frozen=True):
     effects: list[FeatureEffect]
 
 
+class CrossSection(msgspec.Struct, frozen=True):
+    """Horizontal slice through a stem of a whole cloud, with the fitted circle.
+
+    Attributes:
+        height: Height of its middle above the ground [m].
+        x, y: Centre of the circle relative to the axis at breast height [m].
+        radius, radius_sigma: Of the circle [m]; NaN without one.
+        coverage_deg: Part of the circumference with points on it.
+        scatter: Standard deviation of the points from the circle [m].
+        points: Points relative to the centre of the circle [m]; empty where the section has no picture.
+    """
+
+    height: float
+    x: float
+    y: float
+    radius: float
+    radius_sigma: float
+    coverage_deg: float
+    scatter: float
+    points: list[tuple[float, float]]
+
+
 class ClusterStory(msgspec.Struct, frozen=True):
     """A cluster of one scan.
 
@@ -109,6 +133,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
         axes: One standard deviation along the principal axes in the picture: (right, up) of each [m].
         tree, tree_distance: The nearest confirmed tree and its distance [m]; None and NaN if none is near.
         column: Classification of the accumulated scans at its place; None without them.
+        sections: Cross-sections of a candidate of a whole cloud; None for a cluster of a scan.
     """
 
     scan: int
@@ -128,6 +153,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
     tree: int | None
     tree_distance: float
     column: ColumnStory | None
+    sections: list[CrossSection] | None = None
 
 
 class History(msgspec.Struct, frozen=True):
@@ -163,6 +189,10 @@ class TreeStory(msgspec.Struct, frozen=True):
         cluster: Row of its cluster in the current scan; None without one.
         column: Classification of the accumulated scans at its place; None without them.
         history: Estimates in order of time.
+        height, height_sigma: Of the tree [m]; NaN where its top is not seen.
+        height_hidden: Reason why the height is not seen; empty where it is.
+        lean_deg: Angle of the stem from the vertical; NaN if it is not measured.
+        sections: Cross-sections of a tree of a whole cloud, lowest first; None for a tree of a drive.
     """
 
     tree: int
@@ -183,3 +213,8 @@ class TreeStory(msgspec.Struct, frozen=True):
     cluster: int | None
     column: ColumnStory | None
     history: History
+    height: float = math.nan
+    height_sigma: float = math.nan
+    height_hidden: str = ""
+    lean_deg: float = math.nan
+    sections: list[CrossSection] | None = None

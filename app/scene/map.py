@@ -19,7 +19,8 @@ from pipeline.types.records import HIDDEN, Frame, Trees, TruthTrees
 
 Ring = tuple[float, float, float] | None
 
-TREE_HEIGHT = 2.2  # height of a drawn trunk [m]; the map has no heights of trees
+TREE_HEIGHT = 2.2  # height of a drawn trunk of a drive [m]
+BREAST_HEIGHT = 1.3  # height of a drawn trunk of a whole cloud, where its circle is fitted [m]
 UNKNOWN_RADIUS = 0.08  # radius of a drawn trunk whose diameter is unknown [m]
 NUMBERS = 20  # trees nearest to the robot that are labelled with their number and DBH
 
@@ -39,6 +40,7 @@ class MapNodes:
         self.ground = GroundNode(scene)
         self._truth_trees: TruthTrees | None = None
         self._trees = Batch(scene, "/world/trees", nodes.cylinder(), opacity=0.55)
+        self._circles = Circles(scene, "/world/breast", BREAST_HEIGHT, 4.0)
         self._truth = Circles(scene, "/world/truth", 0.04, 2.5)
         self._mark = Circles(scene, "/world/selection", 0.06, 5.0)
         self._labels = LabelNodes(scene, "/world/numbers", 1.0)
@@ -71,7 +73,7 @@ class MapNodes:
         numbers = [int(number) for number in trees.number]
         if not np.array_equal(place, self._shown) or numbers != self._numbers:
             self._shown, self._numbers = place, numbers
-            self._show_trees(place, np.isfinite(trees.dbh))
+            self._show_trees(place, np.isfinite(trees.dbh), frame.of_cloud)
         self.repaint(frame, selected, ring, view)
 
     def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
@@ -79,6 +81,7 @@ class MapNodes:
         Trees are not drawn again."""
         self.ground.visible = view.layers["ground"]
         self._trees.visible = view.layers["trees"]
+        self._circles.visible = view.layers["fits"]
         self._truth.visible = view.layers["truth"]
         trees = confirmed(frame.trees)
         pose = frame.estimate.T_map_base
@@ -111,18 +114,24 @@ class MapNodes:
         """The visible labels."""
         return self._labels.texts
 
-    def _show_trees(self, place: NDArray[np.float64], measured: NDArray[np.bool_]) -> None:
-        """Send the trunks.
+    def _show_trees(self, place: NDArray[np.float64], measured: NDArray[np.bool_], of_cloud: bool) -> None:
+        """Send the trunks; those of a whole cloud are as thick as their circles, which are drawn on their
+        upper ends.
 
         Args:
             place: Number, x, y, radius and height of the ground of each tree, shape (N, 5) [m].
             measured: Whether its diameter was measured, shape (N,).
+            of_cloud: Whether the map is that of a whole cloud.
         """
+        height = BREAST_HEIGHT if of_cloud else TREE_HEIGHT
+        each = colours.choose(measured, colours.TREE, colours.UNMEASURED)
         self._trees.show(
             place[:, [1, 2, 4]],
-            np.column_stack([place[:, 3], place[:, 3], np.full(len(place), TREE_HEIGHT)]),
-            colours.choose(measured, colours.TREE, colours.UNMEASURED),
+            np.column_stack([place[:, 3], place[:, 3], np.full(len(place), height)]),
+            each,
         )
+        rows = place[measured] if of_cloud else place[:0]
+        self._circles.show_at(rows[:, 1:3], rows[:, 3], each[measured][: len(rows)], rows[:, 4])
 
     def _show_mark(self, trees: Trees, selected: int | None, ring: Ring, base_z: float) -> None:
         """Show the ring of the selected cluster or, without one, a ring around the selected tree; none

@@ -194,6 +194,17 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
         )
         super().__init__(node)
         self._waiting: tuple[Points, Colours] | None = None
+        self._size = size
+
+    @property
+    def size(self) -> float:
+        """Diameter of a point [m]."""
+        return self._size
+
+    @size.setter
+    def size(self, size: float) -> None:
+        if size != self._size:
+            self._size = self.node.point_size = size
 
     def show(self, points: Points, colours: Colours | Rgb) -> None:
         """Replace the points; without any the node is hidden. While the layer is off, they are kept and sent

@@ -48,6 +48,7 @@ class TunePanel:
     ) -> None:
         self._on_change = on_change
         self._widgets: dict[str, viser.GuiSliderHandle[Any]] = {}
+        self._folders: list[viser.GuiFolderHandle] = []
         self._preset = gui.add_dropdown(
             "Preset", tuple(PRESETS), initial_value=preset_name, hint=_preset_hint()
         )
@@ -66,7 +67,9 @@ class TunePanel:
 
         values = parameters.flat()
         for stage, specs in itertools.groupby(MAIN, lambda spec: spec.stage):
-            with gui.add_folder(stage):
+            folder = gui.add_folder(stage)
+            self._folders.append(folder)
+            with folder:
                 for spec in specs:
                     self._widgets[spec.name] = self._add_widget(gui, spec, values[spec.name])
         gui.add_markdown("All parameters are in the tab *Tune*.")
@@ -90,6 +93,11 @@ class TunePanel:
             widget.label = _label(spec, spec.name in changed)
         set_value(self._preset, preset_name)
         self._summary.content = _summary(len(changed), preset_name)
+
+    def suit(self, *, cloud: bool) -> None:
+        """Hide the sliders for a whole cloud, whose map does not depend on them."""
+        for folder in self._folders:
+            folder.visible = not cloud
 
     def widget(self, name: str) -> viser.GuiSliderHandle[Any]:
         """Return the slider of a parameter, by its dotted name; KeyError for one that is not in MAIN."""

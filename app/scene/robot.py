@@ -134,9 +134,9 @@ class BodyNode:
         )
 
     def show(self, frame: Frame) -> None:
-        """Show the part at the pose of a scan."""
+        """Show the part at the pose of a scan; hide it for a whole cloud, which has no robot."""
         self._node.vertices = nodes.placed(self._vertices, frame.estimate.T_map_base, frame.base_z)
-        self._node.visible = True
+        self._node.visible = not frame.of_cloud
 
 
 HEIGHT = 0.06  # m above the base

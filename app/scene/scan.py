@@ -23,6 +23,8 @@ OnCluster = Callable[[int | None, Vector, Vector], None]
 # Heights at the ends of the colour ramp: about those of ground and trunks of a stand [m].
 HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
 SCAN = f"{ROBOT}/scan"
+FILTERED_SIZE, CLUSTER_SIZE = 0.03, 0.045  # diameter of a point of a scan [m]
+CLOUD_SIZES, POINTS_ACROSS = (0.02, 0.1), 700.0  # diameters of a point of a cloud [m]; points across a plot
 _NO_POINTS: NDArray[np.float32] = np.zeros((0, 3), np.float32)
 WIDEST_MARKER = 0.6  # [m], the radius of a thick trunk
 
@@ -38,8 +40,8 @@ class ScanNodes:
 
     def __init__(self, scene: viser.SceneApi, on_cluster: OnCluster) -> None:
         self._raw = CloudNode(scene, f"{SCAN}/raw", 0.02)
-        self._filtered = CloudNode(scene, f"{SCAN}/filtered", 0.03)
-        self._clusters = CloudNode(scene, f"{SCAN}/clusters", 0.045)
+        self._filtered = CloudNode(scene, f"{SCAN}/filtered", FILTERED_SIZE)
+        self._clusters = CloudNode(scene, f"{SCAN}/clusters", CLUSTER_SIZE)
         self._fits = Batch(scene, f"{SCAN}/fits", nodes.cylinder(), opacity=0.4, side="double")
         self._markers = Batch(scene, f"{SCAN}/markers", nodes.cylinder(), opacity=0.14)
         self._points = _NO_POINTS, _NO_POINTS
@@ -62,6 +64,8 @@ class ScanNodes:
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
         self._numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
         self._points = nodes.scan_in_map(frame, frame.raw), nodes.scan_in_map(frame, frame.filtered)
+        for node, size in ((self._filtered, FILTERED_SIZE), (self._clusters, CLUSTER_SIZE)):
+            node.size = cloud_point_size(frame) if frame.of_cloud else size
         self._show_fits(frame)
         self._show_markers(frame)
         self.repaint(frame, view, labelled)
@@ -74,11 +78,15 @@ class ScanNodes:
         self._fits.visible = view.layers["fits"]
         self._markers.visible = view.layers["clusters"]
         raw, filtered = self._points
-        self._raw.show(raw, self._ramp_or(frame.raw, view, colours.RAW))
-        self._filtered.show(filtered, self._ramp_or(frame.filtered, view, colours.FILTERED))
+        ends = height_range(frame)
+        self._raw.show(raw, self._ramp_or(frame.raw, view, colours.RAW, ends))
+        # The points of the trees of a cloud are those of the clusters, and are not drawn twice.
+        rest = frame.labels < 0 if frame.of_cloud else slice(None)
+        plain = self._ramp_or(frame.filtered[rest], view, colours.FILTERED, ends)
+        self._filtered.show(filtered[rest], plain)
         member = frame.labels >= 0
         self._clusters.show(filtered[member], cluster_colours(frame, self._numbers, view.colour_by)[member])
-        named = view.layers["labels"]
+        named = view.layers["labels"] and not frame.of_cloud  # the trees have labels; others are too many
         self._labels.show(cluster_labels(frame, self._numbers, view.label_by, labelled) if named else [])
 
     def meant(self, instance: int | None, origin: Float, direction: Float) -> int | None:
@@ -98,7 +106,7 @@ class ScanNodes:
 
     @staticmethod
     def _ramp_or(
-        points: NDArray[np.float32], view: ViewSettings, plain: colours.Rgb
+        points: NDArray[np.float32], view: ViewSettings, plain: colours.Rgb, ends: tuple[float, float]
     ) -> Colours | colours.Rgb:
         """Return colours by height, one per point, if the view is coloured so; otherwise the plain colour.
 
@@ -106,14 +114,16 @@ class ScanNodes:
             points: shape (N, 3) [m] in the level frame of the sensor.
             view: The choices.
             plain: The other colour.
+            ends: Heights at the ends of the ramp [m].
         """
         if view.colour_by == "height":
-            return colours.ramp(points[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
+            return colours.ramp(points[:, 2], *ends)
         return plain
 
     def _show_fits(self, frame: Frame) -> None:
-        """Show a cylinder for each detected stem with a fitted circle."""
-        rows = frame.detections.cluster
+        """Show a cylinder for each detected stem with a fitted circle; none for a whole cloud, whose circles
+        are those of its trees."""
+        rows = frame.detections.cluster if not frame.of_cloud else np.zeros(0, np.int64)
         rows = rows[np.isfinite(frame.clusters.radius[rows])]
         clusters = frame.clusters
         height = shown_height(clusters.extent[rows, 2])
@@ -137,7 +147,10 @@ class ScanNodes:
         radius = np.minimum(np.fmax(width, 0.06), WIDEST_MARKER) + 0.03
         foot = np.column_stack([c.centroid[:, :2], c.centroid[:, 2] - 0.5 * height])
         low = nodes.scan_in_map(frame, foot).astype(np.float64)
-        self._markers.show(low, np.column_stack([radius, radius, height]), colours.by_verdict(c.verdict))
+        size = np.column_stack([radius, radius, height])
+        if frame.of_cloud:  # candidates without a circle are many
+            size[np.isnan(c.radius)] = 0.0
+        self._markers.show(low, size, colours.by_verdict(c.verdict))
         self._axes = (low, low + np.column_stack([np.zeros((len(height), 2)), height]), radius)
 
 
@@ -158,6 +171,21 @@ def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
         on_cluster(instance, event.ray_origin, event.ray_direction)
 
 
+def cloud_point_size(frame: Frame) -> float:
+    """Return the diameter of the points of a whole cloud [m]; it grows with the width of the plot."""
+    width = float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
+    return float(np.clip(width / POINTS_ACROSS, *CLOUD_SIZES))
+
+
+def height_range(frame: Frame) -> tuple[float, float]:
+    """Return the heights at the ends of the colour ramp [m]: of a scan always the same, of a whole cloud
+    those of its lowest and highest points except 1 %."""
+    if not frame.of_cloud or not len(frame.filtered):
+        return HEIGHT_LOW, HEIGHT_HIGH
+    low, high = np.percentile(frame.filtered[:, 2], (1.0, 99.0))
+    return float(low), float(high)
+
+
 def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:
     """Return the colours of the filtered points, uint8, shape (M, 3). Points without a cluster have one
     colour, except by height.
@@ -169,7 +197,7 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
     """
     clusters = frame.clusters
     if colour_by == "height":
-        return colours.ramp(frame.filtered[:, 2], HEIGHT_LOW, HEIGHT_HIGH)
+        return colours.ramp(frame.filtered[:, 2], *height_range(frame))
     if colour_by == "cluster":
         table = colours.by_category(numbers)
     elif colour_by == "eccentricity":  # 1 is round, 100 a line

@@ -13,7 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.scene.colours import ViewSettings
+from app.scene.colours import COLOUR_BY, ViewSettings
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
 from app.scene.panel import PanelCommands, SceneCommands, TunePanel, Value
 from app.scene.robot import RobotNodes, WayNode
@@ -76,7 +76,10 @@ class Scene:
             frame: Results of the scan.
             path: Positions of the robot at all scans in the frame of the map, shape (N, 2) [m].
         """
+        first = self._frame is None
         self._frame, self._path = frame, np.asarray(path, dtype=np.float64).reshape(-1, 2)
+        if first:
+            self._follower.frame_plot(_extent(frame) if frame.of_cloud else 0.0)
         if self.messages > RENEW_AFTER:
             self._renew()
             return
@@ -111,6 +114,14 @@ class Scene:
         if self._frame is not None:  # the scan itself does not change
             with self._server.atomic():
                 self._map.repaint(self._frame, tree, ring, self._view)
+
+    def suit(self, *, cloud: bool) -> None:
+        """Choose how points are coloured when a run begins: a whole cloud by height, a scan by verdict. Other
+        choices of a person stay. The sliders are hidden for a whole cloud, which does not depend on them."""
+        self._tune.suit(cloud=cloud)
+        usual = COLOUR_BY[0]
+        if self._view.colour_by in (usual, "height"):
+            self._view.colour_by = "height" if cloud else usual
 
     @property
     def view(self) -> dict[str, Any]:
@@ -173,7 +184,7 @@ class Scene:
         scene.set_up_direction("+z")
         scene.configure_default_lights(enabled=True, cast_shadow=False)
         self._follower = Follower(self._server)
-        scene.add_grid(
+        self._grid = scene.add_grid(
             f"{WORLD}/ground",
             infinite_grid=True,
             cell_size=1.0,
@@ -220,6 +231,7 @@ class Scene:
         if self._frame is None:
             return
         with self._server.atomic():  # otherwise the points would move before the robot
+            self._grid.visible = not self._frame.of_cloud  # its zero is far below or above the plot
             self._follower.show(self._pose, self._base_z, self._view.follow)
             # First, because the other nodes use the heights of its ground.
             self._map.show(self._frame, self._selected, self._ring, self._view)
@@ -300,9 +312,15 @@ class Scene:
         self.show_parameters(self._parameters, self._preset)
 
 
+def _extent(frame: Frame) -> float:
+    """Return the greater side of the area of the points of a frame [m]; 0 without points."""
+    return float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
+
+
 WORLD = "/world"  # parent of all nodes; its children are in the frame of the map
 BEHIND = (-8.0, -4.5, 6.0)  # position of a camera relative to its target [m]
 ABOVE = (0.0, -0.01, 28.0)
+SEEN = 12.0  # width of the area that these cameras show [m]
 
 
 class Follower:
@@ -319,8 +337,27 @@ class Follower:
     def __init__(self, server: viser.ViserServer) -> None:
         self._world = add_posed(server.scene, WORLD)
         self._server = server
-        server.initial_camera.position = BEHIND
-        server.initial_camera.look_at = (0.0, 0.0, 0.5)
+        self._scale = 1.0
+        self._set_initial_camera()
+
+    def frame_plot(self, extent: float) -> None:
+        """Move all cameras so that they show a plot, or the surroundings of a robot.
+
+        Args:
+            extent: Width of the plot [m]; 0 for a robot.
+        """
+        scale = max(extent / SEEN, 1.0)
+        if scale == self._scale:
+            return
+        self._scale = scale
+        self._set_initial_camera()
+        for client in self._server.get_clients().values():
+            self.look(client, Pose2(), 0.0, from_above=False, origin=True)
+
+    def _set_initial_camera(self) -> None:
+        """Set the camera of browsers that connect later."""
+        self._server.initial_camera.position = tuple(self._scale * np.array(BEHIND))
+        self._server.initial_camera.look_at = (0.0, 0.0, 0.5)
 
     def show(self, pose: Pose2, z: float, follow: bool) -> None:
         """Move the world so that the robot is at the origin, if following is on.
@@ -338,7 +375,9 @@ class Follower:
         """Position of the origin of the map in the world of viser, shape (3,) [m]."""
         return np.array(self._world.position, dtype=np.float64)
 
-    def look(self, client: viser.ClientHandle, pose: Pose2, z: float, *, from_above: bool) -> None:
+    def look(
+        self, client: viser.ClientHandle, pose: Pose2, z: float, *, from_above: bool, origin: bool = False
+    ) -> None:
         """Turn the camera of one browser to the robot.
 
         Args:
@@ -346,11 +385,12 @@ class Follower:
             pose: Pose of the robot in the map.
             z: Height of the robot [m].
             from_above: Whether the camera is above the robot; otherwise behind it.
+            origin: Whether it turns to the origin of the viewer instead.
         """
-        target = np.array([pose.x, pose.y, z]) + self._world.position
+        target = np.zeros(3) if origin else np.array([pose.x, pose.y, z]) + self._world.position
         with client.atomic():
             client.camera.up_direction = np.array([0.0, 0.0, 1.0])
-            client.camera.position = target + (ABOVE if from_above else BEHIND)
+            client.camera.position = target + self._scale * np.array(ABOVE if from_above else BEHIND)
             client.camera.look_at = target
 
 

@@ -23,7 +23,7 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
-from app.sources.opening import open_source
+from app.sources.opening import check_cloud, open_cloud, open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import check_existence
@@ -97,8 +97,9 @@ async def ask(
 
 
 async def check_source(request: SourceRequest) -> None:
-    """Check that a source can be opened. A child process reads the first scan of a file, within 300 s; of
-    simulated runs and live robots only the address is checked.
+    """Check that a source can be opened. A child process reads the first scan of a file, within 300 s, or the
+    header and the first points of a whole cloud; of simulated runs and live robots only the address is
+    checked.
 
     Raises:
         StemmapError: It cannot be opened; the error gives the reason.
@@ -107,6 +108,8 @@ async def check_source(request: SourceRequest) -> None:
         parse_address(request.uri)
     elif request.uri.startswith(SCHEME) and not Path(request.uri).exists():
         parse_uri(request.uri)
+    elif await asyncio.to_thread(is_cloud, request.uri):
+        await asyncio.to_thread(check_cloud, request.uri)  # a copy of this process, which starts at once
     else:
         question = {"ask": "first_scan", "path": request.uri, "request": msgspec.to_builtins(request)}
         await ask(question, patience_s=OPENING_LIMIT_S)
@@ -126,6 +129,8 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
     Raises:
         SourceError: It cannot be read.
     """
+    if is_cloud(question["path"]):
+        return {"kind": f"whole cloud, {open_cloud(question['path']).description.kind}"}
     with closing(open_source(question["path"])) as source:
         return {"kind": source.description.kind}
 

@@ -36,8 +36,17 @@ def open_cloud(uri: str) -> WholeCloud:
     Raises:
         SourceError: As for `open_source`.
     """
-    _check(lambda: clouds.open_cloud(uri), uri)
+    check_cloud(uri)
     return clouds.open_cloud(uri)
+
+
+def check_cloud(uri: str) -> None:
+    """Open a whole cloud only in a child process.
+
+    Raises:
+        SourceError: As for `open_source`.
+    """
+    _check(lambda: clouds.open_cloud(uri), uri)
 
 
 def _check(opening: Callable[[], object], uri: str) -> None:

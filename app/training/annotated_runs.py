@@ -23,6 +23,7 @@ from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import CLASSES, PACKAGE
 from pipeline.config import PRESETS, Parameters, preset
 from pipeline.errors import ParameterError, SourceError
+from pipeline.io.readers.clouds import is_cloud
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Columns, Float, Verdict
@@ -191,6 +192,9 @@ def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
         SourceError: The run cannot be read, is live, or is another recording.
     """
     request = run.request
+    if is_cloud(request.uri):
+        what = "a whole cloud has no scans to learn from"
+        raise SourceError(what, where=request.uri, remedy="Annotate a drive")
     with closing(open_any(request.uri, request.options())) as source:
         if isinstance(source, LiveSource):
             raise SourceError(

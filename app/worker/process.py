@@ -18,11 +18,15 @@ from typing import BinaryIO
 from app.common.child_process import private_streams
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
+from app.robot.source import LiveSource
+from app.worker.inventory_run import CloudSource
 from app.worker.loop import WorkerLoop
 from app.worker.outbox import Outbox
 from app.worker.protocol import ToWorker, WireError, to_worker
 from app.worker.session import Session
 from pipeline.config import Parameters
+from pipeline.io.readers.base import Source, SourceOptions
+from pipeline.io.readers.clouds import is_cloud
 from pipeline.jit import on_compiling
 
 # A scan that is being mapped, or a large file that is being opened, may take a moment to notice. A robot is
@@ -37,18 +41,31 @@ def new_session(folder: Path | None = None) -> Session:
         folder: Folder of the scan caches, which the next opening of a recording uses again; None for
             temporary caches.
     """
-    from app.robot.source import open_any
     from app.worker.mapper_factory import mapper_of
     from app.worker.numba_warmup import compile_ahead, warm_up
 
     return Session(
-        open_source=open_any,
+        open_source=open_any_or_cloud,
         make_mapper=mapper_of,
         parameters=Parameters(),
         folder=folder,
         compile_ahead=compile_ahead,
         warm_up=warm_up,
     )
+
+
+def open_any_or_cloud(uri: str, options: SourceOptions) -> Source | LiveSource:
+    """Open a source by its URI: a whole cloud to be mapped as a whole, else as `open_any`. A drive through a
+    cloud has the URI sim:cloud?file=PATH.
+
+    Raises:
+        SourceError: The source does not exist, has an unknown format, or is damaged.
+    """
+    from app.robot.source import open_any
+    from app.sources.opening import open_cloud
+
+    path = uri.removeprefix("file:").removeprefix("//")
+    return CloudSource(open_cloud(path)) if is_cloud(path) else open_any(uri, options)
 
 
 def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:

@@ -30,6 +30,23 @@ State = Literal["starting", "playing", "paused", "finished", "waiting", "failed"
 
 
 @dataclass(frozen=True, slots=True)
+class CloudFrame:
+    """Frame of a whole cloud.
+
+    Attributes:
+        offset: Offset x, y, z of the frame of the map in the coordinates of the file [m].
+        crs: Coordinate reference system of the file; "" if unknown.
+        points: Number of points of the file.
+        parameters: Dotted names of the parameters that change the map.
+    """
+
+    offset: tuple[float, float, float]
+    crs: str
+    points: int
+    parameters: list[str]
+
+
+@dataclass(frozen=True, slots=True)
 class Status:
     """Status of the run. Times are seconds since the first scan of the run.
 
@@ -62,6 +79,7 @@ class Status:
             rerun.
         camera: Whether the source has camera pictures.
         recording: State of the recording of a live run; empty without one.
+        cloud: Frame of a whole cloud whose stems are mapped; None for a run of scans.
     """
 
     state: State
@@ -93,6 +111,7 @@ class Status:
     camera: bool = False
     remapped: float | None = None
     compiling_since_s: float | None = None
+    cloud: CloudFrame | None = None
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):

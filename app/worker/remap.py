@@ -416,7 +416,7 @@ def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: i
 def _why_not(frame: Frame, place: Float) -> str:
     """Return the reason why a map has no tree at a place, as text: the class of the nearest column unless it
     is a tree, else the number of observations of the nearest tree, or that nothing was detected. Only what is
-    within SAME counts.
+    within SAME counts. For a whole cloud it is the verdict of the nearest candidate.
 
     Args:
         frame: Last scan in that map.
@@ -428,6 +428,10 @@ def _why_not(frame: Frame, place: Float) -> str:
             reason = _column(frame.columns, near)
             if reason:
                 return reason
+    if frame.of_cloud:
+        near = _nearest(frame.estimate.T_map_base.apply(frame.clusters.centre), place)
+        if near >= 0:
+            return f"the candidate there is {Verdict(int(frame.clusters.verdict[near])).label!r}"
     near = _nearest(frame.trees.position, place)
     if near < 0:
         return "no tree was detected there"

@@ -37,7 +37,9 @@ from pipeline.types.records import Float, Frame, Path, Step, Trees
 
 #: Returns a mapper of a source for parameters and a seed, see `mapper_of`.
 MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
-_LARGE = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the file has no name
+_DISK = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the files have no name
+#: Folder of large temporary files; None for the default.
+LARGE = _DISK if _DISK.is_dir() else None
 
 
 class Run:
@@ -383,7 +385,7 @@ def open_run(
     stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
     digest = source.description.digest
     if folder is None or live is not None or not digest:
-        caches = ScanCaches(_LARGE if _LARGE.is_dir() else None)
+        caches = ScanCaches(LARGE)
     else:
         caches = ScanCaches(folder, f"{digest}\n{source.description.uri}\n{chosen.words}\n{seed}")
     run = Run(

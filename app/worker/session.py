@@ -17,11 +17,13 @@ from app.batch.summary import driven, health_word
 from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
-from app.worker.protocol import LONGEST_S, CameraPicture, MapChanges, Opened, State, Status
+from app.worker.inventory_run import CloudSource, InventoryRun
+from app.worker.protocol import LONGEST_S, CameraPicture, CloudFrame, MapChanges, Opened, State, Status
 from app.worker.remap import MapComparison
-from app.worker.run import MakeMapper, Run, open_run
+from app.worker.run import LARGE, MakeMapper, Run, open_run
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
+from pipeline.inventory import PARAMETERS
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SHOWN_NS, PictureSource
 from pipeline.io.readers.ros_messages import COMPRESSED_IMAGE, IMAGE
@@ -30,6 +32,7 @@ from pipeline.types.records import Frame, Path, Trees
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
 Pace = Literal["idle", "replay", "hurry", "live"]
+AnyRun = Run | InventoryRun
 
 _NS = 1_000_000_000
 _MOST_WARNINGS = 20
@@ -71,7 +74,7 @@ class Session:
         self._revision = 0
         self._requested: tuple[str, str, int] | None = None
         self._open_again: Callable[[], Opened | None] = lambda: None
-        self._run: Run | None = None
+        self._run: AnyRun | None = None
         self._robot: LiveSource | None = None
         self._state: State = "starting"
         self._detail = ""
@@ -111,8 +114,8 @@ class Session:
         return 0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / _NS
 
     @property
-    def run(self) -> Run | None:
-        """The open run, or None."""
+    def run(self) -> AnyRun | None:
+        """The open run or whole cloud, or None."""
         return self._run
 
     def next_ns(self) -> int | None:
@@ -182,9 +185,14 @@ class Session:
         Raises:
             SourceError: The odometry is not available for this source.
         """
-        self._run, warnings = open_run(
-            source, odometry, seed, self._parameters, self._make_mapper, self._folder
-        )
+        warnings: tuple[str, ...]
+        if isinstance(source, CloudSource):
+            self._run = InventoryRun(source, self._parameters, LARGE)
+            warnings = source.description.warnings
+        else:
+            self._run, warnings = open_run(
+                source, odometry, seed, self._parameters, self._make_mapper, self._folder
+            )
         self._state, self._detail = "paused", ""
         self._warn(warnings)
         return opened_of(self._run)
@@ -196,7 +204,7 @@ class Session:
         Raises:
             SourceError: There is no scan.
         """
-        if self._run is not None:
+        if isinstance(self._run, Run):
             self._compile_ahead()
             self._run.prepare()
             stories.warm_up(self._run.source.description.sensor)
@@ -209,8 +217,8 @@ class Session:
     def work(self) -> Frame | None:
         """Map the next scan and return its frame, or the frame of the seek target once it is reached.
 
-        None if no run is open, if nothing is to be mapped (`pace` is "idle"), and at the end of the run,
-        whose state then becomes "finished".
+        None if no run is open, if nothing is to be mapped (`pace` is "idle"), while a whole cloud is not
+        mapped completely, and at the end of the run, whose state then becomes "finished".
         """
         run = self._run
         if run is None or self.pace == "idle":
@@ -219,6 +227,8 @@ class Session:
         if self._target.is_at_end(run):
             return self._arrive(run)
         frame = run.map_next(hurried=self._target.sought)
+        if isinstance(run, InventoryRun) and run.share is not None:
+            return None
         if frame is None:
             self._state = "finished" if self._robot is None else self._state
         else:
@@ -392,7 +402,7 @@ class Session:
         """Set the state "paused"."""
         self._state, self._detail = "paused", ""
 
-    def _arrive(self, run: Run) -> Frame | None:
+    def _arrive(self, run: AnyRun) -> Frame | None:
         """Stop at the sought scan and return its frame; None before the first scan. Parameters that were
         changed during the seek apply from this scan onwards."""
         self._target.forget()
@@ -403,7 +413,7 @@ class Session:
             self._send_preview(run)
         return run.map_again() if changed or run.is_bare else run.frame
 
-    def _send_preview(self, run: Run) -> None:
+    def _send_preview(self, run: AnyRun) -> None:
         """Call `on_preview` with the preview of a run, if there is one."""
         if run.preview is not None:
             self.on_preview(self._revision, run.preview)
@@ -445,11 +455,13 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
     )
 
 
-def _with_run(status: Status, run: Run) -> Status:
+def _with_run(status: Status, run: AnyRun) -> Status:
     """Return the status with the fields that the run and its source determine."""
     description = run.source.description
     losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
     frame, distance_m = run.frame, round(driven(run.path)[1], 3)
+    if isinstance(run, InventoryRun):
+        status = _with_cloud(status, run)
     return replace(
         status,
         kind=description.kind,
@@ -468,7 +480,17 @@ def _with_run(status: Status, run: Run) -> Status:
     )
 
 
-def opened_of(run: Run) -> Opened:
+def _with_cloud(status: Status, run: InventoryRun) -> Status:
+    """Return the status of a whole cloud: its frame, and the progress of its first map."""
+    about = run.about
+    cloud = CloudFrame(tuple(about.offset.tolist()), about.crs, about.points, list(PARAMETERS))
+    if run.frame is None and run.share is not None and status.state in ("playing", "paused"):
+        detail = f"Mapping the cloud: {100.0 * run.share:.0f} %"
+        return replace(status, cloud=cloud, state="starting", detail=detail)
+    return replace(status, cloud=cloud)
+
+
+def opened_of(run: AnyRun) -> Opened:
     """Return the message for an opened source. Its length is None unless the source has a known begin and
     end."""
     description = run.source.description
@@ -509,7 +531,7 @@ class SeekTarget:
         """Seek the scan with this index."""
         self._index, self._stamp_ns, self._under_way = index, None, False
 
-    def to_time(self, run: Run, stamp_ns: int) -> None:
+    def to_time(self, run: AnyRun, stamp_ns: int) -> None:
         """Seek the last scan of the run not later than a time [ns]; if that scan was not read yet, the run is
         mapped on until it is found."""
         index = run.index_at(stamp_ns)
@@ -522,7 +544,7 @@ class SeekTarget:
         """End the seek."""
         self._index, self._stamp_ns, self._under_way = None, None, False
 
-    def set_out(self, run: Run) -> None:
+    def set_out(self, run: AnyRun) -> None:
         """Restore a state of the run before the target, once for each target. This happens when mapping
         begins, so that targets that are replaced while the timeline is dragged cost nothing."""
         if self._under_way or not self.sought:
@@ -533,7 +555,7 @@ class SeekTarget:
         elif self._index != run.current or not run.is_whole:
             run.approach(self._index)
 
-    def is_at_end(self, run: Run) -> bool:
+    def is_at_end(self, run: AnyRun) -> bool:
         """Return whether the run has reached the sought scan; False without one. For a time, the following
         scan must be known."""
         if self._index is not None:
@@ -543,7 +565,7 @@ class SeekTarget:
         following = run.peek_ns()
         return following is not None and following > self._stamp_ns
 
-    def words(self, run: Run | None) -> str:
+    def words(self, run: AnyRun | None) -> str:
         """Return a description of the sought scan: its time, for example "1:05", or "scan 12" if its time is
         unknown. Empty without a run or without a sought scan."""
         if run is None or not self.sought:
@@ -551,7 +573,7 @@ class SeekTarget:
         time_s = self.time_s(run)
         return f"scan {self._index}" if time_s is None else clock(time_s)
 
-    def time_s(self, run: Run | None) -> float | None:
+    def time_s(self, run: AnyRun | None) -> float | None:
         """Return the time of the sought scan [s since the first scan]; None without one, or if it is
         unknown."""
         if run is None:

@@ -1,12 +1,16 @@
 """Stem inventory of a whole cloud of a plot by a terrestrial or mobile scanner.
 
-The steps of `map_plot` are extent, ground, thinned points above it, slices, circles, stems. The cloud is read
-three times in parts, so that the memory does not grow with its size.
+The steps of `Inventory` are extent, ground, thinned points above it, slices, circles, stems, crowns. The
+points are read three times in parts, so that the memory does not grow with their number.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Generator
+from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -14,8 +18,9 @@ from pipeline.classification import ForestOf, package_alone
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.inventory.cloud import Thinned, WholeCloud, find_extent
-from pipeline.inventory.cross_sections import HIGHEST, LOWEST, Slices, cut, find_circles
+from pipeline.inventory.cloud import ExtentFinder, SpooledCloud, Thinned, WholeCloud
+from pipeline.inventory.cross_sections import FIGURES, HIGHEST, LOWEST, Slices, cut, find_circles
+from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of
 from pipeline.inventory.stem_model import (
     COVERAGE,
     FIRST,
@@ -46,6 +51,10 @@ COARSE = 0.04  # m; coarser thinning makes diameters less precise
 SURE = 0.5  # share of the votes for pole, person or wall that rejects a stem
 SAME_OBJECT = 0.4  # m; a column within this distance of a stem is the stem
 NEVER = -1  # an unknown time
+LEAST_RADIUS = 0.02  # m; smaller circles are twigs
+SHOWN, SHOWN_SIDE = 1 << 17, 0.02  # points of all heights that are kept, and smallest side of their cubes [m]
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +68,8 @@ class Candidates:
         points: Median number of points on the circle of a slice.
         height: Distance between the lowest and the highest slice [m].
         verdict: See Verdict, int32.
+        stems: Models of the stems, the first rows of this table, shape (N, COLUMNS), N at most K.
+        slices: Circles of these stems, shape (N, S, FIGURES).
     """
 
     place: Float
@@ -68,6 +79,8 @@ class Candidates:
     points: Float
     height: Float
     verdict: Int32
+    stems: Float
+    slices: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,6 +96,9 @@ class PlotMap:
         points: Thinned points between LOWEST and HIGHEST above the ground, shape (N, 4).
         counts: Numbers of points by name.
         voxel_size: Side of the voxels of the thinning [m].
+        whole: Thinned points of all heights (x, y, z, height above the ground), shape (M, 4) [m].
+        crowns: Tree of each of these points, and the heights of the trees.
+        tree_candidate: Row of each tree in `candidates`, shape (T,).
         lean: Shift of the axis of each tree per metre of height, shape (T, 2).
         taper: Change of the radius of each tree per metre of height, shape (T,).
         warnings: Messages for the user.
@@ -94,6 +110,9 @@ class PlotMap:
     candidates: Candidates
     ground: TerrainRaster
     points: Float32
+    whole: Float32
+    crowns: Crowns
+    tree_candidate: Int
     counts: dict[str, int]
     voxel_size: float
     lean: Float
@@ -101,62 +120,174 @@ class PlotMap:
     warnings: tuple[str, ...]
 
 
-def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
-    """Return the map of the stems of a whole cloud.
+#: Parameters that change the map of a cloud.
+PARAMETERS = (
+    "detection.radius_min",
+    "detection.radius_max",
+    "tracking.dbh_arc_min",
+    "ground.slope_max",
+    "classification.forest",
+)
 
-    Args:
-        cloud: The cloud, which is read three times.
-        parameters: All parameters; of the stages ground, detection, tracking and classification a few are
-            used.
-        forests: Returns the random forest by its name.
+
+def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
+    """Return the map of the stems of a whole cloud, see `Inventory`.
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or is larger than a plot.
         StemmapError: There is no such forest.
     """
-    r_min, r_max = parameters.detection.radius_min, parameters.detection.radius_max
-    ground, near, counts = find_ground(cloud, parameters.ground.slope_max)
-    slices = cut(near.points)
-    circles = find_circles(slices, max(r_min, 0.02), r_max)
-    number, stems = chain(circles)
-    fits = follow(slices, circles, number, stems, max(r_min, 0.02), r_max)
-    height = middles(slices)
-    figures = describe_stems(fits, height)
-    _place_by_circles(figures, circles, number)
-    verdict = classify_stems(figures, r_min, r_max)
-    kept = ~is_repeated(figures, verdict)
-    fits, figures, verdict = fits[kept], figures[kept], verdict[kept]
-    places, share = find_upright(near.points, forests(parameters.classification.forest, True))
-    _reject_other_objects(figures, verdict, places, share)
-    tree = verdict == Verdict.TREE
-    # Numbers increase from west to east.
-    order = np.flatnonzero(tree)[np.lexsort((figures[tree, Y], figures[tree, X]))]
-    return PlotMap(
-        trees=_trees(figures[order], np.radians(parameters.tracking.dbh_arc_min)),
-        slices=fits[order],
-        slice_height=height,
-        candidates=_candidates(figures, verdict, places, share),
-        ground=ground,
-        points=near.points,
-        counts={**counts, "thinned": len(near.points), "in slices": len(slices.points)},
-        voxel_size=near.side,
-        lean=figures[order][:, [LEAN_X, LEAN_Y]],
-        taper=figures[order, TAPER],
-        warnings=_warnings(cloud, near, slices, ground),
-    )
+    with closing(Inventory(cloud, forests)) as inventory:
+        return finish(inventory.steps(parameters))
+
+
+class Inventory:
+    """Maps the stems of a whole cloud, also again with other parameters. Stages whose parameters are the same
+    as before are not computed again.
+
+    Args:
+        cloud: The cloud; it is read once.
+        forests: Returns the random forest by its name.
+        folder: Folder of the temporary file with the points; None for that of the system.
+    """
+
+    def __init__(
+        self, cloud: WholeCloud, forests: ForestOf = package_alone, folder: Path | None = None
+    ) -> None:
+        self._cloud, self._forests = SpooledCloud(cloud, folder), forests
+        self._kept: dict[str, tuple[object, Any]] = {}
+
+    def steps(self, parameters: Parameters) -> Generator[float, None, PlotMap]:
+        """Map the cloud; yield the share of the work that is done, from 0 to 1, at least every few tenths of
+        a second, and return the map. The generator may be left before its end.
+
+        Args:
+            parameters: All parameters; those named in PARAMETERS are used.
+
+        Raises:
+            SourceError: The cloud cannot be read, has no points, or is larger than a plot.
+            StemmapError: There is no such forest.
+        """
+        r_min, r_max = parameters.detection.radius_min, parameters.detection.radius_max
+        slope, forest = parameters.ground.slope_max, parameters.classification.forest
+        ground, near, slices, whole, counts = yield from self._keep(
+            "points", slope, lambda: self._points(slope)
+        )
+        circles = yield from self._keep(
+            "circles", (slope, r_min, r_max), lambda: _circles(slices, r_min, r_max)
+        )
+        number, stems = chain(circles)
+        fits = follow(slices, circles, number, stems, max(r_min, LEAST_RADIUS), r_max)
+        yield 0.9
+        height = middles(slices)
+        figures = describe_stems(fits, height)
+        _place_by_circles(figures, circles, number)
+        verdict = classify_stems(figures, r_min, r_max)
+        kept = ~is_repeated(figures, verdict)
+        fits, figures, verdict = fits[kept], figures[kept], verdict[kept]
+        places, share = yield from self._keep("upright", (slope, forest), lambda: self._upright(near, forest))
+        _reject_other_objects(figures, verdict, places, share)
+        tree = verdict == Verdict.TREE
+        # Numbers increase from west to east.
+        order = np.flatnonzero(tree)[np.lexsort((figures[tree, Y], figures[tree, X]))]
+        crowns = find_crowns(whole, figures[order], fits[order], ground)
+        return PlotMap(
+            trees=_trees(figures[order], np.radians(parameters.tracking.dbh_arc_min), crowns),
+            slices=fits[order],
+            slice_height=height,
+            candidates=_candidates(figures, fits, verdict, places, share),
+            tree_candidate=order,
+            ground=ground,
+            points=near.points,
+            whole=whole.points,
+            crowns=crowns,
+            counts={**counts, "thinned": len(near.points), "in slices": len(slices.points)},
+            voxel_size=near.side,
+            lean=figures[order][:, [LEAN_X, LEAN_Y]],
+            taper=figures[order, TAPER],
+            warnings=_warnings(self._cloud, near, slices, ground),
+        )
+
+    def close(self) -> None:
+        """Delete the temporary file."""
+        self._cloud.close()
+
+    def _keep(
+        self, stage: str, key: object, compute: Callable[[], Generator[float, None, T]]
+    ) -> Generator[float, None, T]:
+        """Return the kept result of a stage, or compute it if its parameters differ.
+
+        Args:
+            stage: Name of the stage.
+            key: Parameters on which the result depends.
+            compute: Computes it in steps.
+        """
+        known = self._kept.get(stage)
+        if known is None or known[0] != key:
+            known = self._kept[stage] = (key, (yield from compute()))
+        result: T = known[1]
+        return result
+
+    def _points(
+        self, slope_max: float
+    ) -> Generator[float, None, tuple[TerrainRaster, Thinned, Slices, Voxels, dict[str, int]]]:
+        """Read the points; return ground, points near the ground, their slices, all points, and counts."""
+        whole = Thinned(SHOWN, SHOWN_SIDE)
+        ground, near, counts = yield from ground_steps(self._cloud, slope_max, whole=whole)
+        yield 0.38
+        voxels = voxels_of(whole.points, whole.side)
+        yield 0.4
+        return ground, near, cut(near.points), voxels, counts
+
+    def _upright(self, near: Thinned, forest: str) -> Generator[float, None, tuple[Float, Float]]:
+        """Return the result of `find_upright`."""
+        yield 0.92
+        return find_upright(near.points, self._forests(forest, True))
+
+
+def _circles(slices: Slices, r_min: float, r_max: float) -> Generator[float, None, Float]:
+    """Return the circles of all slices, shape (K, FIGURES + 2)."""
+    found = [np.zeros((0, FIGURES + 2))]
+    for circles in find_circles(slices, max(r_min, LEAST_RADIUS), r_max):
+        found.append(circles)
+        yield 0.4 + 0.5 * (len(found) - 1) / slices.count
+    return np.concatenate(found)
+
+
+def finish(steps: Generator[float, None, T]) -> T:
+    """Return the result of a generator after all of its steps."""
+    while True:
+        try:
+            next(steps)
+        except StopIteration as end:
+            result: T = end.value
+            return result
 
 
 def find_ground(
     cloud: WholeCloud, slope_max: float, *, band: tuple[float, float] = (LOWEST, HIGHEST), most: int = 1 << 21
 ) -> tuple[TerrainRaster, Thinned, dict[str, int]]:
+    """Return the result of `ground_steps`; arguments as in it."""
+    return finish(ground_steps(cloud, slope_max, band=band, most=most))
+
+
+def ground_steps(
+    cloud: WholeCloud,
+    slope_max: float,
+    *,
+    band: tuple[float, float] = (LOWEST, HIGHEST),
+    most: int = 1 << 21,
+    whole: Thinned | None = None,
+) -> Generator[float, None, tuple[TerrainRaster, Thinned, dict[str, int]]]:
     """Return the ground below a cloud, its thinned points (x, y, z, height above the ground) in a band, and
-    counts.
+    counts; yield the share of the whole inventory that is done after each part.
 
     Args:
         cloud: The cloud, which is read three times.
         slope_max: Largest slope of the terrain against the plane of the plot [degrees].
         band: Lowest and highest height above the ground that is kept, both exclusive [m].
         most: Largest number of points after thinning, a power of two.
+        whole: Receives the points of all heights.
 
     Returns:
         Ground; points, of which there may be none; and the numbers of points "read", "apart from the plot"
@@ -165,7 +296,13 @@ def find_ground(
     Raises:
         SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER bytes.
     """
-    extent = find_extent(cloud.parts(), cloud.description.uri)
+    finder, of = ExtentFinder(), max(cloud.description.points, 1)
+    read = 0
+    for part in cloud.parts():
+        finder.add(part, cloud.description.uri)
+        read += len(part)
+        yield min(0.2 * read / of, 0.2)
+    extent = finder.extent(cloud.description.uri)
     room = LowestReturns.room(extent.low, extent.high)
     if room > MOST_RASTER:
         wide, long = (extent.high - extent.low).tolist()
@@ -177,9 +314,11 @@ def find_ground(
     lowest = LowestReturns(extent.low, extent.high)
     for part in cloud.parts():
         lowest.add(part)
+        yield 0.2
     ground = lowest.ground(float(np.radians(slope_max)))
     del lowest
     near, below = Thinned(most), 0
+    yield 0.3
     for part in cloud.parts():
         inside = ((part[:, :2] >= extent.low) & (part[:, :2] <= extent.high)).all(axis=1)
         part = part[inside]
@@ -187,6 +326,9 @@ def find_ground(
         below += int(np.count_nonzero(above < -0.3))
         chosen = (above > band[0]) & (above < band[1])
         near.add(np.column_stack([part[chosen], above[chosen]]))
+        if whole is not None:
+            whole.add(np.column_stack([part, above]))
+        yield 0.35
     counts = {"read": extent.points, "apart from the plot": extent.apart, "below the ground": below}
     return ground, near, counts
 
@@ -228,13 +370,14 @@ def _reject_other_objects(figures: Float, verdict: Int32, places: Float, share: 
     verdict[tree[known]] = kind[known]
 
 
-def _trees(stems: Float, arc_min: float) -> Trees:
+def _trees(stems: Float, arc_min: float, crowns: Crowns) -> Trees:
     """Return the tree table of stems, numbered from 1 in their order, all confirmed; velocities are 0,
     eccentricities NaN, times NEVER, and the observations are the slices.
 
     Args:
         stems: Models of the stems, shape (T, COLUMNS).
         arc_min: Least visible arc of a diameter [rad]; DBH is NaN otherwise, see `diameters`.
+        crowns: Heights of the trees.
     """
     n = len(stems)
     dbh, sigma = diameters(stems, arc_min)
@@ -253,10 +396,13 @@ def _trees(stems: Float, arc_min: float) -> Trees:
         first_seen_ns=np.full(n, NEVER),
         last_seen_ns=np.full(n, NEVER),
         confirmed=np.ones(n, np.bool_),
+        height=crowns.height,
+        height_sigma=crowns.sigma,
+        lean=np.arctan(np.hypot(stems[:, LEAN_X], stems[:, LEAN_Y])),
     )
 
 
-def _candidates(figures: Float, verdict: Int32, places: Float, share: Float) -> Candidates:
+def _candidates(figures: Float, fits: Float, verdict: Int32, places: Float, share: Float) -> Candidates:
     """Return the stems, and after them the upright columns farther than SAME_OBJECT from each stem, as
     candidates. A column has the verdict of its strongest class, NO_ARC in place of TREE, and NaN for all
     measures; arguments as in `_reject_other_objects`, not changed."""
@@ -276,6 +422,8 @@ def _candidates(figures: Float, verdict: Int32, places: Float, share: Float) -> 
         points=points,
         height=np.append(span, nothing),
         verdict=np.append(verdict, kind.astype(np.int32)),
+        stems=figures,
+        slices=fits,
     )
 
 
@@ -307,4 +455,4 @@ def _warnings(cloud: WholeCloud, near: Thinned, slices: Slices, ground: TerrainR
     return tuple(warnings)
 
 
-__all__ = ["Candidates", "PlotMap", "find_ground", "map_plot"]
+__all__ = ["PARAMETERS", "Candidates", "Inventory", "PlotMap", "find_ground", "finish", "map_plot"]

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import tempfile
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import IO, Protocol
 
 import numpy as np
 
@@ -62,6 +64,71 @@ class WholeCloud(Protocol):
         """
 
 
+class SpooledCloud:
+    """A cloud that is read from its source once: later readings come from a temporary file without a name.
+
+    If the disk refuses, each reading comes from the source.
+
+    Args:
+        cloud: The cloud.
+        folder: Folder of the temporary file; None for that of the system.
+    """
+
+    def __init__(self, cloud: WholeCloud, folder: Path | None = None) -> None:
+        self._cloud, self._folder = cloud, folder
+        self._file: IO[bytes] | None = None
+
+    @property
+    def description(self) -> CloudDescription:
+        """Description of the cloud."""
+        return self._cloud.description
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Points left out in the reading of the source, by reason."""
+        return self._cloud.losses
+
+    def parts(self) -> Iterator[Float32]:
+        """Yield all points in parts, see `WholeCloud.parts`."""
+        if self._file is not None:
+            yield from _read_points(self._file)
+            return
+        try:
+            spool: IO[bytes] | None = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115 - kept open
+        except OSError:
+            spool = None
+        complete = False
+        try:
+            for part in self._cloud.parts():
+                if spool is not None:
+                    try:
+                        spool.write(np.ascontiguousarray(part).data)
+                    except OSError:  # the disk is full
+                        spool.close()
+                        spool = None
+                yield part
+            complete = True
+        finally:
+            if complete:
+                self._file = spool
+            elif spool is not None:
+                spool.close()
+
+    def close(self) -> None:
+        """Delete the temporary file."""
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+def _read_points(file: IO[bytes]) -> Iterator[Float32]:
+    """Yield the points of a file of float32 x, y, z in parts of at most SPOOLED, shape (N, 3) [m]."""
+    file.seek(0)
+    while block := file.read(SPOOLED * 12):
+        yield np.frombuffer(block, np.float32).reshape(-1, 3)
+
+
+SPOOLED = 1 << 19  # points that are read at once
 SQUARE = 8.0  # m
 LEAST = 20  # points of a square that belongs to the plot with its neighbours
 MOST_SQUARES = 1 << 20
@@ -83,38 +150,46 @@ class Extent:
     apart: int
 
 
-def find_extent(parts: Iterable[Float32], where: str) -> Extent:
-    """Return the extent of a cloud. Points in sparse squares that have no dense neighbour are outside of it
-    and counted; if no square is dense, all points are inside.
+class ExtentFinder:
+    """Finds the extent of a cloud. Points in sparse squares that have no dense neighbour are outside of it
+    and counted; if no square is dense, all points are inside."""
 
-    Args:
-        parts: Points in parts, shape (N, 3) [m] each, finite; read once. A part may be empty.
-        where: Name of the cloud in errors.
+    def __init__(self) -> None:
+        self._squares: dict[int, tuple[int, Float]] = {}
 
-    Raises:
-        SourceError: There are no points, or they are in more than MOST_SQUARES squares.
-    """
-    squares: dict[int, tuple[int, Float]] = {}
-    for part in parts:
+    def add(self, part: Float32, where: str) -> None:
+        """Add points of shape (N, 3) [m], finite; N may be 0.
+
+        Raises:
+            SourceError: The points are in more than MOST_SQUARES squares; `where` is the name of the cloud.
+        """
         if len(part):
-            _count(part, squares)
-        if len(squares) > MOST_SQUARES:
+            _count(part, self._squares)
+        if len(self._squares) > MOST_SQUARES:
             raise SourceError("the points are spread too widely for a plot", where=where)
-    if not squares:
-        raise SourceError("the cloud has no points", where=where, remedy="Export it again")
-    count = np.array([n for n, _ in squares.values()])
-    bounds = np.array([bound for _, bound in squares.values()])
-    key = np.array(list(squares))
-    dense = set(key[count >= LEAST].tolist()) or set(key.tolist())
-    steps = [(a << 32) + b for a in (-1, 0, 1) for b in (-1, 0, 1)]
-    part_of = np.array([any(k + step in dense for step in steps) for k in key.tolist()])
-    total = int(count.sum())
-    return Extent(
-        bounds[part_of, :2].min(axis=0),
-        bounds[part_of, 2:].max(axis=0),
-        total,
-        total - int(count[part_of].sum()),
-    )
+
+    def extent(self, where: str) -> Extent:
+        """Return the extent of all points so far.
+
+        Raises:
+            SourceError: There are no points; `where` is the name of the cloud.
+        """
+        squares = self._squares
+        if not squares:
+            raise SourceError("the cloud has no points", where=where, remedy="Export it again")
+        count = np.array([n for n, _ in squares.values()])
+        bounds = np.array([bound for _, bound in squares.values()])
+        key = np.array(list(squares))
+        dense = set(key[count >= LEAST].tolist()) or set(key.tolist())
+        steps = [(a << 32) + b for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        part_of = np.array([any(k + step in dense for step in steps) for k in key.tolist()])
+        total = int(count.sum())
+        return Extent(
+            bounds[part_of, :2].min(axis=0),
+            bounds[part_of, 2:].max(axis=0),
+            total,
+            total - int(count[part_of].sum()),
+        )
 
 
 def _count(part: Float32, squares: dict[int, tuple[int, Float]]) -> None:

@@ -8,6 +8,7 @@ Tukey weights).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -301,27 +302,24 @@ def _spacing(points: Float) -> float:
     return float(np.median(distance) / thinned)
 
 
-def find_circles(slices: Slices, r_min: float, r_max: float) -> Float:
-    """Return all circles of all slices that may be stems: at least LEAST points on the arc ARC or more,
-    hollow, and with little scatter.
+def find_circles(slices: Slices, r_min: float, r_max: float) -> Iterator[Float]:
+    """Yield the circles of each slice, lowest first, that may be stems: at least LEAST points on the arc ARC
+    or more, hollow, and with little scatter.
+
+    Each array has the values of `fit_circle`, the slice, and the share of the points inside, shape (K,
+    FIGURES + 2); K may be 0. One trunk may give several circles in a slice.
 
     Args:
         slices: Slices of the plot.
         r_min, r_max: Smallest and largest radius [m].
-
-    Returns:
-        Values of `fit_circle`, the slice, and the share of the points inside, in the order of slices, shape
-        (K, FIGURES + 2); K may be 0. One trunk may give several circles in a slice.
     """
     eps = float(np.clip(1.3 * slices.spacing, EPS_MIN, EPS_MAX))
     tolerance = float(np.clip(0.3 * slices.spacing, 0.01, 0.03))
-    found = [np.zeros((0, FIGURES + 2))]
     for k in range(slices.count):
         xy = np.ascontiguousarray(slices.slab(k)[:, :2])
         label = dbscan_grid(xy, eps, 4)[0]
         order, bounds = group_rows(label, int(label.max(initial=-1)) + 1)
-        found.append(_circles(xy[order], bounds, tolerance, r_min, r_max, float(k)))
-    return np.concatenate(found)
+        yield _circles(xy[order], bounds, tolerance, r_min, r_max, float(k))
 
 
 @compiled

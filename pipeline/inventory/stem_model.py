@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
+from pipeline.detection.verdicts import Check
 from pipeline.geometry.poses import Float
-from pipeline.inventory.cross_sections import Slices, without_scatter
+from pipeline.inventory.cross_sections import STEP, Slices, without_scatter
 from pipeline.inventory.stem_tracing import BREAST, lines
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Int32, Verdict
+
+_MIN: Final = "at least"
+_MAX: Final = "at most"
 
 LOCAL = 1.2  # m above and below breast height in which the taper is nearly constant
 CLOSE = 0.5  # m; largest distance of a slice from breast height for a diameter
@@ -95,36 +101,55 @@ def _evenness(rows: Float, h: Float, out: Float) -> None:
 
 
 def classify_stems(stems: Float, r_min: float, r_max: float) -> Int32:
-    """Return the verdict of each stem, int32, shape (K,): TREE, or the reason of the rejection;
-    TOO_FEW_POINTS for a stem without a radius (NaN).
+    """Return the verdict of each stem, int32, shape (K,): that of the first of its checks that fails, else
+    TREE; TOO_FEW_POINTS for a stem without a radius (NaN).
 
     Args:
         stems: Result of `describe_stems`.
         r_min, r_max: Minimum and maximum radius of a tree [m].
     """
     verdict = np.full(len(stems), Verdict.TREE, np.int32)
+    for check in reversed(stem_checks(stems, r_min, r_max)):  # the first check that fails is written last
+        verdict[check.fails] = check.verdict
+    return verdict
+
+
+def stem_checks(stems: Float, r_min: float, r_max: float) -> tuple[Check, ...]:
+    """Return the checks of `classify_stems` in their order, with all values and limits, as an explanation.
+    Limits that differ from stem to stem are 1, and the values are shares of them."""
     r, slices = stems[:, RADIUS], stems[:, SLICES]
     span = stems[:, LAST] - stems[:, FIRST]
-    taper = stems[:, TAPER_ALL]
+    taper, lean = stems[:, TAPER_ALL], np.hypot(stems[:, LEAN_X], stems[:, LEAN_Y])
     often = np.clip(slices / USUAL, *FORGIVEN)
-    rules: list[tuple[Bool, Verdict]] = [
-        (np.hypot(stems[:, LEAN_X], stems[:, LEAN_Y]) > np.tan(LEAN), Verdict.OTHER),
-        (stems[:, CONTRAST] < LEAST_CONTRAST, Verdict.BUSH),
-        ((taper > WIDENS) | (taper < NARROWS), Verdict.BUSH),
-        (stems[:, SIGMA_R] > UNSURE * r + MODEL, Verdict.NOT_ROUND),
-        (stems[:, SPREAD] > often * np.maximum(WOBBLE, CROOKED * r), Verdict.NOT_ROUND),
-        (stems[:, EVEN] > often * np.maximum(UNEVEN * r, 0.008), Verdict.NOT_ROUND),
-        (stems[:, SCATTER] > often * np.maximum(ROUGH * r, 0.01), Verdict.NOT_ROUND),
-        (slices < FILLED * (span / 0.2 + 1.0), Verdict.BUSH),
-        (stems[:, FIRST] > BEGINS_BELOW, Verdict.OTHER),
-        ((span < LEAST_HIGH) | (slices < LEAST_SLICES), Verdict.TOO_LOW),
-        (r > r_max, Verdict.TOO_THICK),
-        (r < r_min, Verdict.TOO_THIN),
-        (~np.isfinite(r) | (stems[:, POINTS] < LEAST_POINTS), Verdict.TOO_FEW_POINTS),
+    every = span / STEP + 1.0
+    points, first = stems[:, POINTS], stems[:, FIRST]
+    few = ~np.isfinite(r) | (points < LEAST_POINTS)
+    checks = [
+        Check(Verdict.TOO_FEW_POINTS, "points per circle", "", points, _MIN, LEAST_POINTS, "", few),
+        Check(Verdict.TOO_THIN, "radius", "m", r, _MIN, r_min, "detection.radius_min", r < r_min),
+        Check(Verdict.TOO_THICK, "radius", "m", r, _MAX, r_max, "detection.radius_max", r > r_max),
+        Check(Verdict.TOO_LOW, "traced height", "m", span, _MIN, LEAST_HIGH, "", span < LEAST_HIGH),
+        Check(Verdict.TOO_LOW, "slices", "", slices, _MIN, LEAST_SLICES, "", slices < LEAST_SLICES),
+        Check(Verdict.OTHER, "lowest slice", "m", first, _MAX, BEGINS_BELOW, "", first > BEGINS_BELOW),
+        Check(Verdict.BUSH, "share of slices", "", slices / every, _MIN, FILLED, "", slices < FILLED * every),
     ]
-    for rejected, reason in rules:  # the last rule that applies gives the reason
-        verdict[rejected] = reason
-    return verdict
+    for figure, value, limit in (
+        ("scatter of the points", stems[:, SCATTER], often * np.maximum(ROUGH * r, 0.01)),
+        ("unevenness of the radii", stems[:, EVEN], often * np.maximum(UNEVEN * r, 0.008)),
+        ("offset from a straight axis", stems[:, SPREAD], often * np.maximum(WOBBLE, CROOKED * r)),
+        ("sigma of the radius", stems[:, SIGMA_R], UNSURE * r + MODEL),
+    ):
+        name = f"{figure}, share of the limit"
+        checks.append(Check(Verdict.NOT_ROUND, name, "", value / limit, _MAX, 1.0, "", value > limit))
+    contrast, leans = stems[:, CONTRAST], lean > np.tan(LEAN)
+    lean_deg = np.degrees(np.arctan(lean))
+    return (
+        *checks,
+        Check(Verdict.BUSH, "radius gained per metre", "m", taper, _MAX, WIDENS, "", taper > WIDENS),
+        Check(Verdict.BUSH, "radius lost per metre", "m", -taper, _MAX, -NARROWS, "", taper < NARROWS),
+        Check(Verdict.BUSH, "contrast", "", contrast, _MIN, LEAST_CONTRAST, "", contrast < LEAST_CONTRAST),
+        Check(Verdict.OTHER, "lean", "deg", lean_deg, _MAX, float(np.degrees(LEAN)), "", leans),
+    )
 
 
 def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:

@@ -34,7 +34,12 @@ TREE_COLUMNS = (
     "coverage_deg",
     "first_seen_s",
     "last_seen_s",
+    "height_m",
+    "sigma_height_m",
+    "lean_deg",
 )
+#: Columns that earlier versions did not write.
+NEW_TREE_COLUMNS = TREE_COLUMNS[-3:]
 PATH_COLUMNS = ("t_s", "x_m", "y_m", "yaw_rad", "sigma_xy_m")
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
 SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
@@ -57,6 +62,10 @@ DETECTION_COLUMNS = (
 def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
     """Return the confirmed trees as rows of TREE_COLUMNS; unknown values are empty. Seconds count from
     `start_ns` [ns]; a stamp below 0 is unknown."""
+    unknown = np.full(len(trees.number), math.nan)
+    height, height_sigma, lean = (
+        unknown if column is None else column for column in (trees.height, trees.height_sigma, trees.lean)
+    )
     return [
         [
             str(trees.number[k]),
@@ -71,6 +80,9 @@ def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
             _number(math.degrees(trees.coverage[k]), 0) if trees.coverage[k] > 0 else "",
             _number(_seconds(trees.first_seen_ns[k], start_ns), 3),
             _number(_seconds(trees.last_seen_ns[k], start_ns), 3),
+            _number(height[k], 2),
+            _number(height_sigma[k], 2),
+            _number(math.degrees(lean[k]), 1),
         ]
         for k in np.flatnonzero(trees.confirmed)
     ]

@@ -208,6 +208,9 @@ class Trees:
         confirmed: Whether it was observed often enough to be shown and exported.
         sides: int64: bit k is set if the k-th of 36 sectors around the trunk was observed, counted from x to
             y of the map; None if only the coverage is known.
+        height, height_sigma: Height of the tree and its standard deviation [m], NaN where its top is not
+            seen; None if heights are not measured, as in a drive.
+        lean: Angle of the stem from the vertical [rad]; None if it is not measured.
     """
 
     number: Int
@@ -223,6 +226,9 @@ class Trees:
     last_seen_ns: Int
     confirmed: Bool
     sides: Int | None = None
+    height: Float | None = None
+    height_sigma: Float | None = None
+    lean: Float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -359,6 +365,8 @@ class Frame:
         ground: Terrain map, updated every few scans; None without ground segmentation, or if it is unchanged.
         base_z: Height of the base in the terrain map [m].
         clearance: Free distance on the path of the robot; None without obstacle detection.
+        of_cloud: Whether it is the map of a whole cloud: there is no robot, and the pose is the middle of the
+            plot.
     """
 
     index: int
@@ -378,6 +386,7 @@ class Frame:
     ground: HeightMap | None = None
     base_z: float = 0.0
     clearance: Clearance | None = None
+    of_cloud: bool = False
 
     @property
     def health(self) -> Health:

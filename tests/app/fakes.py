@@ -326,6 +326,9 @@ class FakeScene(Scene):
             raise ParameterError("there is no such layer")
         self.calls.append(("choose", (name, value)))
 
+    def suit(self, *, cloud: bool) -> None:
+        self.calls.append(("suit", cloud))
+
     def clear(self) -> None:
         self.calls.append(("clear", None))
 

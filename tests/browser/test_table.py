@@ -53,7 +53,7 @@ COLUMNS = {
 def test_every_column_sorts_both_ways_by_what_the_server_holds(dashboard: Dashboard):
     page, held = dashboard.page, trees(dashboard)
     assert len(held) > 10
-    assert page.locator("#trees th").count() == len(COLUMNS)
+    assert page.locator("#trees th:visible").count() == len(COLUMNS)
     for key, value in reversed(COLUMNS.items()):  # back to the number in the end
         header = page.locator(f"#trees th[data-key={key}]")
         for order, sign in (("ascending", 1.0), ("descending", -1.0)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import re
+from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter
@@ -138,7 +139,7 @@ async def import_table(body: _Import, dashboard: Dash) -> Response:
     """Add the rows of a CSV table in one edit. Return the number of added rows, and the number of rows that
     were left out because they exist already. 422 if the table cannot be read, has a row out of bounds or too
     many rows; then nothing is added."""
-    contents = await asyncio.to_thread(_imported, body)
+    contents = await asyncio.to_thread(_imported, body, dashboard.offset)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new = [content for content in contents if _key(content) not in existing]
     if new:
@@ -169,10 +170,11 @@ async def export_geojson(dashboard: Dash) -> Response:
     with class, DBH [cm], author and time; no features without annotations."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
+    cloud = dashboard.status.cloud is not None
     features = [_feature(row) for row in _rows(dashboard)]
     collection = {
         "type": "FeatureCollection",
-        "coordinateFrame": dict(ROBOTS_FRAME),
+        "coordinateFrame": {**ROBOTS_FRAME, "origin": "that of the cloud"} if cloud else dict(ROBOTS_FRAME),
         "features": features,
     }
     return file_reply(json.dumps(collection, indent=1) + "\n", "truth.geojson", "application/geo+json")
@@ -195,8 +197,11 @@ async def _done(dashboard: Dashboard, edit: _Edit, payload: dict[str, Any], stat
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
-    """Return the annotations of the open run as JSON values."""
-    return [row_payload(row) for row in dashboard.annotation_editor.rows]
+    """Return the annotations of the open run as JSON values, those of a whole cloud in the coordinates of its
+    file."""
+    x, y = dashboard.offset
+    rows = [row_payload(row) for row in dashboard.annotation_editor.rows]
+    return [{**row, "x": row["x"] + x, "y": row["y"] + y} for row in rows]
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
@@ -237,9 +242,14 @@ def _check(content: Content, row: int) -> None:
         )
 
 
-def _imported(body: _Import) -> list[Content]:
-    """Return the rows of an imported table; raises BadRequestError if it cannot be read, or a row or their
-    number is out of bounds."""
+def _imported(body: _Import, offset: tuple[float, float]) -> list[Content]:
+    """Return the rows of an imported table in the frame of the map; raises BadRequestError if it cannot be
+    read, or a row or their number is out of bounds.
+
+    Args:
+        body: The request.
+        offset: Offset of the frame of the map in the coordinates of the table [m].
+    """
     from pipeline.io.ground_truth import parse_truth_trees
 
     try:
@@ -249,7 +259,7 @@ def _imported(body: _Import) -> list[Content]:
     except SourceError as error:
         remedy = "Choose the unit of the diameter" if "unit" in error.what else error.remedy
         raise BadRequestError(error.what, where=error.where, remedy=remedy) from None
-    contents = contents_of(table)
+    contents = contents_of(replace(table, x=table.x - offset[0], y=table.y - offset[1]))
     for line, content in enumerate(contents):
         _check(content, line)
     if len(contents) > MOST_ANNOTATIONS:

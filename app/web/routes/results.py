@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -25,6 +26,7 @@ from app.web.responses import (
     json_reply,
 )
 from app.web.routes.access import Bounds, Dash, ViewerTurn
+from app.worker.protocol import CloudFrame
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import HeightMap, Trees
@@ -57,11 +59,16 @@ async def trees(dashboard: Dash) -> Response:
 
 @router.get("/trees.csv")
 def trees_table(dashboard: Dash) -> Response:
-    """Return the confirmed trees as a CSV table, with only its header before the first map."""
+    """Return the confirmed trees as a CSV table, those of a whole cloud in its coordinates, with only its
+    header before the first map."""
     from pipeline.io.result_files import TREE_COLUMNS, csv_text, tree_rows
 
     shown = dashboard.shown
-    rows = [] if shown is None else tree_rows(shown.frame.trees, dashboard.start_ns)
+    rows = (
+        []
+        if shown is None
+        else tree_rows(_in_file(shown.frame.trees, dashboard.status.cloud), dashboard.start_ns)
+    )
     return file_reply(csv_text(TREE_COLUMNS, rows), "trees.csv")
 
 
@@ -79,16 +86,23 @@ def path_table(dashboard: Dash) -> Response:
 async def export(
     suffix: Literal["gpkg", "shp", "geojson", "dxf", "xlsx", "tif"], dashboard: Dash
 ) -> Response:
-    """Return the map as a file for GIS, CAD or spreadsheets, in local coordinates; a Shapefile as zip
-    archive. The bytes are those of `stemmap export` for a run with the same map. 409 before the first map;
-    422 if a package is missing or the map lacks what the format shows."""
+    """Return the map as a file for GIS, CAD or spreadsheets, in local coordinates or those of a whole cloud;
+    a Shapefile as zip archive. For a run of scans, the bytes are those of `stemmap export` for a run with the
+    same map. 409 before the first map; 422 if a package is missing or the map lacks what the format shows."""
     shown, path = dashboard.shown, dashboard.path
     if shown is None or path is None:
         return _nothing_mapped()
     uri = dashboard.source.uri
     try:
         content, name = await asyncio.to_thread(
-            _exported, uri, shown.frame.trees, path, shown.frame.ground, dashboard.start_ns, f".{suffix}"
+            _exported,
+            uri,
+            shown.frame.trees,
+            path,
+            shown.frame.ground,
+            dashboard.start_ns,
+            f".{suffix}",
+            dashboard.status.cloud,
         )
     except StemmapError as error:
         return failure_reply(422, error)
@@ -96,8 +110,20 @@ async def export(
     return Response(content, 200, headers, media_type="application/octet-stream")
 
 
+def _in_file(trees: Trees, cloud: CloudFrame | None) -> Trees:
+    """Return trees in the coordinates of the file of a whole cloud; those of a run of scans (None) as they
+    are."""
+    return trees if cloud is None else replace(trees, position=trees.position + cloud.offset[:2])
+
+
 def _exported(
-    uri: str, trees: Trees, path: RobotPath, ground: HeightMap | None, start_ns: int, suffix: str
+    uri: str,
+    trees: Trees,
+    path: RobotPath,
+    ground: HeightMap | None,
+    start_ns: int,
+    suffix: str,
+    cloud: CloudFrame | None,
 ) -> tuple[bytes, str]:
     """Return the bytes and the name of the exported file, see `export`."""
     from app.batch.export import export_bytes, for_export
@@ -107,7 +133,12 @@ def _exported(
 
     cells = [] if ground is None else [[float(cell) for cell in row[:3]] for row in terrain_rows(ground)]
     terrain = np.array(cells, np.float64).reshape(-1, 3)
-    return export_bytes(for_export(uri, *as_written(trees, path, start_ns), terrain, MapFrame()), suffix)
+    frame = MapFrame()
+    if cloud is not None:
+        terrain += cloud.offset
+        frame = MapFrame(cloud.crs, how="the cloud's own" if cloud.crs else "")
+    written = as_written(_in_file(trees, cloud), path, start_ns)
+    return export_bytes(for_export(uri, *written, terrain, frame), suffix)
 
 
 @router.get("/evaluation")

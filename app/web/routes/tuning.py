@@ -162,7 +162,7 @@ async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted
     """
     others = await _others(dashboard, settings, any_file) if wanted.also or wanted.held_out else []
     state = dashboard.parameters
-    source, digest, truth = dashboard.source, dashboard.digest, dashboard.truth
+    source, digest, truth = dashboard.source, dashboard.digest, dashboard.file_truth
     return plan_of(wanted, source, digest, truth, state.parameters, state.preset, others)
 
 

@@ -4,7 +4,7 @@ import { byId, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed } from "../core/format.js";
 import { selectCluster } from "../core/live_feed.js";
-import { isPlaying, on, state } from "../core/store.js";
+import { isCloud, isPlaying, on, state } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { verdictOf } from "../core/verdicts.js";
 import { openStory } from "../explain/story.js";
@@ -20,7 +20,7 @@ function show() {
   }
   const verdicts = Object.entries(state.map.verdicts ?? {}).sort((a, b) => (b[0] === "tree") - (a[0] === "tree") || b[1] - a[1]);
   const clusters = verdicts.reduce((sum, [, number]) => sum + number, 0);
-  const lead = clusters
+  const lead = isCloud() ? `${count(clusters, "candidate")} for stems in this cloud, with these verdicts.` : clusters
     ? `Scan ${state.map.index}: ${count(clusters, "cluster")}, with these verdicts.`
     : `Scan ${state.map.index}: no cluster. Check that the pass-through box and the height band contain the stems, and that Radius eps is large enough.`;
   panel().replaceChildren(el("p", { class: "lead", "data-scan": state.map.index, "data-clusters": clusters, text: lead }), bars(verdicts), clusterTable(), points());
@@ -40,6 +40,9 @@ function bars(verdicts) {
   }));
 }
 
+// A whole cloud has no scans, so its candidates have no eccentricity and no distance from a sensor.
+const applies = (_, place) => !isCloud() || ![3, 5].includes(place);
+
 // One row per cluster, the nearest first; a click opens its story.
 function clusterTable() {
   const c = state.map.clusters;
@@ -51,10 +54,10 @@ function clusterTable() {
     return el("tr", { tabindex: "0", "data-cluster": k, onclick: tell, onkeydown: (event) => event.key === "Enter" && tell(),
       "aria-selected": String(chosen?.scan === state.map.index && chosen.cluster === k) },
     ...[String(k + 1), c.verdict[k], String(c.size[k]), c.eccentricity[k] === null ? "∞" : figure(c.eccentricity[k]),
-      figure(c.radius_cm[k]), fixed(c.distance[k], 1)].map((text) => el("td", { text })));
+      figure(c.radius_cm[k]), fixed(c.distance[k], 1)].filter(applies).map((text) => el("td", { text })));
   });
   const heads = [["cluster"], ["verdict"], ["points"], ["e", "Eccentricity λ1/λ2"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
-  return el("table", { id: "cluster-table", class: "plain" }, el("thead", {}, el("tr", {}, ...heads.map(([text, title]) => el("th", { scope: "col", text, title })))),
+  return el("table", { id: "cluster-table", class: "plain" }, el("thead", {}, el("tr", {}, ...heads.filter(applies).map(([text, title]) => el("th", { scope: "col", text, title })))),
     el("tbody", {}, ...rows));
 }
 

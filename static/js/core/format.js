@@ -41,4 +41,6 @@ export function dbhText({ dbh_cm: dbh, sigma_dbh_cm: sigma }) {
   return `DBH ${figure(dbh)}${known(sigma) ? ` ± ${figure(sigma, 2)}` : ""} cm`;
 }
 
+export const heightText = ({ height_m: height, sigma_height_m: sigma }) => (known(height) ? `${fixed(height, 1)} ± ${figure(sigma, 2)} m` : "not seen");
+
 export const seenText = (tree) => (isAssumed(tree) ? "detected in no single scan, only in the accumulated scans" : `detected in ${count(tree.observations, "scan")}`);

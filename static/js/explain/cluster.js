@@ -3,8 +3,10 @@
 import { definitions, el, letterOf } from "../core/dom.js";
 import { clock, figure, NONE } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
+import { isCloud } from "../core/store.js";
 import { verdictOf } from "../core/verdicts.js";
 import { columnFigure } from "./columns.js";
+import { sectionsFigure } from "./sections.js";
 
 const SIZE = 250; // of the picture
 const NAMES = { eccentricity: "eccentricity λ1/λ2" };
@@ -17,6 +19,7 @@ function plain(value, unit) {
 }
 
 export function clusterStory(story) {
+  if (story.sections) return [verdict(story), sectionsFigure(story.sections), checks(story)];
   return [verdict(story), drawing(story), story.circle ? residuals(story) : "", checks(story),
     columnFigure(story.column, "Accumulated scans at this place")];
 }
@@ -30,13 +33,22 @@ function verdict(story) {
 }
 
 function why(story) {
+  if (!story.checks.length && story.sections) return "It stands upright like a stem, but too few of its slices show a circle.";
   if (!story.checks.length) return "It was found by another program and is used without checks.";
   const failed = story.checks.find((check) => check.fails);
+  if (story.sections) return whyOfCloud(story, failed);
   if (!failed) return "It passed all checks below, so it is a stem and is used by SLAM.";
   if (failed.verdict === "at border") return "It extends beyond the pass-through box, the range or the field of view, so a part of it is not visible.";
   if (!failed.relation) return "Its edge is occluded by a nearer object, so its centre is unknown.";
   const side = failed.relation === "at most" ? "above" : "below";
   return `Its ${named(failed)} of ${plain(failed.value, failed.unit)} is ${side} ${failed.title}, ${plain(failed.limit, failed.unit)}.`;
+}
+
+function whyOfCloud(story, failed) {
+  if (!failed && story.verdict === "tree") return `It passed all checks below. It is tree ${story.tree} of the map.`;
+  if (!failed) return `It passed all checks below, but the decision trees classify its surroundings as ${story.verdict}.`;
+  const side = failed.relation === "at most" ? "above" : "below";
+  return `Its ${named(failed)}, ${plain(failed.value, failed.unit)}, is ${side} the limit of ${plain(failed.limit, failed.unit)}.`;
 }
 
 function drawing(story) {
@@ -122,5 +134,5 @@ function checks(story) {
     el("table", { class: "checks" }, el("tbody", {}, ...rows)));
 }
 
-export const clusterTitle = ({ scan, cluster, time_s }) =>
+export const clusterTitle = ({ scan, cluster, time_s }) => isCloud() ? `Candidate ${cluster + 1}` :
   `Cluster ${cluster + 1} of scan ${scan}${time_s === undefined ? "" : `, ${clock(time_s)}`}`;

@@ -37,9 +37,9 @@ function drawContent(pen, view, state) {
   drawClusters(pen, view, state.map?.clusters);
   for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected);
   state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0));
-  drawNumbers(pen, view, trees, state.selected, { robot: state.map && view.toScreen(...state.map.pose) });
+  drawNumbers(pen, view, trees, state.selected, { robot: state.map && !state.status?.cloud && view.toScreen(...state.map.pose) });
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster);
-  if (state.map) drawRobot(pen, view, state.map);
+  if (state.map && !state.status?.cloud) drawRobot(pen, view, state.map);
   if (state.measure?.to) drawMeasure(pen, view, state.measure);
 }
 

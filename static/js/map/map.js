@@ -4,10 +4,10 @@ import { draft } from "../annotate/annotations.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "../annotate/pointer.js";
 import { byId } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
-import { dbhText, NONE, seenText } from "../core/format.js";
+import { dbhText, heightText, NONE, seenText } from "../core/format.js";
 import { select, selectCluster } from "../core/live_feed.js";
 import { nearest } from "../core/nearest.js";
-import { clusters, on, state, trees } from "../core/store.js";
+import { clusters, isCloud, on, state, trees } from "../core/store.js";
 import { openStory } from "../explain/story.js";
 import { drawMap, treeAt } from "./draw.js";
 import { boundsOf, MapCanvas } from "./map_canvas.js";
@@ -26,7 +26,7 @@ const map = new MapCanvas(canvas, {
     drawMap(pen, view, state);
     drawAnnotations(pen, view);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
-    canvas.setAttribute("aria-label", `Map: ${trees().length} trees and the robot's path. The table below lists the trees.${measured}`);
+    canvas.setAttribute("aria-label", `Map: ${trees().length} trees${isCloud() ? "" : " and the robot's path"}. The table below lists the trees.${measured}`);
   },
   gestures: {
     press: (at) => measuring() || grab(at, map.view),
@@ -52,8 +52,8 @@ function describe(at) {
   canvas.classList.toggle("hits", Boolean(tree ?? cluster));
   if (draft.adding || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
-  if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, seenText(tree));
-  else if (cluster) lines.push(`Cluster: ${cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
+  if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isCloud() ? `height ${heightText(tree)}` : seenText(tree));
+  else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
   if (truth) lines.push(`Ground truth: ${truth.kind}, ${truth.dbh_cm === null ? "DBH unknown" : dbhText(truth)}`);
   return lines.join("\n") || NONE;
 }

@@ -18,6 +18,7 @@ export async function openSources(begin = "") {
   if (!dialog.open) dialog.showModal();
   const address = byId("source-uri");
   if (typeof begin === "string" && begin) address.value = begin;
+  showChoice();
   address.focus();
   try {
     list(await get("/api/sources"));
@@ -38,7 +39,25 @@ function list({ scenarios = [], recordings = [] }) {
 }
 
 const entry = (uri, title, doc) =>
-  el("button", { type: "button", onclick: () => ask(uri) }, el("b", { text: title }), el("span", { text: doc }));
+  el("button", { type: "button", onclick: () => (isWholeCloud(uri) ? offerChoice(uri) : ask(uri)) }, el("b", { text: title }), el("span", { text: doc }));
+
+// --- whole clouds: mapped as a whole, or driven through by a simulated robot ---------------------------
+
+const isWholeCloud = (uri) => /\.(laz|las|e57|ply|npy|npz)$/i.test(uri);
+const choice = () => byId("source-form").elements.namedItem("cloud-choice").value;
+
+function showChoice() {
+  byId("source-cloud").hidden = !isWholeCloud(byId("source-uri").value.trim());
+}
+
+// A cloud of the list is written into the field, above which the choice is.
+function offerChoice(uri) {
+  byId("source-uri").value = uri;
+  showChoice();
+  byId("source-open").focus();
+}
+
+const chosenUri = (uri) => (isWholeCloud(uri) && choice() === "drive" ? `sim:cloud?${new URLSearchParams({ file: uri })}` : uri);
 
 export async function ask(uri) {
   if (!uri) {
@@ -83,8 +102,9 @@ export function startSources() {
   byId("source-close").addEventListener("click", () => finish(""));
   byId("source-form").addEventListener("submit", (event) => {
     event.preventDefault();
-    ask(byId("source-uri").value.trim());
+    ask(chosenUri(byId("source-uri").value.trim()));
   });
+  byId("source-uri").addEventListener("input", showChoice);
   startInside();
   on("status", follow);
   startUpload(async ({ uri }) => { if (!dialog.open) await openSources(); ask(uri); });

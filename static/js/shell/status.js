@@ -2,7 +2,7 @@
 
 import { byId, el, setText } from "../core/dom.js";
 import { capital, clock, figure, NONE } from "../core/format.js";
-import { changed, on, state } from "../core/store.js";
+import { changed, isCloud, on, state } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 
 const WORDS = {
@@ -15,6 +15,7 @@ const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans ta
 // title, unit, function of the status that returns [text, class, title], and "minor" if it is hidden first in a narrow strip
 const FIGURES = {
   trees: ["trees", "", (s) => [String(s.trees), ...remapping(s)]],
+  points: ["points", "", (s) => [s.cloud ? s.cloud.points.toLocaleString("en") : NONE]],
   health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health] ?? "soon", reason(s)]],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
@@ -23,6 +24,7 @@ const FIGURES = {
   sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
   f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
+const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
 const cells = {};
 
 // During a re-mapping the shown map is the one before.
@@ -81,6 +83,9 @@ function show() {
     setText(cells[name].label, title ?? cells[name].title);
     cells[name].cell.className = `${cells[name].rank} ${meaning ?? ""}`.trim();
   }
+  for (const name of OF_DRIVES) cells[name].cell.hidden = isCloud();
+  cells.points.cell.hidden = !isCloud();
+  document.body.classList.toggle("cloud", isCloud());
   cells.health.cell.title = healthFigures();
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the ground truth; number of trees of the current scan that are at true trees";
@@ -105,6 +110,7 @@ const isGoing = (status) => Boolean(status?.going_far);
 // The state, with the name of the robot unless it failed: "Live robot1".
 function stateWord(status) {
   if (isGoing(status)) return "Seeking";
+  if (status.cloud && status.state === "finished") return "Mapped";
   const word = status.live && status.state === "playing" ? "Live" : (WORDS[status.state] ?? status.state);
   return status.live && status.robot && status.state !== "failed" ? `${word} ${status.robot}` : word;
 }

@@ -4,13 +4,13 @@ import { isReviewed, KINDS, reviewOf, STATES } from "../annotate/annotations.js"
 import { distance, nearest } from "../core/nearest.js";
 import { state } from "../core/store.js";
 
-export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, seen > 50, ± < 5, e < 10, x -5..5; review state: open, confirmed, rejected, skipped, reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
+export const HELP = "A tree number, or conditions separated by spaces: dbh 20..30, dbh none, seen > 50, ± < 5, e < 10, x -5..5, height > 20 and lean < 5 of a whole cloud; review state: open, confirmed, rejected, skipped, reviewed, unreviewed; class in the ground truth: tree, pole, person, bush, other, none.";
 
 export const sigma = (tree) => 100 * Math.max(...tree.ellipse.slice(0, 2)); // of the position [cm]
 
 const COLUMNS = {
   tree: (t) => t.number, x: (t) => t.x, y: (t) => t.y, "±": sigma, sigma, dbh: (t) => t.dbh_cm,
-  e: (t) => t.eccentricity, seen: (t) => t.observations,
+  e: (t) => t.eccentricity, seen: (t) => t.observations, slices: (t) => t.observations, height: (t) => t.height_m, lean: (t) => t.lean_deg,
 };
 const NAMES = Object.keys(COLUMNS).join("|");
 const NUMBER = "[-+]?\\d+(?:\\.\\d+)?";

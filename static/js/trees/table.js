@@ -8,7 +8,7 @@ import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
-import { on, state, trees } from "../core/store.js";
+import { isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
 import { openStory } from "../explain/story.js";
@@ -19,15 +19,17 @@ const EVERY = 400; // [ms] between two updates
 
 const MARKS = { open: "", confirmed: " ✓", rejected: " ✕", skipped: " ↷" };
 
-// key, title, tooltip, text, value for sorting
+// key, title, tooltip, text, value for sorting, and whether it is shown only for a whole cloud (true) or a run of scans (false)
 const COLUMNS = [
   ["number", "tree", "Number of the tree; ✓ confirmed, ✕ rejected, ↷ skipped in the review", (t) => `${t.number}${MARKS[reviewOf(t)]}`, (t) => t.number],
-  ["x", "x m", "Along the first heading, from the start", (t) => fixed(t.x, 2), (t) => t.x],
-  ["y", "y m", "To the left of the first heading, from the start", (t) => fixed(t.y, 2), (t) => t.y],
+  ["x", "x m", "x in the frame of the map: of a drive along the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.x, 2), (t) => t.x],
+  ["y", "y m", "y in the frame of the map: of a drive to the left of the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.y, 2), (t) => t.y],
   ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
   ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
-  ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity],
-  ["seen", "seen", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations],
+  ["height", "height m", "Height of the tree; – where the cloud does not show its top", (t) => (t.height_m === null ? NONE : `${fixed(t.height_m, 1)} ± ${figure(t.sigma_height_m, 2)}`), (t) => t.height_m ?? -1, true],
+  ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg ?? -1, true],
+  ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
+  ["seen", "seen", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
 ];
 const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
 const rows = new Map();
@@ -47,6 +49,11 @@ function head() {
     el("button", { text: title, title: hint, onclick: () => sortBy(key) })));
   byId("trees").tHead.replaceChildren(el("tr", {}, ...cells));
   markOrder();
+}
+
+// Shows the columns of the kind of run that is open.
+function suitColumns() {
+  for (const row of byId("trees").rows) COLUMNS.forEach(([,,,,, only], place) => { row.cells[place].hidden = only !== undefined && only !== isCloud(); });
 }
 
 function sortBy(key) {
@@ -99,6 +106,7 @@ function fill() {
   });
   while (body.rows.length > listed.length) body.lastChild.remove();
   setText(byId("tree-count"), wanted ? `${listed.length} of ${all.length}` : count(all.length, "tree"));
+  suitColumns();
   byId("trees").hidden = !listed.length;
   byId("trees-png").disabled = !listed.length;
   offerCsv(all.length);
@@ -125,6 +133,7 @@ function exportAs(format) {
 function emptyText(all, wanted, refused) {
   if (all && refused) return `“${refused}” is not a condition. ${HELP}`;
   if (all) return `No tree matches “${wanted}”.`;
+  if (state.map && isCloud()) return "No tree in this cloud. The tab Clusters shows the verdict on each candidate.";
   return state.map ? "No tree yet. A tree is listed once enough scans have detected it. The tab Clusters shows the verdict on each cluster."
     : nothingYet();
 }
@@ -161,7 +170,7 @@ const MOST_ROWS = 600, TALLEST = 16_000; // [px]; some browsers cannot save a ta
 
 // A canvas with the heads and the rows of a table, in the colours of the page.
 export function pictureOf(table) {
-  const lines = [...table.rows].slice(0, MOST_ROWS).map((row) => [...row.cells].map((cell) => cell.textContent));
+  const lines = [...table.rows].slice(0, MOST_ROWS).map((row) => [...row.cells].filter((cell) => !cell.hidden).map((cell) => cell.textContent));
   const more = table.rows.length - lines.length;
   if (more) lines.push(lines[0].map((_, k) => (k ? "" : `+ ${more} in the CSV`)));
   const scale = Math.min(SCALE, TALLEST / (ROW * lines.length));

@@ -3,7 +3,7 @@
 import { button, byId, el, letterOf, setText } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count } from "../core/format.js";
-import { on, state } from "../core/store.js";
+import { isCloud, on, state } from "../core/store.js";
 import { counted, verdictOf } from "../core/verdicts.js";
 import { openTab } from "../shell/tabs.js";
 import { forget, isChanged, isTuning, nameProblem, redo, refuse, reset, save, savedSets, specOf, takeFile, tuning, undo, use } from "./parameters.js";
@@ -67,7 +67,17 @@ function groupOf(stage, specs) {
   return group;
 }
 
-const sifting = () => Boolean(byId("tune-find").value.trim() || byId("tune-only").checked);
+const sifting = () => Boolean(byId("tune-find").value.trim() || byId("tune-only").checked || isCloud());
+
+// Whether the map of the open run depends on a parameter; that of a whole cloud depends on few.
+const matters = (name) => !isCloud() || state.status.cloud.parameters.includes(name);
+let siftedForCloud = false;
+
+function siftForRun() {
+  if (!rows.size || siftedForCloud === isCloud()) return;
+  siftedForCloud = isCloud();
+  sift();
+}
 
 // Filters the rows by the search, best matches first, and opens their stages.
 function sift() {
@@ -80,7 +90,7 @@ function sift() {
     const ranked = [];
     for (const spec of specs) {
       const { node } = rows.get(spec.name);
-      node.hidden = !words.every((word) => node.dataset.words.includes(word)) || (only && !isChanged(spec.name));
+      node.hidden = !words.every((word) => node.dataset.words.includes(word)) || (only && !isChanged(spec.name)) || !matters(spec.name);
       here += node.hidden ? 0 : 1;
       ranked.push({ node, rank: node.hidden || !words.length ? 0 : rankOf(spec, words) });
     }
@@ -188,6 +198,7 @@ export function startTunePanel() {
   on("tuning", showError);
   on("tab", () => isTuning() && show());
   on("map status parameters", showCounts);
+  on("status specs", siftForRun);
 }
 
 // --- clusters of the current scan by verdict, before and after the last change ---------------------------
@@ -201,9 +212,10 @@ function countsBeforeAfter() {
   const names = [...new Set(["tree", ...Object.keys(now), ...Object.keys(then ?? {})])].filter((name) => now[name] || then?.[name] || name === "tree");
   names.sort((a, b) => (b === "tree") - (a === "tree") || (now[b] ?? 0) - (now[a] ?? 0));
   const total = (of) => Object.values(of).reduce((sum, number) => sum + number, 0);
+  const sum = (number) => count(number, isCloud() ? "candidate" : "cluster");
   const pending = state.status?.revision < state.parameters?.revision;
-  const lead = pending ? "Mapping this scan …" : then ? `${total(then)} → ${count(total(now), "cluster")}` : count(total(now), "cluster");
-  const title = `Scan ${index}${then ? ", before and after the last change" : state.status?.state === "playing" ? ". Pause to compare before and after a change." : ". Change a parameter to compare before and after."}`;
+  const lead = pending ? isCloud() ? "Mapping the cloud …" : "Mapping this scan …" : then ? `${total(then)} → ${sum(total(now))}` : sum(total(now));
+  const title = isCloud() ? "Candidates for stems in the cloud" : `Scan ${index}${then ? ", before and after the last change" : state.status?.state === "playing" ? ". Pause to compare before and after a change." : ". Change a parameter to compare before and after."}`;
   const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
   return [el("ul", { class: "chips", title }, el("li", { class: "lead", text: lead }), ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
       same.length ? el("li", { class: "same", text: `unchanged: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];

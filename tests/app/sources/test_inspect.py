@@ -16,6 +16,7 @@ from app.robot.link import Inbox
 from app.robot.source import open_any
 from app.robot.topics import Publisher
 from app.sources import inspection
+from app.sources.inspection import ask, check_source
 from app.sources.request import SourceRequest
 from app.worker.protocol import Open
 from app.worker.session import Session
@@ -30,6 +31,7 @@ from pipeline.types.records import Sensor
 from tests.app.fakes import FakeSource, FakeWorker, make_mapper
 from tests.app.robot.conftest import clouds
 from tests.app.server_for_tests import BEARER, Running, running
+from tests.pipeline.inventory.plots import write_las
 
 MOUNT = (0.1, 0.2, 0.9, 5.0, -3.0, 90.0)
 
@@ -204,3 +206,15 @@ def test_a_run_that_failed_is_opened_again_with_the_same_choice():
     session.play()
     assert asked == [SourceOptions({"scan": "/other"}, None, 5)] * 2
     session.close()
+
+
+async def test_a_whole_cloud_is_checked_without_a_drive_through_it(tmp_path: Path) -> None:
+    """A cube full of points has no path for a robot, but it is a cloud."""
+    points = np.random.default_rng(3).uniform(0.0, 2.0, (5_000, 3))
+    file = write_las(tmp_path / "full.laz", points)
+    await check_source(SourceRequest(str(file)))
+    assert (await ask({"ask": "recording", "path": str(file)}))["kind"].startswith("whole cloud, LAS 1.4")
+    damaged = tmp_path / "damaged.laz"
+    damaged.write_bytes(file.read_bytes()[:300])
+    with pytest.raises(SourceError):
+        await check_source(SourceRequest(str(damaged)))

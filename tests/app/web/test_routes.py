@@ -23,6 +23,7 @@ from app.worker.protocol import (
     Advance,
     Answer,
     AskCluster,
+    CloudFrame,
     MapChanges,
     Open,
     Pause,
@@ -358,6 +359,23 @@ async def test_the_export_gives_the_bytes_of_the_command(both: Running, tmp_path
     else:
         assert reply.content == file.read_bytes()
         assert reply.headers["content-disposition"] == f'attachment; filename="trees.{suffix}"'
+
+
+async def test_the_files_of_a_whole_cloud_are_in_its_coordinates(both: Running) -> None:
+    client, dashboard = both
+    await show(dashboard)
+    assert dashboard.shown is not None
+    cloud = CloudFrame((470600.0, 3810200.0, 300.0), "EPSG:26912", 1000, [])
+    await dashboard.receive(Report(Status("finished", scan_index=0, cloud=cloud)))
+    assert (await client.get("/api/status")).json()["cloud"]["offset"] == [470600.0, 3810200.0, 300.0]
+    x, y = dashboard.shown.frame.trees.position[0]
+    row = (await client.get("/api/trees.csv")).text.splitlines()[1].split(",")
+    assert [float(row[1]), float(row[2])] == pytest.approx([x + 470600.0, y + 3810200.0], abs=1e-3)
+    first = (await client.get("/api/export/geojson")).json()["features"][0]
+    assert first["properties"]["x_m"] == pytest.approx(x + 470600.0, abs=1e-3)
+    assert first["geometry"]["coordinates"] == pytest.approx([-111.3, 34.4], abs=0.3)  # of zone 12
+    trees = (await client.get("/api/trees")).json()["trees"]
+    assert {tree["height_m"] for tree in trees} == {None}
 
 
 async def test_an_export_that_the_map_lacks_or_nobody_knows_is_refused(both: Running) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 from app.worker.process import new_session
 from app.worker.protocol import MapChanges
+from app.worker.run import Run
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
@@ -119,7 +120,7 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
     for wanted in (parameters, BASE, LATER):
         with mapped_from_start(wanted, LAST - 1) as other:
             assert other.frame is not None
-            assert other.run is not None
+            assert isinstance(other.run, Run)
             since = told(other.run.confirmed_s(other.frame.trees))
             confirmed = sorted(other.run._map.record.confirmed_s.values())
             assert sorted(marks[id(wanted)].values()) == confirmed, "those that went again too"
@@ -318,7 +319,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
         assert frame is not None
         known = int(np.count_nonzero(frame.trees.confirmed))
         assert known >= 2
-        assert session.run is not None
+        assert isinstance(session.run, Run)
         marked = dict(session.run._map.record.confirmed_s)
         # No column is ever a tree now; then all are back.
         session.set_parameters(BASE.replace({"classification.tree_share": 1.0}), 1, whole=True)

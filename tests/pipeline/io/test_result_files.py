@@ -91,6 +91,9 @@ def test_a_tree_in_the_promised_units():
         "coverage_deg": "115",
         "first_seen_s": "1.000",
         "last_seen_s": "5.000",
+        "height_m": "",
+        "sigma_height_m": "",
+        "lean_deg": "",
     }
 
 

@@ -1,0 +1,374 @@
+"""A whole cloud as a run of one scan: its frame has the cloud, the candidates for stems and the trees.
+
+The inventory is computed in steps, so that commands are executed between them. Parameters that change the map
+begin another inventory; until it is complete, the map of the one before is shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from app.batch.run_folder import NO_PATH
+from app.common.timers import Stopwatch
+from app.explain.history import TreeHistory
+from app.store.forests import kept_forests
+from app.worker.tree_numbers import TreeNumbers
+from pipeline.config import Parameters
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Pose2, Pose3
+from pipeline.inventory import PARAMETERS, Inventory, PlotMap, finish
+from pipeline.inventory.cloud import CloudDescription, WholeCloud
+from pipeline.inventory.stem_model import LAST
+from pipeline.inventory.terrain_raster import TerrainRaster
+from pipeline.io.readers.base import FileSource, SourceDescription
+from pipeline.types.records import (
+    Clusters,
+    Detections,
+    Float,
+    Frame,
+    HeightMap,
+    Int32,
+    Path,
+    PoseEstimate,
+    Record,
+    Sensor,
+    Trees,
+    Verdict,
+    no_detections,
+)
+
+
+class CloudSource(FileSource):
+    """A whole cloud as a source of one scan at time 0, without records.
+
+    Attributes:
+        cloud: The cloud.
+    """
+
+    def __init__(self, cloud: WholeCloud) -> None:
+        super().__init__()
+        self.cloud = cloud
+        about = cloud.description
+        self._description = SourceDescription(
+            uri=about.uri,
+            kind=f"whole cloud, {about.kind}",
+            sensor=Sensor(name="whole cloud"),
+            T_base_lidar=Pose3.identity(),
+            has_odometry=False,
+            has_imu=False,
+            scans=1,
+            start_ns=0,
+            end_ns=0,
+            digest=about.digest,
+            warnings=about.warnings,
+        )
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Number of points left out, by reason."""
+        return self.cloud.losses
+
+    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+        """Yield nothing: a whole cloud has no scans."""
+        del start_ns
+        yield from ()
+
+
+class InventoryRun:
+    """A whole cloud whose stems are mapped. It has the interface of `app.worker.run.Run`, as far as a run of
+    one scan needs it.
+
+    Args:
+        source: The cloud; `close` closes it.
+        parameters: All parameters.
+        folder: Folder of the temporary file with the points; None for that of the system.
+
+    Attributes:
+        frame: The map as a frame; None before it is complete.
+        plot: The map in the frame of the cloud minus its offset; None before.
+        current: 0 if there is a map, else -1.
+    """
+
+    odometry = ""
+    is_bare = False
+    is_whole = True
+    start_ns = 0
+    path: Path = NO_PATH
+    cache_notice = ""
+    preview: Trees | None = None
+
+    def __init__(self, source: CloudSource, parameters: Parameters, folder: FilePath | None = None) -> None:
+        self.source = source
+        self.stopwatch = Stopwatch()
+        self.history = TreeHistory()
+        self.frame: Frame | None = None
+        self.plot: PlotMap | None = None
+        self.current = -1
+        self._inventory = Inventory(source.cloud, kept_forests(), folder)
+        self._parameters = self._mapped_with = parameters
+        self._numbers = TreeNumbers()
+        self._job: Generator[float, None, PlotMap] | None = None
+        self._share = 0.0
+
+    @property
+    def about(self) -> CloudDescription:
+        """Description of the cloud."""
+        return self.source.cloud.description
+
+    @property
+    def share(self) -> float | None:
+        """Share of the present inventory that is done, from 0 to 1; None if none is computed."""
+        return None if self._job is None else self._share
+
+    def confirmed_s(self, trees: Trees) -> Float:
+        """Return 0 for each tree, shape (T,) [s]."""
+        return np.zeros(len(trees.number))
+
+    @property
+    def known(self) -> int:
+        """Number of scans that were read."""
+        return self.current + 1
+
+    def peek_ns(self) -> int | None:
+        """Return 0 before the map is complete, else None."""
+        return 0 if self.current < 0 else None
+
+    def index_at(self, stamp_ns: int) -> int | None:
+        """Return the index of the only scan."""
+        del stamp_ns
+        return 0
+
+    def stamp_ns(self, index: int) -> int:
+        """Return the time of the only scan [ns]."""
+        del index
+        return 0
+
+    def approach(self, index: int) -> None:
+        """Do nothing: there is one scan."""
+
+    def prepare(self) -> None:
+        """Do nothing: the kernels are compiled by the first inventory."""
+
+    def map_next(self, *, hurried: bool = False) -> Frame | None:
+        """Compute the next step of the first inventory; return the frame of the complete map, else None. The
+        map is complete if `share` is None.
+
+        Raises:
+            StemmapError: The cloud cannot be mapped.
+        """
+        del hurried
+        if self.current >= 0:
+            return None
+        if self._job is None:
+            self._begin()
+        return self.frame if self._advance() else None
+
+    def use(self, parameters: Parameters, index: int) -> bool:
+        """Use other parameters. If they change the map, another inventory begins in place of one that is not
+        complete. Returns False, since no scan is to be mapped again."""
+        del index
+        self._parameters = parameters
+        before, now = self._mapped_with.flat(), parameters.flat()
+        if self.current < 0 or any(before[name] != now[name] for name in PARAMETERS):
+            self._begin()
+        return False
+
+    def remap(self, parameters: Parameters) -> None:
+        """Do nothing: `use` maps the whole cloud."""
+
+    def cancel_remapping(self) -> None:
+        """Leave an inventory that is not complete; the map does not change."""
+        self._job = None
+
+    @property
+    def remapped(self) -> float | None:
+        """Share of the inventory that replaces the map, from 0 to 1; None without one."""
+        return self.share if self.current >= 0 else None
+
+    def remap_on(self, scans: int) -> tuple[Frame, dict[int, float]] | None:
+        """Compute the next step of the inventory that replaces the map.
+
+        Returns:
+            The frame of the new map, and 0 for each tree, by its number [s]; None while it is not complete.
+
+        Raises:
+            StemmapError: The cloud cannot be mapped with these parameters. The map does not change.
+        """
+        del scans
+        if self._job is None or not self._advance() or self.frame is None:
+            return None
+        return self.frame, dict.fromkeys(self.frame.trees.number.tolist(), 0.0)
+
+    def map_again(self) -> Frame | None:
+        """Return the present frame."""
+        return self.frame
+
+    def map_with(self, sets: Sequence[Parameters]) -> list[Frame]:
+        """Return the frame of the map with each set of parameters; the run does not change.
+
+        Raises:
+            StemmapError: The cloud cannot be mapped with a set.
+        """
+        return [_frame_of(finish(self._inventory.steps(each))) for each in sets]
+
+    def parameters_at(self, index: int) -> Parameters:
+        """Return the parameters of the present map."""
+        del index
+        return self._mapped_with
+
+    def close(self) -> None:
+        """Close the cloud and delete the temporary file."""
+        self._job = None
+        self._inventory.close()
+        self.source.close()
+
+    def row_of(self, number: int) -> int:
+        """Return the row of a tree in the map.
+
+        Raises:
+            StemmapError: There is no such tree.
+        """
+        rows = [] if self.frame is None else np.flatnonzero(self.frame.trees.number == number).tolist()
+        if not rows:
+            raise StemmapError(f"there is no tree {number} in the map", remedy="Select another")
+        return int(rows[0])
+
+    def _begin(self) -> None:
+        """Begin an inventory with the present parameters."""
+        self._job, self._share = self._inventory.steps(self._parameters), 0.0
+
+    def _advance(self) -> bool:
+        """Compute a step; return whether the map is complete, which then is the present one. An error ends
+        the inventory."""
+        job = self._job
+        if job is None:
+            return False
+        try:
+            with self.stopwatch.aside():
+                self._share = next(job)
+        except StopIteration as end:
+            self._job = None
+            self._take(end.value)
+            return True
+        except BaseException:
+            self._job = None
+            raise
+        return False
+
+    def _take(self, plot: PlotMap) -> None:
+        """Make a map the present one; trees that stayed keep their numbers."""
+        frame = _frame_of(plot)
+        if self.current >= 0:
+            self._numbers.begin_map(frame.trees, {})
+        self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
+        self.plot, self.current, self._mapped_with = plot, 0, self._parameters
+
+
+def _frame_of(plot: PlotMap) -> Frame:
+    """Return a map of a cloud as a frame. The points are relative to the middle of the plot; the pose is that
+    position. Labels are the rows of the candidates to whose crowns and stems the points belong."""
+    middle = plot.ground.low + 0.5 * plot.ground.cell * np.array(plot.ground.height.shape)
+    base_z = float(plot.ground.at(middle[:1], middle[1:])[0])
+    points = (plot.whole[:, :3] - np.append(middle, base_z)).astype(np.float32)
+    labels = np.append(plot.tree_candidate, -1).astype(np.int32)[plot.crowns.tree]
+    clusters = _clusters_of(plot, middle, base_z, labels)
+    return Frame(
+        index=0,
+        stamp_ns=0,
+        raw=np.zeros((0, 3), np.float32),
+        filtered=points,
+        labels=labels,
+        clusters=clusters,
+        detections=_detections_of(clusters),
+        estimate=PoseEstimate(
+            T_map_base=Pose2(float(middle[0]), float(middle[1]), 0.0),
+            covariance=np.zeros((3, 3)),
+            particles=np.zeros((0, 3)),
+            weights=np.zeros(0),
+            n_eff=0.0,
+            landmarks=np.zeros((0, 2)),
+            resampled=False,
+        ),
+        T_odom_base=Pose2(),
+        sensor_offset=np.zeros(3),
+        trees=plot.trees,
+        counts=plot.counts,
+        warnings=plot.warnings,
+        ground=_height_map(plot.ground),
+        base_z=base_z,
+        of_cloud=True,
+    )
+
+
+def _clusters_of(plot: PlotMap, middle: Float, base_z: float, labels: Int32) -> Clusters:
+    """Return the candidates as clusters; what a cloud does not give is NaN.
+
+    Args:
+        plot: The map.
+        middle, base_z: Origin of the frame of the clusters in that of the map [m].
+        labels: Candidate of each thinned point, -1 for none.
+    """
+    c = plot.candidates
+    n = len(c.verdict)
+    nan = np.full(n, np.nan)
+    foot = plot.ground.at(c.place[:, 0], c.place[:, 1]) - base_z
+    low = np.full(n, 0.3)
+    low[: len(c.stems)] = np.nan_to_num(c.stems[:, LAST], nan=1.3) - np.nan_to_num(c.height[: len(c.stems)])
+    width = 2.0 * np.nan_to_num(c.radius, nan=0.1)
+    height = np.nan_to_num(c.height, nan=1.0)
+    size = np.maximum(np.bincount(labels[labels >= 0], minlength=n), np.nan_to_num(c.points))
+    return Clusters(
+        size=size.astype(np.int64),
+        centroid=np.column_stack([c.place - middle, foot + low + 0.5 * height]),
+        eigenvalues=np.full((n, 3), np.nan),
+        eccentricity=nan,
+        centre=c.place - middle,
+        covariance=np.tile(np.eye(2) * np.nan, (n, 1, 1)),
+        radius=c.radius,
+        radius_sigma=nan,
+        radial_std=c.radial_std,
+        arc=c.arc,
+        extent=np.column_stack([width, width, height]),
+        hidden=np.zeros(n, np.bool_),
+        cut=np.zeros(n, np.bool_),
+        verdict=c.verdict,
+    )
+
+
+def _detections_of(clusters: Clusters) -> Detections:
+    """Return the trees among the clusters as detections."""
+    rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
+    return replace(
+        no_detections(),
+        cluster=rows,
+        centre=clusters.centre[rows],
+        covariance=clusters.covariance[rows],
+        radius=clusters.radius[rows],
+        radius_sigma=clusters.radius_sigma[rows],
+        arc=clusters.arc[rows],
+        eccentricity=clusters.eccentricity[rows],
+    )
+
+
+def _height_map(ground: TerrainRaster) -> HeightMap:
+    """Return the visible ground as a height map, whose cells are multiples of their size; standard deviations
+    are unknown."""
+    cell = ground.cell
+    first = np.floor(ground.low / cell).astype(np.int64)
+    place = np.argwhere(np.ones(np.array(ground.height.shape) + 1, np.bool_)) + first
+    centre = ((place + 0.5) * cell).astype(np.float64)
+    there = np.floor((centre - ground.low) / cell).astype(np.int64)
+    inside = np.flatnonzero(((there >= 0) & (there < ground.seen.shape)).all(axis=1))
+    inside = inside[ground.seen[tuple(there[inside].T)]]
+    place, centre = place[inside], centre[inside]
+    return HeightMap(
+        cell=cell,
+        place=place.astype(np.int32),
+        height=ground.at(centre[:, 0], centre[:, 1]).astype(np.float32),
+        sigma=np.full(len(place), np.nan, np.float32),
+        views=np.ones(len(place), np.int32),
+    )

@@ -1,0 +1,65 @@
+// The story of a stem of a whole cloud: its height, cross-sections with the fitted circles, and the stem curve.
+
+import { definitions, el, letterOf } from "../core/dom.js";
+import { count, figure, fixed, NONE } from "../core/format.js";
+import { circle, line, picture, scaleBar, svg, text } from "../core/svg.js";
+import { verdictOf } from "../core/verdicts.js";
+
+const SIZE = 120; // of the picture of a section
+const BREAST = 1.3; // [m]
+
+export function stemStory(story) {
+  return [el("div", { class: "verdict", "data-verdict": "tree" }, letterOf(verdictOf("tree")),
+    el("div", {}, el("b", { text: "tree" }), el("p", { text: `Circles in ${count(story.observations, "slice")} above one another, between ${figure(story.sections[0].height)} and ${figure(story.sections.at(-1).height)} m above the ground.` }))),
+  figures(story), sectionsFigure(story.sections), stemCurve(story)];
+}
+
+function figures(story) {
+  const [major, minor] = story.ellipse;
+  const measured = story.dbh !== null, seen = story.height !== null;
+  return el("div", { class: "stem-figures" }, definitions([
+    ["DBH", measured ? `${figure(100 * story.dbh)} ± ${figure(100 * story.dbh_sigma, 2)} cm` : NONE],
+    ["height", seen ? `${fixed(story.height, 1)} ± ${figure(story.height_sigma, 2)} m` : "not seen"],
+    ["lean", `${fixed(story.lean_deg, 1)}°`], ["covered", `${figure(story.coverage_deg)}° of 360°`],
+    ["x, y", `${story.position[0].toFixed(2)}, ${story.position[1].toFixed(2)} m`], ["position ±", `${figure(100 * major, 2)} × ${figure(100 * minor, 2)} cm`]]),
+  measured ? "" : el("p", { class: "dim note", text: `The DBH needs ${figure(story.dbh_arc_deg)}° of the circumference.` }),
+  seen ? "" : el("p", { class: "dim note", text: `Height not seen: ${story.height_hidden}.` }));
+}
+
+// Pictures of the sections with points, highest first, all at one scale.
+export function sectionsFigure(sections) {
+  const shown = sections.filter(({ points }) => points.length).reverse();
+  if (!shown.length) return "";
+  const reach = Math.max(0.05, ...shown.map(({ radius, points }) => Math.max(radius ?? 0, ...points.map(([x, y]) => Math.hypot(x, y)))));
+  return el("figure", { "data-sections": String(shown.length) }, el("figcaption", { text: "Cross-sections with the fitted circles; x of the map to the right" }),
+    el("div", { class: "sections" }, ...shown.map((section) => sectionPicture(section, reach))));
+}
+
+function sectionPicture({ height, radius, points, coverage_deg: covered, scatter }, reach) {
+  const middle = SIZE / 2, scale = (SIZE / 2 - 4) / reach;
+  const dots = points.map(([x, y]) => circle(middle + scale * x, middle - scale * y, 1.1, "point"));
+  const at = `${figure(height)} m`, wide = radius === null ? "no circle" : `⌀ ${figure(200 * radius)} cm`;
+  const title = radius === null ? at : `${at}: ${wide}, ${figure(covered)}° covered, scatter ${figure(100 * scatter, 2)} cm`;
+  return el("div", { class: Math.abs(height - BREAST) < 0.11 ? "section breast" : "section", title },
+    picture(SIZE, SIZE, `Cross-section at ${title}`, ...dots, radius === null ? null : circle(middle, middle, scale * radius, "fitted"), scaleBar(5, SIZE - 5, reach / 2, scale)),
+    el("span", { text: at }), el("span", { text: wide }));
+}
+
+// Diameter over height with sigma.
+function stemCurve({ sections, dbh, dbh_sigma: sigma }) {
+  const known = sections.filter(({ radius }) => radius !== null);
+  if (known.length < 2) return "";
+  const [width, tall, left, right, top, bottom] = [400, 200, 40, 388, 14, 168];
+  const high = Math.max(...known.map(({ height }) => height)), most = 1.1 * Math.max(dbh ?? 0, ...known.map(({ radius, radius_sigma: s }) => 2 * (radius + s)));
+  const x = (diameter) => left + (diameter / most) * (right - left), y = (height) => bottom - (height / high) * (bottom - top);
+  const bars = known.map(({ height, radius, radius_sigma: s }) => line(x(2 * (radius - s)), y(height), x(2 * (radius + s)), y(height), "spread"));
+  const curve = svg("polyline", { points: known.map(({ height, radius }) => `${x(2 * radius)},${y(height)}`).join(" "), class: "curve" });
+  const breast = dbh === null ? [] : [line(x(dbh - sigma), y(BREAST), x(dbh + sigma), y(BREAST), "axis"), circle(x(dbh), y(BREAST), 4, "axis")];
+  const step = [0.02, 0.05, 0.1, 0.2, 0.5].find((each) => most / each <= 8) ?? 1;
+  const ticks = Array.from({ length: Math.floor(most / step) + 1 }, (_, k) => k * step);
+  return el("figure", {}, el("figcaption", { text: `Stem curve: diameter over height${dbh === null ? "" : "; the ring is the DBH"}` }),
+    picture(width, tall, "Diameter of the stem over the height above the ground", line(left, bottom, right, bottom, "zero"), line(left, top, left, bottom, "zero"),
+      ...ticks.map((value) => text(x(value), bottom + 15, figure(100 * value), "small", "middle")), text(right, bottom + 29, "diameter [cm]", "small", "end"),
+      ...Array.from({ length: Math.floor(high) + 1 }, (_, k) => text(left - 6, y(k) + 4, String(k), "small", "end")), text(4, top - 2, "m", "small"),
+      ...bars, curve, ...breast));
+}

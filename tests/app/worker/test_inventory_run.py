@@ -1,0 +1,233 @@
+"""A whole cloud in the session: mapped in steps, tuned, explained, and left for a run of scans."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from app.explain.build import cluster_story, tree_story
+from app.worker.outbox import picture_of
+from app.worker.process import new_session, open_any_or_cloud
+from app.worker.protocol import Report, Shown, from_worker
+from app.worker.session import Session
+from pipeline.config import preset
+from pipeline.errors import SourceError, StemmapError
+from pipeline.inventory import PARAMETERS
+from pipeline.io.readers.base import SourceOptions
+from pipeline.types.records import Frame, Verdict
+from tests.pipeline.inventory.plots import PLACES, plot, write_las
+
+FOREST = preset("forest")
+UTM = (470600.0, 3810200.0, 300.0)
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A plot with nine stems in UTM coordinates."""
+    points = plot(np.random.default_rng(1), slope=0.1, per_m2=900)
+    file: Path = tmp_path_factory.mktemp("cloud") / "plot.laz"
+    write_las(file, points, offset=UTM, crs="EPSG:26912")
+    return file
+
+
+@pytest.fixture
+def session(cloud: Path) -> Iterator[Session]:
+    opened = new_session()
+    opened.open(str(cloud), "auto", 0)
+    opened.set_parameters(FOREST, 1)
+    yield opened
+    opened.close()
+
+
+def mapped(session: Session) -> Frame:
+    """Play until the cloud is mapped, as the loop of the worker does."""
+    session.play()
+    while session.pace != "idle":
+        session.work()
+    assert session.frame is not None
+    return session.frame
+
+
+def again(session: Session) -> Frame:
+    """Continue until the inventory that replaces the map is complete."""
+    while session.is_remapping:
+        session.remap(1)
+    assert session.frame is not None
+    return session.frame
+
+
+def test_a_cloud_is_mapped_in_steps_without_a_robot(session: Session) -> None:
+    session.play()
+    seen = []
+    while session.work() is None:
+        seen.append(session.status())
+    shares = [float(status.detail.split()[-2]) for status in seen]
+    assert {status.state for status in seen} == {"starting"}
+    assert len(shares) > 20
+    assert shares == sorted(shares)
+    frame = mapped(session)
+    assert frame.of_cloud
+    assert len(frame.trees.number) == len(PLACES)
+    away = np.hypot(*(frame.trees.position[:, None] - PLACES[:, :2]).transpose(2, 0, 1))
+    assert away.min(axis=1).max() < 0.03
+    status = session.status()
+    assert (status.state, status.scans, status.scan_index, status.trees) == ("finished", 1, 0, len(PLACES))
+    assert status.cloud is not None
+    assert status.cloud.offset == (*UTM[:2], 0.0), "heights below 1000 m are kept"
+    assert "26912" in status.cloud.crs
+    assert status.cloud.parameters == list(PARAMETERS)
+    assert set(PARAMETERS) <= set(FOREST.flat())
+    assert session.path is not None
+    assert len(session.path.x) == 0
+
+
+def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session) -> None:
+    frame = mapped(session)
+    at = frame.estimate.T_map_base.apply(frame.filtered[:, :2].astype(np.float64))
+    assert at.min() > -0.1
+    assert at.max() < 15.1
+    trees = np.flatnonzero(frame.clusters.verdict == Verdict.TREE)
+    assert sorted(frame.detections.cluster) == sorted(trees)
+    for row in trees:
+        mine = at[(frame.labels == row) & (frame.filtered[:, 2] > 1.0)]
+        assert len(mine) > 100
+        assert (
+            np.median(
+                np.hypot(*(mine - PLACES[np.hypot(*(PLACES[:, :2] - mine.mean(axis=0)).T).argmin(), :2]).T)
+            )
+            < 0.5
+        )
+    codec = from_worker()
+    there = codec.decode(codec.encode(Shown(1, 0.0, picture_of(frame), 0, session.path))[4:])  # type: ignore[arg-type]
+    assert isinstance(there, Shown)
+    assert there.frame.of_cloud
+    np.testing.assert_array_equal(there.frame.trees.lean, frame.trees.lean)
+    status = codec.decode(codec.encode(Report(session.status()))[4:])
+    assert isinstance(status, Report)
+    assert status.status.cloud == session.status().cloud
+
+
+def test_a_parameter_of_the_inventory_maps_the_cloud_again_and_keeps_the_numbers(session: Session) -> None:
+    before = mapped(session)
+    session.set_parameters(FOREST.replace({"detection.radius_min": 0.13}), 2)
+    assert session.is_remapping
+    assert session.frame is before, "the old map is shown until the new one is complete"
+    after = again(session)
+    thick = set(before.trees.number[PLACES[nearest(before), 2] > 0.135].tolist())
+    assert set(after.trees.number.tolist()) == thick
+    session.set_parameters(FOREST, 3)
+    back = again(session)
+    assert back.trees.number.tolist() == before.trees.number.tolist()
+    np.testing.assert_array_equal(back.trees.position, before.trees.position)
+
+
+def nearest(frame: Frame) -> np.ndarray:
+    """Row of the true stem of each tree."""
+    away = np.hypot(*(frame.trees.position[:, None] - PLACES[:, :2]).transpose(2, 0, 1))
+    return np.asarray(away.argmin(axis=1))
+
+
+def test_the_latest_of_several_changes_wins(session: Session) -> None:
+    mapped(session)
+    for revision, least in enumerate((0.10, 0.20, 0.16), start=2):
+        session.set_parameters(FOREST.replace({"detection.radius_min": least}), revision)
+        session.remap(1)
+    frame = again(session)
+    assert len(frame.trees.number) == np.count_nonzero(PLACES[:, 2] > 0.165)
+    assert session.status().revision == 4
+
+
+def test_other_parameters_do_not_map_the_cloud_again(session: Session) -> None:
+    before = mapped(session)
+    session.set_parameters(FOREST.replace({"clustering.eps": 0.5, "slam.distance_max": 2.0}), 2)
+    assert not session.is_remapping
+    assert session.frame is before
+
+
+def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session: Session) -> None:
+    frame = mapped(session)
+    for row, number in enumerate(frame.trees.number.tolist()):
+        story = tree_story(session.run, number)
+        assert story.sections is not None
+        assert len(story.sections) == frame.trees.observations[row]
+        heights = [section.height for section in story.sections]
+        assert heights == sorted(heights)
+        shown = [section for section in story.sections if section.points]
+        assert 3 <= len(shown) <= 9
+        assert min(abs(section.height - 1.3) for section in shown) < 0.11
+        for section in shown:
+            off = np.hypot(*np.array(section.points).T) - section.radius
+            assert np.median(np.abs(off)) < 0.02
+        true = PLACES[nearest(frame)[row]]
+        breast = min(story.sections, key=lambda section: abs(section.height - 1.3))
+        assert breast.radius == pytest.approx(true[2], abs=0.01)
+        assert story.lean_deg == pytest.approx(np.degrees(np.arctan(0.05)), abs=0.5)
+        assert np.isnan(story.height) == bool(story.height_hidden)
+        assert story.height_hidden or story.height == pytest.approx(8.0, abs=4.0 * story.height_sigma)
+    with pytest.raises(StemmapError, match="no tree 99"):
+        tree_story(session.run, 99)
+
+
+def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(session: Session) -> None:
+    frame = mapped(session)
+    others = 0
+    for row in range(len(frame.clusters.verdict)):
+        story = cluster_story(session.run, frame, row)
+        assert story.verdict == Verdict(int(frame.clusters.verdict[row])).label
+        failed = [check.verdict for check in story.checks if check.fails]
+        if story.verdict == "tree":
+            assert story.checks
+            assert failed == []
+        else:
+            assert failed == [] or story.verdict == failed[0]
+            others += 1
+        assert story.sections
+        assert (story.tree is not None) == (story.verdict == "tree")
+    assert others == 3, "bushes"
+    with pytest.raises(StemmapError, match="no cluster"):
+        cluster_story(session.run, frame, len(frame.clusters.verdict))
+
+
+def test_two_sets_are_compared_without_a_change_of_the_map(session: Session) -> None:
+    before = mapped(session)
+    few, all_of_them = session.compare([FOREST.replace({"detection.radius_min": 0.2}), FOREST])
+    assert len(few.trees.number) < len(all_of_them.trees.number) == len(PLACES)
+    assert session.frame is before
+
+
+def test_a_seek_or_another_play_leaves_the_map_as_it_is(session: Session) -> None:
+    before = mapped(session)
+    session.seek(5.0)
+    while session.pace == "hurry":
+        session.work()
+    assert session.frame is before
+    session.play()
+    while session.pace != "idle":
+        session.work()
+    assert session.frame is before
+
+
+def test_a_damaged_cloud_is_refused_and_the_address_of_a_drive_is_no_map(cloud: Path, tmp_path: Path) -> None:
+    broken = tmp_path / "broken.laz"
+    broken.write_bytes(cloud.read_bytes()[:300])
+    with pytest.raises(SourceError):
+        open_any_or_cloud(str(broken), SourceOptions())
+    assert open_any_or_cloud(f"file://{cloud}", SourceOptions()).description.kind.startswith("whole cloud")
+    drive = open_any_or_cloud(f"sim:cloud?file={cloud}", SourceOptions())
+    assert drive.description.has_odometry
+    drive.close()
+
+
+def test_a_run_of_scans_follows_a_cloud(session: Session) -> None:
+    mapped(session)
+    session.open("sim:stand?duration=2", "auto", 0)
+    session.set_parameters(FOREST, 2)
+    assert session.status().cloud is None
+    session.advance(1)
+    while session.pace == "hurry":
+        session.work()
+    assert session.frame is not None
+    assert not session.frame.of_cloud

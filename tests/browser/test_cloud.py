@@ -1,0 +1,112 @@
+"""A whole cloud in the page: its stems with sections and heights, tuned and exported; or driven through."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened
+from tests.browser.dashboard import Dashboard
+from tests.browser.serving import Server
+from tests.pipeline.inventory.plots import write_las
+from tests.pipeline.inventory.test_crowns import flat, tree
+
+PLACES = ((2.5, 2.5, 10.0), (7.5, 2.5, 12.0), (2.5, 7.5, 9.0), (7.5, 7.5, 11.0))  # x, y, height [m]
+UTM = (470600.0, 3810200.0, 300.0)
+
+
+@pytest.fixture(scope="module")
+def cloud(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rng = np.random.default_rng(2)
+    points = np.concatenate([flat(10.0, rng), *(tree(x, y, rng, top) for x, y, top in PLACES)])
+    file: Path = tmp_path_factory.mktemp("clouds") / "plot.laz"
+    write_las(file, points, offset=UTM, crs="EPSG:26912")
+    return file
+
+
+@pytest.fixture(scope="module")
+def page(chromium: Browser, tmp_path_factory: pytest.TempPathFactory, cloud: Path) -> Iterator[Dashboard]:
+    folder = str(tmp_path_factory.mktemp("stemmap"))
+    with (
+        Server("sim:stand?duration=5", STEMMAP_FOLDER=folder) as server,
+        opened(chromium, server.link) as made,
+    ):
+        made.pause()
+        yield made
+        assert made.errors == []
+
+
+def open_cloud(page: Dashboard, cloud: Path, drive: bool = False) -> None:
+    """Open the cloud in the dialog, as a person does."""
+    page.page.locator("#source-button").click()
+    page.page.locator("#source-uri").fill("run.mcap")
+    expect(page.page.locator("#source-cloud")).to_be_hidden()
+    page.page.locator("#source-uri").fill(str(cloud))
+    expect(page.page.get_by_label("Map this cloud")).to_be_checked()
+    if drive:
+        page.page.get_by_label("Drive a simulated robot").check()
+    page.page.locator("#source-open").click()
+    expect(page.page.locator("#source-dialog")).to_be_hidden()
+
+
+def test_a_cloud_is_opened_and_its_stems_have_sections_and_heights(page: Dashboard, cloud: Path) -> None:
+    open_cloud(page, cloud)
+    rows = page.page.locator("#trees tbody tr")
+    expect(rows).to_have_count(len(PLACES))
+    expect(page.page.locator("#state b")).to_have_text("Mapped")
+    expect(page.page.locator("#timeline")).to_be_hidden()
+    expect(page.page.locator("[data-figure=health]")).to_be_hidden()
+    heads = [text.strip(" ▲▼") for text in page.page.locator("#trees thead th:visible").all_inner_texts()]
+    assert heads == ["tree", "x m", "y m", "± cm", "DBH cm", "height m", "lean °"]
+    for found in page.ask("/api/trees")["trees"]:
+        x, y, height = min(PLACES, key=lambda at: np.hypot(at[0] - found["x"], at[1] - found["y"]))
+        assert np.hypot(x - found["x"], y - found["y"]) < 0.05
+        assert abs(found["height_m"] - height) < 0.3
+        assert abs(found["dbh_cm"] - 28.0) < 1.5
+    rows.first.click()
+    story = page.page.locator("#panel-story")
+    expect(story.locator("[data-sections] .section")).to_have_count(9)
+    expect(story.locator(".section.breast .fitted")).to_have_count(1)
+    assert story.locator(".section .point").count() > 200
+    expect(story.get_by_text("Stem curve")).to_be_visible()
+
+
+def test_a_slider_maps_the_cloud_again_and_only_those_of_the_inventory_are_shown(page: Dashboard) -> None:
+    panel = page.tab("Tune")
+    expect(panel.locator("[id^='tune-detection.']:visible").first).to_be_visible()
+    expect(panel.locator("[id='tune-clustering.eps']")).to_be_hidden()
+    least = panel.locator("[id='tune-detection.radius_min']")
+    least.fill("0.2")
+    least.press("Enter")
+    page.until_server("/api/trees", "it.trees.length === 0")
+    panel.locator("#tune-undo").click()
+    page.until_server("/api/trees", f"it.trees.length === {len(PLACES)}")
+    assert [tree["number"] for tree in page.ask("/api/trees")["trees"]] == [1, 2, 3, 4]
+
+
+def test_the_export_has_the_coordinates_of_the_file(page: Dashboard) -> None:
+    page.tab("Trees")
+    with page.page.expect_download() as download:
+        page.page.locator("#trees-csv").click()
+    rows = Path(str(download.value.path())).read_text(encoding="utf-8").splitlines()
+    names, first = rows[0].split(","), rows[1].split(",")
+    values = dict(zip(names, first, strict=True))
+    assert len(rows) == 1 + len(PLACES)
+    assert abs(float(values["x_m"]) - UTM[0]) < 10.0
+    assert float(values["height_m"]) > 8.0
+    with page.page.expect_download() as download:
+        page.page.locator("#trees-export").select_option("gpkg")
+    assert download.value.suggested_filename == "trees.gpkg"
+
+
+def test_a_robot_drives_through_the_cloud_as_the_second_choice(page: Dashboard, cloud: Path) -> None:
+    open_cloud(page, cloud, drive=True)
+    page.until_server("/api/status", "it.source.startsWith('sim:cloud') && it.scan_index >= 0")
+    expect(page.page.locator("#timeline")).to_be_visible()
+    expect(page.page.locator("[data-figure=health]")).to_be_visible()
+    heads = page.page.locator("#trees thead th[data-key=height]")
+    expect(heads).to_be_hidden()
