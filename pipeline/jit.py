@@ -41,39 +41,52 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     plain function is the attribute `py_func`.
     """
     # Without _nrt a kernel would inherit the setting of its caller.
-    kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=True)(function)
-    _keep_by_all_sources(kernel, function.__module__)
-    return kernel
+    return _kernel(function, _nrt=True)
 
 
 def compiled_borrowing(function: Callable[P, R]) -> Callable[P, R]:
     """Return a kernel like `compiled`, without reference counting; the function must neither create nor keep
     an array. The atomic operations of reference counting cost more than the arithmetic of a loop over few
     landmarks."""
-    kernel: Callable[P, R] = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)(function)
-    _keep_by_all_sources(kernel, function.__module__)
-    return kernel
+    return _kernel(function, _nrt=False)
 
 
 def compiled_within(function: Callable[P, R]) -> Callable[P, R]:
     """Return a kernel like `compiled_borrowing` that is inlined in each kernel that calls it: a call passes
     each array as eight numbers, which costs more than a short loop."""
-    kernel: Callable[P, R] = numba.njit(
-        cache=True, nogil=True, error_model="numpy", _nrt=False, inline="always"
-    )(function)
-    _keep_by_all_sources(kernel, function.__module__)
-    return kernel
+    return _kernel(function, _nrt=False, inline="always")
 
 
 def compiled_sums(function: Callable[P, R]) -> Callable[P, R]:
     """Return a kernel like `compiled` for sums over arrays, with vector registers, which is several times
     faster. The order of the terms is fixed at compilation: runs on one kind of processor give the same bytes,
     and two kinds may differ in the last bit, like the matrix products of NumPy."""
+    return _kernel(function, _nrt=True, fastmath={"reassoc", "nsz"})
+
+
+_kernels: dict[Any, bool] = {}  # whether its machine code was found in the cache so far
+
+
+def _kernel(function: Callable[P, R], **options: object) -> Callable[P, R]:
+    """Return a function as a kernel with options of Numba, of which all kernels share some."""
     kernel: Callable[P, R] = numba.njit(
-        cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz"}, _nrt=True
+        cache=True,
+        nogil=True,
+        error_model="numpy",
+        no_cfunc_wrapper=True,  # only C code would call it
+        **options,
     )(function)
     _keep_by_all_sources(kernel, function.__module__)
+    _kernels[kernel] = False
     return kernel
+
+
+def count_kept() -> int:
+    """Return the number of kernels of the loaded modules for which `is_kept` is true now or was at an earlier
+    call."""
+    for kernel, found in _kernels.items():
+        _kernels[kernel] = found or is_kept(kernel)
+    return sum(_kernels.values())
 
 
 _callbacks: list[Callable[[], None]] = []

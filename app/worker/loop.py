@@ -56,6 +56,7 @@ class WorkerLoop:
         put: Queues a message to the web process; must not block.
         clock: Returns the time [s] from any origin.
         recent: Frames that were sent recently, to which questions refer.
+        compiled_share: Returns the share of the kernels that are compiled, from 0 to 1.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class WorkerLoop:
         put: Put,
         clock: Callable[[], float] = time.monotonic,
         recent: RecentScans | None = None,
+        compiled_share: Callable[[], float] = lambda: 1.0,
     ) -> None:
         self._session = session
         session.on_preview = lambda revision, trees: put(protocol.Rough(self._run, revision, trees))
@@ -81,6 +83,7 @@ class WorkerLoop:
         self._glimpse_at = 0.0
         self._long_way_at = 0.0
         self._compiling_since_s, self._compiled_at = 0.0, -math.inf
+        self._compiled_share, self._progress_at = compiled_share, -math.inf
         self._mapped = 0  # scans since a scan was mapped again
         self._at_once = 1
 
@@ -319,16 +322,24 @@ class WorkerLoop:
 
     def compiling(self) -> None:
         """Report that the mapping waits for the compilation of a kernel; called during the compilation. The
-        status "playing" becomes "waiting"; further calls report nothing until the next status."""
+        status "playing" becomes "waiting"; further calls report the progress at intervals of _HEARTBEAT_S."""
         self._session.disturb()
         now = self._clock()
         if now > self._compiled_at + _COMPILES_ON_S:
             self._compiling_since_s = time.time()
         self._compiled_at = now
-        if self._reported is None or self._is_compiling_reported:
+        if self._reported is None:
             return
+        if self._is_compiling_reported and now < self._progress_at + _HEARTBEAT_S:
+            return
+        self._progress_at = now
         # The last status, because the session is in the middle of its work.
-        status = replace(self._reported[0], detail=_COMPILING, compiling_since_s=self._compiling_since_s)
+        status = replace(
+            self._reported[0],
+            detail=_COMPILING,
+            compiling_since_s=self._compiling_since_s,
+            compiled=self._compiled_share(),
+        )
         if status.state == "playing":
             status = replace(status, state="waiting")
         self._reported = (status, -math.inf)  # so that the next status is sent at once

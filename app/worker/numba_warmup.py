@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 PATIENCE_S = 1800.0
 _HALVES = ("warm_front_end", "warm_tree_map")
 _POLL_S = 0.2
+_KERNELS = 238  # that both halves compile; only the displayed progress depends on it
 
 
 def compile_ahead() -> None:
@@ -50,6 +51,13 @@ def is_compiled() -> bool:
     from pipeline.tracking.track_classification import classify, nearest_other
 
     return is_kept(nearest_other) and is_kept(classify)
+
+
+def compiled_share() -> float:
+    """Return the share of the kernels of both halves that are cached for the current sources, from 0 to 1."""
+    from pipeline.jit import count_kept
+
+    return min(1.0, count_kept() / _KERNELS)
 
 
 def _cores() -> int:

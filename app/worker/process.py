@@ -76,13 +76,15 @@ def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
         incoming: Stream of encoded commands.
         outgoing: Stream for encoded messages.
     """
+    from app.worker.numba_warmup import compiled_share
+
     commands: queue.Queue[ToWorker | None] = queue.Queue()
     finished = threading.Event()
     reader = threading.Thread(target=_read, args=(incoming, commands, finished, session), daemon=True)
     reader.start()
     recent = RecentScans()
     mailbox = Outbox(outgoing, recent)
-    driver = WorkerLoop(session, commands, mailbox.put, recent=recent)
+    driver = WorkerLoop(session, commands, mailbox.put, recent=recent, compiled_share=compiled_share)
     with on_compiling(_notify_compilation), on_compiling(driver.compiling):
         driver.run()
     mailbox.close()

@@ -75,6 +75,7 @@ class Status:
         robot: Namespace of the robot, empty for none.
         robots: Namespaces of all robots on the network that publish scans.
         compiling_since_s: Start of the present compilation of kernels [s since 1970], None without one.
+        compiled: Share of the kernels that are compiled, from 0 to 1; None without a compilation.
         remapped: Share of the run that is mapped again (see `SetParameters`), from 0 to 1; None without a
             rerun.
         camera: Whether the source has camera pictures.
@@ -112,6 +113,7 @@ class Status:
     remapped: float | None = None
     compiling_since_s: float | None = None
     cloud: CloudFrame | None = None
+    compiled: float | None = None
 
 
 class Play(msgspec.Struct, frozen=True, tag="play"):

@@ -112,10 +112,15 @@ def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: 
     word, notice, thumb = page.evaluate(UNDER, going)
     assert (word, notice) == ("Seeking", "Going to 0:40 … Mapped up to 0:12.0.")
     assert thumb == pytest.approx(40.0, abs=0.05)  # to a step of the line
-    compiling = {"state": "waiting", "detail": "Compiling", "compiling_since_s": time.time() - 100.0}
+    compiling = {
+        "state": "waiting",
+        "detail": "Compiling",
+        "compiling_since_s": time.time() - 100.0,
+        "compiled": 0.437,
+    }
     word, notice, _ = page.evaluate(UNDER, compiling)
     assert word == "Waiting"
-    passed = re.search(r"Compiling\. (\d+) s so far", notice)
+    passed = re.search(r"Compiling\. 43 % of the kernels are compiled\. (\d+) s so far", notice)
     assert passed is not None, notice
     assert int(passed[1]) >= 98, "from its start, not from the opening of the page"
     expect(page.locator("#state b")).to_have_text("Paused")

@@ -158,12 +158,13 @@ function showWay() {
 let ahead = null; // [ms] of the server's clock before that of this machine; null while unknown
 let compiledAt = -Infinity; // when the server last reported compiling [ms]
 
-function compilingFor({ compiling_since_s: since }) {
+function compilingFor({ compiling_since_s: since, compiled }) {
   if (!since) return "";
   compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
-  return passed >= 10 ? `. ${passed} s so far; a slow or busy machine takes longer.` : "";
+  const done = compiled < 1 ? `. ${Math.floor(100 * compiled)} % of the kernels are compiled` : "";
+  return passed >= 10 ? `${done}. ${passed} s so far; a slow or busy machine takes longer.` : done && `${done}.`;
 }
 
 // The changing part of the notice, which a screen reader does not announce.

@@ -101,29 +101,34 @@ def test_nothing_is_said_to_play_before_the_first_scan_is_ready() -> None:
     assert before[0].detail == "Preparing the mapper"
 
 
-def test_a_kernel_that_is_compiled_is_said_once_and_no_silence_follows() -> None:
+def test_compilation_is_reported_with_its_progress_and_no_silence_follows() -> None:
     session, said = make_session(FakeSource(9)), list[FromWorker]()
     commands: queue.Queue[ToWorker | None] = queue.Queue()
 
     def put(message: FromWorker) -> None:
         said.append(message)
         if isinstance(message, Shown) and message.frame.index == 2:
-            driver.compiling()
-            driver.compiling()
+            for _ in range(3):
+                driver.compiling()
         if isinstance(message, Report) and message.status.state == "finished":
             commands.put(None)
 
-    driver = WorkerLoop(session, commands, put, itertools.count().__next__)
+    clock = itertools.count(
+        step=0.6
+    ).__next__  # the second of three calls comes within the second of the first
+    driver = WorkerLoop(session, commands, put, clock, compiled_share=iter([0.25, 0.75]).__next__)
     for command in (Open("fake:"), SetSpeed(0.0), Play()):
         commands.put(command)
     driver.run()
     reports = [m.status for m in said if isinstance(m, Report)]
-    (waits,) = (k for k, status in enumerate(reports) if status.state == "waiting")
-    assert reports[waits].detail == COMPILING.capitalize()
-    assert reports[waits].source == "fake:"
-    assert time.time() - 60.0 < (reports[waits].compiling_since_s or 0.0) <= time.time()
-    assert reports[waits + 1].compiling_since_s is None
-    assert (reports[waits + 1].state, reports[waits + 1].detail) == ("playing", "")
+    waiting = [status for status in reports if status.state == "waiting"]
+    assert [status.compiled for status in waiting] == [0.25, 0.75]
+    for status in waiting:
+        assert (status.detail, status.source) == (COMPILING.capitalize(), "fake:")
+        assert time.time() - 60.0 < (status.compiling_since_s or 0.0) <= time.time()
+    after = reports[reports.index(waiting[-1]) + 1]
+    assert (after.compiling_since_s, after.compiled) == (None, None)
+    assert (after.state, after.detail) == ("playing", "")
 
 
 def test_an_answer_that_compiled_leaves_nothing_to_wait_for(monkeypatch: pytest.MonkeyPatch) -> None:

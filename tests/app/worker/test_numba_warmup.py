@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from app.worker.numba_warmup import warm_front_end, warm_tree_map, warm_up
+from app.worker.numba_warmup import compiled_share, is_compiled, warm_front_end, warm_tree_map, warm_up
 from app.worker.process import new_session
 from pipeline.config import Parameters
 
@@ -32,6 +32,8 @@ def seen():
 
 warm_front_end()
 warm_tree_map()
+assert is_compiled()
+assert compiled_share() > 0.95, compiled_share()
 before = seen()
 assert len(before) > 20, before
 warm_up()
