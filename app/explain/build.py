@@ -1,4 +1,4 @@
-"""Builds the stories: of a cluster from the frame of its scan, of a tree from the newest frame."""
+"""Builds the stories: of a cluster from the frame of its scan, of a tree from the shown frame."""
 
 from __future__ import annotations
 
@@ -97,11 +97,12 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
     )
 
 
-def tree_story(run: AnyRun | None, number: int) -> TreeStory:
-    """Return the explanation of a tree after the newest scan.
+def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStory:
+    """Return the explanation of a tree after a scan.
 
     Args:
         run: The open run, or None.
+        frame: Results of the scan, or None.
         number: Number of the tree.
 
     Raises:
@@ -109,7 +110,6 @@ def tree_story(run: AnyRun | None, number: int) -> TreeStory:
     """
     if isinstance(run, InventoryRun):
         return cloud_tree_story(run, number)
-    frame = run.frame if run else None
     rows = np.flatnonzero(frame.trees.number == number) if frame else np.zeros(0, np.int64)
     if run is None or frame is None or not len(rows):
         raise StemmapError(
@@ -138,7 +138,7 @@ def tree_story(run: AnyRun | None, number: int) -> TreeStory:
         last_seen_s=(int(trees.last_seen_ns[row]) - run.start_ns) / _NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
         column=column_story(frame, trees.position[row], parameters, sensor),
-        history=run.history.of(int(trees.number[row])),
+        history=run.history.of(int(trees.number[row]), frame.index),
     )
 
 

@@ -60,7 +60,7 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
         last_seen_s=0.0,
         cluster=candidate,
         column=None,
-        history=TreeHistory().of(number),
+        history=TreeHistory().of(number, 0),
         height=float(plot.crowns.height[row]),
         height_sigma=float(plot.crowns.sigma[row]),
         height_hidden=plot.crowns.hidden[row],

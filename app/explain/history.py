@@ -70,11 +70,11 @@ class TreeHistory:
         known = self._rows[: self._count]
         return {int(number): (float(x), float(y)) for number, x, y in known[:, [_NUMBER, 4, 5]]}
 
-    def of(self, number: int) -> History:
-        """Return the estimates of the tree with this number: at most 200 rows, the first and the last among
-        them; empty columns for an unknown tree."""
+    def of(self, number: int, scan: int) -> History:
+        """Return the estimates of the tree with this number up to a scan: at most 200 rows, the first and the
+        last among them; empty columns for an unknown tree."""
         known = self._rows[: self._count]
-        mine = known[known[:, _NUMBER] == number]
+        mine = known[(known[:, _NUMBER] == number) & (known[:, _SCAN] <= scan)]
         if len(mine) > _MOST_RETURNED:  # denser for the first observations, where the ellipse changes fastest
             place = np.unique(np.geomspace(1, len(mine), _MOST_RETURNED).astype(np.int64) - 1)
             mine = mine[place]

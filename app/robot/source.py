@@ -30,11 +30,11 @@ from app.robot.zenoh import RosPublisher, ZenohLink
 from app.sources.opening import open_source
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
+from pipeline.io.block_file import SPARE_BYTES, free_space
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions, count_loss
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
 from pipeline.io.recording import outputs
-from pipeline.remapping.scan_cache import SPARE_BYTES, free_space
 from pipeline.types.records import Frame, Path, Record, Truth
 
 #: Motion between two stored pictures, which shows every tree from near, and limits of the disk space.

@@ -1,8 +1,9 @@
 """Cursor over the steps of a source, which can return to any step that was read before.
 
-To return, the cursor reads from one second before the scan and restores the state that the synchroniser had
-there. If the preceding scan differs from the first reading, everything is read from the start. Stepping back
-therefore never changes what is mapped; in the worst case it is slow.
+Steps that were read are stored. To return to one that is not, the cursor reads from one second before the
+scan and restores the state that the synchroniser had there. If the preceding scan differs from the first
+reading, everything is read from the start. Stepping back therefore never changes what is mapped; in the worst
+case it is slow.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from itertools import islice
 
 from app.robot.source import LiveSource
 from app.sources.request import ChosenOdometry
+from app.worker.frame_store import StepStore
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import Source
 from pipeline.odometry.odometry_override import OdometryOverride
@@ -31,10 +33,13 @@ class Cursor:
     Args:
         source: Source that is read; the cursor does not close it.
         odometry: Choice of the odometry.
+        store: Stores the steps that were read; None reads them again.
     """
 
-    def __init__(self, source: Source, odometry: OdometryChoice = "auto") -> None:
-        self._source = source
+    def __init__(
+        self, source: Source, odometry: OdometryChoice = "auto", store: StepStore | None = None
+    ) -> None:
+        self._source, self._store = source, store
         self._odometry: OdometryChoice = odometry
         self._stamps = array("q")
         self._fingerprints = array("q")
@@ -43,6 +48,7 @@ class Cursor:
         self._ahead: Step | None = None
         self._failure: Exception | None = None
         self._steps = self._read(None)
+        self._steps_next: int | None = 0  # index of the step that the source gives next; None if unknown
 
     @property
     def known(self) -> int:
@@ -70,13 +76,33 @@ class Cursor:
         if self._failure is not None:  # a broken iterator would look like the end of the run
             raise self._failure
         if self._ahead is None:
-            try:
-                step = next(self._steps, None)
-            except Exception as error:
-                self._failure = error
-                raise
-            self._ahead = None if step is None else replace(step, index=self._next)
+            self._ahead = self.stored(self._next) or self._from_source()
         return self._ahead
+
+    def stored(self, index: int) -> Step | None:
+        """Return a step that was read before; None if it is not stored."""
+        return None if self._store is None else self._store.read(index)
+
+    def _from_source(self) -> Step | None:
+        """Read the next step from the source and store it; None at the end of the run.
+
+        Raises:
+            SourceError: Nothing more can be read.
+        """
+        try:
+            if self._steps_next != self._next:
+                self._seek_source(self._next)
+            step = next(self._steps, None)
+        except Exception as error:
+            self._failure, self._steps_next = error, None
+            raise
+        if step is None:
+            return None
+        step = replace(step, index=self._next)
+        self._steps_next = self._next + 1
+        if self._store is not None:
+            self._store.put(step)
+        return step
 
     def take(self) -> Step | None:
         """Return the next step and advance; None at the end of the run.
@@ -96,7 +122,8 @@ class Cursor:
         return step
 
     def go_to(self, index: int) -> None:
-        """Move to the position before a step. Nothing is read if that is the present position.
+        """Move to the position before a step. Nothing is read from the source if that is the present
+        position, or if the step is stored.
 
         Args:
             index: Index of the step, at most `known`.
@@ -106,16 +133,31 @@ class Cursor:
         """
         if index == self._next and self._failure is None:
             return
-        self._ahead, self._failure, self._next = None, None, -1
+        self._ahead, self._failure, self._next = None, None, index
+        if index != self._steps_next and (self._store is None or self._store.read(index) is None):
+            try:
+                self._seek_source(index)
+            except Exception as error:
+                self._failure, self._next, self._steps_next = error, -1, None
+                raise
+
+    def close(self) -> None:
+        """Delete the stored steps."""
+        if self._store is not None:
+            self._store.close()
+
+    def _seek_source(self, index: int) -> None:
+        """Read the source up to a step, at most the first one that was not read before.
+
+        Raises:
+            SourceError: The source does not return the same steps again.
+        """
+        self._steps_next = None
         if index == 0:
-            self._steps, self._next = self._read(None), 0
-            return
-        try:
+            self._steps = self._read(None)
+        else:
             self._steps = self._resumed(index - 1) or self._recounted(index - 1)
-        except Exception as error:
-            self._failure = error
-            raise
-        self._next = index
+        self._steps_next = index
 
     def _read(self, start_ns: int | None, after: SynchroniserState | None = None) -> Iterator[Step]:
         """Return an iterator of the steps from the source.
@@ -235,6 +277,13 @@ class LiveCursor:
         self._ready.popleft()
         self._stamps.append(step.scan.stamp_ns)
         return step
+
+    def stored(self, index: int) -> None:
+        """Return None, because the steps of a live run are not stored."""
+        del index
+
+    def close(self) -> None:
+        """Do nothing."""
 
     def go_to(self, index: int) -> None:
         """Check that `index` is the current position, because a live run cannot go back.

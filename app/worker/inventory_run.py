@@ -124,6 +124,10 @@ class InventoryRun:
         """Share of the present inventory that is done, from 0 to 1; None if none is computed."""
         return None if self._job is None else self._share
 
+    def kept(self, index: int) -> None:
+        """Return None: the only scan is the current one."""
+        del index
+
     def confirmed_s(self, trees: Trees) -> Float:
         """Return 0 for each tree, shape (T,) [s]."""
         return np.zeros(len(trees.number))

@@ -100,6 +100,9 @@ class WorkerLoop:
             if command is None:
                 self._session.close()
                 return
+            if isinstance(command, protocol.AskCompare):
+                while self._session.is_shown:  # the mapper is on its way to this scan
+                    self._guarded(self._map)
             if isinstance(command, protocol.Question):
                 self._put(answer(self._session, self._recent, command, self._run))
                 if self._is_compiling_reported:  # an answer may compile other kernels than the run
@@ -109,7 +112,7 @@ class WorkerLoop:
 
     def _next_command(self) -> protocol.ToWorker | None:
         """Return the next command, and wait for it until the next scan is due; None ends the worker. Of
-        successive parameter changes (a slider drag) the last one is returned.
+        successive parameter changes (a slider drag) or seeks (the timeline) the last one is returned.
 
         Raises:
             queue.Empty: Work is due (see `_map`): a scan, a part of a rerun, the preparation, or listening in
@@ -122,9 +125,9 @@ class WorkerLoop:
                 self._taken.append(self._commands.get_nowait())
         command = self._taken.popleft()
         while (
-            isinstance(command, protocol.SetParameters)
+            isinstance(command, protocol.SetParameters | protocol.Seek)
             and self._taken
-            and isinstance(self._taken[0], protocol.SetParameters)
+            and type(self._taken[0]) is type(command)
         ):
             command = self._taken.popleft()
         return command
@@ -179,7 +182,7 @@ class WorkerLoop:
             self._replay.mapped(frame.stamp_ns, now)
         if hurried and self._session.pace != "hurry":  # arrived: time counts from here
             self._replay.release()
-        if hurried and self._session.pace == "hurry" and now < self._glimpse_at:
+        if hurried and self._session.pace == "hurry" and (now < self._glimpse_at or self._session.is_shown):
             return
         self._glimpse_at = now + _GLIMPSE_S
         self._show(self._session.frame)
@@ -253,9 +256,9 @@ class WorkerLoop:
                 session.pause()
             case protocol.Advance(scans=scans):
                 self._held = True
-                session.advance(scans)
+                self._show(session.advance(scans))
             case protocol.Seek(time_s=time_s):
-                session.seek(time_s)
+                self._show(session.seek(time_s))
             case protocol.SetSpeed(factor=factor):
                 self._replay.speed = factor
             case protocol.SetParameters(values=values, revision=revision, whole=whole, step=step):
@@ -351,11 +354,10 @@ class WorkerLoop:
         return self._reported is not None and self._reported[0].detail == _COMPILING
 
     def _show(self, frame: Frame | None) -> None:
-        """Queue a frame with the path and the confirmation times; nothing for None or without a run."""
-        run, path = self._session.run, self._session.path
-        if frame is not None and run is not None and path is not None:
-            confirmed_s = run.confirmed_s(frame.trees)
-            self._put(protocol.Shown(self._run, self._session.time_s, frame, 0, path, confirmed_s))
+        """Queue the frame of the session with the path and the confirmation times; nothing for None."""
+        session, path = self._session, self._session.path
+        if frame is not None and path is not None:
+            self._put(protocol.Shown(self._run, session.time_s, frame, 0, path, session.confirmed_s))
 
     def _report(self) -> None:
         """Queue the present status."""
@@ -444,7 +446,7 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
                 ticket, camera=camera_picture(None if run is None else run.source, stamp_ns)
             )
         case protocol.AskTree(tree=tree):
-            return protocol.Answer(ticket, tree=tree_story(run, tree))
+            return protocol.Answer(ticket, tree=tree_story(run, session.frame, tree))
         case protocol.AskCluster(scan=scan, cluster=cluster):
             frame = recent.find(question.run, scan)
             if frame is None:

@@ -14,6 +14,7 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from app.explain.history import TreeHistory
+from app.worker.frame_store import FrameStore
 from app.worker.protocol import MapChanges, TreeChange
 from app.worker.tree_numbers import SAME
 from pipeline.config import Parameters
@@ -23,7 +24,7 @@ from pipeline.mapper import Mapper, MapperState
 from pipeline.remapping import ClusterTable, Rerun
 from pipeline.remapping.rerun import Segment
 from pipeline.slam import EstimatedPath, Genealogy, KeyframeGraph
-from pipeline.types.records import Columns, Float, Frame, Step, Trees, Verdict
+from pipeline.types.records import Columns, Float, Frame, Path, Step, Trees, Verdict
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
 NS = 1_000_000_000
@@ -38,12 +39,14 @@ class MappingRecord:
         confirmed_s: Time at which each tree was first confirmed, by its number [s since the first scan].
         clusters: Clusters of all scans.
         time_s: Time of the last added scan [s since the first scan].
+        frames: Frames of all scans; None if they are not stored.
     """
 
     history: TreeHistory = field(default_factory=TreeHistory)
     confirmed_s: dict[int, float] = field(default_factory=dict)
     clusters: ClusterTable = field(default_factory=ClusterTable)
     time_s: float = -math.inf
+    frames: FrameStore | None = None
 
     def add(self, frame: Frame, start_ns: int) -> None:
         """Add the results of a scan. If the run went back, the entries of this scan and of later ones are
@@ -62,6 +65,17 @@ class MappingRecord:
         for number in frame.trees.number[frame.trees.confirmed].tolist():
             self.confirmed_s.setdefault(number, time_s)
 
+    def store(self, frame: Frame, path: Path, *, own_numbers: bool = False) -> None:
+        """Store the scan that was added last, unless it is stored. Arguments as in `FrameStore.put`."""
+        if self.frames is not None:
+            self.frames.put(frame, path, self.time_s, self.confirmed(frame.trees), own_numbers=own_numbers)
+
+    def confirmed(self, trees: Trees) -> Float:
+        """Return the time at which each tree was first confirmed [s since the first scan], shape (T,); NaN
+        for trees that never were."""
+        known = self.confirmed_s
+        return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
+
     def ended(self, trees: Trees) -> dict[int, tuple[float, float]]:
         """Return the last position of each tree that was confirmed once and is not among `trees`, by its
         number [m]."""
@@ -75,6 +89,8 @@ class MappingRecord:
             number_of: New number by old number.
         """
         self.history.renumber(number_of)
+        if self.frames is not None:
+            self.frames.renumber(number_of)
         self.confirmed_s = {number_of[k]: at for k, at in self.confirmed_s.items() if k in number_of}
 
 
@@ -97,15 +113,17 @@ class RunMap:
     record: MappingRecord = field(default_factory=MappingRecord)
 
     @classmethod
-    def fresh(cls, mapper: Mapper, parameters: Parameters) -> RunMap:
+    def fresh(cls, mapper: Mapper, parameters: Parameters, frames: FrameStore | None) -> RunMap:
         """Return a map without scans.
 
         Args:
             mapper: A mapper before its first scan.
             parameters: Parameters from the first scan onwards.
+            frames: Stores its frames; None stores none.
         """
         state = mapper.snapshot()
-        return cls(ParameterHistory(parameters), mapper, Snapshots(state), state)
+        record = MappingRecord(frames=frames)
+        return cls(ParameterHistory(parameters), mapper, Snapshots(state), state, record)
 
 
 class Remapping:
@@ -114,14 +132,15 @@ class Remapping:
     Args:
         rerun: The rerun, with a fresh mapper.
         start_ns: Time of the first scan [ns].
+        frames: Stores the frames of the new map; None stores none.
 
     Attributes:
         map: The new map, as far as it goes.
     """
 
-    def __init__(self, rerun: Rerun, start_ns: int) -> None:
+    def __init__(self, rerun: Rerun, start_ns: int, frames: FrameStore | None = None) -> None:
         self.rerun = rerun
-        self.map = RunMap.fresh(rerun.mapper, rerun.mapper.parameters)
+        self.map = RunMap.fresh(rerun.mapper, rerun.mapper.parameters, frames)
         self._start_ns = start_ns
 
     def work(self, scans: int, until: int) -> bool:
@@ -141,7 +160,9 @@ class Remapping:
         for _ in range(min(scans, until - rerun.done)):
             if snapshots.is_due(rerun.done):
                 snapshots.offer(rerun.done, rerun.mapper.snapshot())
-            self.map.record.add(rerun.map_next(), self._start_ns)
+            frame = rerun.map_next()
+            self.map.record.add(frame, self._start_ns)
+            self.map.record.store(frame, rerun.mapper.path, own_numbers=True)
         return rerun.done == until
 
     def finish(self) -> RunMap:

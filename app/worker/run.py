@@ -10,13 +10,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path as FilePath
 
-import numpy as np
+import msgspec
 
 from app.common.timers import Stopwatch
 from app.explain.history import TreeHistory
 from app.robot.source import LiveSource
 from app.sources.request import with_odometry
 from app.worker.cursor import Cursor, LiveCursor
+from app.worker.frame_store import FrameStore, StepStore
+from app.worker.protocol import Shown
 from app.worker.remap import (
     NOT_OF_THE_MAP,
     Remapping,
@@ -54,6 +56,7 @@ class Run:
         odometry: Description of the source of motion.
         reread: Returns the steps from the first scan; None for a live run.
         caches: Caches of the segmented scans of this source.
+        new_frames: Returns a store for the frames of a map; None if they are not stored.
 
     Attributes:
         frame: Result of the current scan; None before the first.
@@ -71,6 +74,7 @@ class Run:
         odometry: str = "",
         reread: Reread | None = None,
         caches: ScanCaches | None = None,
+        new_frames: Callable[[], FrameStore | None] = lambda: None,
     ) -> None:
         self.source = source
         self.odometry = odometry
@@ -79,7 +83,8 @@ class Run:
         self.current = -1
         self.is_bare = False
         self._cursor = cursor
-        self._map = RunMap.fresh(make_mapper(parameters), parameters)
+        self._new_frames = new_frames
+        self._map = RunMap.fresh(make_mapper(parameters), parameters, new_frames())
         self._step: Step | None = None
         self._broken = False
         self._make_mapper, self._reread = make_mapper, reread
@@ -98,8 +103,7 @@ class Run:
     def confirmed_s(self, trees: Trees) -> Float:
         """Return the time at which each tree was first confirmed [s since the first scan], shape (T,); NaN
         for trees that never were."""
-        known = self._map.record.confirmed_s
-        return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
+        return self._map.record.confirmed(trees)
 
     @property
     def start_ns(self) -> int:
@@ -186,14 +190,31 @@ class Run:
         with self.stopwatch.whole_scan():
             frame = self._process(mapper, step, hurried=hurried)
         self._broken = False
+        record = self._map.record
         if new_map:
-            record = self._map.record
             record.renumber(self._numbers.begin_map(frame.trees, record.ended(frame.trees)))
         self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
         self._step, self.current = step, step.index
         self._sample.offer(step)
-        self._map.record.add(self.frame, self.start_ns)
+        record.add(self.frame, self.start_ns)
+        record.store(self.frame, mapper.path)
         return self.frame
+
+    def kept(self, index: int) -> Shown | None:
+        """Return the results of a scan that was mapped, without mapping it again; its points are segmented
+        again. None if they are not stored. The run does not change."""
+        frames = self._map.record.frames
+        shown = None if frames is None else frames.read(index)
+        step = None if shown is None else self._cursor.stored(index)
+        if shown is None or step is None:
+            return None
+        mapper, wanted = self._map.mapper, self._map.parameters.at(index)
+        if mapper.parameters != wanted:
+            mapper = self._make_mapper(wanted)
+        with self.stopwatch.aside():
+            scan = mapper.segment(step)
+        frame = replace(shown.frame, raw=scan.raw, filtered=scan.filtered, labels=scan.labels)
+        return msgspec.structs.replace(shown, frame=frame)
 
     def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> Frame:
         """Return the result of a step, and cache its segmented scan.
@@ -219,7 +240,9 @@ class Run:
         self._preview = self._preview_of(parameters, mapper)
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
         self._remapping = Remapping(
-            Rerun(mapper, self._caches.of(parameters), self._reread, segment_ahead), self.start_ns
+            Rerun(mapper, self._caches.of(parameters), self._reread, segment_ahead),
+            self.start_ns,
+            self._new_frames(),
         )
 
     def _preview_of(self, parameters: Parameters, mapper: Mapper) -> Trees | None:
@@ -281,6 +304,7 @@ class Run:
             raise
         if not finished:
             return None
+        self._close_frames()
         self._remapping, self._map = None, remapping.finish()
         self._cache = self._caches.of(self._map.parameters.at(self.current))
         return self._map_step(self._step, new_map=True), self._map.record.confirmed_s
@@ -346,13 +370,22 @@ class Run:
         changes = self._map.parameters.set_from(index, parameters)
         if changes:
             self._map.snapshots.forget_after(index)
+            if self._map.record.frames is not None:
+                self._map.record.frames.forget_from(index)
         return changes
 
     def close(self) -> None:
-        """Cancel a rerun, and close the source and the scan caches."""
+        """Cancel a rerun, close the source and the scan caches, and delete the stored frames and steps."""
         self.cancel_remapping()
+        self._close_frames()
         self._caches.close()
+        self._cursor.close()
         self.source.close()
+
+    def _close_frames(self) -> None:
+        """Delete the stored frames of the present map."""
+        if self._map.record.frames is not None:
+            self._map.record.frames.close()
 
 
 def open_run(
@@ -391,12 +424,13 @@ def open_run(
     run = Run(
         moving,
         lambda parameters: make_mapper(moving.description, parameters, seed, stopwatch),
-        Cursor(moving, chosen.steps) if live is None else LiveCursor(live, chosen, moving),
+        Cursor(moving, chosen.steps, StepStore(LARGE)) if live is None else LiveCursor(live, chosen, moving),
         parameters,
         stopwatch,
         chosen.words,
         reread=None if live is not None else lambda: steps(moving.records(None), odometry=chosen.steps),
         caches=caches,
+        new_frames=lambda: FrameStore(LARGE) if live is None else None,  # a live run does not step back
     )
     return run, (*source.description.warnings, *([chosen.warning] if chosen.warning else []))
 

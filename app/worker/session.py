@@ -18,7 +18,7 @@ from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.worker.inventory_run import CloudSource, InventoryRun
-from app.worker.protocol import LONGEST_S, CameraPicture, CloudFrame, MapChanges, Opened, State, Status
+from app.worker.protocol import LONGEST_S, CameraPicture, CloudFrame, MapChanges, Opened, Shown, State, Status
 from app.worker.remap import MapComparison
 from app.worker.run import LARGE, MakeMapper, Run, open_run
 from pipeline.config import Parameters
@@ -28,7 +28,7 @@ from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SHOWN_NS, PictureSource
 from pipeline.io.readers.ros_messages import COMPRESSED_IMAGE, IMAGE
 from pipeline.odometry.odometry_override import OdometryOverride
-from pipeline.types.records import Frame, Path, Trees
+from pipeline.types.records import Float, Frame, Path, Trees
 
 OpenSource = Callable[[str, SourceOptions], Source | LiveSource]
 Pace = Literal["idle", "replay", "hurry", "live"]
@@ -79,6 +79,7 @@ class Session:
         self._state: State = "starting"
         self._detail = ""
         self._target = SeekTarget()
+        self._kept: Shown | None = None  # the sought scan, as long as the mapper is on its way to it
         self._comparison = MapComparison()
         self._remaps_on_arrival = False
         self._warnings: dict[str, None] = {}
@@ -99,17 +100,38 @@ class Session:
 
     @property
     def frame(self) -> Frame | None:
-        """Frame of the current scan; None without a run, or before its first scan."""
+        """Frame of the current scan, or of the sought scan if it was mapped; None without a run, or before
+        its first scan."""
+        if self._kept is not None:
+            return self._kept.frame
         return self._run.frame if self._run else None
 
     @property
     def path(self) -> Path | None:
-        """Path up to the current scan, without rows before its first scan; None without a run."""
+        """Path up to the scan of `frame`, without rows before its first scan; None without a run."""
+        if self._kept is not None:
+            return self._kept.path
         return self._run.path if self._run else None
 
     @property
+    def confirmed_s(self) -> Float | None:
+        """Confirmation time of each tree of `frame` [s since the first scan]; None without a frame."""
+        if self._kept is not None:
+            return self._kept.confirmed_s
+        return (
+            None
+            if self._run is None or self._run.frame is None
+            else self._run.confirmed_s(self._run.frame.trees)
+        )
+
+    @property
+    def is_shown(self) -> bool:
+        """Whether a sought scan is shown from its stored results, while the mapper is on its way to it."""
+        return self._kept is not None
+
+    @property
     def time_s(self) -> float:
-        """Time of the current scan since the first scan of the run [s]; 0 before the first scan."""
+        """Time of the scan of `frame` since the first scan of the run [s]; 0 before the first scan."""
         frame = self.frame
         return 0.0 if self._run is None or frame is None else (frame.stamp_ns - self._run.start_ns) / _NS
 
@@ -264,26 +286,46 @@ class Session:
         if self._state == "playing":
             self._state = "paused"
 
-    def advance(self, scans: int) -> None:
+    def advance(self, scans: int) -> Frame | None:
         """Pause and seek a number of scans forward, or back if it is negative, from the sought scan if there
         is one, else from the current one; at most back to the first scan. A live run only gets a message that
-        it cannot seek; nothing happens without a run."""
+        it cannot seek; nothing happens without a run.
+
+        Returns:
+            The sought scan if it was mapped, see `is_shown`; else None.
+        """
         if self._run is None or self._is_live():
-            return
+            return None
         here = self._run.current if self._target.index is None else self._target.index
         self._settle()
         self._target.to_scan(max(0, here + scans))
+        return self._show_kept(self._run)
 
-    def seek(self, time_s: float) -> None:
+    def seek(self, time_s: float) -> Frame | None:
         """Seek to the last scan not later than a time; a playing run then plays on, any other is paused.
         Times are clipped to 0 to LONGEST_S; NaN and infinity are ignored. A live run only gets a message that
-        it cannot seek."""
+        it cannot seek.
+
+        Returns:
+            The sought scan if it was mapped, see `is_shown`; else None.
+        """
         if self._run is None or not math.isfinite(time_s) or self._is_live():
-            return
+            return None
         if self._state != "playing":
             self._settle()
         seconds = min(max(time_s, 0.0), LONGEST_S)
         self._target.to_time(self._run, self._run.start_ns + round(seconds * _NS))
+        return self._show_kept(self._run)
+
+    def _show_kept(self, run: AnyRun) -> Frame | None:
+        """Show the sought scan from its stored results, and return it. None if it is the current scan, is not
+        stored, or would be mapped with other parameters on arrival."""
+        index, self._kept = self._target.index, None
+        if index is None or (index == run.current and run.is_whole):
+            return None
+        if run.parameters_at(index) == self._parameters:
+            self._kept = run.kept(index)
+        return self.frame if self.is_shown else None
 
     def set_parameters(
         self, parameters: Parameters, revision: int, *, whole: bool = False, step: int | None = None
@@ -361,6 +403,7 @@ class Session:
         stays open until `play` or `open`."""
         self._state, self._detail = "failed", detail
         self._target.forget()
+        self._kept = None
         if self._run is not None:
             self._run.cancel_remapping()
 
@@ -375,10 +418,10 @@ class Session:
             time_s=self.time_s,
             warnings=list(self._warnings),
             revision=self._revision,
-            going_to=self._target.words(run),
-            going_to_s=self._target.time_s(run),
+            going_to="" if self.is_shown else self._target.words(run),
+            going_to_s=None if self.is_shown else self._target.time_s(run),
         )
-        status = status if run is None else _with_run(status, run)
+        status = status if run is None else _with_run(status, run, self.frame, self.path)
         return status if robot is None else with_robot(status, robot)
 
     def close(self) -> None:
@@ -406,6 +449,7 @@ class Session:
         """Stop at the sought scan and return its frame; None before the first scan. Parameters that were
         changed during the seek apply from this scan onwards."""
         self._target.forget()
+        self._kept = None
         changed = run.use(self._parameters, run.current)
         if self._remaps_on_arrival:
             self._remaps_on_arrival = False
@@ -427,6 +471,7 @@ class Session:
         self._remaps_on_arrival = False
         self._warnings.clear()
         self._target.forget()
+        self._kept = None
 
     def _warn(self, warnings: Iterable[str]) -> None:
         """Add warnings, each once and the newest last; only the last 20 are kept."""
@@ -455,11 +500,17 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
     )
 
 
-def _with_run(status: Status, run: AnyRun) -> Status:
-    """Return the status with the fields that the run and its source determine."""
+def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | None) -> Status:
+    """Return the status with the fields that the run and its source determine.
+
+    Args:
+        status: The status.
+        run: The run.
+        frame, path: The shown scan with the path up to it; None before the first scan.
+    """
     description = run.source.description
     losses = tuple(f"{reason} ({n})" for reason, n in run.source.losses.items() if n)
-    frame, distance_m = run.frame, round(driven(run.path)[1], 3)
+    distance_m = 0.0 if path is None else round(driven(path)[1], 3)
     if isinstance(run, InventoryRun):
         status = _with_cloud(status, run)
     return replace(

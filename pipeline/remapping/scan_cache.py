@@ -12,16 +12,11 @@ import contextlib
 import hashlib
 import json
 import os
-import shutil
 import struct
-import weakref
-import zlib
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryFile, gettempdir
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -33,6 +28,7 @@ from pipeline.config import Parameters
 from pipeline.front_end import ColumnInput, SegmentedScan
 from pipeline.geometry.quantisation import POINT
 from pipeline.io.atomic_files import hold, is_held
+from pipeline.io.block_file import MOST_BYTES, BinaryFile, BlockFile, unnamed_file
 from pipeline.io.checkpoints.codec import decode, encode
 from pipeline.types.records import Float, Float32, Int32, Scan, Step, SynchroniserState, UInt16
 
@@ -127,20 +123,12 @@ def unpack(block: bytes | bytearray) -> tuple[Step, SegmentedScan]:
     return packed.step, replace(packed.scan, column_input=None if given is None else given.unpacked())
 
 
-MOST_BYTES = 4 << 30  # of one file
 MOST_IN_FOLDER = 8 << 30  # of all named files of a folder
 MOST_OPEN = 3  # files of one source
-SPARE_BYTES = 2 << 30  # of the disk are left to recordings and to other programs
-SCANS_BETWEEN_CHECKS = 50  # of the free space of the disk
 SUFFIX = ".scans"
 MAGIC = b"stemmap scans 4\n"
-ROW = np.dtype([("index", "<i8"), ("length", "<i8"), ("block_crc", "<u4"), ("row_crc", "<u4")])
-
 SEGMENTATION_STAGES = ("acquisition", "filters", "ground", "clustering", "shape")
 SEGMENTATION_CLASSIFICATION = ("method", "every")  # they decide which scans have input for the columns
-DAMAGED = "the scan cache of this recording is damaged: {} scans are intact, the others are processed again"
-
-_File = Any  # binary, with seek, write and readinto; its class depends on the operating system
 
 
 def segmentation_key(parameters: Parameters) -> bytes:
@@ -153,77 +141,19 @@ def segmentation_key(parameters: Parameters) -> bytes:
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).digest()[:16]
 
 
-class ScanCache:
-    """Segmented scans of one source under one set of segmentation parameters.
-
-    Args:
-        file: An open file that holds the header, or is empty; None where no file can be had.
-        header: Header of the file.
-        folder: Folder of the file, of which the free space is checked.
-        most: Size that the file may reach. A scan that does not fit is not stored.
-
-    Attributes:
-        refusal: Why some scans are not stored, for people; empty where all are.
-        notice: What is wrong with the file that was found, for people; empty where nothing is.
-    """
-
-    def __init__(
-        self, file: _File, header: bytes, folder: Path | None = None, most: int = MOST_BYTES
-    ) -> None:
-        """Open the cache and find its scans. A file with another header is emptied; one that is cut or
-        damaged is cut after the last valid row, with a `notice`. Errors of the disk appear in `refusal`."""
-        self._file: _File = file
-        self._folder, self._most = folder, most
-        self._rows: dict[int, tuple[int, Any]] = {}  # by scan: position of its block, and its row
-        self.refusal = self.notice = ""
-        self._end = len(header)
-        if file is None:
-            self.refusal = "no scan is cached: no folder can be written to"
-            return
-        weakref.finalize(self, file.close)
-        try:
-            self._open(header)
-        except OSError as error:
-            self.refusal = f"no scan is cached: {error.strerror or error}"
-
-    def __len__(self) -> int:
-        """Return the number of stored scans."""
-        return len(self._rows)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of the file [bytes]."""
-        return self._end
-
-    def has_all(self, scans: int) -> bool:
-        """Return whether the scans 0 to `scans` - 1 are all stored."""
-        return len(self._rows) >= scans and all(index in self._rows for index in range(scans))
+class ScanCache(BlockFile):
+    """Segmented scans of one source under one set of segmentation parameters; see `BlockFile`."""
 
     def put(self, step: Step, scan: SegmentedScan) -> None:
         """Store a scan at the end of the file, unless its number is stored already or the cache is closed. If
         the block, the file or the disk is full, or writing fails, it is not stored and `refusal` contains the
         reason; nothing is raised."""
-        if self._file is None or step.index in self._rows:
+        if step.index in self:
             return
         try:
-            block = pack(step, scan)
-            if self._end + ROW.itemsize + len(block) > self._most:
-                self._refuse(step.index, f"the cache is limited to {self._most / 1e9:.1f} GB")
-                return
-            if step.index % SCANS_BETWEEN_CHECKS == 0 and free_space(self._folder) < SPARE_BYTES + len(block):
-                self._refuse(step.index, f"less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left")
-                return
-            row = np.array((step.index, len(block), zlib.crc32(block), 0), ROW)
-            row["row_crc"] = _checksum(row)
-            _write(self._file, self._end, row.tobytes() + block)
+            self.put_block(step.index, pack(step, scan))
         except TooLargeError as error:
             self._refuse(step.index, str(error))
-            return
-        except OSError as error:
-            self._refuse(step.index, error.strerror or str(error))
-            return
-        self._rows[step.index] = (self._end + ROW.itemsize, row)
-        self._end += ROW.itemsize + len(block)
 
     def read(self, index: int, stamp_ns: int | None = None) -> tuple[Step, SegmentedScan] | None:
         """Return a scan without its raw points. None if it is not stored, the cache is closed, or its time
@@ -235,56 +165,8 @@ class ScanCache:
             index: Number of the scan.
             stamp_ns: Time that it must have [ns]; None accepts any.
         """
-        if index not in self._rows or self._file is None:
-            return None
-        at, row = self._rows[index]
-        block = bytearray(int(row["length"]))
-        try:
-            if _read(self._file, at, block) != int(row["block_crc"]):
-                raise ValueError("the checksum is wrong")
-            step, scan = unpack(block)
-        except (OSError, ValueError, KeyError, TypeError, RuntimeError):
-            del self._rows[index]
-            self.notice = DAMAGED.format(len(self._rows))
-            return None
-        return (step, scan) if stamp_ns in (None, step.scan.stamp_ns) else None
-
-    def close(self) -> None:
-        """Close the file; a file without a name is deleted. Later calls of `put` and `read` do nothing."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-    def _open(self, header: bytes) -> None:
-        """Read the rows of the file, without their blocks. A file without this header is emptied; the part
-        after the last valid row is cut off.
-
-        Raises:
-            OSError: The disk refuses.
-        """
-        size = self._file.seek(0, os.SEEK_END)
-        start = bytearray(len(header))
-        if size < len(header) or _read(self._file, 0, start) < 0 or start != header:
-            self._file.truncate(0)
-            _write(self._file, 0, header)
-            return
-        while self._end + ROW.itemsize <= size:
-            data = bytearray(ROW.itemsize)
-            _read(self._file, self._end, data)
-            row: Any = np.frombuffer(data, ROW)[0]
-            length, at = int(row["length"]), self._end + ROW.itemsize
-            if row["row_crc"] != _checksum(row) or length < 0 or at + length > size:
-                break
-            self._rows[int(row["index"])] = (at, row)
-            self._end = at + length
-        if self._end < size:
-            self.notice = DAMAGED.format(len(self._rows))
-            self._file.truncate(self._end)
-
-    def _refuse(self, index: int, why: str) -> None:
-        """Set `refusal` to the first scan that is not stored and the reason; later ones may be smaller and
-        fit."""
-        self.refusal = self.refusal or f"scan {index} and possibly later scans are not cached: {why}"
+        found = self.read_block(index, unpack)
+        return found if found is not None and stamp_ns in (None, found[0].scan.stamp_ns) else None
 
 
 class ScanCaches:
@@ -324,22 +206,16 @@ class ScanCaches:
         process has it, otherwise in a file without a name."""
         identity = hashlib.sha256(self._source.encode() + key + _code_digest()).digest()
         header = MAGIC + identity
-        file: _File = None
+        file: BinaryFile = None
         if self._source and self._folder is not None:
             with contextlib.suppress(OSError):  # the disk refuses, or another process has the file
                 file = _named_file(self._folder, identity)
         if file is None:
-            file = _unnamed_file(self._folder)
+            file = unnamed_file(self._folder)
         return ScanCache(file, header, self._folder, self._most)
 
 
-def free_space(folder: Path | None) -> int:
-    """Return the number of free bytes on the disk of a folder; that of temporary files for None or a missing
-    folder."""
-    return shutil.disk_usage(folder if folder is not None and folder.is_dir() else gettempdir()).free
-
-
-def _named_file(folder: Path, identity: bytes) -> _File:
+def _named_file(folder: Path, identity: bytes) -> BinaryFile:
     """Return the open file of an identity (32 bytes), which this process locks. Creates the folder and the
     file, and removes old files of the folder, see `_make_room`.
 
@@ -357,15 +233,6 @@ def _named_file(folder: Path, identity: bytes) -> _File:
         raise
     path.touch()
     return file
-
-
-def _unnamed_file(folder: Path | None) -> _File:
-    """Return an open file without a name in the folder, or else in the folder of the system; None if neither
-    is possible."""
-    for place in (folder, None):
-        with contextlib.suppress(OSError):
-            return TemporaryFile(dir=place, buffering=0)
-    return None
 
 
 def _make_room(folder: Path, keep: Path) -> None:
@@ -395,36 +262,3 @@ def _code_digest() -> bytes:
         state.update(path.relative_to(folder).as_posix().encode())
         state.update(path.read_bytes())
     return state.digest()
-
-
-def _checksum(row: Any) -> int:  # noqa: ANN401 - of ROW
-    """Return the CRC-32 of a row (ROW) without its last field, which contains it."""
-    return zlib.crc32(row.tobytes()[:-4])
-
-
-def _write(file: _File, at: int, block: bytes) -> None:
-    """Write a block completely at a position of the file [bytes].
-
-    Raises:
-        OSError: The disk refuses.
-    """
-    file.seek(at)
-    view = memoryview(block)
-    while view:
-        view = view[file.write(view) or 0 :]
-
-
-def _read(file: _File, at: int, into: bytearray) -> int:
-    """Fill a block from a position of the file [bytes]; return its CRC-32, -1 if the file ends before.
-
-    Raises:
-        OSError: The disk refuses.
-    """
-    file.seek(at)
-    view = memoryview(into)
-    while view:
-        read = file.readinto(view) or 0
-        if not read:
-            return -1
-        view = view[read:]
-    return zlib.crc32(into)

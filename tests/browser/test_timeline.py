@@ -90,7 +90,10 @@ UNDER = """async changes => {
       changed('status');
       await new Promise(done => setTimeout(done, 400));
     }
-    return [text('#state b'), text('#notice p'), Number(document.querySelector('#timeline').value)];
+    const line = document.querySelector('#seeking');
+    const told = [line.ariaLabel, line.ariaValueNow, line.firstChild.style.width];
+    const seeking = line.hidden ? '' : told.join(' ');
+    return [text('#state b'), text('#notice p'), Number(document.querySelector('#timeline').value), seeking];
   };
   const told = await tell();
   state.status = before;
@@ -109,8 +112,9 @@ def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: 
         "time_s": 12.0,
         "detail": "Going to 0:40 …",
     }
-    word, notice, thumb = page.evaluate(UNDER, going)
-    assert (word, notice) == ("Seeking", "Going to 0:40 … Mapped up to 0:12.0.")
+    word, notice, thumb, seeking = page.evaluate(UNDER, going)
+    assert (word, notice) == ("Seeking", "")  # nothing covers the buttons of the map
+    assert seeking == "Mapping up to 0:40 30 30%"
     assert thumb == pytest.approx(40.0, abs=0.05)  # to a step of the line
     compiling = {
         "state": "waiting",
@@ -118,8 +122,8 @@ def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: 
         "compiling_since_s": time.time() - 100.0,
         "compiled": 0.437,
     }
-    word, notice, _ = page.evaluate(UNDER, compiling)
-    assert word == "Waiting"
+    word, notice, _, seeking = page.evaluate(UNDER, compiling)
+    assert (word, seeking) == ("Waiting", "")
     passed = re.search(r"Compiling\. 43 % of the kernels are compiled\. (\d+) s so far", notice)
     assert passed is not None, notice
     assert int(passed[1]) >= 98, "from its start, not from the opening of the page"

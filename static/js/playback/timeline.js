@@ -10,6 +10,8 @@ import { newestFirst } from "../core/timing.js";
 const ICONS = { play: "M5 3l12 7-12 7z", pause: "M5 3h4v14H5zM12 3h4v14h-4z" };
 let dragging = false;
 
+// Whether the run is on its way to a scan that takes long to reach.
+export const isGoing = (status) => Boolean(status?.going_far);
 export const playing = () => ["playing", "waiting"].includes(state.status?.state);
 const ready = () => playing() || ["paused", "finished"].includes(state.status?.state);
 export const togglePlay = () => ready() && send(playing() ? "pause" : "play");
@@ -44,9 +46,22 @@ function show() {
   }
   line.setAttribute("aria-valuetext", clock(Number(line.value)));
   setText(byId("time-end"), status.live ? "live" : status.end_s === null && status.scan_index >= 0 ? "open end" : clock(status.end_s));
+  showSeeking(status);
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(status.speed);
   showWarnings(status.warnings ?? []);
+}
+
+// How far the scans up to a distant target are mapped.
+function showSeeking(status) {
+  const line = byId("seeking");
+  line.hidden = !isGoing(status);
+  if (line.hidden) return;
+  const percent = Math.floor(100 * Math.min(status.time_s / Math.max(status.going_to_s ?? status.end_s ?? 0, 1e-3), 1));
+  line.setAttribute("aria-label", `Mapping up to ${status.going_to}`);
+  line.setAttribute("aria-valuenow", String(percent));
+  line.title = `Mapping up to ${status.going_to}: ${percent} %`;
+  line.firstElementChild.style.width = `${percent}%`;
 }
 
 function showWarnings(warnings) {

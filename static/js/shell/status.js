@@ -1,9 +1,10 @@
 // The status strip and the notice below it.
 
 import { byId, el, setText } from "../core/dom.js";
-import { capital, clock, figure, NONE } from "../core/format.js";
+import { capital, figure, NONE } from "../core/format.js";
 import { changed, isCloud, on, state } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
+import { isGoing } from "../playback/timeline.js";
 
 const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
@@ -104,9 +105,6 @@ function showName(title) {
   else if (name.textContent !== title) name.replaceChildren(el("span", { text: title.slice(0, cut) }), el("i", { text: title.slice(cut) }));
 }
 
-// Whether the run is on its way to a distant scan.
-const isGoing = (status) => Boolean(status?.going_far);
-
 // The state, with the name of the robot unless it failed: "Live robot1".
 function stateWord(status) {
   if (isGoing(status)) return "Seeking";
@@ -170,7 +168,7 @@ function compilingFor({ compiling_since_s: since, compiled }) {
 // The changing part of the notice, which a screen reader does not announce.
 function progressOf(status) {
   if (!state.connected || !status?.detail) return "";
-  return isGoing(status) ? ` Mapped up to ${clock(status.time_s)}.` : compilingFor(status);
+  return compilingFor(status);
 }
 
 // The clocks of server and browser may differ; the date of an answer is the server's.
@@ -190,7 +188,7 @@ function showNotice(quiet) {
   const text = !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. The last state is shown; the page reconnects by itself.`
     : quiet ? `No data for ${seconds(state.heardAt)} s. The last state is shown.`
-    : status?.detail ?? "";
+    : isGoing(status) ? "" : status?.detail ?? ""; // the line above the timeline shows the progress of a seek
   notice.hidden = !text;
   const failed = state.connected && status?.state === "failed";
   notice.classList.toggle("failed", failed);

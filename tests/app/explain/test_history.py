@@ -36,10 +36,10 @@ def test_what_is_told_is_the_newest_pass_up_to_the_newest_scan(scans: list[int])
     for turn, index in enumerate(scans):
         history.record(seen(index, float(turn)), START_NS)
         known = {k: x for k, x in known.items() if k < index} | {index: float(turn)}
-    told = history.of(1)
+    told = history.of(1, 10**6)
     assert told.x == [known[k] for k in sorted(known)]
     assert told.time_s == pytest.approx([0.1 * k for k in sorted(known)])
-    assert history.of(3).x == []
+    assert history.of(3, 10**6).x == []
 
 
 def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch):
@@ -48,7 +48,7 @@ def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch
     for index in range(3000):
         history.record(seen(index, float(index), observations=index + 1), START_NS)
         assert len(history) <= 200
-    told = history.of(2)
+    told = history.of(2, 10**6)
     assert told.x[:10] == [float(k) for k in range(10)]
     assert told.x[-1] > 2500
 
@@ -57,7 +57,7 @@ def test_a_long_history_is_told_with_its_ends():
     history = TreeHistory()
     for index in range(1500):
         history.record(seen(index, float(index)), START_NS)
-    told = history.of(1)
+    told = history.of(1, 10**6)
     assert len(told.x) <= 200
     assert told.x[0] == 0.0
     assert told.x[-1] == 1499.0

@@ -25,6 +25,7 @@ from app.robot.source import FULL, REFUSED, SPARED, LiveSource, PictureStore
 from app.robot.topics import PICTURE_TYPES, Publisher, choose
 from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
+from pipeline.io.block_file import SPARE_BYTES
 from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.camera import SHOWN_NS, Picture
 from pipeline.io.readers.container import Message
@@ -35,7 +36,6 @@ from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAG
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.io.recording import write_recording
 from pipeline.io.recording.rendering import CAMERA, with_pictures
-from pipeline.remapping.scan_cache import SPARE_BYTES
 from pipeline.types.records import Path as Way
 from pipeline.types.records import Record, Scan, Truth
 from tests.app.batch.test_tree_pictures import trees_at

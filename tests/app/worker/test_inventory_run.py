@@ -150,7 +150,7 @@ def test_other_parameters_do_not_map_the_cloud_again(session: Session) -> None:
 def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session: Session) -> None:
     frame = mapped(session)
     for row, number in enumerate(frame.trees.number.tolist()):
-        story = tree_story(session.run, number)
+        story = tree_story(session.run, session.frame, number)
         assert story.sections is not None
         assert len(story.sections) == frame.trees.observations[row]
         heights = [section.height for section in story.sections]
@@ -168,7 +168,7 @@ def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session
         assert np.isnan(story.height) == bool(story.height_hidden)
         assert story.height_hidden or story.height == pytest.approx(8.0, abs=4.0 * story.height_sigma)
     with pytest.raises(StemmapError, match="no tree 99"):
-        tree_story(session.run, 99)
+        tree_story(session.run, session.frame, 99)
 
 
 def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(session: Session) -> None:

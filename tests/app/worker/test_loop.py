@@ -138,7 +138,7 @@ def test_an_answer_that_compiled_leaves_nothing_to_wait_for(monkeypatch: pytest.
         waiting.put(message)
     driver = WorkerLoop(session, waiting, said.append)
 
-    def compile_first(_run: object, number: int) -> None:
+    def compile_first(_run: object, _frame: object, number: int) -> None:
         driver.compiling()
         raise StemmapError(f"tree {number} is not known")
 
@@ -455,7 +455,7 @@ def test_what_was_sent_can_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None
 def test_a_story_that_fails_is_logged_and_stops_nothing(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def fail(_run: object, _number: int) -> None:
+    def fail(_run: object, _frame: object, _number: int) -> None:
         raise ZeroDivisionError("on purpose")
 
     session = make_session(FakeSource(3))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+from typing import Any
+
 import numpy as np
 import pytest
 
 from app.worker.process import new_session
 from app.worker.session import Session
 from pipeline.config import Parameters
-from pipeline.types.records import Frame
+from pipeline.types.records import Float, Frame, Path
 
 URI = "sim:stand?duration=7"
 
@@ -62,3 +65,86 @@ def test_a_slider_on_the_standing_scan_and_back_leaves_no_trace(session: Session
     following = stand_at(session, 13)
     stand_at(session, 2)
     assert_same(stand_at(session, 13), following)
+
+
+def assert_equal(a: Any, b: Any, name: str = "") -> None:
+    """Records are equal in all arrays and values."""
+    if dataclasses.is_dataclass(a):
+        assert type(a) is type(b)
+        for each in dataclasses.fields(a):
+            assert_equal(getattr(a, each.name), getattr(b, each.name), f"{name}.{each.name}")
+    elif isinstance(a, np.ndarray):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+        assert a.dtype == b.dtype, name
+    else:
+        assert a == b or (a != a and b != b), (name, a, b)
+
+
+def mapped(session: Session, scans: int) -> list[tuple[Frame, Path, Float]]:
+    """Play so many scans: the frame, the path and the confirmation times at each."""
+    results = []
+    session.play()
+    for _ in range(scans):
+        frame = session.work()
+        assert frame is not None
+        assert session.path is not None
+        assert session.confirmed_s is not None
+        results.append((frame, session.path, session.confirmed_s))
+    session.pause()
+    return results
+
+
+def looked_at(session: Session, index: int) -> tuple[Frame, Path, Float]:
+    """Seek a scan without mapping: what is shown of it at once."""
+    shown = session.advance(index - session.status().scan_index)
+    assert shown is not None
+    assert shown is session.frame
+    assert session.is_shown
+    assert session.status().scan_index == index
+    assert session.status().going_to == ""
+    assert session.path is not None
+    assert session.confirmed_s is not None
+    return shown, session.path, session.confirmed_s
+
+
+def test_a_mapped_scan_is_shown_again_without_mapping(session: Session) -> None:
+    results = mapped(session, 65)
+    for index in (63, 62, 0, 31, 33, 50, 64 - 1):
+        shown = looked_at(session, index)
+        for old, new, name in zip(results[index], shown, ("frame", "path", "confirmed"), strict=True):
+            assert_equal(old, new, f"{name} {index}")
+    # The mapper arrives at the scan that is shown, and the run goes on from there.
+    before = looked_at(session, 61)
+    while session.pace == "hurry":
+        session.work()
+    assert not session.is_shown
+    for old, new in zip(before[:2], (session.frame, session.path), strict=True):
+        assert_equal(old, new)
+    session.play()
+    following = session.work()
+    assert_equal(following, results[62][0])
+
+
+def test_after_a_change_of_the_whole_run_its_scans_are_shown_with_the_new_map(session: Session) -> None:
+    mapped(session, 60)
+    other = Parameters().replace({"clustering.eps": 0.4})
+    session.set_parameters(other, 1, whole=True)
+    while session.remap(20) is None:
+        pass
+    shown = looked_at(session, 30)[0]
+    while session.pace == "hurry":
+        session.work()
+    assert session.frame is not None
+    assert_equal(shown.clusters, session.frame.clusters)
+    assert_equal(shown.estimate, session.frame.estimate)
+    np.testing.assert_array_equal(shown.filtered, session.frame.filtered)
+    np.testing.assert_array_equal(
+        shown.trees.number[shown.trees.confirmed], session.frame.trees.number[session.frame.trees.confirmed]
+    )
+
+
+def test_with_other_parameters_in_force_nothing_of_before_is_shown(session: Session) -> None:
+    mapped(session, 30)
+    session.set_parameters(Parameters().replace({"clustering.eps": 0.4}), 1)
+    assert session.advance(-10) is None  # its scan is mapped with these parameters on arrival
+    assert not session.is_shown

@@ -397,7 +397,7 @@ def test_what_was_kept_when_it_was_open_before_is_used_by_who_is_in_a_hurry(tmp_
 
 
 def test_without_room_for_the_scans_they_are_read_once_more_and_that_is_said(monkeypatch):
-    monkeypatch.setattr("pipeline.remapping.scan_cache.SPARE_BYTES", 1 << 62)
+    monkeypatch.setattr("pipeline.io.block_file.SPARE_BYTES", 1 << 62)
     with closing(new_session()) as session:
         session.open(URI, "auto", 3)
         session.set_parameters(BASE, 0)

@@ -24,6 +24,7 @@ BROWSERS = 5
 FROM_S, WINDOW_S, ROUNDS = 14.0, 8.0, 5
 IDLE_S, CHANGES, LATE, PAGES = 10.0, 30, 5, 3
 SLOWER, LATENCY_MS, IDLE_PERCENT, READY_S, LATE_S, SLIDER_MS = 5.0, 150.0, 5.0, 3.0, 2.0, 150.0  # asked for
+MAPPED_MS = 150.0
 LONGEST_S = 300.0
 
 
@@ -149,6 +150,11 @@ def _waiting(dashboard: Dashboard, returns: float) -> Table:
     page, scene = _slider_ms(dashboard)
     row("a slider's change, to the page", page, "ms", SLIDER_MS, 0.95)
     row("a slider's change, to the 3D scene", scene, "ms", SLIDER_MS, 0.95)
+    back, sought = _mapped_ms(dashboard)
+    row("a step back, to the page", back[0], "ms", MAPPED_MS, 0.95)
+    row("a step back, to the 3D scene", back[1], "ms", MAPPED_MS, 0.95)
+    row("a time that was mapped, to the page", sought[0], "ms", MAPPED_MS, 0.95)
+    row("a time that was mapped, to the 3D scene", sought[1], "ms", MAPPED_MS, 0.95)
     row("the server while a run stands, five browsers", _idle(dashboard), "% of a core", IDLE_PERCENT)
 
     dashboard.browsers.ask({"do": "browsers", "count": 0})
@@ -169,8 +175,8 @@ def _waiting(dashboard: Dashboard, returns: float) -> Table:
         tuple(rows),
         (
             "Scans and sliders are judged by the p95, all else by the median. From the server: from the "
-            "message of the mapping process to the browser's socket. A slider: from sending the change to "
-            "its answer.",
+            "message of the mapping process to the browser's socket. A slider, a step, a time: from sending "
+            "it to its answer.",
             f"A day of 10 Hz sends {864_000 * per_scan:,.0f} messages to the scene ({per_scan:.1f} a scan), "
             "which renews itself before one has to walk through more than 2,000,000: one comes right before "
             "that. The messages are real, and sent through the scene's server as fast as it can.",
@@ -196,6 +202,26 @@ def _slider_ms(dashboard: Dashboard) -> tuple[list[float], list[float]]:
         scene.append(told["scene"])
         time.sleep(0.3)
     return page[1:], scene[1:]
+
+
+def _mapped_ms(dashboard: Dashboard) -> list[tuple[list[float], list[float]]]:
+    """How long page and scene wait for a scan that was mapped before [ms]: for steps back, one soon after the
+    other, and for times all over the run."""
+    last = round(10 * (FROM_S + WINDOW_S))
+    dashboard.stand(last / 10)
+    at = dashboard.browsers.ask({"do": "status"})["scan_index"]
+    answers: list[list[dict[str, float]]] = [[], []]
+    for k in range(CHANGES):
+        step = {"type": "advance", "scans": -1}
+        answers[0].append(dashboard.browsers.ask({"do": "go", "command": step, "index": at - 1 - k}))
+        time.sleep(0.1)
+    for k in range(CHANGES):
+        # A prime number of scans on: the times are spread evenly over the run.
+        index = (at + 71 * (k + 1)) % at
+        sought = {"type": "seek", "time_s": 0.1 * index + 0.01}
+        answers[1].append(dashboard.browsers.ask({"do": "go", "command": sought, "index": index}))
+        time.sleep(0.3)
+    return [([each["map"] for each in told], [each["scene"] for each in told]) for told in answers]
 
 
 def _idle(dashboard: Dashboard) -> list[float]:

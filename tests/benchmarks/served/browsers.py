@@ -98,6 +98,8 @@ class Browsers:
                 return status
             case {"do": "change", "changes": changes}:
                 return await self._change(changes)
+            case {"do": "go", "command": command, "index": index}:
+                return await self._go(command, index)
             case {"do": "late"}:
                 return await self._late()
         raise ValueError(question)
@@ -111,6 +113,20 @@ class Browsers:
         await _until(lambda: bool(browser.maps and browser.clouds))
         (await sending).raise_for_status()
         return {"map": 1e3 * (browser.maps[0][1] - start), "scene": 1e3 * (browser.clouds[0] - start)}
+
+    async def _go(self, command: dict[str, Any], index: int) -> dict[str, Any]:
+        """Step or seek to a scan while the run stands; milliseconds until the first browser has it."""
+        (browser, *_) = self._open
+        browser.maps, browser.clouds = [], []
+        start = time.monotonic()
+        sending = asyncio.create_task(self._web.post("/api/command", json=command))
+        await _until(lambda: any(each == index for each, _ in browser.maps))
+        shown = next(at for each, at in browser.maps if each == index)
+        # The scene is drawn after the map is sent; points before that are of a scan on the way.
+        await _until(lambda: any(at >= shown for at in browser.clouds))
+        drawn = next(at for at in browser.clouds if at >= shown)
+        (await sending).raise_for_status()
+        return {"map": 1e3 * (shown - start), "scene": 1e3 * (drawn - start)}
 
     async def _late(self) -> dict[str, Any]:
         """Seconds until one that comes late has the map and the points of the scan."""

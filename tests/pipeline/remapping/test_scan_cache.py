@@ -205,7 +205,7 @@ def test_without_a_folder_to_write_to_nothing_is_stored_and_that_is_said(monkeyp
     def refused(**_: object) -> None:
         raise PermissionError
 
-    monkeypatch.setattr("pipeline.remapping.scan_cache.TemporaryFile", refused)
+    monkeypatch.setattr("pipeline.io.block_file.TemporaryFile", refused)
     with closing(ScanCaches()) as caches:
         assert len(fill(caches.of(BASE), BASE, run()[0][:2])) == 0
         assert "no folder can be written to" in caches.of(BASE).refusal
