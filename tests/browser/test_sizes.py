@@ -36,7 +36,11 @@ OVERLAPS = """() => {
 }"""
 
 
-@pytest.mark.parametrize("size", [(1440, 900), (1280, 800), (1024, 768), (390, 844)])
+# The last but one are 1600 x 900 and 1280 x 720 at a zoom of 200 %.
+SIZES = [(1440, 900), (1280, 800), (1024, 768), (820, 1180), (800, 450), (640, 360), (390, 844)]
+
+
+@pytest.mark.parametrize("size", SIZES)
 def test_nothing_overflows_the_page(chromium: Browser, server: Server, size: tuple[int, int]):
     with opened(chromium, server.link, *size, scene=size[0] == 390) as dashboard:
         dashboard.until("() => document.querySelectorAll('#trees tbody tr').length > 0")

@@ -41,7 +41,7 @@ const backToPackage = () => doing(() => post("/api/parameters/reset", { names: [
 
 export function learnSection() {
   return el("section", { class: "learn", "aria-label": "Learn" },
-    el("h3", { text: "Learn" }), el("p", { id: "learn-known", class: "note dim" }), el("div", { id: "learn-now", role: "status" }),
+    el("h2", { text: "Learn" }), el("p", { id: "learn-known", class: "note dim" }), el("div", { id: "learn-now", role: "status" }),
     el("p", { id: "learn-error", class: "error", role: "alert", hidden: true }));
 }
 

@@ -4,9 +4,11 @@ import { command, post } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { clock } from "../core/format.js";
 import { attempted, showProblem } from "../core/problem.js";
+import { roving } from "../core/roving.js";
 import { on, state } from "../core/store.js";
 
 const NAMES = { tree: "tree confirmed", warning: "warning", change: "parameters changed", health: "SLAM health", annotation: "annotated" };
+const keepTabStop = roving(byId("marks"), ".mark", "horizontal");
 let start = null; // start of a loop whose end is not set yet [s]
 
 function showMarks() {
@@ -16,10 +18,13 @@ function showMarks() {
   const key = `${end} ${events.length} ${events.at(-1)?.text} ${events.map((event) => `${event.t}${event.before ? "b" : ""}`).join()}`;
   if (lane.dataset.shown === key) return;
   lane.dataset.shown = key;
+  const focused = lane.contains(document.activeElement) ? document.activeElement.title : null;
   lane.replaceChildren(...(end > 0 ? [loopBar()] : []), ...events.map(({ t, kind, text, before }) => el("button", {
     class: `mark ${kind}${before ? " before" : ""}`, tabindex: "-1", title: `${clock(t)} ${NAMES[kind]}: ${text}${before ? " (before the last change; it is replaced when the run gets there)" : ""}`, "aria-label": `${clock(t)} ${text}`,
     style: { left: `${(100 * t) / end}%` }, onclick: () => attempted(() => command("seek", { time_s: t })),
   })));
+  keepTabStop();
+  if (focused !== null) [...lane.children].find((mark) => mark.title === focused)?.focus();
 }
 
 function loopBar() {

@@ -138,7 +138,7 @@ async function undo() {
   go(addressOf(run));
 }
 
-byId("runs").tHead.replaceChildren(el("tr", {}, ...HEADS.map(([text, cls]) => el("th", { scope: "col", class: cls, text: text || " " }))));
+byId("runs").tHead.replaceChildren(el("tr", {}, ...HEADS.map(([text, cls]) => (text ? el("th", { scope: "col", class: cls, text }) : el("td", { class: cls })))));
 byId("runs-find").addEventListener("input", fill);
 byId("runs-compare").addEventListener("click", () => go([...ticked].map((key) => `compare=${encodeURIComponent(key)}`).join("&")));
 byId("toast-undo").addEventListener("click", undo);

@@ -8,6 +8,7 @@ import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
+import { roving } from "../core/roving.js";
 import { isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
@@ -33,6 +34,7 @@ const COLUMNS = [
 ];
 const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
 const rows = new Map();
+const keepTabStop = roving(byId("trees").tBodies[0], "tr", "vertical");
 let order = { key: "number", descending: false };
 
 function dbh(tree) {
@@ -77,7 +79,7 @@ function sorted(all) {
 
 function rowOf(tree) {
   if (!rows.has(tree.number)) {
-    const row = el("tr", { tabindex: "0", "data-tree": tree.number, onclick: () => toggle(tree.number),
+    const row = el("tr", { tabindex: "-1", "data-tree": tree.number, onclick: () => toggle(tree.number),
       onkeydown: (event) => event.key === "Enter" && toggle(tree.number) }, ...COLUMNS.map(() => el("td")));
     rows.set(tree.number, row);
   }
@@ -105,6 +107,7 @@ function fill() {
     if (body.rows[place] !== row) body.insertBefore(row, body.rows[place] ?? null);
   });
   while (body.rows.length > listed.length) body.lastChild.remove();
+  keepTabStop();
   setText(byId("tree-count"), wanted ? `${listed.length} of ${all.length}` : count(all.length, "tree"));
   suitColumns();
   byId("trees").hidden = !listed.length;

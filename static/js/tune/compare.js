@@ -133,7 +133,7 @@ function fillComparison({ pictures, differences }, nameA, nameB) {
 const row = (name, a, b, cls = "") => el("tr", { class: `${cls} ${a === b ? "" : "differs"}`.trim(), "data-row": name },
   el("th", { scope: "row", text: name }), el("td", { text: String(a) }), el("td", { text: String(b) }), el("td", { text: a === b ? "" : b > a ? `+${b - a}` : `−${a - b}` }));
 
-const head = (...titles) => el("thead", {}, el("tr", {}, ...titles.map((text) => el("th", { scope: "col", text }))));
+const head = (...titles) => el("thead", {}, el("tr", {}, ...titles.map((text) => (text ? el("th", { scope: "col", text }) : el("td")))));
 
 function verdictTable(a, b) {
   const names = [...new Set(["tree", ...Object.keys(a.verdicts), ...Object.keys(b.verdicts)])];

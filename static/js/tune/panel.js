@@ -217,7 +217,7 @@ function countsBeforeAfter() {
   const lead = pending ? isCloud() ? "Mapping the cloud …" : "Mapping this scan …" : then ? `${total(then)} → ${sum(total(now))}` : sum(total(now));
   const title = isCloud() ? "Candidates for stems in the cloud" : `Scan ${index}${then ? ", before and after the last change" : state.status?.state === "playing" ? ". Pause to compare before and after a change." : ". Change a parameter to compare before and after."}`;
   const same = names.filter((name) => then && name !== "tree" && (now[name] ?? 0) === (then[name] ?? 0));
-  return [el("ul", { class: "chips", title }, el("li", { class: "lead", text: lead }), ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
+  return [el("ul", { class: "chips", title, tabindex: "0", "aria-label": "Clusters by verdict" }, el("li", { class: "lead", text: lead }), ...names.filter((name) => !same.includes(name)).map((name) => chip(name, then ? then[name] ?? 0 : null, now[name] ?? 0)), ...truthChips(right, wrong, before),
       same.length ? el("li", { class: "same", text: `unchanged: ${same.map((name) => counted(now[name], name)).join(", ")}` }) : "")];
 }
 
