@@ -14,7 +14,7 @@ from tests.browser.serving import Server
 from tests.browser.test_contrast import DIALOGS, TABS
 
 THEMES = ("dark", "light")
-OVERLAYS = ("layers-button", "stages-button", "compare-button")
+OVERLAYS = ("layers-button", "stages-button", "compare-button", "layout-button")
 # viser's client in the frame of the scene; listed apart, because its elements are not ours.
 SCENE = "#scene"
 VISER = {"button-name", "landmark-one-main", "page-has-heading-one", "region"}

@@ -13,10 +13,11 @@ import { closeOver, openOver } from "../scene/overlay.js";
 import { pressInScene } from "../scene/scene.js";
 import { openSearch } from "../tune/panel.js";
 import { redo, reset, undo } from "../tune/parameters.js";
+import { exchange, showTabs, standardLayout, toggleMap, toggleTabs } from "./layout.js";
 import { openTab } from "./tabs.js";
 
 const click = (id) => () => byId(id).click();
-export const openDrawer = () => byId("side").classList.add("open");
+export const openDrawer = () => { byId("side").classList.add("open"); showTabs(); };
 export const toTab = (name) => () => { openDrawer(); openTab(name); byId(`tab-${name}`).focus(); };
 const inAnnotate = (run) => edits(() => { if (!annotating()) toTab("annotate")(); run(); });
 
@@ -73,5 +74,8 @@ export const ACTIONS = [
   ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: redo your last edit", "", "", inAnnotate(redoEdit)],
   ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],
   ["Clear the selection; close the overlay of the scene", "esc", "Escape", leave],
+  ["Layout: exchange map and scene", "x", "x", exchange, "exchange map and scene"],
+  ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],
+  ["Layout: standard sizes and places", "", "", standardLayout],
   ["Keyboard shortcuts", "?", "?", showSheet],
 ];

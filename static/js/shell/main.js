@@ -27,12 +27,13 @@ import { startCompare } from "../tune/compare.js";
 import { startTunePanel } from "../tune/panel.js";
 import { startTuning } from "../tune/parameters.js";
 import { startKeys } from "./keys.js";
+import { startLayout } from "./layout.js";
 import { startPalette } from "./palette.js";
 import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startScenePanel, startLayers, startKeys, startPalette, startDrawer, startWelcome, startShare]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLayers, startKeys, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

@@ -1,0 +1,134 @@
+// Sizes and places of map, scene and tabs in a wide window: dragged, collapsed, exchanged, remembered and saved by name.
+
+import { byId, el, recall, remember } from "../core/dom.js";
+
+// left: width of the left part, top: height of the upper right part, both in percent; exchanged: the scene is on the left.
+const STANDARD = { left: 45, top: 55, exchanged: false, map: true, tabs: true };
+const BUILT_IN = {
+  Standard: STANDARD,
+  "Large scene": { ...STANDARD, left: 62, exchanged: true },
+  "Long table": { ...STANDARD, top: 25 },
+};
+const LEAST = 15, MOST = 80; // [%]
+const STEP = 2; // [%] by an arrow key
+const LONGEST_NAME = 40, MOST_SAVED = 20;
+const work = document.querySelector(".work");
+let layout = { ...STANDARD };
+let saved = {};
+
+const stored = (key) => {
+  try {
+    return JSON.parse(recall(key)) ?? {};
+  } catch {
+    return {}; // not written by this page
+  }
+};
+const clipped = (percent) => Math.min(MOST, Math.max(LEAST, Number(percent) || LEAST));
+const all = () => ({ ...BUILT_IN, ...saved });
+const same = (one) => Object.keys(STANDARD).every((key) => one[key] === layout[key]);
+
+export function setLayout(changes) {
+  layout = { ...layout, ...changes };
+  layout.left = clipped(layout.left);
+  layout.top = clipped(layout.top);
+  remember("layout", JSON.stringify(layout));
+  show();
+}
+
+export const exchange = () => setLayout({ ...(layout.exchanged ? STANDARD : BUILT_IN["Large scene"]), top: layout.top, tabs: layout.tabs });
+export const toggleMap = () => setLayout({ map: !layout.map });
+export const toggleTabs = () => setLayout({ tabs: !layout.tabs });
+export const showTabs = () => layout.tabs || toggleTabs();
+export const standardLayout = () => setLayout(STANDARD);
+
+function show() {
+  work.style.setProperty("--left", `${layout.left}%`);
+  work.style.setProperty("--top", `${layout.top}%`);
+  work.classList.toggle("exchanged", layout.exchanged && layout.map);
+  work.classList.toggle("no-map", !layout.map);
+  work.classList.toggle("no-tabs", !layout.tabs);
+  for (const [id, value] of [["split-left", layout.left], ["split-top", layout.top]]) byId(id).setAttribute("aria-valuenow", String(Math.round(value)));
+  byId("map-exchange").setAttribute("aria-pressed", String(layout.exchanged));
+  byId("layout-map").checked = layout.map;
+  byId("layout-tabs").checked = layout.tabs;
+  fillNames();
+  dispatchEvent(new Event("resize")); // of the plots
+}
+
+function fillNames() {
+  const list = byId("layout-names"), names = Object.keys(all());
+  const chosen = names.find((name) => same(all()[name])) ?? "";
+  list.replaceChildren(el("option", { value: "", text: "Choose a layout …" }), ...names.map((name) => el("option", { value: name, text: name })));
+  list.value = chosen;
+  byId("layout-delete").disabled = !(chosen in saved);
+}
+
+function save() {
+  const name = byId("layout-name").value.trim().slice(0, LONGEST_NAME);
+  if (!name || name in BUILT_IN || Object.keys(saved).length >= MOST_SAVED) return;
+  saved = { ...saved, [name]: { ...layout } };
+  remember("layouts", JSON.stringify(saved));
+  byId("layout-name").value = "";
+  fillNames();
+}
+
+function drop() {
+  delete saved[byId("layout-names").value];
+  remember("layouts", JSON.stringify(saved));
+  fillNames();
+}
+
+function startSplitter(id, side, keys, percentAt) {
+  const splitter = byId(id);
+  splitter.addEventListener("pointerdown", (event) => {
+    if (event.button) return;
+    event.preventDefault();
+    splitter.setPointerCapture(event.pointerId);
+    document.body.classList.add("resizing"); // the frame of the scene would take the pointer
+  });
+  splitter.addEventListener("pointermove", (event) => {
+    if (splitter.hasPointerCapture(event.pointerId)) setLayout({ [side]: percentAt(event, work.getBoundingClientRect()) });
+  });
+  splitter.addEventListener("lostpointercapture", () => document.body.classList.remove("resizing"));
+  splitter.addEventListener("dblclick", () => setLayout({ [side]: STANDARD[side] }));
+  splitter.addEventListener("keydown", (event) => {
+    const step = keys[event.key];
+    if (!step || event.shiftKey) return;
+    event.preventDefault();
+    event.stopPropagation(); // the arrows would also step the run
+    setLayout({ [side]: layout[side] + step * STEP });
+  });
+}
+
+function menu() {
+  return [
+    el("label", {}, el("input", { id: "layout-map", type: "checkbox", onchange: toggleMap }), " 2D map"),
+    el("label", {}, el("input", { id: "layout-tabs", type: "checkbox", onchange: toggleTabs }), " Tabs and table"),
+    el("button", { class: "small", text: "Exchange map and scene", onclick: exchange }),
+    el("div", { class: "row" }, el("select", { id: "layout-names", "aria-label": "Saved layouts", onchange: (event) => event.target.value && setLayout(all()[event.target.value]) }),
+      el("button", { id: "layout-delete", class: "small", text: "Delete", title: "Delete the chosen layout", onclick: drop })),
+    el("div", { class: "row" }, el("input", { id: "layout-name", type: "text", maxlength: String(LONGEST_NAME), placeholder: "name", "aria-label": "Name of the layout", autocomplete: "off" }),
+      el("button", { id: "layout-save", class: "small", text: "Save", title: "Save this layout under the name", onclick: save })),
+  ];
+}
+
+export function startLayout() {
+  const button = byId("layout-button"), box = byId("layout-menu");
+  box.replaceChildren(...menu());
+  const open = (wanted) => {
+    box.hidden = !wanted;
+    button.setAttribute("aria-expanded", String(wanted));
+  };
+  button.addEventListener("click", () => open(box.hidden));
+  box.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape") return;
+    event.stopPropagation();
+    open(false);
+    button.focus();
+  });
+  byId("map-exchange").addEventListener("click", exchange);
+  startSplitter("split-left", "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
+  startSplitter("split-top", "top", { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (event.clientY - box.top)) / box.height);
+  saved = stored("layouts");
+  setLayout(stored("layout"));
+}
