@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+import pytest
 from playwright.sync_api import expect
 
 from tests.browser.dashboard import Dashboard
@@ -110,3 +111,22 @@ def test_actions_are_found_and_executed(dashboard: Dashboard):
     expect(page.locator("#panel-story")).to_have_attribute("data-story", f"tree {number}")
     page.locator("#map").press("Escape")
     assert dashboard.errors == []
+
+
+@pytest.mark.parametrize(
+    ("word", "found"),
+    [
+        ("help", "Keyboard shortcuts"),
+        ("zoom", "Zoom in on the map"),
+        ("delete", "Annotate: delete the chosen annotation"),
+        ("screenshot", "Save the map as a picture (PNG)"),
+        ("qgis", "Export the map: GeoPackage"),
+        ("resolution", "Voxel size"),
+    ],
+)
+def test_actions_and_settings_are_found_by_other_words(dashboard: Dashboard, word: str, found: str):
+    page = dashboard.page
+    page.locator("#palette-button").click()
+    page.locator("#palette-find").fill(word)
+    expect(page.locator("#palette-list [role=option]", has_text=found).first).to_be_visible()
+    page.keyboard.press("Escape")

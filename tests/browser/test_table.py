@@ -214,3 +214,20 @@ def test_an_unmeasured_sigma_is_called_assumed(dashboard: Dashboard):
     expect(cell).to_have_attribute("title", re.compile("^Assumed"))
     dashboard.stand(23.05)  # takes the true map again
     expect(cell).not_to_have_text(re.compile("≈"))
+
+
+def test_the_map_dims_the_trees_that_the_filter_leaves_out(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Trees")
+    picture = "() => document.querySelector('#map').toDataURL()"
+
+    def drawn(text: str) -> str:
+        page.locator("#find").fill(text)
+        dashboard.drawn()
+        dashboard.drawn()
+        return str(page.evaluate(picture))
+
+    whole = drawn("")
+    assert drawn("dbh < 1") != whole
+    assert drawn("seen > 0 no such word") == whole  # not understood: nothing is left out
+    assert drawn("") == whole

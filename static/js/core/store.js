@@ -12,6 +12,7 @@ export const state = {
   learning: null,    // {state, words, learned}: decision trees being trained from annotations
   parameters: null,  // {preset, set, revision, undo, redo, values, changed}
   sets: null,        // {sets: [{name, who, at_s}]}: saved sets of parameters
+  holds: null,       // test of a tree by the filter of the table; null without a filter
   selected: null,    // number of the selected tree
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when selected
   view: null,        // layers and choices of the 3D scene

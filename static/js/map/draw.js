@@ -11,6 +11,7 @@ const TURN = 2 * Math.PI;
 export const symbolRadius = (tree, scale) =>
   Math.max(tree.dbh_cm === null ? 3.5 : 3 + 0.11 * tree.dbh_cm, tree.dbh_cm === null ? 0 : (tree.dbh_cm / 200) * scale);
 
+const LEFT_OUT = 0.2; // opacity of trees that the filter of the table leaves out
 const TREE_REACH = 14; // [px] around the symbol of a tree
 
 // The tree at a point of the canvas [px], or null.
@@ -35,9 +36,14 @@ function drawContent(pen, view, state) {
   if (state.ghost) drawGhost(pen, view, state.ghost);
   const trees = state.map?.trees ?? [];
   drawClusters(pen, view, state.map?.clusters);
-  for (const tree of trees) drawTree(pen, view, tree, tree.number === state.selected);
+  const isLeftOut = (tree) => state.holds?.(tree) === false && tree.number !== state.selected;
+  for (const tree of trees) {
+    pen.globalAlpha = isLeftOut(tree) ? LEFT_OUT : 1;
+    drawTree(pen, view, tree, tree.number === state.selected);
+  }
+  pen.globalAlpha = 1;
   state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0));
-  drawNumbers(pen, view, trees, state.selected, { robot: state.map && !state.status?.cloud && view.toScreen(...state.map.pose) });
+  drawNumbers(pen, view, trees.filter((tree) => !isLeftOut(tree)), state.selected, { robot: state.map && !state.status?.cloud && view.toScreen(...state.map.pose) });
   if (state.selectedCluster) drawRing(pen, view, state.selectedCluster);
   if (state.map && !state.status?.cloud) drawRobot(pen, view, state.map);
   if (state.measure?.to) drawMeasure(pen, view, state.measure);

@@ -101,5 +101,5 @@ export function startMap() {
   byId("map-csv").addEventListener("click", () => saveCsv("map.csv", tableOfMap()));
   byId("map-fit").addEventListener("click", () => map.fit());
   on("annotating", showNextToReview);
-  on("map truth selection measure tab annotations annotating compare ghost theme", map.redraw);
+  on("map truth filter selection measure tab annotations annotating compare ghost theme", map.redraw);
 }

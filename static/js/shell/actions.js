@@ -37,7 +37,10 @@ function leave() {
   select(null);
 }
 
-// title, keys as shown, key of the event ("" if it has none of its own), action, title in the list of shortcuts
+const pressOnMap = (key) => () => byId("map").dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+
+// title, keys as shown, key of the event ("" if it has none of its own), action, title in the list of shortcuts ("": not listed
+// there), other words by which it is searched
 export const ACTIONS = [
   ["Play or pause", "space", " ", edits(togglePlay)],
   ["One scan back", "←", "", edits(() => advance(-1))], ["One scan forward", "→", "", edits(() => advance(1))],
@@ -46,7 +49,8 @@ export const ACTIONS = [
   ["Follow the robot in the scene, or stop following", "f", "", edits(toggleFollow)],
   ["View the robot from above", "t", "", edits(() => pressInScene("t"))], ["View the robot from behind", "b", "", edits(() => pressInScene("b"))],
   ["Measure a distance on the map", "m", "m", toggleMeasure],
-  ["Show the whole map", "", "", click("map-fit")],
+  ["Show the whole map", "", "", click("map-fit"), null, "fit zoom reset"],
+  ["Zoom in on the map", "+", "", pressOnMap("+"), "on the map: zoom in", "enlarge magnify closer"], ["Zoom out of the map", "-", "", pressOnMap("-"), "on the map: zoom out", "shrink farther"],
   ["Stages: raw, filtered, clusters and trunks side by side", "s", "s", () => openOver("stages")],
   ["Compare two sets of parameters on this scan (A | B)", "c", "c", () => openOver("compare")],
   ["Camera: trees and clusters in the picture of this scan", "v", "v", () => openOver("camera")],
@@ -59,23 +63,25 @@ export const ACTIONS = [
   ["Download the parameters as a file", "", "", click("tune-download")],
   ["Upload parameters from a file", "", "", edits(() => { toTab("tune")(); byId("tune-upload").click(); })],
   ["Layers of the scene", "", "", edits(click("layers-button"))],
-  ["Light or dark theme", "", "", click("theme-button")],
-  ["Open another run", "", "", edits(openSources)],
-  ["All runs: show, compare or replay them", "", "", click("runs-link")],
+  ["Light or dark theme", "", "", click("theme-button"), null, "colours night day sunlight appearance settings"],
+  ["Open another run", "", "", edits(openSources), null, "load file recording upload source robot live"],
+  ["All runs: show, compare, replay or delete them", "", "", click("runs-link"), null, "history remove rename"],
   ["Share: link to this moment, view-only link", "", "", click("share-button")],
-  ["Save the map as a picture (PNG)", "", "", click("map-png")], ["Save the map as a table (CSV)", "", "", click("map-csv")],
+  ["Save the map as a picture (PNG)", "", "", click("map-png"), null, "screenshot image export"], ["Save the map as a table (CSV)", "", "", click("map-csv")],
   ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
-  ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv")],
+  ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv"), null, "export table spreadsheet"],
+  ["Export the map: GeoPackage, Shapefile, DXF, XLSX …", "", "", () => { toTab("trees")(); byId("trees-export").focus(); }, null, "save download gis qgis cad excel geojson"],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
   ["Annotate: add trees by clicks on the map", "", "", inAnnotate(() => toggleAdding(true))],
   ["Annotate: skip to the next tree to review", "", "", inAnnotate(skip)],
   ["Annotate: the selected tree is a tree", "", "", inAnnotate(() => review("tree"))],
   ["Annotate: the selected tree is not a tree", "", "", inAnnotate(() => review(draft.kind))],
+  ["Annotate: delete the chosen annotation", "del", "", inAnnotate(() => document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "Delete", bubbles: true }))), "", "remove erase"],
   ["Annotate: undo your last edit", "", "", inAnnotate(undoEdit)], ["Annotate: redo your last edit", "", "", inAnnotate(redoEdit)],
   ["Annotate: import trees from CSV", "", "", inAnnotate(click("annotate-import"))],
   ["Clear the selection; close the overlay of the scene", "esc", "Escape", leave],
   ["Layout: exchange map and scene", "x", "x", exchange, "exchange map and scene"],
   ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],
   ["Layout: standard sizes and places", "", "", standardLayout],
-  ["Keyboard shortcuts", "?", "?", showSheet],
+  ["Keyboard shortcuts", "?", "?", showSheet, null, "help keys hotkeys manual"],
 ];

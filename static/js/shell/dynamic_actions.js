@@ -18,6 +18,11 @@ import { openDrawer, toTab } from "./actions.js";
 import { NAMES as TABS } from "./tabs.js";
 
 const AGAINST = [["both", "ground truth and annotations"], ["own", "ground truth only"], ["annotations", "annotations only"]];
+// Words that people of other programs use for a parameter.
+const ALSO = {
+  "clustering.eps": "neighbourhood tolerance cluster distance epsilon", "clustering.min_points": "cluster size density minpts", "filters.voxel_size": "resolution downsample thin leaf grid",
+  "slam.particles": "accuracy hypotheses", "acquisition.range_max": "far reach distance",
+};
 const CHOICES = { colour_by: "Colour the scene by", label_by: "Label the scene with" };
 
 // Whether a button exists and is not hidden, apart from its panel being closed.
@@ -77,7 +82,7 @@ export function presentActions() {
   const sets = [...tuning.presets.map(({ name }) => [`Use the preset ${name}`, "", edits(() => use(name))]), ...savedSets().map(({ name }) => [`Use the saved set ${name}`, "", edits(() => use(name))])];
   const speeds = [...byId("speed").options].map(({ value, text }) => [`Speed ${text}`, "", edits(() => attempted(() => command("set_speed", { factor: Number(value) })))]);
   const parameters = tuning.specs.map(({ name, stage, title, doc }) =>
-    [`${stage}: ${title} (${shown(state.parameters?.values[name], specOf(name))}${isChanged(name) ? ", changed" : ""})`, "", () => openParameter(name), `${name} ${doc}`]);
+    [`${stage}: ${title} (${shown(state.parameters?.values[name], specOf(name))}${isChanged(name) ? ", changed" : ""})`, "", () => openParameter(name), `setting ${name} ${doc} ${ALSO[name] ?? ""}`]);
   const sensitivities = tuning.specs.filter(({ kind }) => kind !== "name").map((spec) =>
     [`Sensitivity of ${spec.title} (${spec.stage})`, "", edits(() => { openParameter(spec.name); requestSensitivity(spec); }), `${spec.name} how much does it matter ∿`]);
   const found = trees().map(({ number }) => [`Tree ${number}`, "", () => { openDrawer(); openStory("tree"); select(number); }]);

@@ -55,7 +55,7 @@ function act(event, inScene) {
 }
 
 function sheet() {
-  const own = ACTIONS.filter(([, keys]) => keys).map(([title, keys, , , text]) => [keys, text ?? title]);
+  const own = ACTIONS.filter(([, keys, , , text]) => keys && text !== "").map(([title, keys, , , text]) => [keys, text ?? title]);
   return [["ctrl+k", "search all actions"], ...own, ["1 … 0", "show or hide a layer of the scene"], ...ANNOTATE_KEYS];
 }
 

@@ -21,7 +21,7 @@ export function openPalette() {
 // begins with the first word, other titles, keywords.
 function search(text) {
   const words = text.toLowerCase().split(/\s+/).filter(Boolean);
-  const all = [...ACTIONS.map(([title, keys, , run]) => [title, keys, run]), ...presentActions()].filter(([, , run]) => mayDo(run));
+  const all = [...ACTIONS.map(([title, keys, , run, , more]) => [title, keys, run, more ?? ""]), ...presentActions()].filter(([, , run]) => mayDo(run));
   const fitting = all.filter(([title, , , more = ""]) => words.every((word) => `${title} ${more}`.toLowerCase().includes(word)));
   return fitting.map((entry, place) => ({ entry, place, rank: rankOf(entry[0], words, text) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);
 }

@@ -9,7 +9,7 @@ import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
 import { roving } from "../core/roving.js";
-import { isCloud, on, state, trees } from "../core/store.js";
+import { changed, isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
 import { openStory } from "../explain/story.js";
@@ -101,6 +101,7 @@ function fill() {
   const wanted = byId("find").value.trim();
   const { holds, refused } = filterOf(wanted);
   const listed = sorted(all.filter(holds));
+  showFilter(wanted && !refused ? wanted : "", holds);
   const body = byId("trees").tBodies[0];
   listed.forEach((tree, place) => {
     const row = rowOf(tree);
@@ -115,6 +116,16 @@ function fill() {
   offerCsv(all.length);
   byId("find").setAttribute("aria-invalid", String(Boolean(refused)));
   setText(byId("trees-empty"), listed.length ? "" : emptyText(all.length, wanted, refused));
+}
+
+let dimmed = ""; // the filter of which the map knows
+
+// The map dims what the filter leaves out.
+function showFilter(wanted, holds) {
+  if (wanted === dimmed) return;
+  dimmed = wanted;
+  state.holds = wanted ? holds : null;
+  changed("filter");
 }
 
 const csv = byId("trees-csv"), csvTitle = csv.title;
