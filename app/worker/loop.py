@@ -35,6 +35,9 @@ _REPORT_S = 0.25
 # The supervisor replaces a worker that plays and is silent for long.
 _HEARTBEAT_S = 1.0
 _GLIMPSE_S = 0.5
+# The mapper follows to a scan that is shown from stored results this time after the last command, so that the
+# next step of a person, and drawing in the other processes, do not wait for it.
+_RESTORE_S = 0.3
 _COMPILING = COMPILING.capitalize()
 _COMPILES_ON_S = 60.0  # kernels compiled within this time of one another count as one wait
 # Interval at which messages of a live source are taken; it costs less than 1 % of a core.
@@ -81,7 +84,7 @@ class WorkerLoop:
         self._prepared = False
         self._reported: tuple[protocol.Status, float] | None = None
         self._glimpse_at = 0.0
-        self._long_way_at = 0.0
+        self._long_way_at = self._restore_at = 0.0
         self._compiling_since_s, self._compiled_at = 0.0, -math.inf
         self._compiled_share, self._progress_at = compiled_share, -math.inf
         self._mapped = 0  # scans since a scan was mapped again
@@ -145,12 +148,15 @@ class WorkerLoop:
         return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
-        """Return the time until the next scan is due [s]: 0 while a rerun works or a scan is overdue, the
+        """Return the time until the next scan is due [s]: that until `_RESTORE_S` after a command if a sought
+        scan is shown from stored results, 0 while a rerun works or a scan is overdue, the
         interval `_LISTEN_S` for a live run without a queued scan, and None if only a command can start work.
         An error of the source sets the state to "failed" and is reported."""
         pace = self._session.pace
         if self._session.is_remapping:
             return 0.0
+        if self._session.is_shown:
+            return max(0.0, self._restore_at - self._clock())
         if pace == "idle":
             return None
         if pace == "live":
@@ -242,6 +248,7 @@ class WorkerLoop:
         """Execute a command and send the status. An error sets the state "failed"."""
         self._replay.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
+        self._restore_at = self._clock() + _RESTORE_S
         self._guarded(lambda: self._carry_out(command))
         self._report()
 
