@@ -116,7 +116,7 @@ CENTIMETRES = {
 
 def test_the_columns_name_the_directions_of_the_axes(dashboard: Dashboard):
     dashboard.tab("Trees")
-    for key, words in {"x": "Along the first heading", "y": "left of the first heading"}.items():
+    for key, words in {"x": "along the first heading", "y": "left of"}.items():
         button = dashboard.page.locator(f"#trees th[data-key={key}] button")
         assert words in (button.get_attribute("title") or "")
 
