@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 
 from pipeline.classification import ColumnClassifier, ColumnClassifierState, ForestOf, ScanView, package_alone
+from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
 from pipeline.front_end import DetectionResult, SegmentedScan, detect, segment
@@ -209,6 +210,12 @@ class Mapper:
         """The terrain map of all tiles so far: copies that are made at each access, in a time that grows with
         the map."""
         return self._terrain.record()
+
+    @property
+    def voxels(self) -> VoxelMap:
+        """The voxels of all scans; empty without the column classifier. Not a copy: it changes with the next
+        scan."""
+        return self._columns.memory
 
     @property
     def motion(self) -> Float:

@@ -44,6 +44,7 @@ class Drawing(msgspec.Struct, frozen=True):
         encoding, width, height, step, data: As in `Picture`.
         box: Left, top, right, bottom of a frame [pixels]; None draws none.
         text: Label of the box.
+        region: Left, top, right, bottom of the part that is drawn [pixels]; None draws all.
     """
 
     encoding: str
@@ -53,18 +54,24 @@ class Drawing(msgspec.Struct, frozen=True):
     data: bytes
     box: tuple[float, float, float, float] | None = None
     text: str = ""
+    region: tuple[float, float, float, float] | None = None
 
     @classmethod
     def of(
-        cls, picture: Picture, box: tuple[float, float, float, float] | None = None, text: str = ""
+        cls,
+        picture: Picture,
+        box: tuple[float, float, float, float] | None = None,
+        text: str = "",
+        region: tuple[float, float, float, float] | None = None,
     ) -> Drawing:
         """Return the drawing of a picture of a camera.
 
         Args:
             picture: The picture.
-            box, text: As in `Drawing`.
+            box, text, region: As in `Drawing`.
         """
-        return cls(picture.encoding, picture.width, picture.height, picture.step, picture.data, box, text)
+        raw = (picture.encoding, picture.width, picture.height, picture.step, picture.data)
+        return cls(*raw, box, text, region)
 
 
 def draw_safely(drawing: Drawing) -> bytes | None:
@@ -107,6 +114,10 @@ def draw(drawing: Drawing) -> bytes:
             raise ValueError("too many pixels")
         picture.load()
     picture = picture.convert("RGB")
+    corner = (0.0, 0.0)
+    if drawing.region is not None:
+        corner = drawing.region[:2]
+        picture = picture.crop(drawing.region)
     factor = min(1.0, LARGEST_SIDE / max(picture.size))
     if factor < 1.0:
         picture = picture.resize(
@@ -114,7 +125,9 @@ def draw(drawing: Drawing) -> bytes:
         )
     if drawing.box is not None:
         pen = ImageDraw.Draw(picture)
-        left, top, right, bottom = (factor * side for side in drawing.box)
+        left, top, right, bottom = (
+            factor * (side - at) for side, at in zip(drawing.box, corner * 2, strict=True)
+        )
         pen.rectangle([left, top, max(right, left + 1), max(bottom, top + 1)], outline=_YELLOW, width=3)
         pen.text((left + 5, top + 4), drawing.text[:60], fill=_YELLOW)
     out = io.BytesIO()

@@ -14,9 +14,10 @@ from app.batch.tree_pictures import stem_corners
 from app.common.draw_picture import Drawing, draw_safely
 from app.dashboard.payload import clusters_payload
 from app.dashboard.selection import NoStoryError, WorkerClient
+from app.worker.protocol import CameraPicture
 from pipeline.geometry.poses import Pose2, interpolate
 from pipeline.io.readers.camera import Camera
-from pipeline.types.records import Float, Frame, Path
+from pipeline.types.records import Float, Frame, Path, Trees
 
 #: All browsers together get so many pictures a second at most.
 _PAUSE_S = 0.3
@@ -91,6 +92,27 @@ class CameraView:
             "received": found.received,
         }
 
+    async def tree(self, number: int, trees: Trees, path: Path | None) -> bytes:
+        """Return the part of a camera picture that shows a tree best, as JPEG, with a frame around its stem.
+
+        Args:
+            number: Number of the tree.
+            trees: Trees of the map.
+            path: Path of the run; None before the first scan.
+
+        Raises:
+            NoStoryError: No picture shows the tree, or it cannot be decoded.
+            WorkerBusyError: The worker did not answer in time.
+        """
+        async with self._turn:
+            await asyncio.sleep(max(0.0, self._next_at - time.monotonic()))
+            found = await self._client.tree_picture(number)
+            content = await asyncio.to_thread(drawn_tree, found, number, trees, path)
+            self._next_at = time.monotonic() + _PAUSE_S
+        if content is None:
+            raise NoStoryError(f"no picture shows tree {number}", remedy="Select another")
+        return content
+
     def _check(self, of: int) -> None:
         """Check that run number `of` is still shown.
 
@@ -99,6 +121,41 @@ class CameraView:
         """
         if of != self._of:
             raise NoStoryError("another run was opened", remedy="Its picture comes with its first scan")
+
+
+# Share of the picture around the frame of a tree that is shown, in heights of the frame.
+_MARGIN = 0.6
+
+
+def drawn_tree(found: CameraPicture, number: int, trees: Trees, path: Path | None) -> bytes | None:
+    """Return the part of a picture around a tree as JPEG; None if the tree is not in it, or it cannot be
+    decoded. Arguments as in `CameraView.tree`.
+
+    Args:
+        found: The picture with its camera.
+        number: Number of the tree.
+        trees: Trees of the map.
+        path: Path of the run.
+    """
+    rows = np.flatnonzero(trees.number == number)
+    camera, picture = found.camera, found.picture
+    if camera is None or path is None or len(path.stamp_ns) < 2 or not len(rows):
+        return None
+    row = int(rows[0])
+    x, y = _pose_at(path, picture.stamp_ns).inverse().apply(trees.position[row])
+    box = _box(camera, stem_corners(float(x), float(y), float(trees.dbh[row])))
+    if box is None:
+        return None
+    left, top = box["left"] * camera.width, box["top"] * camera.height
+    right, bottom = left + box["width"] * camera.width, top + box["height"] * camera.height
+    margin = _MARGIN * (bottom - top)
+    region = (
+        max(0.0, left - margin),
+        max(0.0, top - margin),
+        min(float(camera.width), right + margin),
+        min(float(camera.height), bottom + margin),
+    )
+    return draw_safely(Drawing.of(picture, (left, top, right, bottom), f"tree {number}", region))
 
 
 FARTHEST, NEAREST = 25.0, 0.5  # m; trees farther away are only a few pixels wide

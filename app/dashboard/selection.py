@@ -10,13 +10,15 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from app.dashboard.broadcast import Broadcast
-from app.explain.records import ClusterStory, TreeStory
+from app.explain.records import ClusterStory, MapSection, TreeStory
 from app.worker.protocol import (
     Answer,
     AskCamera,
     AskCluster,
     AskCompare,
+    AskSection,
     AskTree,
+    AskTreePicture,
     CameraPicture,
     Question,
     WorkerBusyError,
@@ -89,6 +91,16 @@ class WorkerClient:
         """Return the camera picture of the run nearest to a time [ns]."""
         answer = await self._ask(AskCamera(next(self._tickets), self._shown_run(), stamp_ns))
         return _known(answer.camera)
+
+    async def tree_picture(self, number: int) -> CameraPicture:
+        """Return the camera picture of the run that shows a tree best, by its number."""
+        answer = await self._ask(AskTreePicture(next(self._tickets), self._shown_run(), number))
+        return _known(answer.camera)
+
+    async def section(self) -> MapSection:
+        """Return the accumulated points at breast height after the current scan."""
+        answer = await self._ask(AskSection(next(self._tickets), self._shown_run()))
+        return _known(answer.section)
 
     def _shown_run(self) -> int:
         """Return the number of the shown run; raises NoStoryError if there is none."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from app.common.arrays import evenly_spaced
 from app.explain.cloud import check_results, cloud_cluster_story, cloud_tree_story
+from app.explain.gathered import points_around
 from app.explain.history import half_axes
 from app.explain.records import CheckResult, Circle, ClusterStory, ColumnStory, FeatureEffect, TreeStory
 from app.store.forests import kept_forests
@@ -138,6 +139,7 @@ def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStor
         last_seen_s=(int(trees.last_seen_ns[row]) - run.start_ns) / _NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
         column=column_story(frame, trees.position[row], parameters, sensor),
+        points=points_around(run.voxels, trees.position[row]),
         history=run.history.of(int(trees.number[row]), frame.index),
     )
 

@@ -10,6 +10,8 @@ import math
 
 import msgspec
 
+from pipeline.types.records import Int32
+
 
 class CheckResult(msgspec.Struct, frozen=True):
     """One check of a cluster.
@@ -171,6 +173,20 @@ class History(msgspec.Struct, frozen=True):
     dbh_sigma: list[float]
 
 
+class MapSection(msgspec.Struct, frozen=True):
+    """The accumulated points at breast height, seen from above.
+
+    Attributes:
+        side: Side of a cell [m].
+        origin: Lower left corner of cell (0, 0) in the frame of the map [m].
+        cells: Occupied cells along x and y, int32, shape (N, 2).
+    """
+
+    side: float
+    origin: tuple[float, float]
+    cells: Int32
+
+
 class TreeStory(msgspec.Struct, frozen=True):
     """A tree of the map.
 
@@ -188,6 +204,8 @@ class TreeStory(msgspec.Struct, frozen=True):
         first_seen_s, last_seen_s: [s].
         cluster: Row of its cluster in the current scan; None without one.
         column: Classification of the accumulated scans at its place; None without them.
+        points: Accumulated points around it: x, y from its position in the frame of the map and height above
+            the ground [m], see `app.explain.gathered.points_around`; empty without them.
         history: Estimates in order of time.
         height, height_sigma: Of the tree [m]; NaN where its top is not seen.
         height_hidden: Reason why the height is not seen; empty where it is.
@@ -212,6 +230,7 @@ class TreeStory(msgspec.Struct, frozen=True):
     last_seen_s: float
     cluster: int | None
     column: ColumnStory | None
+    points: list[tuple[float, float, float]]
     history: History
     height: float = math.nan
     height_sigma: float = math.nan

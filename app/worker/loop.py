@@ -18,10 +18,11 @@ import msgspec
 
 from app.common.text import COMPILING
 from app.explain.build import cluster_story, tree_story
+from app.explain.gathered import section
 from app.explain.history import RecentScans
 from app.worker import protocol
 from app.worker.outbox import for_comparison
-from app.worker.session import Session, camera_picture
+from app.worker.session import Session, camera_picture, tree_picture
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError
 from pipeline.types.records import Frame
@@ -452,6 +453,12 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
             return protocol.Answer(
                 ticket, camera=camera_picture(None if run is None else run.source, stamp_ns)
             )
+        case protocol.AskTreePicture(tree=tree):
+            return protocol.Answer(ticket, camera=tree_picture(run, tree))
+        case protocol.AskSection():
+            if run is None:
+                raise StemmapError("no run is open", remedy="Open one")
+            return protocol.Answer(ticket, section=section(run.voxels))
         case protocol.AskTree(tree=tree):
             return protocol.Answer(ticket, tree=tree_story(run, session.frame, tree))
         case protocol.AskCluster(scan=scan, cluster=cluster):

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from app.explain.records import ClusterStory, TreeStory
+from app.explain.records import ClusterStory, MapSection, TreeStory
 from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 from pipeline.io.readers.camera import Camera, Picture
@@ -304,6 +304,20 @@ class AskCamera(_Question, frozen=True, tag="ask_camera"):
     stamp_ns: int
 
 
+class AskTreePicture(_Question, frozen=True, tag="ask_tree_picture"):
+    """Request the camera picture of the run that shows a tree best.
+
+    Attributes:
+        tree: Number of the tree.
+    """
+
+    tree: int
+
+
+class AskSection(_Question, frozen=True, tag="ask_section"):
+    """Request the accumulated points at breast height."""
+
+
 class CameraPicture(msgspec.Struct, frozen=True):
     """An encoded picture with the pose of its camera.
 
@@ -325,8 +339,8 @@ class Answer(msgspec.Struct, frozen=True, tag="answer"):
 
     Attributes:
         ticket: Identifier of the question.
-        cluster, tree, frames, camera: One of them is set unless `missing` is; `frames` has one frame per
-            parameter set, without raw points.
+        cluster, tree, frames, camera, section: One of them is set unless `missing` is; `frames` has one frame
+            per parameter set, without raw points.
         missing: Reason why there is no answer, and the remedy.
     """
 
@@ -335,6 +349,7 @@ class Answer(msgspec.Struct, frozen=True, tag="answer"):
     tree: TreeStory | None = None
     frames: list[Frame] | None = None
     camera: CameraPicture | None = None
+    section: MapSection | None = None
     missing: str = ""
 
 
@@ -406,7 +421,7 @@ class Rough(msgspec.Struct, frozen=True, tag="rough"):
 
 
 FromWorker = Opened | Shown | Report | Answer | Remapped | Rough
-Question = AskCluster | AskTree | AskCompare | AskCamera
+Question = AskCluster | AskTree | AskCompare | AskCamera | AskTreePicture | AskSection
 ToWorker = Command | Begin | Question
 
 

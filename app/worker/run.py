@@ -27,6 +27,7 @@ from app.worker.remap import (
     segment_all,
 )
 from app.worker.tree_numbers import TreeNumbers
+from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
@@ -117,6 +118,11 @@ class Run:
     def path(self) -> Path:
         """The path up to the current scan."""
         return self._map.mapper.path
+
+    @property
+    def voxels(self) -> VoxelMap:
+        """The voxels of all scans up to the current one; empty without the column classifier. Not a copy."""
+        return self._map.mapper.voxels
 
     def peek_ns(self) -> int | None:
         """Return the time of the next scan [ns]; None at the end of the run, or before a live scan

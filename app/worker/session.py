@@ -14,6 +14,7 @@ from typing import Literal
 import numpy as np
 
 from app.batch.summary import driven, health_word
+from app.batch.tree_pictures import best_views
 from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
@@ -669,3 +670,35 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
         )
     received = origin.picture_counts if isinstance(origin, LiveSource) else ""
     return CameraPicture(picture, *origin.camera(), received)
+
+
+def tree_picture(run: Run | None, number: int) -> CameraPicture:
+    """Return the camera picture of a run that shows a tree best, see `best_views`, with its camera model.
+
+    Of a recording, the pictures nearest to the mapped scans are considered, because a list of all pictures
+    would need the whole recording.
+
+    Args:
+        run: The run; None where none is open.
+        number: Number of the tree.
+
+    Raises:
+        StemmapError: The source has no camera or an unknown one, or no picture shows the tree.
+    """
+    frame = None if run is None else run.frame
+    if run is None or frame is None:
+        raise StemmapError("nothing is mapped yet", remedy="Press play, or open a run")
+    origin: object = run.source.source if isinstance(run.source, OdometryOverride) else run.source
+    if not has_camera(run.source.description) or not isinstance(origin, PictureSource):
+        raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
+    camera, why = origin.camera()
+    if camera is None:
+        raise StemmapError(f"trees cannot be found in the pictures: {why}")
+    stamps = run.path.stamp_ns
+    if isinstance(origin, LiveSource):
+        stamps = np.array(origin.picture_stamps(), np.int64)
+    tree = replace(frame.trees, confirmed=frame.trees.confirmed & (frame.trees.number == number))
+    views = best_views(camera, tree, run.path, stamps)
+    if not views:
+        raise StemmapError(f"no picture shows tree {number}", remedy="Play on, or select another")
+    return camera_picture(run.source, views[0].stamp_ns)

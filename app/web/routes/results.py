@@ -11,7 +11,7 @@ from fastapi import APIRouter, Path, Query
 from starlette.responses import Response
 
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.payload import comparison_payload, doubts_of, stages_payload, trees_payload
+from app.dashboard.payload import comparison_payload, doubts_of, packed, stages_payload, trees_payload
 from app.dashboard.scores import pairs_payload
 from app.dashboard.selection import NoStoryError
 from app.web.responses import (
@@ -214,6 +214,30 @@ async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
     if content is None:
         return error_reply(404, "this picture is not kept any more", remedy="Ask for the newest one")
     return Response(content, 200, {"Cache-Control": "no-store"}, media_type="image/jpeg")
+
+
+@router.get("/camera/tree/{number}.jpg", dependencies=[ViewerTurn])
+async def tree_picture(number: Number, dashboard: Dash) -> Response:
+    """Return the part of the camera picture that shows a tree best, as JPEG; 404 if no picture shows it, 409
+    before the first map, 503 if the worker is busy."""
+    if dashboard.shown is None:
+        return _nothing_mapped()
+    try:
+        content = await dashboard.camera.tree(number, dashboard.shown.frame.trees, dashboard.path)
+    except NoStoryError as error:
+        return failure_reply(404, error)
+    return Response(content, 200, {"Cache-Control": "no-store"}, media_type="image/jpeg")
+
+
+@router.get("/section", dependencies=[ViewerTurn])
+async def section(dashboard: Dash) -> Response:
+    """Return the accumulated points at breast height seen from above as a binary block: side of a cell and
+    lower left corner of cell (0, 0) [m], and the occupied cells along x and y; 409 before the first map, 503
+    if the worker is busy."""
+    if dashboard.shown is None:
+        return _nothing_mapped()
+    found = await dashboard.worker_client.section()
+    return block_reply(packed({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
 
 
 @router.get("/stages", dependencies=[ViewerTurn])

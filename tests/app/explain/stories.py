@@ -79,5 +79,6 @@ def tree_story(number: int) -> TreeStory:
         last_seen_s=23.0,
         cluster=None,
         column=None,
+        points=[(0.15, 0.0, 1.3)],
         history=History([0.5], [1.0], [2.0], [0.02], [0.01], [0.3], [0.3], [0.01]),
     )

@@ -60,6 +60,8 @@ ROUTES = [
     ("POST", "/api/inside"),
     ("GET", "/api/camera"),
     ("GET", "/api/camera/{stamp_ns}.jpg"),
+    ("GET", "/api/camera/tree/{number}.jpg"),
+    ("GET", "/api/section"),
     ("POST", "/api/compare"),
     ("GET", "/api/sets"),
     ("POST", "/api/sets"),

@@ -11,10 +11,19 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from app.dashboard.camera_view import marks_of
+from app.dashboard.camera_view import drawn_tree, marks_of
 from app.dashboard.dashboard import Dashboard
-from app.worker.protocol import Answer, AskCamera, CameraPicture, Shown, ToWorker, from_worker
-from app.worker.session import camera_picture, has_camera
+from app.worker.process import new_session
+from app.worker.protocol import (
+    Answer,
+    AskCamera,
+    AskTreePicture,
+    CameraPicture,
+    Shown,
+    ToWorker,
+    from_worker,
+)
+from app.worker.session import camera_picture, has_camera, tree_picture
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import open_source
@@ -142,6 +151,56 @@ def test_a_picture_travels_between_the_processes(source: RosSource):
     np.testing.assert_array_equal(back.camera.camera.K, CAMERA.K)
 
 
+def test_the_best_picture_of_a_tree_is_one_that_shows_it(source: RosSource):
+    session = new_session()
+    session.open(source.description.uri, "auto", 3)
+    session.play()
+    while session.pace == "replay":
+        session.work()
+    run, frame_ = session.run, session.frame
+    assert run is not None
+    assert frame_ is not None
+    shown = 0
+    for row in np.flatnonzero(frame_.trees.confirmed):
+        number = int(frame_.trees.number[row])
+        try:
+            found = tree_picture(run, number)
+        except StemmapError:
+            continue
+        shown += 1
+        content = drawn_tree(found, number, frame_.trees, run.path)
+        assert content is not None
+        picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
+        assert picture.shape[1] < CAMERA.width  # a part of it
+        yellow = np.flatnonzero((np.abs(picture - [255, 208, 0]).sum(axis=2) < 120).sum(axis=0) > 20)
+        brown = np.abs(picture - [104, 78, 52]).sum(axis=2) < 60
+        inside = brown[:, yellow[0] : yellow[-1]].mean()
+        assert inside > 0.2, f"tree {number} is not in its frame"
+    assert shown > 3
+    with pytest.raises(StemmapError, match="no picture shows tree 999"):
+        tree_picture(run, 999)
+    session.close()
+    with pytest.raises(StemmapError, match="nothing is mapped"):
+        tree_picture(None, 1)
+
+
+async def test_the_page_asks_for_the_picture_of_a_tree(both: Running) -> None:
+    client, dashboard = both
+    assert (await client.get("/api/camera/tree/1.jpg")).status_code == 409
+    await dashboard.receive(opened())
+    await dashboard.receive(Shown(1, 0.2, current((5.0, 0.0)), 0, path([0.0, 0.5, 1.0])))
+    stamp_ns = dashboard.path.stamp_ns[-1] if dashboard.path is not None else 0
+    raw = Picture(int(stamp_ns), "rgb8", CAMERA.width, CAMERA.height, CAMERA.width * 3, bytes(3 * 640 * 480))
+    answering(dashboard, CameraPicture(raw, CAMERA, ""), "no picture shows tree 2")
+    jpeg = await client.get("/api/camera/tree/1.jpg")
+    assert jpeg.headers["content-type"] == "image/jpeg"
+    width, height = Image.open(io.BytesIO(jpeg.content)).size
+    assert 0 < width < CAMERA.width
+    assert 0 < height <= CAMERA.height
+    missing = await client.get("/api/camera/tree/2.jpg")
+    assert (missing.status_code, "no picture shows tree 2" in missing.text) == (404, True)
+
+
 def answering(dashboard: Dashboard, *pictures: CameraPicture | str) -> list[int]:
     """The worker answers with these, one after the other; gives what it was asked for."""
     worker, left, asked = dashboard.worker, list(pictures), list[int]()
@@ -150,8 +209,8 @@ def answering(dashboard: Dashboard, *pictures: CameraPicture | str) -> list[int]
 
     async def answer(command: ToWorker, /) -> None:
         await send(command)
-        if isinstance(command, AskCamera):
-            asked.append(command.stamp_ns)
+        if isinstance(command, AskCamera | AskTreePicture):
+            asked.append(command.stamp_ns if isinstance(command, AskCamera) else command.tree)
             told = left.pop(0)
             told_of: dict[str, Any] = {"missing": told} if isinstance(told, str) else {"camera": told}
             await dashboard.receive(Answer(command.ticket, **told_of))
