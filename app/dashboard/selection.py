@@ -176,6 +176,7 @@ class Selection:
 
 
 Ring = tuple[float, float, float] | None
+Place = tuple[float, float, float]
 
 
 class Selector:
@@ -184,7 +185,7 @@ class Selector:
     Args:
         worker_client: Requests the explanations.
         live: Broadcast to the browsers.
-        mark: Highlights a tree and a ring in the scene.
+        mark: Highlights a tree and a ring in the scene, and returns x, y and height of the ground there [m].
         run: Returns the number of the present run, None without one.
         newest: Returns the index of the newest shown scan, None without one.
     """
@@ -193,7 +194,7 @@ class Selector:
         self,
         worker_client: WorkerClient,
         live: Broadcast,
-        mark: Callable[[int | None, Ring], None],
+        mark: Callable[[int | None, Ring], Place | None],
         *,
         run: Callable[[], int | None],
         newest: Callable[[], int | None],
@@ -275,6 +276,6 @@ class Selector:
     def _select(self, selection: Selection) -> None:
         """Set the selection, highlight it in the scene and broadcast it."""
         self.selection = selection
-        self._mark(selection.tree, selection.ring)
-        self._live.publish("selection", selection.as_plain())
+        place = self._mark(selection.tree, selection.ring)
+        self._live.publish("selection", {**selection.as_plain(), "place": place})
         self._live.publish("missing", None)

@@ -93,6 +93,17 @@ class MapNodes:
         self._labels.show(labels)
         self.labelled = [label.place[:2] for label in labels]
 
+    def place_of(self, frame: Frame, tree: int | None, ring: Ring) -> tuple[float, float, float] | None:
+        """Return x, y and height of the ground of the selected cluster, else of the selected tree [m]; None
+        without them. Arguments as in `show`."""
+        places = confirmed(frame.trees).position[confirmed(frame.trees).number == tree]
+        if ring is not None:
+            places = np.array([ring[:2]])
+        if not len(places):
+            return None
+        z = self.ground.heights(places[:1], frame.base_z)
+        return float(places[0, 0]), float(places[0, 1]), float(z[0])
+
     def show_truth(self, trees: TruthTrees | None) -> None:
         """Show rings at the objects of the ground truth, on the known ground; None removes them."""
         self._truth_trees = trees

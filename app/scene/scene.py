@@ -102,18 +102,24 @@ class Scene:
         with self._server.atomic():
             self._map.show_truth(trees)
 
-    def select(self, tree: int | None, ring: Ring = None) -> None:
+    def select(self, tree: int | None, ring: Ring = None) -> Vector | None:
         """Highlight the selection in place of the one before. It is drawn with the next scan if none is
         shown.
+
+        Returns:
+            x, y and height of the ground of the selection in the frame of the map [m]; None if it is not in
+            the shown map.
 
         Args:
             tree: Number of the selected tree, or None; an unknown number highlights nothing.
             ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
         """
         self._selected, self._ring = tree, ring
-        if self._frame is not None:  # the scan itself does not change
-            with self._server.atomic():
-                self._map.repaint(self._frame, tree, ring, self._view)
+        if self._frame is None:
+            return None
+        with self._server.atomic():  # the scan itself does not change
+            self._map.repaint(self._frame, tree, ring, self._view)
+        return self._map.place_of(self._frame, tree, ring)
 
     def suit(self, *, cloud: bool) -> None:
         """Choose how points are coloured when a run begins: a whole cloud by height, a scan by verdict. Other

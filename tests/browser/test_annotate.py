@@ -225,6 +225,80 @@ def test_skipped_trees_are_stored_come_last_and_are_listed_by_their_state(person
     assert person.errors == []
 
 
+def test_the_card_shows_the_evidence_on_the_selected_tree(person: Dashboard):
+    page = person.page
+    page.evaluate("() => import('/static/js/core/live_feed.js').then(({ select }) => select(null))")
+    expect(page.locator("#review-title")).to_be_hidden()
+    for tree in doubted(person)[:2]:
+        page.locator("#annotate-next").click()
+        number = tree["number"]
+        evidence = page.locator(f"#review-evidence[data-tree='{number}']")
+        expect(evidence.locator("svg")).to_have_count(2)
+        expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
+        story = person.ask(f"/api/story/tree/{number}")
+        expect(page.locator("#review-votes [data-gathered]")).to_have_attribute(
+            "data-gathered", story["column"]["verdict"]
+        )
+        drawn = evidence.locator("svg").first.locator(".cloud")
+        places = drawn.evaluate_all("all => all.map(it => it.getAttribute('d').split('M').length - 1)")
+        assert sum(places) == len(story["points"])
+        # The circle has the scale of the points: 0.75 m are half of the picture.
+        radius = float(evidence.locator("circle.fit").get_attribute("r") or 0)
+        assert radius == pytest.approx(story["dbh"] / 2 * 120 / 0.75, rel=1e-3)
+        expect(page.locator("#review-state")).to_have_text("open")
+    for name in ("yes", "no", "next"):
+        box = page.locator(f"#annotate-{name}").bounding_box()
+        assert box is not None
+        assert min(box["width"], box["height"]) >= 44  # fingers
+    page.locator("#annotate-no").click()
+    person.until_server("/api/annotations", "it.trees.length === 1 && it.trees[0].kind === 'other'")
+    assert person.errors == []
+
+
+def test_accumulated_points_lie_under_the_map_of_the_tab(person: Dashboard):
+    page = person.page
+    page.get_by_role("button", name="Fit").click()
+    person.eventually(lambda: page.evaluate(CELLS_DRAWN) == 1.0, lambda: page.evaluate(CELLS_DRAWN))
+    person.tab("Scores")
+    person.drawn()
+    assert page.evaluate(CELLS_DRAWN) < 1.0
+    person.tab("Annotate")
+    person.eventually(lambda: page.evaluate(CELLS_DRAWN) == 1.0, lambda: page.evaluate(CELLS_DRAWN))
+    assert person.errors == []
+
+
+def test_the_camera_follows_the_selection_unless_it_is_switched_off(person: Dashboard):
+    page, scene = person.page, person.scene
+    one, two, three = person.ask("/api/trees")["trees"][:3]
+
+    def looks_at(tree: dict[str, Any]) -> bool:
+        x, y, z = scene.evaluate(LOOKED_AT)
+        return bool(abs(x - tree["x"]) < 0.05 and abs(y - tree["y"]) < 0.05 and abs(z - 1.3) < 1.0)
+
+    def until_seen(tree: dict[str, Any]) -> None:
+        person.eventually(lambda: looks_at(tree), lambda: (scene.evaluate(LOOKED_AT), tree))
+
+    page.locator("#annotate-next").click()  # from the review
+    tree = page.evaluate(
+        "() => import('/static/js/core/store.js').then(({ selectedTree }) => selectedTree())"
+    )
+    until_seen(tree)
+    assert scene.evaluate(DISTANCE) <= 7.01
+    person.tab("Trees")  # from the table
+    wanted = one if one["number"] != tree["number"] else two
+    page.locator(f"#trees [data-tree='{wanted['number']}']").click()
+    until_seen(wanted)
+    page.locator("#focus-selection").click()
+    expect(page.locator("#focus-selection")).to_have_attribute("aria-pressed", "false")
+    person.tab("Trees")
+    page.locator(f"#trees [data-tree='{three['number']}']").click()
+    page.wait_for_timeout(1500)
+    assert looks_at(wanted)
+    page.locator("#focus-selection").click()
+    until_seen(three)
+    assert person.errors == []
+
+
 def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
     person: Dashboard, chromium: Browser, server: Server
 ):
@@ -351,6 +425,39 @@ IMPORTED = """async table => {
   const said = { run, table, browser: "c".repeat(32), who: "another" };
   await fetch("/api/annotations/import", { method: "POST", headers: { "Content-Type": "application/json" },
     body: JSON.stringify(said) });
+}"""
+
+# The share of the cells of the section inside of the map whose centre is painted.
+CELLS_DRAWN = """async () => {
+  const [{ unpack }, { screenOf }] = await Promise.all([
+    import('/static/js/scene/points.js'), import('/static/js/map/map.js'),
+  ]);
+  const answer = await fetch('/api/section');
+  if (!answer.ok) return -1;
+  const { side, origin, arrays: { cells } } = unpack(await answer.arrayBuffer());
+  const canvas = document.querySelector('#map'), pen = canvas.getContext('2d');
+  const image = pen.getImageData(0, 0, canvas.width, canvas.height);
+  let inside = 0, drawn = 0;
+  for (let k = 0; k < cells.length; k += 2) {
+    const centre = screenOf(origin[0] + side * (cells[k] + 0.5), origin[1] + side * (cells[k + 1] + 0.5));
+    const [x, y] = centre.map(at => Math.floor(at * devicePixelRatio));
+    if (x < 1 || y < 1 || x >= canvas.width - 1 || y >= canvas.height - 1) continue;
+    inside += 1;
+    drawn += image.data[4 * (y * canvas.width + x) + 3] > 0;
+  }
+  return inside > 50 ? drawn / inside : -2;
+}"""
+
+# The place at which the camera looks, in the frame of the map, and its distance from it.
+LOOKED_AT = """() => {
+  const { camera, cameraControl, nodeRefFromName } = window.__viserMutable;
+  const target = cameraControl.getTarget(camera.position.clone());
+  return target.applyMatrix4(nodeRefFromName['/world'].matrixWorld.clone().invert()).toArray();
+}"""
+DISTANCE = """() => {
+  const { camera, cameraControl } = window.__viserMutable;
+  const [at, from] = [camera.position.clone(), camera.position.clone()];
+  return cameraControl.getTarget(at).distanceTo(cameraControl.getPosition(from));
 }"""
 
 # At once, however slow the machine is: a pause between them would make two edits of it.

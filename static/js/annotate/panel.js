@@ -7,7 +7,9 @@ import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
 import { annotating, callMe, change, choose, contradictionText, draft, importTable, KINDS, myName, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, undo, unreviewed, votesText } from "./annotations.js";
+import { card, fillCard, startCard } from "./card.js";
 import { learnSection, startLearning } from "./learning.js";
+import { startSection } from "./section.js";
 
 const AGAINST = { both: "its ground truth and annotations", own: "its ground truth only", annotations: "annotations only" };
 const EVERY = 300; // [ms] between two updates while a run plays
@@ -35,16 +37,16 @@ function build() {
   byId("panel-annotate").replaceChildren(
     el("div", { class: "annotate-head" },
       el("p", { id: "annotate-count", class: "annotate-count" }),
+      button("annotate-add", "Add (A)", "Add trees by clicks on the map (A)", () => toggleAdding()),
       button("annotate-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("annotate-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
     el("div", { id: "annotate-states", class: "annotate-tools", role: "group", "aria-label": "Found trees by review state" }, ...STATES.map((each) =>
       button(`annotate-${each}`, each, `List the ${each} trees`, () => showTrees(each), "quiet small"))),
-    el("p", { id: "annotate-hint", class: "note dim", role: "status" }),
-    el("div", { class: "annotate-tools" },
-      button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree")),
-      button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class on the right (N)", () => review(draft.kind)), el("label", { class: "annotate-as" }, "it is a ", kind),
-      button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip),
-      button("annotate-add", "Add (A)", "Add trees by clicks on the map (A)", () => toggleAdding())),
+    el("div", { class: "review-buttons", role: "group", "aria-label": "Is the selected found tree a tree?" },
+      button("annotate-yes", "Yes (Y)", "The selected found tree is a tree (Y)", () => review("tree"), ""),
+      button("annotate-no", "No (N)", "The selected found tree is not a tree but of the class on the right (N)", () => review(draft.kind), ""), el("label", { class: "annotate-as" }, "it is a ", kind),
+      button("annotate-next", "Next (S)", "Skip the selected tree, which comes last then, and select the next one, the most doubtful first (S)", skip, "")),
     el("p", { id: "annotate-error", class: "error", role: "alert", hidden: true }),
+    card(el("p", { id: "annotate-hint", class: "note dim", role: "status" })),
     el("div", { id: "annotate-truth", class: "annotate-truth", hidden: true },
       el("label", { title: "The ground truth of this run is never changed: an annotation that contradicts it is kept next to it" }, "Score against ",
         el("select", { id: "annotate-against", onchange: (event) => scoreAgainst(event.target.value) }, ...Object.entries(AGAINST).map(([value, text]) => el("option", { value, text })))),
@@ -125,6 +127,7 @@ function fill() {
   byId("annotate-error").hidden = !(draft.error || problem);
   setText(byId("annotate-error"), problem || draft.error);
   setText(byId("annotate-hint"), hint(selected && left.includes(selected) ? selected : null));
+  fillCard();
   byId("annotate-truth").hidden = state.annotations?.own == null;
   byId("annotate-against").value = state.annotations?.against ?? "both";
   setText(byId("annotate-warned"), contradictionText());
@@ -157,6 +160,8 @@ function fillTable() {
 export function startAnnotatePanel() {
   build();
   startLearning();
+  startCard();
+  startSection();
   on("map", throttled(fill, EVERY));
   on("annotating", () => { if (draft.error || draft.adding) imported = ""; fill(); });
   on("selection", () => { imported = ""; });

@@ -18,7 +18,7 @@ const receivers = {
   evaluation(message) { state.evaluation = message.TA ? message : null; },
   annotations(message) { state.annotations = message; },
   learning(message) { state.learning = message; },
-  selection(message) { receiveSelection(message.tree ?? null, message.cluster ?? null); },
+  selection(message) { receiveSelection(message.tree ?? null, message.cluster ?? null, message.place ?? null); },
   events(message) { state.events = message.events; },
   view(message) { state.view = message; },
   remapped(message) { state.remapped = message.ghost ? message : null; },
@@ -38,10 +38,10 @@ function receiveMap({ path, ...map }) {
 }
 
 // An answer to an earlier click must not undo a later one.
-function receiveSelection(tree, cluster) {
+function receiveSelection(tree, cluster, place) {
   if (chosen && chosen.tree !== tree && performance.now() < chosen.until) return;
   chosen = null;
-  Object.assign(state, { selected: tree, selectedCluster: cluster });
+  Object.assign(state, { selected: tree, selectedCluster: cluster, place });
 }
 
 export function connect() {
@@ -70,7 +70,7 @@ export function select(tree) {
   if (!sendMessage({ type: "select", tree })) return;
   // A tree that is selected already gets no answer; waiting for one would hide the next selection made elsewhere.
   if (state.selected !== tree || state.selectedCluster) chosen = { tree, until: performance.now() + ANSWER_WAIT };
-  Object.assign(state, { selected: tree, selectedCluster: null });
+  Object.assign(state, { selected: tree, selectedCluster: null, place: null });
   changed("selection");
 }
 

@@ -14,6 +14,7 @@ export const state = {
   sets: null,        // {sets: [{name, who, at_s}]}: saved sets of parameters
   holds: null,       // test of a tree by the filter of the table; null without a filter
   selected: null,    // number of the selected tree
+  place: null,       // [x, y, z] of the selection on the ground, once the server has answered
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when selected
   view: null,        // layers and choices of the 3D scene
   ghost: null,       // `remapped` or `rough` while the previous map is drawn as an overlay

@@ -5,13 +5,14 @@ import { clock, count, figure, isAssumed, NONE } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
 import { columnFigure } from "./columns.js";
+import { gatheredFigure } from "./gathered.js";
 import { stemStory } from "./sections.js";
 
 const TURN = 2 * Math.PI;
 
 export function treeStory(story, showCluster) {
   if (story.sections) return stemStory(story);
-  return [verdict(story), overview(story, showCluster), positions(story), columnFigure(story.column, "Verdict on the accumulated scans")];
+  return [verdict(story), overview(story, showCluster), gatheredFigure(story), positions(story), columnFigure(story.column, "Verdict on the accumulated scans")];
 }
 
 function verdict(story) {

@@ -2,6 +2,7 @@
 
 import { draft } from "../annotate/annotations.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "../annotate/pointer.js";
+import { drawSection } from "../annotate/section.js";
 import { byId } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
 import { dbhText, heightText, NONE, seenText } from "../core/format.js";
@@ -23,6 +24,7 @@ const map = new MapCanvas(canvas, {
   bounds: () => (state.path.length + trees().length ? boundsOf(state.path, trees()) : boundsOf(state.truth ?? [])),
   describe,
   paint(pen, view) {
+    drawSection(pen, view);
     drawMap(pen, view, state);
     drawAnnotations(pen, view);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
@@ -101,5 +103,5 @@ export function startMap() {
   byId("map-csv").addEventListener("click", () => saveCsv("map.csv", tableOfMap()));
   byId("map-fit").addEventListener("click", () => map.fit());
   on("annotating", showNextToReview);
-  on("map truth filter selection measure tab annotations annotating compare ghost theme", map.redraw);
+  on("map truth filter selection measure tab annotations annotating section compare ghost theme", map.redraw);
 }

@@ -8,6 +8,7 @@ import { stopMeasuring, toggleMeasure } from "../map/measure.js";
 import { openSources } from "../open/dialog.js";
 import { setLoop } from "../playback/event_marks.js";
 import { advance, togglePlay } from "../playback/timeline.js";
+import { toggleFocus } from "../scene/focus.js";
 import { toggleFollow } from "../scene/layers.js";
 import { closeOver, openOver } from "../scene/overlay.js";
 import { pressInScene } from "../scene/scene.js";
@@ -47,6 +48,7 @@ export const ACTIONS = [
   ["Ten scans back", "shift ←", "", edits(() => advance(-10))], ["Ten scans forward", "shift →", "", edits(() => advance(10))],
   ["Loop: set its start, then its end, then remove it", "l", "l", edits(setLoop)],
   ["Follow the robot in the scene, or stop following", "f", "", edits(toggleFollow)],
+  ["Focus: move the camera to the selected tree or cluster, or stop", "", "", toggleFocus],
   ["View the robot from above", "t", "", edits(() => pressInScene("t"))], ["View the robot from behind", "b", "", edits(() => pressInScene("b"))],
   ["Measure a distance on the map", "m", "m", toggleMeasure],
   ["Show the whole map", "", "", click("map-fit"), null, "fit zoom reset"],

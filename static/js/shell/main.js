@@ -16,6 +16,7 @@ import { startMarks } from "../playback/event_marks.js";
 import { startTimeline } from "../playback/timeline.js";
 import { startPlots } from "../plots/plots.js";
 import { startCamera } from "../scene/camera.js";
+import { startFocus } from "../scene/focus.js";
 import { startLayers } from "../scene/layers.js";
 import { startOverlay } from "../scene/overlay.js";
 import { startScenePanel } from "../scene/panel.js";
@@ -34,6 +35,6 @@ import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startScenePanel, startLayers, startKeys, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLayers, startFocus, startKeys, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

@@ -160,6 +160,11 @@ def test_the_picture_stays_where_it_is_when_following_ends(scene: Scene):
 
 def test_selection_is_marked_and_named(scene: Scene):
     scene.show(make_frame(0), PATH[:1])
+    place = scene.select(7)
+    trees = make_frame(0).trees
+    assert place == pytest.approx([*trees.position[trees.number == 7][0], 0.0])
+    assert scene.select(999) is None
+    assert scene.select(7, (1.0, 2.0, 0.3)) == pytest.approx((1.0, 2.0, 0.0))
     scene.select(7)
     assert node(scene, "/world/selection").visible
     assert any(text.startswith("tree 7, DBH") for text in scene._map.texts)

@@ -1,0 +1,79 @@
+// The review card of the tab Annotate: what is known of the selected tree. The figures are those of its story.
+
+import { get } from "../core/api.js";
+import { byId, el, setText } from "../core/dom.js";
+import { capital } from "../core/format.js";
+import { on, selectedTree, state } from "../core/store.js";
+import { keepFresh, throttled } from "../core/timing.js";
+import { columnFigure } from "../explain/columns.js";
+import { gatheredFigure } from "../explain/gathered.js";
+import { annotating, reviewOf } from "./annotations.js";
+
+const EVERY = 1000; // [ms] between two updates while the run plays
+const PAUSE = 100; // [ms] between two requests
+let shown = "", pictured = null; // version of the shown evidence; number of the tree of the camera picture
+
+const evidence = () => byId("review-evidence");
+
+// The card around `hint`, which is visible without a selected tree, too.
+export const card = (hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
+  el("h3", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" })),
+  el("div", { id: "review-evidence" }), hint,
+  el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
+  el("div", { id: "review-votes" }));
+
+const refresh = keepFresh(async () => {
+  const tree = annotating() ? selectedTree() : null;
+  if (!tree) return;
+  const { number } = tree, version = `${number} ${state.map.index} ${state.parameters?.revision}`;
+  if (version === shown) return;
+  let points, votes = "";
+  try {
+    const story = await get(`/api/story/tree/${number}`);
+    points = gatheredFigure(story);
+    votes = columnFigure(story.column, "Votes on the accumulated scans");
+    shown = version;
+  } catch (error) {
+    points = el("p", { class: "empty", text: capital(error.message) });
+  }
+  if (state.selected !== number) return; // another tree was selected meanwhile
+  evidence().replaceChildren(points);
+  byId("review-votes").replaceChildren(votes);
+  evidence().dataset.tree = String(number);
+  fillCard();
+}, PAUSE);
+
+// The camera picture is requested once for each selection.
+function requestPicture(number) {
+  if (pictured === number) return;
+  pictured = number;
+  const box = byId("review-camera"), image = box.querySelector("img");
+  box.hidden = true;
+  if (!state.status?.camera) return;
+  image.onload = () => { box.hidden = pictured !== number; };
+  image.alt = `Tree ${number} in the camera picture`;
+  image.src = `/api/camera/tree/${number}.jpg`;
+}
+
+// Evidence of another tree stays visible but dimmed until that of the selected one arrives.
+export function fillCard() {
+  const tree = selectedTree();
+  byId("review").classList.toggle("empty-card", !tree);
+  if (!tree) {
+    shown = "";
+    pictured = null;
+    return;
+  }
+  const old = evidence().dataset.tree !== String(tree.number), review = reviewOf(tree);
+  setText(byId("review-title"), `Tree ${tree.number}${old ? ": loading …" : ""}`);
+  setText(byId("review-state"), review);
+  byId("review-state").dataset.state = review;
+  byId("review").classList.toggle("loading", old);
+  byId("review").setAttribute("aria-busy", String(old));
+  requestPicture(tree.number);
+}
+
+export function startCard() {
+  on("map", throttled(refresh, EVERY));
+  on("tab selection", refresh);
+}
