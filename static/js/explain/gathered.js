@@ -5,6 +5,8 @@ import { figure } from "../core/format.js";
 import { circle, line, picture, scaleBar, svg, text } from "../core/svg.js";
 
 const REACH = 0.75; // [m] around the tree in which the server sends points
+const LEAST = 0.4, UNKNOWN = 0.5; // [m] least reach of the view from above, and that of a tree without DBH
+const CROWN = 3; // [m] above the ground; higher points are not shown from above
 const BREAST = 1.3, LOW = 1.0, HIGH = 1.6; // [m] above the ground
 const LOWEST_TOP = 3; // [m] least height of the side view
 const SIZE = 240, WIDTH = 130, LEFT = 34; // of the two pictures, and of the heights on the left of the second
@@ -24,12 +26,13 @@ export function gatheredFigure({ points, dbh }) {
 }
 
 function fromAbove(near, others, dbh) {
-  const middle = SIZE / 2, scale = middle / REACH;
+  const reach = dbh === null ? UNKNOWN : Math.min(REACH, Math.max(LEAST, 1.5 * dbh));
+  const middle = SIZE / 2, scale = middle / reach;
   const at = ([x, y]) => [middle + scale * x, middle - scale * y];
-  return picture(SIZE, SIZE, "The accumulated points within 0.75 m from above, x of the map to the right", dots(others.map(at), ""), dots(near.map(at), "near"),
+  return picture(SIZE, SIZE, "The accumulated points up to 3 m above the ground from above, x of the map to the right", dots(others.filter(([, , z]) => z < CROWN).map(at), ""), dots(near.map(at), "near"),
     dbh === null ? null : circle(middle, middle, (scale * dbh) / 2, "fit"),
     line(middle - 4, middle, middle + 4, middle, "axis"), line(middle, middle - 4, middle, middle + 4, "axis"),
-    scaleBar(8, SIZE - 8, REACH / 2, scale));
+    scaleBar(8, SIZE - 8, reach / 2, scale));
 }
 
 function fromTheSide(near, others, dbh) {
