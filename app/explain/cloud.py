@@ -60,6 +60,7 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
         last_seen_s=0.0,
         cluster=candidate,
         column=None,
+        points=[],  # the cross-sections have them
         history=TreeHistory().of(number, 0),
         height=float(plot.crowns.height[row]),
         height_sigma=float(plot.crowns.sigma[row]),

@@ -35,15 +35,15 @@ def points_around(voxels: VoxelMap, place: NDArray[np.float64]) -> list[tuple[fl
     return [(x, y, z) for x, y, z in np.round(np.concatenate(chosen), 2).tolist()]
 
 
-def section(voxels: VoxelMap) -> MapSection:
+def section(accumulated: NDArray[np.floating]) -> MapSection:
     """Return the occupied cells between BREAST_LOW and BREAST_HIGH, seen from above. The side of a cell is
     that of a voxel, doubled until there are at most 20,000 cells.
 
     Args:
-        voxels: Voxels of all scans.
+        accumulated: Points of all scans or of a whole cloud: x, y in the map and height above the ground,
+            shape (N, 3) [m].
     """
-    mean = voxels.mean[: voxels.used]
-    points = mean[_at_breast(mean[:, 2]), :2].astype(np.float64)
+    points = accumulated[_at_breast(accumulated[:, 2]), :2].astype(np.float64)
     origin = np.floor(points.mean(axis=0) if len(points) else np.zeros(2))
     side = SIDE
     while True:

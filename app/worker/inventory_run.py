@@ -29,6 +29,7 @@ from pipeline.types.records import (
     Clusters,
     Detections,
     Float,
+    Float32,
     Frame,
     HeightMap,
     Int32,
@@ -127,6 +128,14 @@ class InventoryRun:
     def kept(self, index: int) -> None:
         """Return None: the only scan is the current one."""
         del index
+
+    @property
+    def accumulated(self) -> Float32:
+        """Points of the cross-sections: x, y and height above the ground, shape (N, 3) [m]; none before the
+        map is complete."""
+        if self.plot is None:
+            return np.zeros((0, 3), np.float32)
+        return self.plot.points[:, [0, 1, 3]].astype(np.float32)
 
     def confirmed_s(self, trees: Trees) -> Float:
         """Return 0 for each tree, shape (T,) [s]."""

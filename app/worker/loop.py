@@ -458,7 +458,7 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
         case protocol.AskSection():
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
-            return protocol.Answer(ticket, section=section(run.voxels))
+            return protocol.Answer(ticket, section=section(run.accumulated))
         case protocol.AskTree(tree=tree):
             return protocol.Answer(ticket, tree=tree_story(run, session.frame, tree))
         case protocol.AskCluster(scan=scan, cluster=cluster):

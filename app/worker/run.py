@@ -36,7 +36,7 @@ from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import KnownMap, Reread, Rerun, Sample, ScanCaches, preview_trees
 from pipeline.stage_timer import StageTimer
-from pipeline.types.records import Float, Frame, Path, Step, Trees
+from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
 #: Returns a mapper of a source for parameters and a seed, see `mapper_of`.
 MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
@@ -118,6 +118,12 @@ class Run:
     def path(self) -> Path:
         """The path up to the current scan."""
         return self._map.mapper.path
+
+    @property
+    def accumulated(self) -> Float32:
+        """Points of all scans up to the current one: x, y in the map and height above the ground [m], shape
+        (N, 3); none without the column classifier."""
+        return self.voxels.mean[: self.voxels.used]
 
     @property
     def voxels(self) -> VoxelMap:

@@ -672,7 +672,7 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     return CameraPicture(picture, *origin.camera(), received)
 
 
-def tree_picture(run: Run | None, number: int) -> CameraPicture:
+def tree_picture(run: Run | InventoryRun | None, number: int) -> CameraPicture:
     """Return the camera picture of a run that shows a tree best, see `best_views`, with its camera model.
 
     Of a recording, the pictures nearest to the mapped scans are considered, because a list of all pictures

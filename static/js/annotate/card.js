@@ -7,6 +7,7 @@ import { on, selectedTree, state } from "../core/store.js";
 import { keepFresh, throttled } from "../core/timing.js";
 import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
+import { sectionsFigure } from "../explain/sections.js";
 import { annotating, reviewOf } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
@@ -30,8 +31,8 @@ const refresh = keepFresh(async () => {
   let points, votes = "";
   try {
     const story = await get(`/api/story/tree/${number}`);
-    points = gatheredFigure(story);
-    votes = columnFigure(story.column, "Votes on the accumulated scans");
+    points = story.sections ? sectionsFigure(story.sections) : gatheredFigure(story);
+    if (!story.sections) votes = columnFigure(story.column, "Votes on the accumulated scans");
     shown = version;
   } catch (error) {
     points = el("p", { class: "empty", text: capital(error.message) });

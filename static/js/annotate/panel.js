@@ -53,7 +53,7 @@ function build() {
       el("p", { id: "annotate-warned", class: "note warned", role: "status" })),
     el("div", { class: "annotate-list" },
       el("table", { id: "annotations", class: "plain" }, el("thead", {}, el("tr", {},
-        ...["tree", "class", "DBH cm", "x m", "y m", "by", ""].map((text) => el("th", { scope: "col", text })))), el("tbody"))),
+        ...["tree", "class", "DBH cm", "x m", "y m", "by"].map((text) => el("th", { scope: "col", text })), el("td"))), el("tbody"))),
     el("div", { class: "annotate-files" },
       el("label", {}, "Your name ", name),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,

@@ -55,13 +55,13 @@ def test_a_thicket_is_thinned_evenly():
 
 def test_without_voxels_there_is_nothing():
     assert points_around(VoxelMap.empty(), np.zeros(2)) == []
-    assert section(VoxelMap.empty()).cells.shape == (0, 2)
+    assert section(np.zeros((0, 3))).cells.shape == (0, 2)
 
 
 @given(st.floats(-300.0, 300.0), st.floats(-300.0, 300.0))
 def test_the_section_holds_the_cells_at_breast_height_only(x: float, y: float):
     voxels = voxels_of(np.concatenate([ring(x, y, 0.3, 1.3), ring(x + 3.0, y, 0.3, 0.5), ring(x, y, 0.5, 3)]))
-    found = section(voxels)
+    found = section(voxels.mean[: voxels.used])
     assert found.side == SIDE
     centre = np.array(found.origin) + (found.cells + 0.5) * found.side
     reach = np.hypot(*(centre - [x, y]).T)
@@ -72,13 +72,13 @@ def test_the_section_holds_the_cells_at_breast_height_only(x: float, y: float):
 def test_a_large_section_has_larger_cells_and_covers_the_same_places():
     rng = np.random.default_rng(0)
     places = np.column_stack([rng.uniform(-200, 200, (120_000, 2)), np.full(120_000, 1.3)])
-    found = section(voxels_of(places))
+    found = section(places)
     assert found.side in (2 * SIDE, 4 * SIDE, 8 * SIDE, 16 * SIDE, 32 * SIDE)
     assert 2_000 < len(found.cells) <= 20_000
     held = {tuple(cell) for cell in found.cells.tolist()}
     wanted = np.floor((places[:, :2] - found.origin) / found.side).astype(int)
     inside = sum(tuple(cell) in held for cell in wanted.tolist())
-    assert inside > 0.97 * len(places)  # the mean of a voxel may be in the next cell
+    assert inside == len(places)
 
 
 def test_the_points_of_a_mapped_tree_are_on_its_fitted_circle(session: Session):

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from app.explain.build import cluster_story, tree_story
+from app.explain.gathered import section as at_breast
 from app.worker.outbox import picture_of
 from app.worker.process import new_session, open_any_or_cloud
 from app.worker.protocol import Report, Shown, from_worker
-from app.worker.session import Session
+from app.worker.session import Session, tree_picture
 from pipeline.config import preset
 from pipeline.errors import SourceError, StemmapError
 from pipeline.inventory import PARAMETERS
@@ -169,6 +170,18 @@ def test_the_story_of_a_tree_has_sections_whose_points_are_on_the_circle(session
         assert story.height_hidden or story.height == pytest.approx(8.0, abs=4.0 * story.height_sigma)
     with pytest.raises(StemmapError, match="no tree 99"):
         tree_story(session.run, session.frame, 99)
+
+
+def test_the_section_at_breast_height_shows_each_stem(session: Session) -> None:
+    assert session.run is not None
+    assert len(at_breast(session.run.accumulated).cells) == 0
+    frame = mapped(session)
+    found = at_breast(session.run.accumulated)
+    centre = np.array(found.origin) + (found.cells + 0.5) * found.side
+    away = np.hypot(*(frame.trees.position[:, None] - centre).transpose(2, 0, 1)).min(axis=1)
+    assert (away < 0.5 * frame.trees.dbh + found.side).all()
+    with pytest.raises(StemmapError, match="no camera"):
+        tree_picture(session.run, 1)
 
 
 def test_the_verdict_of_a_candidate_is_that_of_its_first_check_that_fails(session: Session) -> None:
