@@ -96,7 +96,9 @@ def test_the_points_of_a_mapped_tree_are_on_its_fitted_circle(session: Session):
         true = np.argmin(distance)
         if truth.trees.kind[true] != "tree" or distance[true] > 0.1:
             continue
-        points = np.array(tree_story(session.run, int(trees.number[row])).points).reshape(-1, 3)
+        points = np.array(tree_story(session.run, session.frame, int(trees.number[row])).points).reshape(
+            -1, 3
+        )
         at_breast = points[(points[:, 2] >= BREAST_LOW) & (points[:, 2] < BREAST_HIGH)]
         if len(at_breast) < 10:  # far away, every fourth scan is accumulated only
             continue
