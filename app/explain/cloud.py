@@ -22,7 +22,10 @@ from pipeline.types.records import Verdict
 
 _PICTURES = 9  # cross-sections with points
 _MOST_POINTS = 300  # of a cross-section
-_AROUND, _BESIDE = 1.6, 0.1  # width of a picture as a share of the radius, and at least beside the circle [m]
+_REACH, _MARGIN = (
+    1.6,
+    0.1,
+)  # a picture shows this multiple of the radius, and at least this margin around it [m]
 _UNKNOWN_RADIUS = 0.15  # m, of a candidate without a circle
 
 
@@ -175,7 +178,7 @@ def _points_around(plot: PlotMap, height: float, centre: Float, radius: float) -
         height: Middle of the slice above the ground [m].
         centre, radius: The circle [m].
     """
-    reach = max(_AROUND * radius, radius + _BESIDE)
+    reach = max(_REACH * radius, radius + _MARGIN)
     inside = np.abs(plot.points[:, 3] - height) < 0.5 * THICK * STEP
     offset = plot.points[inside, :2].astype(np.float64) - centre
     offset = offset[np.hypot(*offset.T) < reach]

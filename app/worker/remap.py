@@ -23,7 +23,7 @@ from pipeline.front_end import SegmentedScan
 from pipeline.mapper import Mapper, MapperState
 from pipeline.remapping import ClusterTable, Rerun
 from pipeline.remapping.rerun import Segment
-from pipeline.slam import EstimatedPath, Genealogy, KeyframeGraph
+from pipeline.slam import Genealogy, KeyframeGraph
 from pipeline.types.records import Columns, Float, Frame, Path, Step, Trees, Verdict
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
@@ -216,7 +216,7 @@ _MOST_BYTES = 256 << 20
 def nbytes(state: object) -> int:
     """Return the number of bytes of all arrays in nested dataclasses, lists and tuples; 0 for other
     values."""
-    if isinstance(state, np.ndarray | EstimatedPath | Genealogy | KeyframeGraph):
+    if isinstance(state, np.ndarray | Genealogy | KeyframeGraph):
         return state.nbytes
     if isinstance(state, list | tuple):
         return sum(map(nbytes, state))

@@ -4,11 +4,10 @@ from pipeline.slam.fastslam import FastSlam
 from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.loop_correction import Loop
 from pipeline.slam.motion import Motion
-from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
+from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.state import SlamState
 
 __all__ = [
-    "EstimatedPath",
     "FastSlam",
     "Genealogy",
     "KeyframeGraph",

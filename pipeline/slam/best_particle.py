@@ -1,4 +1,4 @@
-"""Choice of the best particle, whose map, path and, if the particles are far apart, pose are reported."""
+"""Choice of the best particle, whose map and, if the particles are far apart, pose are reported."""
 
 from __future__ import annotations
 

@@ -314,8 +314,9 @@ class FastSlam:
 
     @property
     def best_pose(self) -> Pose2:
-        """Pose of the best particle at the last used scan, with respect to which its landmarks are known."""
-        return Pose2(*self.state.pose[self.state.best].tolist())
+        """Pose of the best particle at the newest scan, in the frame of its landmarks."""
+        state = self.state
+        return Pose2(*state.pose[state.best].tolist()) @ Pose2(*state.motion.tolist())
 
     def landmarks(self) -> Landmarks:
         """Return all landmarks of the best particle, those with few hits and in inactive places as well, with

@@ -40,7 +40,7 @@ class EstimatedPath:
 
     @classmethod
     def of(cls, poses: Float) -> EstimatedPath:
-        """Return the path with these poses, shape (N, 3), which are copied."""
+        """Return the path with the poses x, y [m], yaw [rad] of all scans, shape (N, 3), which are copied."""
         whole = len(poses) // BLOCK * BLOCK
         blocks = tuple(poses[k : k + BLOCK].copy() for k in range(0, whole, BLOCK))
         return cls(blocks, poses[whole:].copy())
@@ -49,20 +49,15 @@ class EstimatedPath:
         """Return the number of scans."""
         return BLOCK * len(self.blocks) + len(self.newest)
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the poses [bytes]."""
-        return len(self) * 3 * self.newest.itemsize
-
     def with_pose(self, pose: Float) -> EstimatedPath:
-        """Return the path with the pose of one more scan, shape (3,)."""
+        """Return the path with the pose of one more scan, x, y [m], yaw [rad], shape (3,)."""
         newest = np.concatenate([self.newest, pose[None]])
         if len(newest) < BLOCK:
             return EstimatedPath(self.blocks, newest)
         return EstimatedPath((*self.blocks, newest), np.zeros((0, 3)))
 
     def poses(self) -> Float:
-        """Return the poses of all scans as a copy, shape (N, 3)."""
+        """Return the poses of all scans as a copy, x, y [m], yaw [rad], shape (N, 3)."""
         return np.concatenate([*self.blocks, self.newest])
 
 

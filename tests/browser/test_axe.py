@@ -69,8 +69,8 @@ def test_no_tab_no_dialog_and_no_page_has_a_violation(page_of_a_run: Dashboard):
     page.locator("#runs tbody tr button").first.click()
     expect(page.locator(".run-map canvas")).to_be_visible()
     found["runs"] = in_both_themes(page)
-    listed = [f"{where}: {each}" for where, told in found.items() for each in told]
-    assert not listed, "\n".join(listed)
+    violations = [f"{where}: {each}" for where, rules in found.items() for each in rules]
+    assert not violations, "\n".join(violations)
 
 
 def test_the_card_of_the_first_visit_and_a_lost_link(chromium: Browser, server: Server):

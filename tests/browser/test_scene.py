@@ -317,7 +317,7 @@ def test_accumulated_map_voxels_and_errors_are_layers(dashboard: Dashboard):
     page.get_by_role("button", name="Layers").click()
 
 
-APART = 25  # [px] between markers, so that a click does not hit the one beside
+APART = 25  # [px] between markers, so that a click does not hit its neighbour
 
 
 @pytest.fixture

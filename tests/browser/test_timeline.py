@@ -91,8 +91,8 @@ UNDER = """async changes => {
       await new Promise(done => setTimeout(done, 400));
     }
     const line = document.querySelector('#seeking');
-    const told = [line.ariaLabel, line.ariaValueNow, line.firstChild.style.width];
-    const seeking = line.hidden ? '' : told.join(' ');
+    const progress = [line.ariaLabel, line.ariaValueNow, line.firstChild.style.width];
+    const seeking = line.hidden ? '' : progress.join(' ');
     return [text('#state b'), text('#notice p'), Number(document.querySelector('#timeline').value), seeking];
   };
   const told = await tell();

@@ -166,8 +166,8 @@ const compared = (a, b) => (a < b ? -1 : a > b ? 1 : 0);
 
 const skippedAt = (tree) => annotationOf(tree)?.at_s ?? 0; // 0: open
 
-// Found trees that nobody decided on: the open ones first, of these the most doubtful, then the least often observed; then the
-// skipped ones in the order in which they were skipped.
+// Found trees that are open or skipped. Open trees come first, sorted by doubt and then by the number of observations; skipped
+// trees follow in the order in which they were skipped.
 export const unreviewed = () => trees().filter((tree) => !isReviewed(tree)).sort((a, b) =>
   skippedAt(a) - skippedAt(b) || compared(margin(a), margin(b)) || a.observations - b.observations || a.number - b.number);
 

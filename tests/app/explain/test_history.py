@@ -30,15 +30,15 @@ def seen(index: int, x: float, numbers: tuple[int, ...] = (1, 2), observations: 
 
 
 @given(st.lists(st.integers(0, 30), min_size=1, max_size=60))
-def test_what_is_told_is_the_newest_pass_up_to_the_newest_scan(scans: list[int]):
+def test_the_history_is_the_newest_pass_up_to_the_newest_scan(scans: list[int]):
     history = TreeHistory()
     known: dict[int, float] = {}
     for turn, index in enumerate(scans):
         history.record(seen(index, float(turn)), START_NS)
         known = {k: x for k, x in known.items() if k < index} | {index: float(turn)}
-    told = history.of(1, 10**6)
-    assert told.x == [known[k] for k in sorted(known)]
-    assert told.time_s == pytest.approx([0.1 * k for k in sorted(known)])
+    story = history.of(1, 10**6)
+    assert story.x == [known[k] for k in sorted(known)]
+    assert story.time_s == pytest.approx([0.1 * k for k in sorted(known)])
     assert history.of(3, 10**6).x == []
 
 
@@ -48,19 +48,19 @@ def test_it_is_bounded_and_keeps_the_first_views(monkeypatch: pytest.MonkeyPatch
     for index in range(3000):
         history.record(seen(index, float(index), observations=index + 1), START_NS)
         assert len(history) <= 200
-    told = history.of(2, 10**6)
-    assert told.x[:10] == [float(k) for k in range(10)]
-    assert told.x[-1] > 2500
+    story = history.of(2, 10**6)
+    assert story.x[:10] == [float(k) for k in range(10)]
+    assert story.x[-1] > 2500
 
 
-def test_a_long_history_is_told_with_its_ends():
+def test_a_long_history_is_story_with_its_ends():
     history = TreeHistory()
     for index in range(1500):
         history.record(seen(index, float(index)), START_NS)
-    told = history.of(1, 10**6)
-    assert len(told.x) <= 200
-    assert told.x[0] == 0.0
-    assert told.x[-1] == 1499.0
+    story = history.of(1, 10**6)
+    assert len(story.x) <= 200
+    assert story.x[0] == 0.0
+    assert story.x[-1] == 1499.0
 
 
 @given(st.floats(0.1, 5.0), st.floats(0.01, 1.0), st.floats(-1.5, 1.5))

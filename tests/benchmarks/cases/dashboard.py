@@ -223,7 +223,7 @@ def _mapped_ms(dashboard: Dashboard) -> list[tuple[list[float], list[float]]]:
         sought = {"type": "seek", "time_s": 0.1 * index + 0.01}
         answers[1].append(dashboard.browsers.ask({"do": "go", "command": sought, "index": index}))
         time.sleep(0.3)
-    return [([each["map"] for each in told], [each["scene"] for each in told]) for told in answers]
+    return [([each["map"] for each in times], [each["scene"] for each in times]) for times in answers]
 
 
 def _idle(dashboard: Dashboard) -> list[float]:

@@ -500,13 +500,15 @@ def test_two_trees_seen_in_one_scan_stay_two():
     assert landmarks_of(slam) == [2, 2, 2]
 
 
-def test_the_path_contains_the_estimate_of_each_scan():
-    slam = fresh(particles=30)
+@pytest.mark.parametrize("update_distance", [0.0, 5.0])
+def test_the_path_contains_the_estimate_of_each_scan(update_distance):
+    slam = fresh(particles=30, update_distance=update_distance)
     estimates = [estimate for estimate, _, _ in _drive(slam, scans=120)]
     reported = np.array([estimate.T_map_base.as_array() for estimate in estimates])
     np.testing.assert_array_equal(slam.path(), reported)
     best = estimates[-1].particles[slam.state.best]
     np.testing.assert_allclose(slam.best_pose.as_array(), best, atol=1e-9)
+    assert (slam.state.since_update > 0.0) == (update_distance > 0.0)
 
 
 def test_the_power_of_the_weights_is_that_of_the_likelihood():
