@@ -18,7 +18,7 @@ const evidence = () => byId("review-evidence");
 
 // The card around `hint`, which is visible without a selected tree, too.
 export const card = (hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
-  el("h3", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" })),
+  el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" })),
   el("div", { id: "review-evidence" }), hint,
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
