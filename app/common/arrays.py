@@ -1,11 +1,25 @@
-"""Rows of arrays: those that two arrays share, and an even selection of them."""
+"""Rows of arrays and tables: some of a table, those that two arrays share, and an even selection."""
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+T = TypeVar("T")
+
+
+def rows_of(table: T, rows: Any) -> T:  # noqa: ANN401 - what indexes an array
+    """Return some rows of a record of columns, for example of `Trees`; columns that are None stay None.
+
+    Args:
+        table: A dataclass whose fields are arrays of equal length, or None.
+        rows: Indexes, a mask or a slice.
+    """
+    columns = {f.name: getattr(table, f.name) for f in fields(table)}  # type: ignore[arg-type]
+    return type(table)(**{name: None if c is None else c[rows] for name, c in columns.items()})
 
 
 def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:

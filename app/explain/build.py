@@ -140,7 +140,7 @@ def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStor
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
         column=column_story(frame, trees.position[row], parameters, sensor),
         points=points_around(run.voxels, trees.position[row]),
-        history=run.history.of(int(trees.number[row]), frame.index),
+        history=run.history(int(trees.number[row]), frame.index),
     )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -51,19 +50,6 @@ class TreeHistory:
         if self._spacing > 1:
             rows = rows[(rows[:, _SCAN] % self._spacing == 0) | (rows[:, _OBSERVATIONS] <= _ALL_OF_FIRST)]
         self._append(rows)
-
-    def renumber(self, number_of: Mapping[int, int]) -> None:
-        """Replace the numbers of trees; the rows of trees without a new number are removed.
-
-        Args:
-            number_of: New number by old number.
-        """
-        known = self._rows[: self._count]
-        numbers = np.array([number_of.get(int(old), 0) for old in known[:, _NUMBER]], dtype=np.float64)
-        kept = known[numbers > 0]
-        kept[:, _NUMBER] = numbers[numbers > 0]
-        self._count = len(kept)
-        self._rows[: self._count] = kept
 
     def last_places(self) -> dict[int, tuple[float, float]]:
         """Return the newest position of each tree by its number [m]."""

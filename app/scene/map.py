@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.common.arrays import first_difference
+from app.common.arrays import first_difference, rows_of
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
 from app.scene.labels import TREE_WIDTH, Label, LabelNodes, Place, apart
@@ -66,7 +66,7 @@ class MapNodes:
         """
         if self.ground.show(frame.ground):
             self.show_truth(self._truth_trees)
-        trees = confirmed(frame.trees)
+        trees = rows_of(frame.trees, frame.trees.confirmed)
         foot = np.round(self.ground.heights(trees.position, frame.base_z), 1)
         radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS)
         place = np.column_stack([trees.number, np.round(trees.position, 2), np.round(radius, 3), foot])
@@ -83,7 +83,7 @@ class MapNodes:
         self._trees.visible = view.layers["trees"]
         self._circles.visible = view.layers["fits"]
         self._truth.visible = view.layers["truth"]
-        trees = confirmed(frame.trees)
+        trees = rows_of(frame.trees, frame.trees.confirmed)
         pose = frame.estimate.T_map_base
         foot = self.ground.heights(trees.position, frame.base_z)
         self._show_mark(trees, selected, ring, frame.base_z)
@@ -96,7 +96,7 @@ class MapNodes:
     def place_of(self, frame: Frame, tree: int | None, ring: Ring) -> tuple[float, float, float] | None:
         """Return x, y and height of the ground of the selected cluster, else of the selected tree [m]; None
         without them. Arguments as in `show`."""
-        places = confirmed(frame.trees).position[confirmed(frame.trees).number == tree]
+        places = frame.trees.position[frame.trees.confirmed & (frame.trees.number == tree)]
         if ring is not None:
             places = np.array([ring[:2]])
         if not len(places):
@@ -163,12 +163,6 @@ class MapNodes:
             places, radii = np.vstack([places, ring[:2]]), [*radii, ring[2] + 0.12]
         each = np.tile(np.array([colours.SELECTION], dtype=np.uint8), (len(radii), 1))
         self._mark.show_at(places, np.array(radii), each, self.ground.heights(places, base_z))
-
-
-def confirmed(trees: Trees) -> Trees:
-    """Return the confirmed trees of a table; columns that are None stay None."""
-    known = {name: column for name in Trees.__slots__ if (column := getattr(trees, name)) is not None}
-    return Trees(**{name: column[trees.confirmed] for name, column in known.items()})
 
 
 def tree_labels(

@@ -14,7 +14,6 @@ import numpy as np
 
 from app.batch.run_folder import NO_PATH
 from app.common.timers import Stopwatch
-from app.explain.history import TreeHistory
 from app.store.forests import kept_forests
 from app.worker.tree_numbers import TreeNumbers
 from pipeline.config import Parameters
@@ -89,7 +88,7 @@ class InventoryRun:
         folder: Folder of the temporary file with the points; None for that of the system.
 
     Attributes:
-        frame: The map as a frame; None before it is complete.
+        frame, confirmed_s: The map as a frame, and 0 for each of its trees [s]; None before it is complete.
         plot: The map in the frame of the cloud minus its offset; None before.
         current: 0 if there is a map, else -1.
     """
@@ -105,8 +104,8 @@ class InventoryRun:
     def __init__(self, source: CloudSource, parameters: Parameters, folder: FilePath | None = None) -> None:
         self.source = source
         self.stopwatch = Stopwatch()
-        self.history = TreeHistory()
         self.frame: Frame | None = None
+        self.confirmed_s: Float | None = None
         self.plot: PlotMap | None = None
         self.current = -1
         self._inventory = Inventory(source.cloud, kept_forests(), folder)
@@ -136,10 +135,6 @@ class InventoryRun:
         if self.plot is None:
             return np.zeros((0, 3), np.float32)
         return self.plot.points[:, [0, 1, 3]].astype(np.float32)
-
-    def confirmed_s(self, trees: Trees) -> Float:
-        """Return 0 for each tree, shape (T,) [s]."""
-        return np.zeros(len(trees.number))
 
     @property
     def known(self) -> int:
@@ -202,7 +197,7 @@ class InventoryRun:
         """Share of the inventory that replaces the map, from 0 to 1; None without one."""
         return self.share if self.current >= 0 else None
 
-    def remap_on(self, scans: int) -> tuple[Frame, dict[int, float]] | None:
+    def remap_next(self) -> tuple[Frame, dict[int, float]] | None:
         """Compute the next step of the inventory that replaces the map.
 
         Returns:
@@ -211,7 +206,6 @@ class InventoryRun:
         Raises:
             StemmapError: The cloud cannot be mapped with these parameters. The map does not change.
         """
-        del scans
         if self._job is None or not self._advance() or self.frame is None:
             return None
         return self.frame, dict.fromkeys(self.frame.trees.number.tolist(), 0.0)
@@ -278,6 +272,7 @@ class InventoryRun:
         if self.current >= 0:
             self._numbers.begin_map(frame.trees, {})
         self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
+        self.confirmed_s = np.zeros(len(frame.trees.number))
         self.plot, self.current, self._mapped_with = plot, 0, self._parameters
 
 

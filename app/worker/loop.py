@@ -47,8 +47,6 @@ _LISTEN_S = 0.005
 # the rerun continues, even if the replay is late.
 _REMAP_S = 0.02
 _SCANS_A_REMAP = 4
-# Scans that a rerun maps in one call; fewer where a scan takes long.
-_AT_ONCE = 8
 
 
 class WorkerLoop:
@@ -89,7 +87,6 @@ class WorkerLoop:
         self._compiling_since_s, self._compiled_at = 0.0, -math.inf
         self._compiled_share, self._progress_at = compiled_share, -math.inf
         self._mapped = 0  # scans since a scan was mapped again
-        self._at_once = 1
 
     def run(self) -> None:
         """Execute commands and map scans until the command None; then close the session. Errors of the run
@@ -212,17 +209,10 @@ class WorkerLoop:
 
     def _remap(self) -> None:
         """Continue a rerun for up to `_REMAP_S`, and send the new map when the rerun is complete."""
-        begun = self._clock()
-        while True:
-            requested = self._clock()
-            done = self._session.remap(self._at_once)
-            now = self._clock()
-            if now > requested + 2.0 * _REMAP_S:
-                self._at_once = max(1, self._at_once // 2)
-            elif now < requested + _REMAP_S:
-                self._at_once = min(_AT_ONCE, 2 * self._at_once)
-            if done is not None or not self._session.is_remapping or now >= begun + _REMAP_S:
-                break
+        until = self._clock() + _REMAP_S
+        done = self._session.remap()
+        while done is None and self._session.is_remapping and self._clock() < until:
+            done = self._session.remap()
         if done is None:
             self._report_when_due(self._clock())
             return

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 from msgspec import structs
 
-from app.common.arrays import evenly_spaced, first_difference
+from app.common.arrays import evenly_spaced, first_difference, rows_of
 from app.explain.history import RecentScans
 from app.worker.protocol import FromWorker, Opened, Report, Shown, WireError, from_worker
 from pipeline.types.records import Frame, HeightMap, Path
@@ -148,7 +148,9 @@ class Outbox:
         else:
             self._sent_ground = picture.ground
         self._sent_run = shown.run
-        return structs.replace(shown, frame=picture, path_start=start, path=rows_from(shown.path, start))
+        return structs.replace(
+            shown, frame=picture, path_start=start, path=rows_of(shown.path, slice(start, None))
+        )
 
 
 def _is_standing(message: FromWorker) -> bool:
@@ -166,17 +168,14 @@ def _replaces(newer: FromWorker, older: FromWorker) -> bool:
     return (newer.status.source, newer.status.state) == (older.status.source, older.status.state)
 
 
-_PATH_COLUMNS = ("stamp_ns", "x", "y", "yaw", "sigma_xy")
+def path_columns(path: Path) -> list[np.ndarray]:
+    """Return the columns of a path, in the order of its fields."""
+    return [getattr(path, name) for name in Path.__slots__]
 
 
 def rows_in_common(old: Path, new: Path) -> int:
     """Return the number of equal leading rows of two paths."""
-    return min(first_difference(getattr(old, name), getattr(new, name)) for name in _PATH_COLUMNS)
-
-
-def rows_from(path: Path, start: int) -> Path:
-    """Return the rows of a path from row `start` onwards."""
-    return Path(*(getattr(path, name)[start:] for name in _PATH_COLUMNS))
+    return min(map(first_difference, path_columns(old), path_columns(new)))
 
 
 def joined(old: Path | None, start: int, tail: Path) -> Path:
@@ -190,8 +189,8 @@ def joined(old: Path | None, start: int, tail: Path) -> Path:
     """
     if old is None or start == 0:
         return tail
-    columns = ((getattr(old, name)[:start], getattr(tail, name)) for name in _PATH_COLUMNS)
-    return Path(*(np.concatenate(parts) for parts in columns))
+    columns = zip(path_columns(old), path_columns(tail), strict=True)
+    return Path(*(np.concatenate([before[:start], rest]) for before, rest in columns))
 
 
 MOST_POINTS = 200_000

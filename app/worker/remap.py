@@ -6,9 +6,9 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
@@ -20,55 +20,63 @@ from app.worker.tree_numbers import SAME
 from pipeline.config import Parameters
 from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
-from pipeline.mapper import Mapper, MapperState
+from pipeline.mapper import Mapper
 from pipeline.remapping import ClusterTable, Rerun
 from pipeline.remapping.rerun import Segment
 from pipeline.slam import Genealogy, KeyframeGraph
-from pipeline.types.records import Columns, Float, Frame, Path, Step, Trees, Verdict
+from pipeline.types.records import Columns, Float, Frame, Step, Trees, Verdict
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
 NS = 1_000_000_000
 
 
-@dataclass(slots=True)
-class MappingRecord:
-    """Results of the mapped scans that are not part of the map.
+class RunMap:
+    """A map of the scans of a run, with the states to which it can return, and what is known of each mapped
+    scan. Its trees have the numbers of the mapper, see `TreeNumbers`.
+
+    Args:
+        mapper: A mapper before its first scan.
+        parameters: Parameters from the first scan onwards.
+        start_ns: Returns the time of the first scan [ns].
+        frames: Stores the frames; None stores none.
 
     Attributes:
+        before: State of the mapper before the current scan.
+        snapshots: Earlier states of the mapper.
         history: Estimate of each tree over time.
         confirmed_s: Time at which each tree was first confirmed, by its number [s since the first scan].
         clusters: Clusters of all scans.
-        time_s: Time of the last added scan [s since the first scan].
-        frames: Frames of all scans; None if they are not stored.
     """
 
-    history: TreeHistory = field(default_factory=TreeHistory)
-    confirmed_s: dict[int, float] = field(default_factory=dict)
-    clusters: ClusterTable = field(default_factory=ClusterTable)
-    time_s: float = -math.inf
-    frames: FrameStore | None = None
+    def __init__(
+        self,
+        mapper: Mapper,
+        parameters: Parameters,
+        start_ns: Callable[[], int],
+        frames: FrameStore | None = None,
+    ) -> None:
+        self.mapper, self.frames = mapper, frames
+        self.parameters = ParameterHistory(parameters)
+        self.before = mapper.snapshot()
+        self.snapshots = Snapshots(self.before)
+        self.history, self.clusters = TreeHistory(), ClusterTable()
+        self.confirmed_s: dict[int, float] = {}
+        self._start_ns, self._time_s = start_ns, -math.inf
 
-    def add(self, frame: Frame, start_ns: int) -> None:
-        """Add the results of a scan. If the run went back, the entries of this scan and of later ones are
-        replaced. A tree keeps the time of its first confirmation.
-
-        Args:
-            frame: Results of the scan.
-            start_ns: Time of the first scan of the run [ns].
-        """
+    def add(self, frame: Frame) -> None:
+        """Add the results of the scan that was mapped last. If the run went back, the entries of this scan
+        and of later ones are replaced. A tree keeps the time of its first confirmation."""
+        start_ns = self._start_ns()
         self.history.record(frame, start_ns)
         self.clusters.record(frame)
         time_s = (frame.stamp_ns - start_ns) / NS
-        if time_s <= self.time_s:
+        if time_s <= self._time_s:
             self.confirmed_s = {number: at for number, at in self.confirmed_s.items() if at < time_s}
-        self.time_s = time_s
+        self._time_s = time_s
         for number in frame.trees.number[frame.trees.confirmed].tolist():
             self.confirmed_s.setdefault(number, time_s)
-
-    def store(self, frame: Frame, path: Path, *, own_numbers: bool = False) -> None:
-        """Store the scan that was added last, unless it is stored. Arguments as in `FrameStore.put`."""
         if self.frames is not None:
-            self.frames.put(frame, path, self.time_s, self.confirmed(frame.trees), own_numbers=own_numbers)
+            self.frames.put(frame, self.mapper.path, time_s, self.confirmed(frame.trees))
 
     def confirmed(self, trees: Trees) -> Float:
         """Return the time at which each tree was first confirmed [s since the first scan], shape (T,); NaN
@@ -82,87 +90,47 @@ class MappingRecord:
         last = self.history.last_places()
         return {n: last[n] for n in self.confirmed_s.keys() - set(trees.number.tolist()) if n in last}
 
-    def renumber(self, number_of: Mapping[int, int]) -> None:
-        """Replace the numbers of trees; trees without a new number are removed.
+    def use(self, parameters: Parameters, index: int) -> bool:
+        """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
+        value changes; then what is stored of later scans is dropped."""
+        changes = self.parameters.set_from(index, parameters)
+        if changes:
+            self.snapshots.forget_after(index)
+            if self.frames is not None:
+                self.frames.forget_from(index)
+        return changes
 
-        Args:
-            number_of: New number by old number.
-        """
-        self.history.renumber(number_of)
+    def close(self) -> None:
+        """Delete the stored frames."""
         if self.frames is not None:
-            self.frames.renumber(number_of)
-        self.confirmed_s = {number_of[k]: at for k, at in self.confirmed_s.items() if k in number_of}
-
-
-@dataclass(slots=True, eq=False)
-class RunMap:
-    """A map of the scans of a run, with the states from which it can continue and to which it can return.
-
-    Attributes:
-        parameters: Parameters with which each scan was mapped.
-        mapper: The mapper.
-        snapshots: Earlier states of the mapper.
-        before: State of the mapper before the current scan.
-        record: History of the mapped scans.
-    """
-
-    parameters: ParameterHistory
-    mapper: Mapper
-    snapshots: Snapshots[MapperState]
-    before: MapperState
-    record: MappingRecord = field(default_factory=MappingRecord)
-
-    @classmethod
-    def fresh(cls, mapper: Mapper, parameters: Parameters, frames: FrameStore | None) -> RunMap:
-        """Return a map without scans.
-
-        Args:
-            mapper: A mapper before its first scan.
-            parameters: Parameters from the first scan onwards.
-            frames: Stores its frames; None stores none.
-        """
-        state = mapper.snapshot()
-        record = MappingRecord(frames=frames)
-        return cls(ParameterHistory(parameters), mapper, Snapshots(state), state, record)
+            self.frames.close()
 
 
 class Remapping:
     """A run that is mapped again from its first scan.
 
     Args:
-        rerun: The rerun, with a fresh mapper.
-        start_ns: Time of the first scan [ns].
-        frames: Stores the frames of the new map; None stores none.
-
-    Attributes:
-        map: The new map, as far as it goes.
+        rerun: The rerun, with the mapper of the new map.
+        new_map: The new map, before its first scan.
     """
 
-    def __init__(self, rerun: Rerun, start_ns: int, frames: FrameStore | None = None) -> None:
-        self.rerun = rerun
-        self.map = RunMap.fresh(rerun.mapper, rerun.mapper.parameters, frames)
-        self._start_ns = start_ns
+    def __init__(self, rerun: Rerun, new_map: RunMap) -> None:
+        self.rerun, self.map = rerun, new_map
 
-    def work(self, scans: int, until: int) -> bool:
-        """Map more scans; return whether `until` scans are mapped. If the run went back meanwhile, the rerun
-        goes back as well.
-
-        Args:
-            scans: Maximum number of scans to map now.
-            until: Number of scans that the complete rerun has.
+    def map_next(self, until: int) -> bool:
+        """Map the next scan; return whether `until` scans are mapped. If the run went back meanwhile, the
+        rerun goes back as well.
 
         Raises:
-            StemmapError: A scan cannot be read again.
+            StemmapError: The scan cannot be read again.
         """
         rerun, snapshots = self.rerun, self.map.snapshots
         if rerun.done > until:
             rerun.go_back(*snapshots.newest(until))
-        for _ in range(min(scans, until - rerun.done)):
+        if rerun.done < until:
             if snapshots.is_due(rerun.done):
                 snapshots.offer(rerun.done, rerun.mapper.snapshot())
-            frame = rerun.map_next()
-            self.map.record.add(frame, self._start_ns)
-            self.map.record.store(frame, rerun.mapper.path, own_numbers=True)
+            self.map.add(rerun.map_next())
         return rerun.done == until
 
     def finish(self) -> RunMap:
@@ -338,13 +306,6 @@ def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Ste
             yield first, scan.result()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def segment_all(segment: Segment, steps: list[Step]) -> list[SegmentedScan]:
-    """Return the segmented scan of each step, in order; two threads segment them. An exception of `segment`
-    is raised."""
-    with ThreadPoolExecutor(2, thread_name_prefix="segment") as pool:
-        return list(pool.map(segment, steps))
 
 
 MOVED = 0.05  # smallest reported motion [m]

@@ -7,16 +7,17 @@ mapped. It does not depend on pauses, jumps, or which states of the mapper are k
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path as FilePath
 
 import msgspec
 
 from app.common.timers import Stopwatch
-from app.explain.history import TreeHistory
+from app.explain.records import History
 from app.robot.source import LiveSource
 from app.sources.request import with_odometry
-from app.worker.cursor import Cursor, LiveCursor
+from app.worker.cursor import Cursor, live_steps
 from app.worker.frame_store import FrameStore, StepStore
 from app.worker.protocol import Shown
 from app.worker.remap import (
@@ -24,17 +25,17 @@ from app.worker.remap import (
     Remapping,
     RunMap,
     segment_ahead,
-    segment_all,
 )
 from app.worker.tree_numbers import TreeNumbers
 from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.front_end import SegmentedScan
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.remapping import KnownMap, Reread, Rerun, Sample, ScanCaches, preview_trees
+from pipeline.remapping import KnownMap, Rerun, ScanCaches, preview_trees, sample_scans
 from pipeline.stage_timer import StageTimer
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
@@ -55,12 +56,14 @@ class Run:
         parameters: Parameters from the first scan onwards.
         stopwatch: Measures the stages of the mapper.
         odometry: Description of the source of motion.
-        reread: Returns the steps from the first scan; None for a live run.
+        is_live: Whether the source is a robot: its scans cannot be read again, and their frames are not
+            stored.
         caches: Caches of the segmented scans of this source.
-        new_frames: Returns a store for the frames of a map; None if they are not stored.
 
     Attributes:
         frame: Result of the current scan; None before the first.
+        confirmed_s: Time at which each of its trees was first confirmed [s since the first scan], NaN for
+            trees that never were; None before the first scan.
         current: Index of the current scan; -1 before the first.
         is_bare: Whether the frame has no points, see `map_next`.
     """
@@ -69,42 +72,41 @@ class Run:
         self,
         source: Source,
         make_mapper: Callable[[Parameters], Mapper],
-        cursor: Cursor | LiveCursor,
+        cursor: Cursor,
         parameters: Parameters,
         stopwatch: Stopwatch,
-        odometry: str = "",
-        reread: Reread | None = None,
-        caches: ScanCaches | None = None,
-        new_frames: Callable[[], FrameStore | None] = lambda: None,
+        odometry: str,
+        caches: ScanCaches,
+        *,
+        is_live: bool,
     ) -> None:
         self.source = source
         self.odometry = odometry
         self.stopwatch = stopwatch
         self.frame: Frame | None = None
+        self.confirmed_s: Float | None = None
         self.current = -1
         self.is_bare = False
-        self._cursor = cursor
-        self._new_frames = new_frames
-        self._map = RunMap.fresh(make_mapper(parameters), parameters, new_frames())
+        self._cursor, self._is_live = cursor, is_live
+        self._make_mapper = make_mapper
+        self._map = self._new_map(make_mapper(parameters))
         self._step: Step | None = None
         self._broken = False
-        self._make_mapper, self._reread = make_mapper, reread
-        self._caches = ScanCaches() if caches is None else caches
-        self._cache = self._caches.of(parameters)
-        self._sample = Sample()
+        self._caches = caches
+        self._cache = caches.of(parameters)
         self._numbers = TreeNumbers()
         self._remapping: Remapping | None = None
         self._preview: Trees | None = None
 
-    @property
-    def history(self) -> TreeHistory:
-        """Estimate of each tree over time."""
-        return self._map.record.history
+    def _new_map(self, mapper: Mapper) -> RunMap:
+        """Return an empty map of a mapper before its first scan."""
+        frames = None if self._is_live else FrameStore(LARGE)
+        return RunMap(mapper, mapper.parameters, lambda: self.start_ns, frames)
 
-    def confirmed_s(self, trees: Trees) -> Float:
-        """Return the time at which each tree was first confirmed [s since the first scan], shape (T,); NaN
-        for trees that never were."""
-        return self._map.record.confirmed(trees)
+    def history(self, number: int, scan: int) -> History:
+        """Return the estimates of a tree up to a scan, see `TreeHistory.of`."""
+        in_map = self._numbers.in_map(number)
+        return self._map.history.of(-1 if in_map is None else in_map, scan)
 
     @property
     def start_ns(self) -> int:
@@ -202,21 +204,18 @@ class Run:
         with self.stopwatch.whole_scan():
             frame = self._process(mapper, step, hurried=hurried)
         self._broken = False
-        record = self._map.record
         if new_map:
-            record.renumber(self._numbers.begin_map(frame.trees, record.ended(frame.trees)))
+            self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))
         self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
         self._step, self.current = step, step.index
-        self._sample.offer(step)
-        record.add(self.frame, self.start_ns)
-        record.store(self.frame, mapper.path)
+        self._map.add(frame)
+        self.confirmed_s = self._map.confirmed(frame.trees)
         return self.frame
 
     def kept(self, index: int) -> Shown | None:
         """Return the results of a scan that was mapped, without mapping it again; its points are segmented
         again. None if they are not stored. The run does not change."""
-        frames = self._map.record.frames
-        shown = None if frames is None else frames.read(index)
+        shown = None if self._map.frames is None else self._map.frames.read(index)
         step = None if shown is None else self._cursor.stored(index)
         if shown is None or step is None:
             return None
@@ -225,8 +224,10 @@ class Run:
             mapper = self._make_mapper(wanted)
         with self.stopwatch.aside():
             scan = mapper.segment(step)
-        frame = replace(shown.frame, raw=scan.raw, filtered=scan.filtered, labels=scan.labels)
-        return msgspec.structs.replace(shown, frame=frame)
+        trees, rows = self._numbers.stored(shown.frame.trees)
+        frame = replace(shown.frame, raw=scan.raw, filtered=scan.filtered, labels=scan.labels, trees=trees)
+        confirmed_s = None if shown.confirmed_s is None else shown.confirmed_s[rows]
+        return msgspec.structs.replace(shown, frame=frame, confirmed_s=confirmed_s)
 
     def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> Frame:
         """Return the result of a step, and cache its segmented scan.
@@ -251,11 +252,9 @@ class Run:
         mapper = self._make_mapper(parameters)
         self._preview = self._preview_of(parameters, mapper)
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
-        self._remapping = Remapping(
-            Rerun(mapper, self._caches.of(parameters), self._reread, segment_ahead),
-            self.start_ns,
-            self._new_frames(),
-        )
+        reread = None if self._is_live else self._cursor.again
+        rerun = Rerun(mapper, self._caches.of(parameters), reread, segment_ahead)
+        self._remapping = Remapping(rerun, self._new_map(mapper))
 
     def _preview_of(self, parameters: Parameters, mapper: Mapper) -> Trees | None:
         """Return approximate trees of the map with other parameters; None before the first scan or if the
@@ -263,16 +262,23 @@ class Run:
         frame, present = self.frame, self._map
         if frame is None or self._broken:
             return None
-        known = KnownMap(present.parameters.at(0), present.record.clusters, self.path, frame.columns)
-        sample = None
-        if known.needs_sample(parameters) and self._reread is not None:
-            sample = self._sample.segmented(mapper.segmenter(), self.current + 1, segment_all)
-        return preview_trees(known, parameters, sample)
+        known = KnownMap(present.parameters.at(0), present.clusters, self.path, frame.columns)
+        return preview_trees(known, parameters, lambda: self._sample(mapper))
+
+    def _sample(self, mapper: Mapper) -> dict[int, SegmentedScan]:
+        """Return some of the scans up to the current one by their numbers, segmented with the parameters of a
+        mapper by two threads; those that are not stored are missing."""
+        size = 0 if self._step is None else self._step.scan.points.nbytes
+        steps = [step for n in sample_scans(self.current + 1, size) if (step := self._cursor.stored(n))]
+        with ThreadPoolExecutor(2, thread_name_prefix="segment") as pool:
+            scans = pool.map(mapper.segmenter(), steps)
+            return {step.index: scan for step, scan in zip(steps, scans, strict=True)}
 
     def cancel_remapping(self) -> None:
         """Cancel the rerun that `remap` began; the map does not change."""
         if self._remapping is not None:
             self._remapping.rerun.close()
+            self._remapping.map.close()
             self._remapping = None
 
     @property
@@ -294,9 +300,9 @@ class Run:
         """Reason why scans are not cached, or cached scans are not used; empty if they are."""
         return "; ".join(filter(None, (self._cache.refusal, self._cache.notice)))
 
-    def remap_on(self, scans: int) -> tuple[Frame, dict[int, float]] | None:
-        """Map up to `scans` scans of the rerun. After the last one the run continues with the new map, as if
-        its parameters had been in force from the start.
+    def remap_next(self) -> tuple[Frame, dict[int, float]] | None:
+        """Map the next scan of the rerun. After the last one the run continues with the new map, as if its
+        parameters had been in force from the start.
 
         Returns:
             The current scan in the new map, and the time at which each tree was confirmed, by its number [s];
@@ -310,16 +316,18 @@ class Run:
             return None
         try:
             with self.stopwatch.aside():
-                finished = remapping.work(scans, self.current)
+                finished = remapping.map_next(self.current)
         except BaseException:  # also a fault of the mapper, which another try would repeat
             self.cancel_remapping()
             raise
         if not finished:
             return None
-        self._close_frames()
+        self._map.close()
         self._remapping, self._map = None, remapping.finish()
         self._cache = self._caches.of(self._map.parameters.at(self.current))
-        return self._map_step(self._step, new_map=True), self._map.record.confirmed_s
+        frame = self._map_step(self._step, new_map=True)
+        confirmed_s = {self._numbers.known(n): at for n, at in self._map.confirmed_s.items()}
+        return frame, {number: at for number, at in confirmed_s.items() if number is not None}
 
     def parameters_at(self, index: int) -> Parameters:
         """Return the parameters with which the scan with this index was or will be mapped."""
@@ -377,27 +385,16 @@ class Run:
         self.current, self._step, self._broken = scans - 1, None, False
 
     def use(self, parameters: Parameters, index: int) -> bool:
-        """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
-        value changes; then states of the mapper after that scan are dropped."""
-        changes = self._map.parameters.set_from(index, parameters)
-        if changes:
-            self._map.snapshots.forget_after(index)
-            if self._map.record.frames is not None:
-                self._map.record.frames.forget_from(index)
-        return changes
+        """Use other parameters from the scan with an index onwards, see `RunMap.use`."""
+        return self._map.use(parameters, index)
 
     def close(self) -> None:
         """Cancel a rerun, close the source and the scan caches, and delete the stored frames and steps."""
         self.cancel_remapping()
-        self._close_frames()
+        self._map.close()
         self._caches.close()
         self._cursor.close()
         self.source.close()
-
-    def _close_frames(self) -> None:
-        """Delete the stored frames of the present map."""
-        if self._map.record.frames is not None:
-            self._map.record.frames.close()
 
 
 def open_run(
@@ -428,23 +425,28 @@ def open_run(
         source.close()
         raise
     stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
-    digest = source.description.digest
-    if folder is None or live is not None or not digest:
+    description = source.description
+    if folder is None or live is not None or not description.digest:
         caches = ScanCaches(LARGE)
     else:
-        caches = ScanCaches(folder, f"{digest}\n{source.description.uri}\n{chosen.words}\n{seed}")
+        caches = ScanCaches(folder, f"{description.digest}\n{description.uri}\n{chosen.words}\n{seed}")
+    if live is None:
+        cursor = Cursor(
+            lambda: steps(moving.records(None), odometry=chosen.steps), description.uri, StepStore(LARGE)
+        )
+    else:
+        cursor = Cursor(lambda: live_steps(live, chosen, moving), description.uri)
     run = Run(
         moving,
         lambda parameters: make_mapper(moving.description, parameters, seed, stopwatch),
-        Cursor(moving, chosen.steps, StepStore(LARGE)) if live is None else LiveCursor(live, chosen, moving),
+        cursor,
         parameters,
         stopwatch,
         chosen.words,
-        reread=None if live is not None else lambda: steps(moving.records(None), odometry=chosen.steps),
-        caches=caches,
-        new_frames=lambda: FrameStore(LARGE) if live is None else None,  # a live run does not step back
+        caches,
+        is_live=live is not None,
     )
-    return run, (*source.description.warnings, *([chosen.warning] if chosen.warning else []))
+    return run, (*description.warnings, *([chosen.warning] if chosen.warning else []))
 
 
 def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Parameters], ...]:

@@ -119,11 +119,7 @@ class Session:
         """Confirmation time of each tree of `frame` [s since the first scan]; None without a frame."""
         if self._kept is not None:
             return self._kept.confirmed_s
-        return (
-            None
-            if self._run is None or self._run.frame is None
-            else self._run.confirmed_s(self._run.frame.trees)
-        )
+        return self._run.confirmed_s if self._run else None
 
     @property
     def is_shown(self) -> bool:
@@ -365,9 +361,9 @@ class Session:
         """Whether a rerun is in progress and can continue now, that is, no scan is sought."""
         return self._run is not None and self._run.remapped is not None and not self._target.sought
 
-    def remap(self, scans: int) -> tuple[Frame, MapChanges] | None:
-        """Map a number of scans of the run again. If a scan cannot be read, the rerun ends with a warning and
-        the map stays.
+    def remap(self) -> tuple[Frame, MapChanges] | None:
+        """Map the next scan of the run again. If it cannot be read, the rerun ends with a warning and the map
+        stays.
 
         Returns:
             After the last scan, the frame of the current scan in the new map and the differences; before, and
@@ -377,7 +373,7 @@ class Session:
         if run is None or shown is None:
             return None
         try:
-            done = run.remap_on(scans)
+            done = run.remap_next()
         except StemmapError as error:
             self._warn([f"the run was not mapped again, its map is as before: {error}"])
             return None

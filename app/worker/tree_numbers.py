@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from app.common.arrays import rows_of
 from pipeline.evaluation import match
 from pipeline.types.records import Trees
 
@@ -45,21 +46,36 @@ class TreeNumbers:
         self._next = max(self._next, int(numbers.max(initial=0)) + 1)
         return replace(trees, number=numbers)
 
-    def begin_map(self, trees: Trees, ended: Mapping[int, Place]) -> dict[int, int]:
+    def begin_map(self, trees: Trees, ended: Mapping[int, Place]) -> None:
         """Begin another map of the run.
 
         Args:
             trees: Its trees at the scan that was numbered last in the map before.
             ended: Last positions of its trees that ended before this scan, by their numbers in the new map.
-
-        Returns:
-            Number of each of these trees by its number in the new map.
         """
         self._number_of = {}
         self._name(_places(trees, np.flatnonzero(trees.confirmed)))
         self._name(_places(trees, np.flatnonzero(~trees.confirmed)))
         self._name(ended)
-        return dict(self._number_of)
+
+    def known(self, number: int) -> int | None:
+        """Return the number of a tree by its number in the present map; None for a tree that was never
+        numbered."""
+        return number if self._number_of is None else self._number_of.get(number)
+
+    def in_map(self, number: int) -> int | None:
+        """Return the number of a tree in the present map; None if the map has no such tree."""
+        if self._number_of is None:
+            return number
+        return next((in_map for in_map, known in self._number_of.items() if known == number), None)
+
+    def stored(self, trees: Trees) -> tuple[Trees, NDArray[np.int64]]:
+        """Return the trees of an earlier frame of the present map with their numbers, and their rows. Trees
+        that were never numbered are left out: they ended in a rerun, and were not confirmed."""
+        known = [self.known(number) for number in trees.number.tolist()]
+        rows = np.array([row for row, number in enumerate(known) if number is not None], np.int64)
+        numbers = np.array([number for number in known if number is not None], np.int64)
+        return replace(rows_of(trees, rows), number=numbers), rows
 
     def _name(self, places: Mapping[int, Place]) -> None:
         """Give numbers to trees of the present map: those of the trees of the last frame, then those of

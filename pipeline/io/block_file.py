@@ -1,7 +1,7 @@
 """A file of numbered blocks, for results that are too large for memory.
 
-It begins with a header. Then follow the blocks in any order, each with a row that holds its number, its
-length and its checksum, so that a cut or damaged file is good up to that place.
+It begins with a header. Then follow the blocks in any order, compressed, each with a row that holds its
+number, its length and its checksum, so that a cut or damaged file is good up to that place.
 """
 
 from __future__ import annotations
@@ -16,10 +16,13 @@ from tempfile import TemporaryFile, gettempdir
 from typing import Any, TypeVar
 
 import numpy as np
+import zstandard
 
 B = TypeVar("B")
 
 MOST_BYTES = 4 << 30  # of one file
+LARGEST = 1 << 28  # bytes of a block before compression; the largest known clouds need a fiftieth
+_LEVEL = 1  # of the compression; higher levels take longer and save one percent
 SPARE_BYTES = 2 << 30  # of the disk are left to recordings and to other programs
 BLOCKS_BETWEEN_CHECKS = 50  # of the free space of the disk
 ROW = np.dtype([("index", "<i8"), ("length", "<i8"), ("block_crc", "<u4"), ("row_crc", "<u4")])
@@ -78,16 +81,20 @@ class BlockFile:
         """Return whether the blocks 0 to `blocks` - 1 are all stored."""
         return len(self._rows) >= blocks and all(index in self._rows for index in range(blocks))
 
-    def put_block(self, index: int, block: bytes) -> bool:
+    def put_block(self, index: int, content: bytes) -> bool:
         """Store a block at the end of the file, unless its number is stored already or the file is closed. If
-        the file or the disk is full, or writing fails, it is not stored and `refusal` contains the reason;
-        nothing is raised.
+        it is larger than LARGEST, the file or the disk is full, or writing fails, it is not stored and
+        `refusal` contains the reason; nothing is raised.
 
         Returns:
             Whether a block with this number is stored.
         """
         if self._file is None or index in self._rows:
             return index in self._rows
+        if len(content) > LARGEST:
+            self._refuse(index, f"its data takes more than {LARGEST >> 20} MB")
+            return False
+        block = zstandard.ZstdCompressor(_LEVEL).compress(content)
         try:
             if self._end + ROW.itemsize + len(block) > self._most:
                 self._refuse(index, f"the cache is limited to {self._most / 1e9:.1f} GB")
@@ -105,14 +112,15 @@ class BlockFile:
         self._end += ROW.itemsize + len(block)
         return True
 
-    def read_block(self, index: int, unpack: Callable[[bytearray], B]) -> B | None:
-        """Return the content of a block; None if it is not stored or the file is closed.
+    def read_block(self, index: int, unpack: Callable[[bytes], B]) -> B | None:
+        """Return the content of a block; None if it is not stored or the file is closed. Its size is checked
+        before memory is taken.
 
         A damaged block is removed from the index, so that it can be stored again; `notice` reports it.
 
         Args:
             index: Number of the block.
-            unpack: Returns the content of the bytes; it raises ValueError, KeyError, TypeError or
+            unpack: Returns the record of the bytes; it raises ValueError, KeyError, TypeError or
                 RuntimeError if they are damaged.
         """
         if index not in self._rows or self._file is None:
@@ -122,8 +130,10 @@ class BlockFile:
         try:
             if _read(self._file, at, block) != int(row["block_crc"]):
                 raise ValueError("the checksum is wrong")
-            return unpack(block)
-        except (OSError, ValueError, KeyError, TypeError, RuntimeError):
+            if not 0 <= zstandard.frame_content_size(block) <= LARGEST:
+                raise ValueError("the size of the block is not valid")
+            return unpack(zstandard.ZstdDecompressor().decompress(block))
+        except (OSError, ValueError, KeyError, TypeError, RuntimeError, zstandard.ZstdError):
             del self._rows[index]
             self.notice = DAMAGED.format(len(self._rows))
             return None

@@ -13,7 +13,7 @@ from collections import deque
 import numpy as np
 
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.types.records import Imu, SynchroniserState, Turn
+from pipeline.types.records import Imu, Turn
 
 KEEP_NS = 3_000_000_000
 GAP_NS = 60_000_000  # longest time between two readings over which the rate is integrated
@@ -88,22 +88,6 @@ class Gyro:
             self._blocks = min(self._blocks + 1, BLOCKS_MOST)
             self._bias += (mean - self._bias) / self._blocks
             self._scatter += (sigma - self._scatter) / self._blocks
-
-    def state(self, stamp_ns: int) -> SynchroniserState:
-        """Return the bias, the comparison with the wheels and the other estimates, for `go_on_from`.
-
-        Args:
-            stamp_ns: Time of the state [ns].
-        """
-        block = tuple(self._block)
-        of_bias = stamp_ns, self._bias, self._scatter, self._blocks, block
-        return SynchroniserState(*of_bias, self._same, self._turned, self._proven)
-
-    def go_on_from(self, state: SynchroniserState) -> None:
-        """Restore the estimates that `state` returned; the readings stay."""
-        self._bias, self._scatter = state.bias, state.scatter
-        self._blocks, self._block = state.blocks, list(state.block)
-        self._same, self._turned, self._proven = state.equal_readings, state.turn_sums, state.proven
 
     @property
     def proven(self) -> bool:

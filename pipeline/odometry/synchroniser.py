@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -20,7 +19,6 @@ from pipeline.types.records import (
     Record,
     Scan,
     Step,
-    SynchroniserState,
     Turn,
 )
 
@@ -44,9 +42,7 @@ def steps(
     records: Iterable[Record],
     *,
     odometry: OdometryChoice = "auto",
-    first_index: int = 0,
     losses: Counter[str] | None = None,
-    after: SynchroniserState | None = None,
 ) -> Iterator[Step]:
     """Yield a step for each scan: the scan with odometry and tilt interpolated to its time, the measured
     pose, and the turn by the gyroscope.
@@ -59,12 +55,10 @@ def steps(
         records: Records in the order of arrival.
         odometry: "static" ignores odometry, so that no step has a pose and no scan waits; the other choices
             use it.
-        first_index: Number of the first step.
         losses: Counter of what was left out, by reason, increased in place; None for none.
-        after: State of the estimates at a step of an earlier reading; the records begin shortly before it.
     """
     counted = Counter[str]() if losses is None else losses
-    joiner = Synchroniser(use_odometry=odometry != "static", index=first_index, losses=counted, after=after)
+    joiner = Synchroniser(use_odometry=odometry != "static", losses=counted)
     for record in records:
         joiner.add(record)
         yield from joiner.ready()
@@ -76,25 +70,18 @@ class Synchroniser:
 
     Args:
         use_odometry: Whether odometry is used; without it no scan waits.
-        index: Number of the first step.
         losses: Counts what was left out, by reason.
-        after: See `steps`.
     """
 
-    def __init__(
-        self, *, use_odometry: bool, index: int, losses: Counter[str], after: SynchroniserState | None = None
-    ) -> None:
+    def __init__(self, *, use_odometry: bool, losses: Counter[str]) -> None:
         """Create a synchroniser without records."""
         self._losses = losses
         self._use_odometry = use_odometry
-        self._index = index
+        self._index = 0
         self._scans: deque[Scan] = deque()
         self._odometry = OdometryBuffer()
         self._imu: deque[Imu] = deque()
         self._gyro = Gyro()
-        self._after = after
-        if after is not None:
-            self._gyro.go_on_from(after)
         self._stepped: Pose2 | None = None  # odometry of the last step
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # time [ns], roll and pitch [rad]
@@ -217,7 +204,7 @@ class Synchroniser:
         since, newest = self._odometry.standing_since, self._odometry.newest
         settled = since is not None and imu.stamp_ns - since[0] > SETTLES_NS
         fresh = newest is not None and imu.stamp_ns - newest.stamp_ns < STALE_NS
-        still = settled and fresh and self._after is None
+        still = settled and fresh
         oldest = self._needed_ns(imu.stamp_ns)
         # The rate depends on the tilt by its square only, so the tilt is updated in fixed intervals of time.
         if imu.stamp_ns // TILTS_NS != self._gyro_tilt[0] // TILTS_NS:
@@ -244,10 +231,7 @@ class Synchroniser:
         return not self._use_odometry if newest is None else newest.stamp_ns >= scan.stamp_ns
 
     def _join(self, scan: Scan) -> Step:
-        """Return the step of a scan, with the warnings and doubts since the last step, which are reset. With
-        a state `after`, the estimates of the first step at or after it are replaced by that state."""
-        if self._stepped_ns is None and self._after is not None and self._after.stamp_ns < scan.stamp_ns:
-            self._stepped_ns = self._after.stamp_ns
+        """Return the step of a scan, with the warnings and doubts since the last step, which are reset."""
         self._report_pause(scan.stamp_ns)
         pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
@@ -267,17 +251,7 @@ class Synchroniser:
             measured=self._measured.at(scan.stamp_ns, pose, odometry_at),
             turn=turn if self._gyro.proven else None,
             turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
-            synchroniser_state=replace(
-                self._gyro.state(scan.stamp_ns),
-                standing_since=self._odometry.standing_since,
-                tilt=self._gyro_tilt,
-            ),
         )
-        if self._after is not None and scan.stamp_ns >= self._after.stamp_ns:
-            step = replace(step, synchroniser_state=self._after)
-            self._gyro.go_on_from(self._after)
-            self._odometry.standing_since, self._gyro_tilt = self._after.standing_since, self._after.tilt
-            self._after = None
         self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
         self._stepped = pose
         self._index += 1
@@ -293,7 +267,7 @@ class Synchroniser:
             pose: Pose by the odometry at that time, or None.
         """
         turn = None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, stamp_ns)
-        if turn is None or pose is None or self._stepped is None or self._doubt or self._after is not None:
+        if turn is None or pose is None or self._stepped is None or self._doubt:
             return turn
         self._gyro.compare(float(wrap_angle(pose.yaw - self._stepped.yaw)), turn)
         return turn

@@ -1,6 +1,6 @@
 """Remapping: a run mapped again with other parameters, and the preview of its result."""
 
-from pipeline.remapping.preview import ClusterTable, KnownMap, Sample, preview_trees
+from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees, sample_scans
 from pipeline.remapping.rerun import Reread, Rerun
 from pipeline.remapping.scan_cache import ScanCache, ScanCaches, segmentation_key
 
@@ -9,9 +9,9 @@ __all__ = [
     "KnownMap",
     "Reread",
     "Rerun",
-    "Sample",
     "ScanCache",
     "ScanCaches",
     "preview_trees",
+    "sample_scans",
     "segmentation_key",
 ]

@@ -10,7 +10,7 @@ tree is found in the sample, before and after, gives an estimate for all scans.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -24,10 +24,9 @@ from pipeline.front_end import SegmentedScan
 from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.remapping.rerun import Segment
 from pipeline.remapping.scan_cache import SEGMENTATION_STAGES
 from pipeline.tracking.track_classification import REACH, nearest_other, tree_columns
-from pipeline.types.records import Bool, Clusters, Columns, Frame, Int, Path, Step, Trees, Verdict
+from pipeline.types.records import Bool, Clusters, Columns, Frame, Int, Path, Trees, Verdict
 
 MOST_PLACES = 20_000
 LEAST_HITS = 2  # finds of a tree in the sample, below which the sample says nothing about it
@@ -144,50 +143,19 @@ class ClusterTable:
         return _grouped(self._columns["centre"][:rows], tree, start, pose, _reach(p), MOST_PLACES)
 
 
-class Sample:
-    """Every n-th scan of a run with its points. Where the sample is too large, n doubles."""
+def sample_scans(scans: int, size: int) -> range:
+    """Return the numbers of the scans that a sample of a run has: every n-th one, where n is the smallest
+    power of two with at most SAMPLE_SCANS scans and SAMPLE_BYTES; at least the first scan.
 
-    def __init__(self) -> None:
-        """Create an empty sample that keeps every scan."""
-        self._steps: dict[int, Step] = {}
-        self._spacing = 1
-
-    def __len__(self) -> int:
-        """Return the number of scans."""
-        return len(self._steps)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of the points [bytes]."""
-        return sum(step.scan.points.nbytes for step in self._steps.values())
-
-    def offer(self, step: Step) -> None:
-        """Keep a scan if its number is a multiple of the spacing. While more than SAMPLE_SCANS scans or
-        SAMPLE_BYTES are kept, the spacing doubles, and scans between are removed; one scan always remains."""
-        if step.index % self._spacing:
-            return
-        self._steps[step.index] = step
-        while len(self) > 1 and (len(self) > SAMPLE_SCANS or self.nbytes > SAMPLE_BYTES):
-            self._spacing *= 2
-            self._steps = {n: kept for n, kept in self._steps.items() if n % self._spacing == 0}
-
-    def segmented(
-        self,
-        segment: Segment,
-        scans: int,
-        segment_all: Callable[[Segment, list[Step]], Iterable[SegmentedScan]] = map,
-    ) -> dict[int, SegmentedScan]:
-        """Return the segmented scans of the sample with numbers below `scans`, by number, ascending; may be
-        empty.
-
-        Args:
-            segment: Segments one scan.
-            scans: Number of scans of the run that are considered.
-            segment_all: Segments a list of scans and returns the results in the same order, one by one or
-                several at once.
-        """
-        numbers = [n for n in sorted(self._steps) if n < scans]
-        return dict(zip(numbers, segment_all(segment, [self._steps[n] for n in numbers]), strict=True))
+    Args:
+        scans: Number of scans of the run.
+        size: Size of the points of a scan [bytes].
+    """
+    most = max(1, min(SAMPLE_SCANS, SAMPLE_BYTES // max(size, 1)))
+    spacing = 1
+    while len(numbers := range(0, scans, spacing)) > most:
+        spacing *= 2
+    return numbers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -206,14 +174,11 @@ class KnownMap:
     path: Path
     columns: Columns | None
 
-    def needs_sample(self, parameters: Parameters) -> bool:
-        """Return whether the parameters change the clusters: whether a stage of the segmentation differs."""
-        before = self.parameters
-        return any(getattr(before, stage) != getattr(parameters, stage) for stage in SEGMENTATION_STAGES)
-
 
 def preview_trees(
-    known: KnownMap, parameters: Parameters, sample: Mapping[int, SegmentedScan] | None = None
+    known: KnownMap,
+    parameters: Parameters,
+    take_sample: Callable[[], Mapping[int, SegmentedScan]] = dict,
 ) -> Trees | None:
     """Return the trees that a rerun with other parameters would approximately give, without diameters,
     covariances and times (NaN or 0). All are confirmed, and their numbers (from 1) are unrelated to those of
@@ -222,23 +187,24 @@ def preview_trees(
     Args:
         known: The run as it is mapped; unchanged.
         parameters: The other parameters.
-        sample: Some scans as these parameters segment them, by their numbers, ascending. Needed where
-            `KnownMap.needs_sample`.
+        take_sample: Returns some scans as these parameters segment them, by their numbers, ascending. It is
+            called if the parameters change the clusters: if a stage of the segmentation differs.
 
     Returns:
         The trees. None if no scan is known, if the parameters classify columns in another way (apart from
-        `tree_share`), or if a needed sample is missing or empty.
+        `tree_share`), or if a needed sample is empty.
     """
     path = np.stack([known.path.x, known.path.y, known.path.yaw], axis=1)
     scans = min(len(path), len(known.clusters))
     if scans == 0 or not _classifies_alike(known.parameters, parameters):
         return None
     table, path = known.clusters.of(range(scans)), path[:scans]
-    if not known.needs_sample(parameters):
+    same = {stage: getattr(known.parameters, stage) for stage in SEGMENTATION_STAGES}
+    if all(getattr(parameters, stage) == before for stage, before in same.items()):
         return _trees(_all_places(known, table, path, parameters))
+    sample = take_sample()
     if not sample:
         return None
-    same = {stage: getattr(known.parameters, stage) for stage in SEGMENTATION_STAGES}
     before = _all_places(known, table, path, parameters.model_copy(update=same))
     return _trees(_with_sample(before, known, table, path, parameters, sample))
 

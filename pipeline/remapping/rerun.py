@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from itertools import dropwhile
 
 from pipeline.errors import StemmapError
 from pipeline.front_end import SegmentedScan
@@ -11,7 +10,7 @@ from pipeline.mapper import Mapper, MapperState
 from pipeline.remapping.scan_cache import ScanCache
 from pipeline.types.records import Frame, Step
 
-Reread = Callable[[], Iterator[Step]]
+Reread = Callable[[int], Iterator[Step]]
 Segment = Callable[[Step], SegmentedScan]
 SegmentSteps = Callable[[Segment, Iterator[Step]], Iterator[tuple[Step, SegmentedScan]]]
 
@@ -27,12 +26,11 @@ class Rerun:
     Args:
         mapper: A fresh mapper with the new parameters.
         cache: Cache for scans that are segmented with these parameters; missing scans are added to it.
-        reread: Returns the steps of the run from its first scan; None for a live run.
+        reread: Returns the steps of the run from the one with an index on; None for a live run.
         segment_steps: Segments the scans that are read again: in turn, or ahead of the mapping.
 
     Attributes:
         done: Number of scans that are mapped.
-        was_read: Whether the source was read again.
     """
 
     def __init__(
@@ -45,7 +43,6 @@ class Rerun:
         """Prepare a rerun; nothing is read."""
         self.mapper = mapper
         self.done = 0
-        self.was_read = False
         self._cache, self._reread, self._segment_steps = cache, reread, segment_steps
         self._segmented: Iterator[tuple[Step, SegmentedScan]] | None = None
 
@@ -63,8 +60,7 @@ class Rerun:
         return frame
 
     def go_back(self, scans: int, state: MapperState) -> None:
-        """Return to an earlier state of the mapper, taken after `scans` scans. The source is read again from
-        its beginning where it is needed."""
+        """Return to an earlier state of the mapper, taken after `scans` scans."""
         self.mapper.restore(state)
         self.done, self._segmented = scans, None
 
@@ -85,9 +81,7 @@ class Rerun:
                 remedy="Open the recording of the run",
             )
         if self._segmented is None:
-            rest = dropwhile(lambda step: step.index < index, self._reread())
-            self._segmented = self._segment_steps(self.mapper.segmenter(), rest)
-            self.was_read = True
+            self._segmented = self._segment_steps(self.mapper.segmenter(), self._reread(index))
         for step, scan in self._segmented:
             if step.index == index:
                 self._cache.put(step, scan)

@@ -12,15 +12,12 @@ import contextlib
 import hashlib
 import json
 import os
-import struct
 from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-import msgspec
 import numpy as np
-import zstandard
 
 import pipeline
 from pipeline.classification.voxel_map import SLICE, SLICES
@@ -29,17 +26,10 @@ from pipeline.front_end import ColumnInput, SegmentedScan
 from pipeline.geometry.quantisation import POINT
 from pipeline.io.atomic_files import hold, is_held
 from pipeline.io.block_file import MOST_BYTES, BinaryFile, BlockFile, unnamed_file
-from pipeline.io.checkpoints.codec import decode, encode
-from pipeline.types.records import Float, Float32, Int32, Scan, Step, SynchroniserState, UInt16
+from pipeline.io.checkpoints.codec import record_bytes, record_of
+from pipeline.types.records import Float, Float32, Int32, Scan, Step, UInt16
 
 HIGHEST = SLICES * SLICE  # m above the ground; higher points are not integrated into the columns
-LARGEST = 1 << 28  # bytes of a block; the largest known clouds need a fiftieth
-_LEVEL = 1  # higher levels take longer and save one percent
-_LENGTH = struct.Struct("<I")
-
-
-class TooLargeError(ValueError):
-    """A scan is larger than the cache accepts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,46 +69,25 @@ class _PackedScan:
 
 
 def pack(step: Step, scan: SegmentedScan) -> bytes:
-    """Return a step and its segmented scan as a compressed block. Of the points only those of the column
-    input are kept; clearance and the state of the synchroniser are omitted.
-
-    Raises:
-        TooLargeError: The block is larger than `unpack` accepts, LARGEST bytes before compression.
-    """
+    """Return a step and its segmented scan as a block. Of the points only those of the column input are kept;
+    clearance is omitted."""
     no_points: Float32 = np.zeros((0, 3), np.float32)
     lean = replace(
         scan, raw=no_points, filtered=no_points, labels=scan.labels[:0], column_input=None, clearance=None
     )
-    packed = _PackedScan(
-        replace(step, scan=Scan(step.scan.stamp_ns, no_points), synchroniser_state=SynchroniserState()),
-        lean,
-        None if scan.column_input is None else _PackedColumnInput.of(scan.column_input),
+    return record_bytes(
+        _PackedScan(
+            replace(step, scan=Scan(step.scan.stamp_ns, no_points)),
+            lean,
+            None if scan.column_input is None else _PackedColumnInput.of(scan.column_input),
+        )
     )
-    tree, arrays = encode(packed, planes=True)
-    text = msgspec.json.encode(tree)
-    block = _LENGTH.pack(len(text)) + text + arrays
-    if len(block) > LARGEST:
-        raise TooLargeError(f"its data takes more than {LARGEST >> 20} MB")
-    return zstandard.ZstdCompressor(level=_LEVEL).compress(block)
 
 
-def unpack(block: bytes | bytearray) -> tuple[Step, SegmentedScan]:
+def unpack(block: bytes) -> tuple[Step, SegmentedScan]:
     """Return the step and the segmented scan that `pack` was given, without what it omits; z of the column
-    points is 0. Sizes are checked before memory is taken.
-
-    Raises:
-        ValueError: The block is damaged. A damaged block can also raise KeyError, TypeError or RuntimeError.
-    """
-    try:
-        if not 0 <= zstandard.frame_content_size(block) <= LARGEST:
-            raise ValueError("the size of the block is not valid")
-        data = zstandard.ZstdDecompressor().decompress(block)
-    except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from None
-    if len(data) < _LENGTH.size:
-        raise ValueError("the block is cut off")
-    end = _LENGTH.size + _LENGTH.unpack_from(data)[0]
-    packed = decode(_PackedScan, msgspec.json.decode(data[_LENGTH.size : end]), data[end:], planes=True)
+    points is 0. Errors as `record_of`."""
+    packed = record_of(_PackedScan, block)
     given = packed.column_input
     return packed.step, replace(packed.scan, column_input=None if given is None else given.unpacked())
 
@@ -145,15 +114,9 @@ class ScanCache(BlockFile):
     """Segmented scans of one source under one set of segmentation parameters; see `BlockFile`."""
 
     def put(self, step: Step, scan: SegmentedScan) -> None:
-        """Store a scan at the end of the file, unless its number is stored already or the cache is closed. If
-        the block, the file or the disk is full, or writing fails, it is not stored and `refusal` contains the
-        reason; nothing is raised."""
-        if step.index in self:
-            return
-        try:
+        """Store a scan, unless its number is stored already, see `put_block`."""
+        if step.index not in self:
             self.put_block(step.index, pack(step, scan))
-        except TooLargeError as error:
-            self._refuse(step.index, str(error))
 
     def read(self, index: int, stamp_ns: int | None = None) -> tuple[Step, SegmentedScan] | None:
         """Return a scan without its raw points. None if it is not stored, the cache is closed, or its time

@@ -17,7 +17,7 @@ from typing import Any
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource, open_live
 from app.sources.request import with_odometry
-from app.worker.cursor import LiveCursor
+from app.worker.cursor import Cursor, live_steps
 from app.worker.numba_warmup import warm_up
 from pipeline.config import preset
 from pipeline.io.readers.container import Message
@@ -78,7 +78,7 @@ def main(port: str, robot: str, place: str = "") -> None:
             preset("forest"), sensor=description.sensor, T_base_lidar=description.T_base_lidar, seed=0
         )
         moving, chosen = with_odometry(source, "auto")
-        cursor, mapped = LiveCursor(source, chosen, moving), []
+        cursor, mapped = Cursor(lambda: live_steps(source, chosen, moving), description.uri), []
         while not source._ending.is_set() or source.scans_waiting:
             step = cursor.take()
             if step is None:

@@ -17,6 +17,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
 
+import msgspec
 import numpy as np
 
 from pipeline.errors import StemmapError
@@ -27,6 +28,7 @@ NOT_SAVED = "not saved"  # in the metadata of a field that is not saved and gets
 # returns its value, or None for its default.
 ADDED = "added"
 _ALIGN = 8
+_LENGTH = 4  # bytes of the length of the text of a record
 _hints = cache(typing.get_type_hints)
 
 
@@ -80,6 +82,26 @@ def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: 
     blob = _Blob(planes)
     tree = _encoded(record, blob)
     return tree, b"".join(blob.parts)
+
+
+def record_bytes(record: Any) -> bytes:  # noqa: ANN401 - any record
+    """Return a record as bytes that compress well, see `encode`: the length of the JSON text (4 bytes,
+    little-endian), the text, and the arrays in planes."""
+    tree, arrays = encode(record, planes=True)
+    text = msgspec.json.encode(tree)
+    return len(text).to_bytes(_LENGTH, "little") + text + arrays
+
+
+def record_of(kind: type[R], data: bytes) -> R:
+    """Return the record of a type that `record_bytes` was given.
+
+    Raises:
+        ValueError: The bytes are damaged. Damaged bytes can also raise KeyError, TypeError or RuntimeError.
+    """
+    end = _LENGTH + int.from_bytes(data[:_LENGTH], "little")
+    if len(data) < end:
+        raise ValueError("the block is cut off")
+    return decode(kind, msgspec.json.decode(data[_LENGTH:end]), data[end:], planes=True)
 
 
 def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401

@@ -116,7 +116,8 @@ def test_what_came_so_far_is_mapped_again_while_more_comes(robot, parameters):
         assert here.session.is_remapping
         for each in (here, other, wanted):
             each.send(1)
-        done = here.session.remap(4)
+        for _ in range(4):
+            done = done or here.session.remap()
     assert len(here.frames) > begun
     assert here.frames == other.frames, "the rerun disturbs nothing that comes meanwhile"
     frame = done[0]
@@ -133,7 +134,7 @@ def test_a_rerun_that_is_given_up_leaves_the_live_run_as_it_is(robot):
     for each in (here, other):
         each.send(ASKED)
     here.session.set_parameters(LATER, 1, whole=True)
-    here.session.remap(2)
+    here.session.remap()
     for each in (here, other):
         each.session.set_parameters(FEWER, 2)
         each.send(SCANS)

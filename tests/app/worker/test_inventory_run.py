@@ -55,7 +55,7 @@ def mapped(session: Session) -> Frame:
 def again(session: Session) -> Frame:
     """Continue until the inventory that replaces the map is complete."""
     while session.is_remapping:
-        session.remap(1)
+        session.remap()
     assert session.frame is not None
     return session.frame
 
@@ -135,7 +135,7 @@ def test_the_latest_of_several_changes_wins(session: Session) -> None:
     mapped(session)
     for revision, least in enumerate((0.10, 0.20, 0.16), start=2):
         session.set_parameters(FOREST.replace({"detection.radius_min": least}), revision)
-        session.remap(1)
+        session.remap()
     frame = again(session)
     assert len(frame.trees.number) == np.count_nonzero(PLACES[:, 2] > 0.165)
     assert session.status().revision == 4

@@ -47,7 +47,7 @@ for revision, change in enumerate([{"classification.tree_share": 0.7}, {"detecti
     session.set_parameters(Parameters().replace(change), revision + 1, whole=True)
     assert session.is_remapping
     while session.is_remapping:
-        session.remap(8)
+        session.remap()
 session.close()
 print(*sorted(seen() - before), sep="\\n", end="")
 """

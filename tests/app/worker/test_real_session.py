@@ -129,7 +129,7 @@ def test_after_a_change_of_the_whole_run_its_scans_are_shown_with_the_new_map(se
     mapped(session, 60)
     other = Parameters().replace({"clustering.eps": 0.4})
     session.set_parameters(other, 1, whole=True)
-    while session.remap(20) is None:
+    while session.remap() is None:
         pass
     shown = looked_at(session, 30)[0]
     while session.pace == "hurry":

@@ -83,10 +83,10 @@ def _mapped_once(parameters: str, last: int) -> tuple[object, object]:
         return told(opened.frame), told(opened.path)
 
 
-def remapped(session: Session, scans: int = 7) -> tuple[Frame, MapChanges]:
+def remapped(session: Session) -> tuple[Frame, MapChanges]:
     """Map again until it is done."""
     while session.is_remapping:
-        done = session.remap(scans)
+        done = session.remap()
         if done is not None:
             return done
     raise AssertionError("it was given up")
@@ -114,15 +114,15 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
         frame, changes = remapped(session)
         assert changes.revision == revision
         now: tuple[object, ...] = (told(frame), told(session.path))
-        now += (told(session._run.confirmed_s(frame.trees)),)
+        now += (told(session._run.confirmed_s),)
         assert marks.setdefault(id(wanted), dict(changes.confirmed)) == dict(changes.confirmed)
         assert maps.setdefault(id(wanted), now) == now
     for wanted in (parameters, BASE, LATER):
         with mapped_from_start(wanted, LAST - 1) as other:
             assert other.frame is not None
             assert isinstance(other.run, Run)
-            since = told(other.run.confirmed_s(other.frame.trees))
-            confirmed = sorted(other.run._map.record.confirmed_s.values())
+            since = told(other.run.confirmed_s)
+            confirmed = sorted(other.run._map.confirmed_s.values())
             assert sorted(marks[id(wanted)].values()) == confirmed, "those that went again too"
             assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
 
@@ -230,7 +230,8 @@ def test_where_the_scan_is_sought_first_it_comes_once_the_scan_is_there(session,
 
 def test_a_newer_change_stops_an_older_one(session):
     session.set_parameters(WIDER, 1, whole=True)
-    session.remap(5)
+    for _ in range(5):
+        session.remap()
     session.set_parameters(FEWER, 2, whole=True)
     frame, _ = remapped(session)
     assert told(frame) == mapped_with(FEWER, frame.index)[0]
@@ -254,7 +255,8 @@ def test_what_a_held_slider_changes_is_told_against_the_map_before_it_was_taken(
 
 def test_a_change_from_here_on_leaves_the_map_before_it(session):
     session.set_parameters(WIDER, 1, whole=True)
-    session.remap(5)
+    for _ in range(5):
+        session.remap()
     session.set_parameters(FEWER, 2)
     assert not session.is_remapping
     assert session.status().remapped is None
@@ -263,7 +265,8 @@ def test_a_change_from_here_on_leaves_the_map_before_it(session):
 @pytest.mark.parametrize("done", [3, 30])
 def test_who_goes_back_meanwhile_gets_the_map_of_where_he_is(session, done):
     session.set_parameters(FEWER, 1, whole=True)
-    session.remap(done)
+    for _ in range(done):
+        session.remap()
     session.seek(1.5)
     assert not session.is_remapping  # until it is there
     settle(session)
@@ -280,7 +283,7 @@ def test_it_goes_on_while_the_run_plays(session):
     done = None
     while done is None:
         session.work()
-        done = session.remap(2)
+        done = session.remap() or session.remap()
     frame, _ = done
     assert told(frame) == mapped_with(FEWER, frame.index)[0]
     after = session.work()
@@ -296,14 +299,14 @@ def test_what_cannot_be_read_again_leaves_the_map_and_says_so(session, monkeypat
     run = session._run
     before = told(session.frame)
 
-    def nothing() -> Iterator[object]:
+    def nothing(_index: int) -> Iterator[object]:
         raise SourceError("the disk is gone")
 
-    monkeypatch.setattr(run, "_reread", nothing)
+    monkeypatch.setattr(run._cursor, "again", nothing)
     session.set_parameters(WIDER, 1)
     at_hand = told(session.frame)
     session.set_parameters(WIDER, 2, whole=True)
-    assert session.remap(5) is None
+    assert session.remap() is None
     assert not session.is_remapping
     assert told(session.frame) == at_hand != before
     assert any("was not mapped again" in w and "the disk is gone" in w for w in session.status().warnings)
@@ -320,7 +323,7 @@ def test_it_tells_which_trees_came_and_went_and_why():
         known = int(np.count_nonzero(frame.trees.confirmed))
         assert known >= 2
         assert isinstance(session.run, Run)
-        marked = dict(session.run._map.record.confirmed_s)
+        marked = dict(session.run._map.confirmed_s)
         # No column is ever a tree now; then all are back.
         session.set_parameters(BASE.replace({"classification.tree_share": 1.0}), 1, whole=True)
         _, none = remapped(session)
@@ -343,7 +346,8 @@ def test_it_tells_which_trees_came_and_went_and_why():
 def test_a_change_on_the_way_to_another_scan_acts_on_the_whole_run_there(session, begun_before):
     if begun_before:
         session.set_parameters(WIDER, 1, whole=True)
-        session.remap(5)
+        for _ in range(5):
+            session.remap()
     session.seek(2.0)
     session.set_parameters(FEWER, 2, whole=True)
     assert not session.is_remapping
@@ -357,14 +361,15 @@ def test_a_change_on_the_way_to_another_scan_acts_on_the_whole_run_there(session
 
 def test_a_fault_on_the_way_ends_it_and_is_told_once(session, monkeypatch):
     session.set_parameters(FEWER, 1, whole=True)
-    session.remap(3)
+    for _ in range(3):
+        session.remap()
 
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
     monkeypatch.setattr(session._run._remapping.rerun.mapper, "process", broken)
     with pytest.raises(ZeroDivisionError):
-        session.remap(3)
+        session.remap()
     assert not session.is_remapping
     session.set_parameters(WIDER, 2, whole=True)
     session.fail("the run stopped")

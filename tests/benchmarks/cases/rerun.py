@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from pipeline.config import Parameters
     from pipeline.io.readers.base import Source
     from pipeline.mapper import Mapper
-    from pipeline.remapping import KnownMap, Sample, ScanCaches
+    from pipeline.remapping import KnownMap, ScanCaches
     from pipeline.types.records import Step
 
 NAME = "rerun"
@@ -42,7 +42,7 @@ def run() -> list[Table]:
 
     base, source = preset("forest"), open_source(URI)
     with closing(ScanCaches(most=8 << 30)) as caches:
-        held, sample, known, first_s = _first_run(source, base, caches)
+        held, known, first_s = _first_run(source, base, caches)
         scans = len(caches.of(base))
         size_kb = 1e-3 * caches.of(base).nbytes / scans
         reruns = [_row("first run, without reading", scans, first_s)]
@@ -50,12 +50,12 @@ def run() -> list[Table]:
         for name, value in CACHED:
             tried, words = base.replace({name: value}), f"{name} → {value}"
             reruns.append(_row(words, scans, _rerun_s(source, tried, caches, scans, None)))
-            previews.append(_preview(words, known, tried, source, None))
+            previews.append(_preview(words, known, tried, source, held))
         for name, value in SEGMENTED:
             tried, words = base.replace({name: value}), f"{name} → {value}"
             seconds = _rerun_s(source, tried, caches, len(held), held)
             reruns.append(_row(words, len(held), seconds))
-            previews.append(_preview(words, known, tried, source, sample))
+            previews.append(_preview(words, known, tried, source, held))
     return [
         Table(
             f"{URI}, preset forest, warm",
@@ -70,7 +70,7 @@ def run() -> list[Table]:
             "Preview before the rerun",
             ("change", "trees", "s", "asked s", "reached"),
             tuple(previews),
-            (f"For the last rows a sample of {len(sample)} scans is segmented again, by two threads.",),
+            ("For the last rows a sample of scans is segmented again.",),
         ),
     ]
 
@@ -88,17 +88,12 @@ def _mapper(source: Source, parameters: Parameters) -> Mapper:
 
 def _first_run(
     source: Source, parameters: Parameters, caches: ScanCaches
-) -> tuple[list[Step], Sample, KnownMap, float]:
-    """Map the run and cache its scans; returns its first scans, a sample, the map, and the seconds taken."""
+) -> tuple[list[Step], KnownMap, float]:
+    """Map the run and cache its scans; returns its first scans, the map, and the seconds taken."""
     from pipeline.odometry.synchroniser import steps
-    from pipeline.remapping import ClusterTable, KnownMap, Sample
+    from pipeline.remapping import ClusterTable, KnownMap
 
-    mapper, cache, clusters, sample = (
-        _mapper(source, parameters),
-        caches.of(parameters),
-        ClusterTable(),
-        Sample(),
-    )
+    mapper, cache, clusters = _mapper(source, parameters), caches.of(parameters), ClusterTable()
     held: list[Step] = []
     spent, columns = 0.0, None
     for step in islice(steps(source.records()), SCANS):
@@ -108,11 +103,10 @@ def _first_run(
         spent += time.perf_counter() - start
         cache.put(step, scan)
         clusters.record(frame)
-        sample.offer(step)
         columns = frame.columns
         if len(held) < HELD:
             held.append(step)
-    return held, sample, KnownMap(parameters, clusters, mapper.path, columns), spent
+    return held, KnownMap(parameters, clusters, mapper.path, columns), spent
 
 
 def _rerun_s(
@@ -122,7 +116,7 @@ def _rerun_s(
     from app.worker.remap import segment_ahead
     from pipeline.remapping import Rerun, ScanCaches
 
-    spent, reread = 0.0, None if held is None else lambda: iter(held)
+    spent, reread = 0.0, None if held is None else lambda index: iter(held[index:])
     for most in (min(scans, 50), scans):
         gc.collect()
         with closing(ScanCaches()) as fresh:
@@ -136,21 +130,17 @@ def _rerun_s(
 
 
 def _preview(
-    words: str, known: KnownMap, parameters: Parameters, source: Source, sample: Sample | None
+    words: str, known: KnownMap, parameters: Parameters, source: Source, held: list[Step]
 ) -> tuple[Cell, ...]:
     """The preview; one before compiles the kernels."""
-    from app.worker.remap import segment_all
-    from pipeline.remapping import preview_trees
+    from pipeline.remapping import preview_trees, sample_scans
 
+    segment = _mapper(source, parameters).segmenter()
+    numbers = sample_scans(len(held), held[0].scan.points.nbytes)
     trees, spent = None, 0.0
     for _ in range(2):
         start = time.perf_counter()
-        segmented = None
-        if sample is not None:
-            segmented = sample.segmented(
-                _mapper(source, parameters).segmenter(), len(known.clusters), segment_all
-            )
-        trees = preview_trees(known, parameters, segmented)
+        trees = preview_trees(known, parameters, lambda: {n: segment(held[n]) for n in numbers})
         spent = time.perf_counter() - start
     if trees is None:
         return (words, "none", "", PREVIEW_S, "")

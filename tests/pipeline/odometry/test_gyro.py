@@ -256,23 +256,6 @@ def test_an_imu_reading_that_comes_late_or_twice_is_counted():
     assert [s.turn for s in told] == [s.turn for s in wanted]
 
 
-@pytest.mark.parametrize("at", [3, 12, 19, 25, 36])
-@pytest.mark.parametrize("tilt", [(0.0, 0.0), (0.1, -0.2)])
-def test_who_reads_on_from_a_scan_with_what_was_learnt_gets_the_same_steps(at, tilt):
-    records = [
-        reading((r.stamp_ns - START) / MS, r.angular_velocity[2], tilt) if isinstance(r, Imu) else r
-        for r in told_by_robot(0.32, 0.3)
-    ]
-    whole = list(steps(records))
-    state = whole[at].synchroniser_state
-    later = [r for r in records if r.stamp_ns >= state.stamp_ns - 1000 * MS]
-    again = [s for s in steps(later, after=state) if s.scan.stamp_ns >= state.stamp_ns]
-    wanted = [(s.turn, s.turn_rate, s.synchroniser_state) for s in whole[at:]]
-    assert [(s.turn, s.turn_rate, s.synchroniser_state) for s in again] == wanted
-    assert whole[-1].synchroniser_state.blocks > 0
-    assert whole[-1].synchroniser_state.proven
-
-
 def test_scans_are_deskewed_by_the_rate_of_the_gyroscope():
     points = np.array([[10.0, 0.0, 0.0]], np.float32)
     swept = Scan(START, points, offset_ns=np.array([50 * MS], np.int32))

@@ -200,7 +200,3 @@ def test_memory_does_not_grow_with_the_run():
     joiner = stream.gi_frame.f_locals["joiner"]
     assert len(joiner._odometry._readings) < 300
     assert len(joiner._imu) < 300
-
-
-def test_numbers_may_go_on_from_before():
-    assert [s.index for s in steps([at(0), at(100)], first_index=7)] == [7, 8]

@@ -8,10 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.worker.remap import segment_all
-from pipeline.io.checkpoints import encode
-from pipeline.remapping import ClusterTable, Rerun, Sample, ScanCaches, preview_trees
-from pipeline.remapping.preview import MOST_PLACES, SAMPLE_SCANS, _grouped
+from pipeline.remapping import ClusterTable, Rerun, ScanCaches, preview_trees, sample_scans
+from pipeline.remapping.preview import MOST_PLACES, SAMPLE_BYTES, SAMPLE_SCANS, _grouped
 from pipeline.types.records import Verdict
 from tests.pipeline.remapping.mapped import BASE, frames, mapper, run
 
@@ -105,11 +103,9 @@ SEGMENTATIONS = [
 
 
 def sampled(parameters):
-    """A sample of the run as segmented with these parameters."""
-    sample = Sample()
-    for step in run()[0]:
-        sample.offer(step)
-    return sample.segmented(mapper(parameters).segmenter(), len(run()[0]))
+    """Takes a sample of the run as segmented with these parameters."""
+    steps, segment = run()[0], mapper(parameters).segmenter()
+    return lambda: {n: segment(steps[n]) for n in sample_scans(len(steps), steps[0].scan.points.nbytes)}
 
 
 @pytest.mark.parametrize("method", ["columns", "none"])
@@ -121,7 +117,7 @@ def test_a_sample_shows_the_effect_of_other_clusters(change, method, known):
     assert preview is not None
     if method == "columns":
         with closing(ScanCaches()) as caches:
-            rerun = Rerun(mapper(parameters), caches.of(parameters), lambda: iter(run()[0]))
+            rerun = Rerun(mapper(parameters), caches.of(parameters), lambda n: iter(run()[0][n:]))
             frame = frames(rerun, len(run()[0]))[-1]
         exact = frame.trees.position[frame.trees.confirmed]
     else:
@@ -165,34 +161,10 @@ def test_a_sample_without_clusters_leaves_the_trees_of_columns(known):
     assert (apart.min(axis=1, initial=np.inf) < 0.3).mean() < 0.5
 
 
-def test_two_threads_segment_a_sample_as_one_does():
-    sample, parameters = Sample(), BASE.replace({"clustering.eps": 0.3})
-    for step in run()[0][:20]:
-        sample.offer(step)
-    two = sample.segmented(mapper(parameters).segmenter(), 20, segment_all)
-    one = sample.segmented(mapper(parameters).segmenter(), 20)
-    assert list(one) == list(two) == list(range(20))
-    assert encode(tuple(two.values())) == encode(tuple(one.values()))
-
-
 def test_a_sample_is_spread_over_the_run_and_bounded():
-    step, sample = run()[0][0], Sample()
-    scan, asked = mapper(BASE).segment(step), []
-
-    def segment(step):
-        asked.append(step.index)
-        return scan
-
-    for index in range(1000):
-        sample.offer(replace(step, index=index))
-    held = list(sample.segmented(segment, 900))
-    assert held == asked
-    assert SAMPLE_SCANS // 2 <= len(sample) <= SAMPLE_SCANS
-    assert len(set(np.diff(held))) == 1
-    assert held[0] == 0
-    assert held[-1] < 900
-    large = replace(step, scan=replace(step.scan, points=np.zeros((500_000, 3), np.float32)))
-    sample = Sample()
-    for index in range(100):
-        sample.offer(replace(large, index=index))
-    assert len(sample) <= 3
+    few, many, large = sample_scans(20, 1000), sample_scans(1000, 1000), sample_scans(100, SAMPLE_BYTES // 3)
+    assert list(few) == list(range(20))
+    assert SAMPLE_SCANS // 2 <= len(many) <= SAMPLE_SCANS
+    assert (many[0], many.step) == (0, 32)
+    assert 1 <= len(large) <= 3
+    assert list(sample_scans(5, 2 * SAMPLE_BYTES)) == [0]
