@@ -8,7 +8,6 @@ import json
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,9 +17,10 @@ from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.batch.run_folder import FinishedRun
+    from app.tuning.jobs import JobResult
     from app.tuning.report import Comparison
-    from app.tuning.sweep import PreparedRun, SweepPlan, SweepResult
-    from app.tuning.workers import Workers
+    from app.tuning.scoring import PreparedRun
+    from app.tuning.sweep import SweepPlan
     from pipeline.config import Parameters
     from pipeline.config.model import Value
     from pipeline.evaluation import MapScores
@@ -211,11 +211,6 @@ def add_grid_flags(parser: argparse.ArgumentParser) -> None:
         help="processes on this machine (default: one per core)",
     )
     group.add_argument(
-        "--dask",
-        metavar="ADDRESS",
-        help="use the Dask cluster at tcp://host:port; runs and stemmap must have the same paths there",
-    )
-    group.add_argument(
         "--out",
         metavar="DIR",
         type=Path,
@@ -240,7 +235,6 @@ def refuse_without_grid(arguments: argparse.Namespace) -> None:
     """
     given = {
         "--jobs": arguments.jobs,
-        "--dask": arguments.dask,
         "--out": arguments.out,
         "--keep": arguments.keep,
         "--preset, --config and --set": flags.says_parameters(arguments),
@@ -286,17 +280,18 @@ def run_grid(arguments: argparse.Namespace) -> int:
     from app.tuning.sweep import plan_jobs
 
     plan = plan_jobs(runs, sets, lambda run, changes: _base(arguments, run, changes))
-    numbers = list(plan.jobs)
-    outcome = _swept(arguments, plan)
-    comparison = compare_results(plan, dict(zip(numbers, outcome.answers, strict=True)))
-    return _print_comparison(arguments, comparison, outcome, refused=refused)
+    answers = _swept(arguments, plan)
+    comparison = compare_results(plan, dict(zip(plan.jobs, answers, strict=True)))
+    return _print_comparison(arguments, comparison, refused=refused)
 
 
 def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
     """Return the runs that can be scored, and the number of the others, which are reported on standard
     error."""
     from app.sources.request import SourceRequest, mount_of_degrees
-    from app.tuning.sweep import prepare_run
+    from app.store.records import contents_of
+    from app.tuning.plan import PlannedRun
+    from app.tuning.scoring import prepare_run
 
     runs, refused = [], 0
     for number, name in enumerate(arguments.runs):
@@ -309,7 +304,8 @@ def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
                 dict(arguments.topics),
                 mount_of_degrees(arguments.mount),
             )
-            runs.append(prepare_run(source, truth))
+            planned = PlannedRun(source, None if truth is None else tuple(contents_of(truth)))
+            runs.append(prepare_run(planned))
         except StemmapError as error:
             print(f"stemmap: left out: {flags.plain(str(error))}", file=sys.stderr)
             refused += 1
@@ -336,52 +332,44 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
     return flags.chosen_parameters(arguments, suits, present)[1]
 
 
-def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> SweepResult:
-    """Compute all jobs of a plan with a progress bar, and return their results."""
+def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
+    """Compute all jobs of a plan with a progress bar, in --jobs processes (default: one per usable core, at
+    most one per job). Return their results, and print warnings to standard error."""
     from tqdm import tqdm
 
     from app.common.settings import from_environment
+    from app.common.text import count
     from app.tuning.sweep import ResultStore, sweep
+    from app.tuning.workers import ScoringProcesses
 
     folder = from_environment().folder
     kept = ResultStore(arguments.keep or (folder and folder / "results"))
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    processes: ScoringProcesses[int] = ScoringProcesses(min(arguments.jobs or cores, len(plan.jobs)))
     with (
-        _workers(arguments, len(plan.jobs)) as workers,
+        contextlib.closing(processes),
         tqdm(
             total=len(plan.jobs), unit="set", file=sys.stderr, disable=not sys.stderr.isatty(), leave=False
         ) as bar,
     ):
-        return sweep(list(plan.jobs.values()), workers, kept, bar.update)
+        outcome = sweep(list(plan.jobs.values()), processes, kept, bar.update)
+    if outcome.known:
+        print(f"{count(outcome.known, 'stored result')} used", file=sys.stderr)
+    lost = [
+        f"{count(times, 'process', 'processes')} lost during a job: {reason}"
+        for reason, times in sorted(processes.lost.items())
+    ]
+    for warning in (*outcome.warnings, *lost):
+        print(f"warning: {flags.plain(warning)}", file=sys.stderr)
+    return outcome.answers
 
 
-@contextlib.contextmanager
-def _workers(arguments: argparse.Namespace, jobs: int) -> Iterator[Workers]:
-    """Yield the workers of --dask or --jobs (default: one process per usable core, at most one per job), and
-    close them at the end."""
-    from app.tuning.workers import DaskWorkers, Processes
-
-    workers: Workers
-    if arguments.dask is not None:
-        workers = DaskWorkers(arguments.dask)
-    else:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        workers = Processes(min(arguments.jobs or cores, jobs))
-    try:
-        yield workers
-    finally:
-        workers.close()
-
-
-def _print_comparison(
-    arguments: argparse.Namespace, comparison: Comparison, outcome: SweepResult, *, refused: int
-) -> int:
-    """Print the comparison, as JSON with --json, write its files with --out, and print warnings to standard
-    error.
+def _print_comparison(arguments: argparse.Namespace, comparison: Comparison, *, refused: int) -> int:
+    """Print the comparison, as JSON with --json, and write its files with --out.
 
     Args:
         arguments: Arguments of the command.
         comparison: The comparison.
-        outcome: How its results were computed.
         refused: Number of runs that could not be used.
 
     Returns:
@@ -404,12 +392,6 @@ def _print_comparison(
         except OSError as error:
             raise flags.cannot_write(error, arguments.out) from None
         print(f"{', '.join(names)} in {arguments.out}", file=sys.stderr)
-    if outcome.known:
-        print(f"{count(outcome.known, 'stored result')} used", file=sys.stderr)
-    for warning in outcome.warnings:
-        print(f"warning: {flags.plain(warning)}", file=sys.stderr)
-    for reason, times in sorted(outcome.lost.items()):
-        print(f"warning: {count(times, 'worker')} lost during a job: {flags.plain(reason)}", file=sys.stderr)
     failed = comparison.failed
     for why, times in Counter(row.error for row in failed).items():
         print(f"left out: {count(times, 'result')}: {flags.plain(why)}", file=sys.stderr)

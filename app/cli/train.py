@@ -213,11 +213,11 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
     from pipeline.config import preset
 
     settings = from_environment()
-    if settings.folder is None and not settings.database:
+    if settings.folder is None:
         raise StemmapError("there is no data folder with annotations", remedy="Set STEMMAP_FOLDER")
     if out is not None and not out.absolute().parent.is_dir():
         raise StemmapError("the folder for --out does not exist", where=str(out.parent))
-    with closing(Store(settings.folder, database=settings.database)) as store:
+    with closing(Store(settings.folder)) as store:
         runs = _chosen(store, names)
     learned = learn(
         runs,

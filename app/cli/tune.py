@@ -78,15 +78,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="number of processes; with one, the same input gives the same result (default: 1)",
     )  # fmt: skip
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="TOML file for the best set")
-    place = parser.add_mutually_exclusive_group()
-    place.add_argument(
+    parser.add_argument(
         "--journal", metavar="FILE", type=Path,
         help="file with the trials; the same command continues with it (default: next to --out)",
-    )  # fmt: skip
-    place.add_argument(
-        "--storage", metavar="ADDRESS", nargs="?", const="",
-        help="store the trials in PostgreSQL, where several machines share them: "
-        "postgresql://name@host/database (without an address: that of STEMMAP_DATABASE)",
     )  # fmt: skip
     flags.add_parameter_flags(parser)
     flags.add_run_flags(parser)
@@ -144,7 +138,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
         runs=_planned(arguments),
         axes=axes_of(arguments.over or SENSIBLE),
         start=parameters.model_dump(),
-        storage=_storage(arguments),
+        journal=str((arguments.journal or arguments.out.with_suffix(".journal")).absolute()),
         preset=preset_name,
         goal=arguments.goal,
         false_max=arguments.false_max,
@@ -212,28 +206,6 @@ def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
             remedy="Name the run of each file: --truth RUN=FILE",
         )
     return {**named, **dict(zip(others, bare, strict=False))}
-
-
-def _storage(arguments: argparse.Namespace) -> str:
-    """Return the path of the journal (default: --out with the suffix .journal) or the address of the
-    database.
-
-    Raises:
-        ParameterError: --storage gives no address of a PostgreSQL database.
-    """
-    from app.common.settings import from_environment
-    from app.tuning.storage import is_server
-
-    if arguments.storage is None:
-        return str((arguments.journal or arguments.out.with_suffix(".journal")).absolute())
-    address = arguments.storage or from_environment().database
-    if not is_server(address):
-        raise ParameterError(
-            "this is not the address of a PostgreSQL database" if address else "no database is given",
-            where=address,
-            remedy="Give postgresql://name@host/database, or set STEMMAP_DATABASE",
-        )
-    return str(address)
 
 
 def _search(search: Search) -> bool:

@@ -26,7 +26,6 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_HOSTS": "further host names by which browsers may call the server, with commas between",
     "STEMMAP_RECORDINGS": "folder whose recordings the page offers",
     "STEMMAP_FOLDER": "folder for runs, annotations and uploads (default: stemmap in your folder for data)",
-    "STEMMAP_DATABASE": "PostgreSQL database for runs and annotations, postgresql://name@host/database",
     "STEMMAP_FILES": "files that the owner's link may open: any, or folders (only those in the data folders);"
     " default: any for requests from this machine, folders for others; set folders behind a proxy or tunnel",
     "STEMMAP_UPLOAD_GB": "largest recording that a browser may upload, in GB (default: 20)",
@@ -49,7 +48,6 @@ class Settings:
         recordings: Folder whose recordings the page offers, or None.
         body_limit: Maximum size of the body of a request [bytes].
         folder: Folder of runs, annotations and uploads; None keeps them in memory.
-        database: Address of a PostgreSQL database for runs and annotations; empty for a file in the folder.
         upload_limit: Maximum size of an uploaded recording [bytes].
         message_limit: Maximum size of a websocket message of a browser [bytes].
         files: Files that an owner may open: "any", "folders" (recordings in the data folders), or "" for any
@@ -65,7 +63,6 @@ class Settings:
     upload_limit: int = 20_000_000_000
     message_limit: int = 1_000_000
     folder: Path | None = None
-    database: str = ""
     files: Files = ""
 
     @property
@@ -134,7 +131,6 @@ class Environment(msgspec.Struct, frozen=True, rename=lambda name: f"STEMMAP_{na
     token: Annotated[str, Meta(pattern=r"\A([A-Za-z0-9_-]{16,200})?\Z")] = ""
     hosts: str = ""
     recordings: str = ""
-    database: str = ""
     files: Files = ""
     upload_gb: Annotated[float, Meta(gt=0.0, le=1e6)] = 20.0
 
@@ -147,10 +143,16 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         environment: The variables; None for those of this process.
 
     Raises:
-        StemmapError: A variable has an invalid value, the host is not a loopback address, or the folder of
-            recordings does not exist.
+        StemmapError: A variable has an invalid value, the host is not a loopback address, the folder of
+            recordings does not exist, or STEMMAP_DATABASE of earlier versions is set.
     """
     variables = os.environ if environment is None else environment
+    if variables.get("STEMMAP_DATABASE"):
+        raise StemmapError(
+            "other databases than the SQLite file in STEMMAP_FOLDER are no longer supported",
+            where="STEMMAP_DATABASE",
+            remedy="Unset it",
+        )
     try:
         given = msgspec.convert(dict(variables), Environment, strict=False)
     except msgspec.ValidationError as error:
@@ -173,7 +175,6 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         hosts=tuple(name.strip().lower() for name in given.hosts.split(",") if name.strip()),
         recordings=recordings,
         folder=data_folder(variables),
-        database=given.database,
         files=given.files,
         upload_limit=round(1e9 * given.upload_gb),
     )

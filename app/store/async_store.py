@@ -29,11 +29,10 @@ class AsyncStore:
 
     Args:
         folder: Folder of the database; None keeps it in memory.
-        database: Address of a PostgreSQL database in place of the folder.
     """
 
-    def __init__(self, folder: Path | None, database: str = "") -> None:
-        self._folder, self._database = folder, database
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
         self._store: Store | None = None
         # One thread runs the requests in their order and never two at once.
         self._thread = ThreadPoolExecutor(1, "store")
@@ -70,10 +69,10 @@ class AsyncStore:
         from app.store.store import Store
 
         if self._store is None:
-            self._store = Store(self._folder, database=self._database)
+            self._store = Store(self._folder)
         try:
             return function(self._store)
-        except SQLAlchemyError as error:  # a full disk, a server that stopped
+        except SQLAlchemyError as error:  # a full disk
             raise StemmapError(
                 f"the database refused: {reason_of(error)}", remedy="Nothing was changed; try again"
             ) from None

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+from sqlalchemy.exc import SQLAlchemyError
 
 from pipeline.errors import StemmapError
 
@@ -43,24 +43,18 @@ def _prepare_tables(connection: sa.Connection) -> None:
 
 FILE_NAME = "annotations.sqlite"
 _PATIENCE_MS = 5000
-_PATIENCE_S = 5
-# Number of the advisory lock that every writer holds; any constant.
-_LOCK = 7_330_117
 
 
-def open_engine(folder: Path | None, database: str = "") -> sa.Engine:
+def open_engine(folder: Path | None) -> sa.Engine:
     """Return the engine of a database with current tables.
 
     Args:
         folder: Folder of the SQLite file, created if necessary; None keeps the database in memory.
-        database: Address of a PostgreSQL database, used instead of the folder; empty for none.
 
     Raises:
-        StemmapError: The folder or the server cannot be used, or the database is damaged, of another version
-            or of another program; it is not modified.
+        StemmapError: The folder cannot be used, or the database is damaged, of another version or of another
+            program; it is not modified.
     """
-    if database:
-        return _open_server(database)
     if folder is None:
         return _checked(_sqlite(":memory:"), "memory")
     path = folder / FILE_NAME
@@ -73,29 +67,6 @@ def open_engine(folder: Path | None, database: str = "") -> sa.Engine:
             remedy="Name another folder with STEMMAP_FOLDER",
         ) from None
     return _checked(_sqlite(str(path)), str(path))
-
-
-def _open_server(database: str) -> sa.Engine:
-    """Return the engine of a PostgreSQL database with current tables.
-
-    Raises:
-        StemmapError: The address is invalid, the driver is not installed, or the database cannot be used.
-    """
-    remedy = "Give STEMMAP_DATABASE as postgresql://name@host/database"
-    try:
-        url = sa.make_url(database)
-    except (ArgumentError, ValueError):
-        raise StemmapError("this is not the address of a database", remedy=remedy) from None
-    if url.drivername not in ("postgresql", "postgresql+psycopg"):
-        raise StemmapError(f"{url.drivername} is not supported", where="STEMMAP_DATABASE", remedy=remedy)
-    where = url.render_as_string(hide_password=True)
-    try:
-        engine = _postgresql(url)
-    except ImportError:
-        raise StemmapError(
-            "the driver of PostgreSQL is missing", where=where, remedy="Install stemmap[postgres]"
-        ) from None
-    return _checked(engine, where)
 
 
 def _sqlite(database: str) -> sa.Engine:
@@ -123,26 +94,6 @@ def _sqlite(database: str) -> sa.Engine:
     return engine
 
 
-def _postgresql(url: sa.URL) -> sa.Engine:
-    """Return an engine with one connection; each transaction holds a lock that all writers share, or fails
-    after 5 s."""
-    engine = sa.create_engine(
-        url.set(drivername="postgresql+psycopg"),
-        pool_size=1,
-        max_overflow=0,
-        pool_pre_ping=True,  # the server may have been restarted
-        connect_args={"connect_timeout": _PATIENCE_S, "application_name": "stemmap"},
-    )
-
-    @sa.event.listens_for(engine, "begin")
-    def _(connection: sa.Connection) -> None:
-        # Equivalent to BEGIN IMMEDIATE above. A lock that is not granted in time is an error.
-        connection.exec_driver_sql(f"SET LOCAL lock_timeout = {_PATIENCE_MS}")
-        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_LOCK})")
-
-    return engine
-
-
 def _checked(engine: sa.Engine, where: str) -> sa.Engine:
     """Check a database, create its tables if it is new, and return the engine; it is disposed of after an
     error.
@@ -157,10 +108,9 @@ def _checked(engine: sa.Engine, where: str) -> sa.Engine:
     keep = "It was not changed: move it away to start with an empty one, or restore a copy"
     try:
         with engine.begin() as connection:
-            if engine.dialect.name == "sqlite":
-                result = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
-                if result != "ok":
-                    raise StemmapError("the annotations are damaged", where=where, remedy=keep)
+            result = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
+            if result != "ok":
+                raise StemmapError("the annotations are damaged", where=where, remedy=keep)
             _prepare_tables(connection)
     except StemmapError as error:
         engine.dispose()
@@ -170,11 +120,8 @@ def _checked(engine: sa.Engine, where: str) -> sa.Engine:
         raise StemmapError(what, where=where, remedy=error.remedy or keep) from None
     except (SQLAlchemyError, sqlite3.Error) as error:
         engine.dispose()
-        remedy = (
-            keep if engine.dialect.name == "sqlite" else "Check that the server runs and accepts this user"
-        )
         raise StemmapError(
-            f"the annotations cannot be read: {reason_of(error)}", where=where, remedy=remedy
+            f"the annotations cannot be read: {reason_of(error)}", where=where, remedy=keep
         ) from None
     return engine
 

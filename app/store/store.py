@@ -336,16 +336,13 @@ class Store:
     Args:
         folder: Folder of the database; None keeps it in memory.
         clock: Returns the time in nanoseconds since 1970.
-        database: Address of a PostgreSQL database, used instead of the folder.
 
     Raises:
         StemmapError: The database cannot be used; the file is not modified.
     """
 
-    def __init__(
-        self, folder: Path | None, clock: Callable[[], int] = time.time_ns, database: str = ""
-    ) -> None:
-        self._engine = open_engine(folder, database)
+    def __init__(self, folder: Path | None, clock: Callable[[], int] = time.time_ns) -> None:
+        self._engine = open_engine(folder)
         self._clock = clock
         self.book = RunRecords(self._engine, clock)
 
@@ -646,7 +643,7 @@ def _content(row: Row[Any]) -> Content:
 
 def _key(source: str) -> str:
     """Return the lookup key of a source: itself, or the text "sha256" and its digest if it is longer than 600
-    characters, because PostgreSQL index entries are limited to 2,700 bytes."""
+    characters, as in the databases of earlier versions."""
     return source if len(source) <= _LONGEST_KEY else f"sha256 {sha256(source.encode()).hexdigest()}"
 
 

@@ -50,7 +50,7 @@ def read_axes(words: Iterable[str]) -> tuple[GridAxis, ...]:
     axes: dict[str, GridAxis] = {}
     for word in words:
         name, equals, text = (part.strip() for part in word.partition("="))
-        found = [_axis(name, [text])] if equals else _axes_of(Path(word))
+        found = [grid_axis(name, [text])] if equals else _axes_of(Path(word))
         for axis in found:
             if axis.name in axes:
                 raise ParameterError(f"{axis.name} is given twice", remedy="Put its values into one list")
@@ -109,10 +109,10 @@ def _axes_of(file: Path) -> list[GridAxis]:
     axes = []
     for stage, entry in given.items():
         if stage == PRESET:
-            axes.append(_axis(PRESET, entry if isinstance(entry, list) else [entry]))
+            axes.append(grid_axis(PRESET, entry if isinstance(entry, list) else [entry]))
         elif isinstance(entry, dict):
             axes += [
-                _axis(f"{stage}.{name}", values if isinstance(values, list) else [values])
+                grid_axis(f"{stage}.{name}", values if isinstance(values, list) else [values])
                 for name, values in entry.items()
             ]
         else:
@@ -124,7 +124,7 @@ def _axes_of(file: Path) -> list[GridAxis]:
     return axes
 
 
-def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
+def grid_axis(name: str, entries: Sequence[Any]) -> GridAxis:
     """Return the axis of a parameter or PRESET; equal values are merged.
 
     Args:
@@ -147,8 +147,6 @@ def _axis(name: str, entries: Sequence[Any]) -> GridAxis:
     values = [value for entry in entries for part in _parts(_text(entry)) for value in _values(spec, part)]
     if not values or len(values) > MOST_VALUES:
         raise ParameterError(f"{name} has {len(values):,} values, not 1 to {MOST_VALUES:,}", remedy=_EXAMPLE)
-    for value in values:
-        _check(spec, value)
     return GridAxis(name, tuple(dict.fromkeys(values)))
 
 
@@ -164,27 +162,26 @@ def _parts(text: str) -> list[str]:
 
 def _values(spec: FieldSpec, text: str) -> list[Value]:
     """Return the values of one part of a list: a single value, or those of a range "LOW..HIGH/COUNT" or
-    "LOW..HIGH/COUNTlog". Bounds of the declaration are not checked.
+    "LOW..HIGH/COUNTlog".
 
     Raises:
-        ParameterError: The text cannot be parsed, a range has fewer than 2 or more than `MOST_VALUES` values,
-            or the ends are not finite (or not above 0 for "log").
+        ParameterError: The text cannot be parsed, a value is out of bounds, a range has fewer than 2 or more
+            than `MOST_VALUES` values, or its ends are not above 0 for "log".
     """
     start, dots, rest = text.partition("..")
     if not dots:
-        return [_value(spec, text)]
+        return [checked_value(spec, text)]
     end, _, how_many = rest.rpartition("/")  # the last slash: units contain slashes too
     counted = _COUNT.fullmatch(how_many.strip())
     if spec.kind not in ("int", "float") or counted is None:
         raise ParameterError(
             f"{spec.name} = {text!r} is not a range of numbers with a number of values", remedy=_EXAMPLE
         )
-    low, high = float(_value(spec, start)), float(_value(spec, end))
+    low, high = float(checked_value(spec, start)), float(checked_value(spec, end))
     count, ratio = int(counted[1]), counted[2] is not None
-    if not 2 <= count <= MOST_VALUES or not (math.isfinite(low) and math.isfinite(high)):
+    if not 2 <= count <= MOST_VALUES:
         raise ParameterError(
-            f"{spec.name} = {text!r}: a range has 2 to {MOST_VALUES:,} values between two numbers",
-            remedy=_EXAMPLE,
+            f"{spec.name} = {text!r}: a range has 2 to {MOST_VALUES:,} values", remedy=_EXAMPLE
         )
     if ratio and min(low, high) <= 0.0:
         raise ParameterError(f"{spec.name} = {text!r}: equal ratios need numbers above 0", remedy=_EXAMPLE)
@@ -214,22 +211,17 @@ def _rounded(spec: FieldSpec, value: float) -> Value:
     return round(value) if spec.kind == "int" else float(f"{value:.12g}")
 
 
-def _value(spec: FieldSpec, text: str) -> Value:
-    """Parse a value, with or without its unit; raises ParameterError if it is invalid. Bounds are not
-    checked."""
+def checked_value(spec: FieldSpec, text: str) -> Value:
+    """Parse a value, with or without its unit. Contradictions between two values depend on the other
+    parameters and are not checked.
+
+    Raises:
+        ParameterError: It is invalid, or outside of the bounds or choices of the parameter.
+    """
     bare = text.strip()
     if spec.kind in ("int", "float") and spec.unit:
         bare = bare.removesuffix(spec.unit).strip()
-    return parsed(spec, bare)
-
-
-def _check(spec: FieldSpec, value: Value) -> None:
-    """Check that a single value is in the bounds or choices of its parameter. Contradictions between two
-    values depend on the other parameters.
-
-    Raises:
-        ParameterError: It is not.
-    """
+    value = parsed(spec, bare)
     if spec.kind in ("int", "float") and spec.minimum is not None and spec.maximum is not None:
         if not spec.minimum <= float(value) <= spec.maximum:
             raise ParameterError(
@@ -241,3 +233,4 @@ def _check(spec: FieldSpec, value: Value) -> None:
         raise ParameterError(
             f"{spec.name} = {value!r} is not one of {', '.join(spec.choices) or 'true, false'}"
         )
+    return value

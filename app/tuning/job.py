@@ -340,7 +340,7 @@ def plan_of(
         runs=(shown, *_planned(request, others)),
         axes=axes,
         start=parameters.model_dump(),
-        storage="",
+        journal="",
         preset=preset,
         goal=request.goal,
         false_max=request.false_max,

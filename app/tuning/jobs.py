@@ -1,6 +1,7 @@
 """Jobs: a run with its true trees that is mapped and scored with one parameter set.
 
-Jobs and results are sent to the workers and back as JSON: paths, parameters and scores, never point clouds.
+Jobs and results are sent to the scoring processes and back as JSON: paths, parameters and scores, never point
+clouds.
 """
 
 from __future__ import annotations
@@ -8,7 +9,7 @@ from __future__ import annotations
 import hashlib
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
@@ -22,16 +23,13 @@ from pipeline.errors import StemmapError
 from pipeline.evaluation import MapScores
 from pipeline.types.records import TruthTrees
 
-#: Reason of a failure: "job" is the same on every worker; "worker" and "version" concern only this worker.
-Fault = Literal["", "job", "worker", "version"]
 
-
-class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class RunWithTruth(msgspec.Struct, frozen=True):
     """A run that is mapped and scored.
 
     Attributes:
-        source: Source, and how it is mapped. A path is absolute and names the same recording on every worker.
-        digest: SHA-256 of the source, by which a worker recognises another recording.
+        source: Source, and how it is mapped.
+        digest: SHA-256 of the source, by which another recording at the same path is recognised.
         truth: True trees in the frame of the map.
     """
 
@@ -40,27 +38,26 @@ class RunWithTruth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     truth: list[Content]
 
 
-class Job(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Job(msgspec.Struct, frozen=True):
     """A run with one parameter set.
 
     Attributes:
         run: The run.
         parameters: All values, by stage and name.
-        code: Digest of the code that made the job, see `code_digest`; other code may give other scores.
     """
 
     run: RunWithTruth
     parameters: dict[str, dict[str, Any]]
-    code: str
 
     def key(self) -> str:
-        """Return a SHA-256 (hex) of all that determines the scores, without the path of the recording."""
+        """Return a SHA-256 (hex) of all that determines the scores except the code, without the path of the
+        recording."""
         source = msgspec.structs.replace(self.run.source, uri="")
         placeless = msgspec.structs.replace(self, run=msgspec.structs.replace(self.run, source=source))
         return hashlib.sha256(msgspec.json.encode(placeless, order="sorted")).hexdigest()
 
 
-class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class JobResult(msgspec.Struct, frozen=True):
     """The result of a job.
 
     Attributes:
@@ -69,7 +66,6 @@ class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         seconds: Computing time [s].
         looked: Whether the front end ran; False if its cached results were used.
         error: Reason of the failure.
-        fault: Kind of the failure.
     """
 
     scores: MapScores | None
@@ -78,7 +74,6 @@ class JobResult(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seconds: float = 0.0
     looked: bool = False
     error: str = ""
-    fault: Fault = ""
 
     @property
     def problem(self) -> str:

@@ -13,13 +13,13 @@ import msgspec
 
 from app.common.text import value_text, version
 from app.sources.request import SourceRequest
-from app.store.records import Content, contents_of
-from app.tuning.grid import spec_of
+from app.store.records import Content
+from app.tuning.grid import checked_value, grid_axis, spec_of
+from app.tuning.jobs import RunWithTruth
 from pipeline.config import FieldSpec, Parameters
 from pipeline.config.model import Value, validated
 from pipeline.errors import ParameterError
 from pipeline.evaluation import MapScores
-from pipeline.types.records import TruthTrees
 
 # --- goal -------------------------------------------------------------------------------------------
 
@@ -337,10 +337,14 @@ def _axis(text: str) -> SearchAxis:
     why = _NO_PART_OF_THE_MAP.get(name.partition(".")[0])
     if why is not None:
         raise ParameterError(f"{name} {why}; it cannot be searched over", remedy="Set it with --set")
-    if spec.kind == "name":
-        return _names(spec, bounds)
     if spec.minimum is None or spec.maximum is None:
-        return _choice(spec, bounds) if given else SearchAxis(name, "choice", choices=_all_choices(spec))
+        all_values = () if spec.kind == "name" else spec.choices or (False, True)
+        values = grid_axis(name, [bounds]).values if given else all_values
+        for value in values:
+            Parameters().replace({name: value})  # raises an error with the syntax of a name
+        if len(values) < 2:
+            raise ParameterError(f"{text}: at least two values are needed", remedy=f"E.g. {name}=A,B")
+        return SearchAxis(name, "choice", choices=tuple(v if isinstance(v, bool) else str(v) for v in values))
     low, high = _range(spec, bounds) if given else (spec.minimum, spec.maximum)
     return SearchAxis(name, "int" if spec.kind == "int" else "float", low, high)
 
@@ -353,62 +357,15 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
             the upper one, or one is outside of the bounds of the declaration.
     """
     first, dots, last = bounds.partition("..")
-    try:
-        if not dots:
-            raise ValueError
-        whole = spec.kind == "int"
-        low, high = (float(int(end)) if whole else float(end) for end in (first, last))
-    except (ValueError, OverflowError):
-        kind = "whole numbers" if spec.kind == "int" else "numbers"
+    if not dots:
+        example = f"{spec.name}={spec.minimum:g}..{spec.maximum:g}"
         raise ParameterError(
-            f"{spec.name}={bounds}: not two {kind} with .. between", remedy=f"E.g. {_example(spec)}"
-        ) from None
-    assert spec.minimum is not None  # noqa: S101 - it is a number
-    assert spec.maximum is not None  # noqa: S101
-    if not low < high:
+            f"{spec.name}={bounds}: not two numbers with .. between", remedy=f"E.g. {example}"
+        )
+    low, high = (checked_value(spec, end) for end in (first, last))
+    if not float(low) < float(high):
         raise ParameterError(f"{spec.name}={bounds}: the lower bound must be less than the upper one")
-    if not (spec.minimum <= low and high <= spec.maximum):
-        raise ParameterError(
-            f"{spec.name}={bounds} is outside of the parameter's range",
-            remedy=f"It goes from {spec.minimum:g} to {spec.maximum:g}",
-        )
-    return low, high
-
-
-def _choice(spec: FieldSpec, words: str) -> SearchAxis:
-    """Parse "A,B" for a parameter with choices or a switch; repeated choices are merged.
-
-    Raises:
-        ParameterError: A choice is unknown, or there are fewer than two different ones.
-    """
-    known = {value_text(choice): choice for choice in _all_choices(spec)}
-    given = [word.strip() for word in words.split(",")]
-    unknown = [word for word in given if word not in known]
-    if unknown or len(set(given)) < 2:
-        what = f"{unknown[0]!r} is not one of its values" if unknown else "at least two values are needed"
-        raise ParameterError(f"{spec.name}={words}: {what}", remedy=f"Choose from {', '.join(known)}")
-    return SearchAxis(spec.name, "choice", choices=tuple(known[word] for word in dict.fromkeys(given)))
-
-
-def _names(spec: FieldSpec, words: str) -> SearchAxis:
-    """Parse "A,B" for a parameter whose value is a free name; empty and repeated names are dropped.
-
-    Raises:
-        ParameterError: There are fewer than two different names, or one has an invalid syntax.
-    """
-    given = tuple(dict.fromkeys(word.strip() for word in words.split(",") if word.strip()))
-    if len(given) < 2:
-        raise ParameterError(
-            f"{spec.name} is a name and has no bounds", remedy=f"Give at least two names: {spec.name}=A,B"
-        )
-    for word in given:
-        Parameters().replace({spec.name: word})  # raises an error with the syntax of a name
-    return SearchAxis(spec.name, "choice", choices=given)
-
-
-def _all_choices(spec: FieldSpec) -> tuple[str | bool, ...]:
-    """Return all values of a choice; False and True for a switch."""
-    return spec.choices or (False, True)
+    return float(low), float(high)
 
 
 def _ends(axis: SearchAxis) -> tuple[Value, ...]:
@@ -416,11 +373,6 @@ def _ends(axis: SearchAxis) -> tuple[Value, ...]:
     if axis.kind == "choice":
         return axis.choices
     return axis.value_of(axis.low), axis.value_of(axis.high)
-
-
-def _example(spec: FieldSpec) -> str:
-    """Return a parameter with its declared bounds in the syntax of `--over`."""
-    return f"{spec.name}={spec.minimum:g}..{spec.maximum:g}"
 
 
 # --- plan and trials --------------------------------------------------------------------------------
@@ -455,7 +407,7 @@ class Plan(msgspec.Struct, frozen=True):
         runs: At least one that is not held out.
         axes: The parameters that are searched, with their bounds.
         start: All parameters with which the search begins, by stage. They are the first trial.
-        storage: Path of a journal, address of a PostgreSQL database, or "" for the memory.
+        journal: Path of the file of the trials; "" keeps them in memory.
         preset: Name of the preset from which the parameters come.
         goal, false_max: See `app.tuning.plan.Goal`.
         seed: Random seed of the mapping and of the sampler.
@@ -467,7 +419,7 @@ class Plan(msgspec.Struct, frozen=True):
     runs: tuple[PlannedRun, ...]
     axes: tuple[SearchAxis, ...]
     start: dict[str, dict[str, Any]]
-    storage: str
+    journal: str
     preset: str = "forest"
     goal: GoalName = "f1"
     false_max: float = 0.1
@@ -525,18 +477,12 @@ def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
     }
 
 
-def digest_with_truth(plan: Plan, source: SourceRequest, digest: str, truth: TruthTrees) -> str:
-    """Return a SHA-256 (hex) of a source, its true trees, and the choices with which it is opened if they
-    differ from those of the plan.
-
-    Args:
-        plan: The search.
-        source: How the run is opened.
-        digest: Digest of the source.
-        truth: The true trees.
-    """
+def digest_with_truth(plan: Plan, run: RunWithTruth) -> str:
+    """Return a SHA-256 (hex) of a run of a search: its source, its true trees, and the choices with which it
+    is opened if they differ from those of the plan."""
+    source = run.source
     default = SourceRequest(source.uri, plan.odometry, plan.seed)
     chosen = [source.seed, source.odometry, source.topics, source.mount]
     differs = chosen != [default.seed, default.odometry, default.topics, default.mount]
-    text = msgspec.json.encode([digest, contents_of(truth), *([chosen] if differs else [])])
+    text = msgspec.json.encode([run.digest, run.truth, *([chosen] if differs else [])])
     return hashlib.sha256(text).hexdigest()

@@ -1,4 +1,4 @@
-"""Maps and scores runs with one parameter set after another; the program of the worker processes of a grid
+"""Maps and scores runs with one parameter set after another; the program of the scoring processes of a grid
 comparison, a sensitivity curve or a search.
 
 It receives `Job`s as lines of JSON and sends the `JobResult`s. The front end of the mapper depends on few
@@ -11,29 +11,28 @@ from __future__ import annotations
 import argparse
 import contextlib
 import sys
-import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
-from typing import IO
 
 import msgspec
 
-import pipeline.jit
-from app.batch.run_folder import NO_PATH, as_written, score_map
+from app.batch.run_folder import NO_PATH, as_written, read_run, read_run_record, score_map
 from app.common.child_process import ParentConnection, run_child
-from app.sources.request import SourceRequest, with_odometry
+from app.dashboard.annotations import laid_over
+from app.sources.request import SourceRequest, request_of_kept, with_odometry
 from app.store.forests import kept_forests
-from app.store.records import as_truth
-from app.tuning.jobs import Fault, Job, JobResult, RunWithTruth, code_digest
+from app.store.records import as_truth, contents_of
+from app.tuning.jobs import Job, JobResult, RunWithTruth
+from app.tuning.plan import PlannedRun
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
-from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import open_source
 from pipeline.io.readers.clouds import is_cloud, open_cloud
-from pipeline.jit import on_compiling
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import ScanCache, ScanCaches
@@ -212,6 +211,21 @@ class _DamagedCacheError(Exception):
 OpenRun = OpenDrive | OpenCloud
 
 
+@dataclass(frozen=True, slots=True)
+class PreparedRun:
+    """A run that can be mapped and scored.
+
+    Attributes:
+        name: As the user named it.
+        run: The run with its true trees.
+        preset: Name of the preset that suits it.
+    """
+
+    name: str
+    run: RunWithTruth
+    preset: str
+
+
 def open_run(source: SourceRequest) -> OpenRun:
     """Open a source. The caller closes it.
 
@@ -221,8 +235,58 @@ def open_run(source: SourceRequest) -> OpenRun:
     return OpenCloud(source) if is_cloud(source.uri) else OpenDrive(source)
 
 
-class NotHereError(StemmapError):
-    """The recording or the random forest is missing on this worker; another worker may have it."""
+def prepare_run(planned: PlannedRun) -> PreparedRun:
+    """Open a run, read its true trees and close it.
+
+    Args:
+        planned: The run; its URI may be a folder that `stemmap map` wrote, which names its source.
+
+    Raises:
+        StemmapError: It cannot be read, is another recording than the annotated one, or has no true trees; or
+            the folder's map was made of several sources.
+    """
+    name, source = planned.source.uri, _source_of(planned.source)
+    with closing(open_run(source)) as run:
+        if planned.digest and planned.digest not in (run.digest, run.recording_digest):
+            raise SourceError(
+                "this is another recording than the one that was annotated",
+                where=name,
+                remedy="Open it and annotate it, or leave it out",
+            )
+        if planned.truth is not None:
+            truth: TruthTrees | None = as_truth(planned.truth)
+        else:
+            truth = run.own_truth
+            if planned.annotations is not None:
+                truth = laid_over(truth, planned.annotations)
+        if truth is None or not len(truth.x):
+            remedy = "Give its true trees with --truth trees.csv, in the frame of the map"
+            if planned.annotations is not None:
+                remedy = "Open it and annotate some in the tab Annotate, or leave it out"
+            raise SourceError("the run has no true trees", where=name, remedy=remedy)
+        return PreparedRun(name, RunWithTruth(source, run.digest, contents_of(truth)), run.preset)
+
+
+def _source_of(source: SourceRequest) -> SourceRequest:
+    """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with the seed,
+    topics and mounting of the folder, the requested odometry, and topics and mounting of the request where
+    given.
+
+    Raises:
+        SourceError: The map of the folder was made of several sources, or its files are damaged.
+    """
+    folder = FilePath(source.uri)
+    if not (folder / "run.json").is_file():
+        return source
+    run, record = read_run(folder), read_run_record(folder)
+    if record.get("continued"):
+        raise SourceError(
+            "this map was made of several sources", where=source.uri, remedy="Name the sources themselves"
+        )
+    kept = request_of_kept(run.uri, odometry=source.odometry, seed=run.seed, choices=record.get("chosen"))
+    return msgspec.structs.replace(
+        kept, topics=source.topics or kept.topics, mount=source.mount or kept.mount
+    )
 
 
 class Scorer:
@@ -238,25 +302,18 @@ class Scorer:
         self._open: dict[bytes, OpenRun] = {}
 
     def score(self, job: Job) -> JobResult:
-        """Return the result of a job; every exception becomes its `error`. The fault is "version" if the job
-        was made by other code, "worker" if the recording or the forest is missing here, otherwise "job"."""
-        if job.code != code_digest():
-            other = f"this worker has stemmap {code_digest()}, the job comes from {job.code}"
-            return _failed(f"{other}. Install the same version on both", "version")
+        """Return the result of a job; every exception becomes its `error`."""
         begun = time.perf_counter()
         try:
             parameters = validated(job.parameters)
-            with _errors_of_this_worker():
-                kept_forests().check(parameters)  # learned forests are in the data folder of each machine
+            kept_forests().check(parameters)
             mapped = self._run(job.run).map(parameters)
-        except NotHereError as error:
-            return _failed(str(error), "worker")
         except StemmapError as error:
-            return _failed(str(error))
+            return JobResult(None, error=str(error))
         except MemoryError:
-            return _failed("this needs more memory than the machine has")
+            return JobResult(None, error="this needs more memory than the machine has")
         except Exception as error:  # a fault with one set must not end the others
-            return _failed(f"this is a fault in stemmap: {type(error).__name__}: {error}")
+            return JobResult(None, error=f"this is a fault in stemmap: {type(error).__name__}: {error}")
         scores = score_map(mapped.trees, mapped.path, as_truth(job.run.truth), parameters)
         seconds = time.perf_counter() - begun
         return JobResult(scores, mapped.scans, len(mapped.trees.number), seconds, mapped.front_end_ran)
@@ -270,91 +327,18 @@ class Scorer:
         """Return an open run, from memory or newly opened.
 
         Raises:
-            NotHereError: It cannot be opened on this worker, or is another recording.
-            ParameterError: The request is invalid on every worker.
+            StemmapError: It cannot be opened, or is another recording than that of the job.
         """
         key = msgspec.json.encode([requested.source, requested.digest])
         if key not in self._open:
             if len(self._open) >= self._most:
                 self._open.pop(next(iter(self._open))).close()
-            self._open[key] = _opened(requested)
+            run = open_run(requested.source)
+            if run.digest != requested.digest:
+                run.close()
+                raise SourceError("the recording was replaced by another one", where=requested.source.uri)
+            self._open[key] = run
         return self._open[key]
-
-
-_scorer = Scorer()  # of a worker of a cluster, which may have several threads
-_scorer_lock = threading.Lock()
-
-
-def score_json(text: bytes) -> bytes:
-    """Return the result of a job on a worker of a cluster, both as JSON. One job at a time is computed in
-    this process. Invalid JSON gives a result with the fault "version"."""
-    try:
-        job = msgspec.json.decode(text, type=Job)
-    except msgspec.MsgspecError as error:
-        return msgspec.json.encode(_failed(f"this is not a job: {error}", "version"))
-    with _scorer_lock, one_compiler_at_a_time():
-        return msgspec.json.encode(_scorer.score(job))
-
-
-@contextlib.contextmanager
-def one_compiler_at_a_time() -> Iterator[None]:
-    """Inside, a kernel that must be compiled waits until no other worker of this machine compiles. The second
-    worker then finds the compiled kernel. The lock is held from the first compilation to the end of the
-    block; Windows has no lock."""
-    with contextlib.ExitStack() as stack:
-        held: list[IO[bytes]] = []
-
-        def wait() -> None:
-            if not held:
-                held.append(stack.enter_context(FilePath(pipeline.jit.__file__).open("rb")))
-                _lock(held[0])
-
-        with on_compiling(wait):
-            yield
-
-
-def _lock(file: IO[bytes]) -> None:
-    """Wait for an exclusive lock of an open file, which ends when the file is closed; does nothing on
-    Windows."""
-    if sys.platform != "win32":
-        import fcntl
-
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
-
-
-def _opened(requested: RunWithTruth) -> OpenRun:
-    """Open a run and check its digest.
-
-    Raises:
-        NotHereError: It cannot be opened here, or is another recording than that of the job.
-        ParameterError: The request is invalid on every worker.
-    """
-    with _errors_of_this_worker():
-        run = open_run(requested.source)
-    if run.digest != requested.digest:
-        run.close()
-        raise NotHereError(
-            "this worker has another recording of that name",
-            where=requested.source.uri,
-            remedy="All workers must have the same file at this place",
-        )
-    return run
-
-
-@contextlib.contextmanager
-def _errors_of_this_worker() -> Iterator[None]:
-    """Raise what is missing here as NotHereError; errors of parameters are the same on every worker."""
-    try:
-        yield
-    except ParameterError:
-        raise
-    except StemmapError as error:
-        raise NotHereError(error.what, where=error.where, remedy=error.remedy) from None
-
-
-def _failed(error: str, fault: Fault = "job") -> JobResult:
-    """Return a result without scores."""
-    return JobResult(None, error=error, fault=fault)
 
 
 def main(words: list[str]) -> None:
@@ -371,9 +355,7 @@ def main(words: list[str]) -> None:
 
     def work(parent: ParentConnection) -> None:
         while True:
-            job = parent.receive(Job)
-            with one_compiler_at_a_time():
-                parent.send(scorer.score(job))
+            parent.send(scorer.score(parent.receive(Job)))
 
     run_child(work, low_priority=arguments.low_priority)
 

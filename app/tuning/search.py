@@ -1,28 +1,26 @@
-"""The search: Optuna suggests a parameter set, workers map the runs with it, and the scores are stored.
+"""The search: Optuna suggests a parameter set, processes map the runs with it, and the scores are stored.
 
 A suggestion depends only on the trials before it, its number and the seed. A stopped search therefore
-continues with the trials that it would have made, and with one worker the same input gives the same result.
+continues with the trials that it would have made, and with one process the same input gives the same result.
 """
 
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from app.batch.summary import far_map, far_truth
-from app.common.child_process import ParentConnection, python_module, run_child
-from app.dashboard.annotations import laid_over
-from app.store.records import as_truth, contents_of
-from app.tuning.jobs import Job, RunWithTruth, code_digest
+from app.common.child_process import ParentConnection, run_child
+from app.tuning.jobs import Job, JobResult
 from app.tuning.plan import (
     Plan,
-    PlannedRun,
     RunScore,
     Trial,
     check,
@@ -33,78 +31,12 @@ from app.tuning.plan import (
     values_of,
 )
 from app.tuning.result import SearchMessage, SearchStart, best_of, result_of
-from app.tuning.scoring import open_run
-from app.tuning.storage import open_trials
-from app.tuning.workers import SCORING, Done, Lost, Processes, Workers
+from app.tuning.scoring import prepare_run
+from app.tuning.trials import Journal, Trials
+from app.tuning.workers import COMMAND, ScoringProcesses
 from pipeline.config.model import Value
-from pipeline.errors import ParameterError, SourceError, StemmapError
+from pipeline.errors import ParameterError, StemmapError
 from pipeline.evaluation import MapScores
-from pipeline.types.records import TruthTrees
-
-MOST_LOSSES = 4  # a set of parameters that loses so many workers ends the search
-
-
-@dataclass(frozen=True, slots=True)
-class SearchRun:
-    """A run of a search with its true trees.
-
-    Attributes:
-        uri, held_out: As planned.
-        digest: Digest of the source, how it is opened and its true trees.
-        run: What the workers map and score.
-    """
-
-    uri: str
-    held_out: bool
-    digest: str
-    run: RunWithTruth
-
-
-def _prepared(plan: Plan, planned: PlannedRun) -> SearchRun:
-    """Open a run, read its true trees, and close it again.
-
-    Raises:
-        StemmapError: It cannot be read, is another recording than the annotated one, or has no true trees.
-    """
-    uri = planned.source.uri
-    with closing(open_run(planned.source)) as run:
-        truth = _truth(planned, run.own_truth)
-        if planned.digest and planned.digest not in (run.digest, run.recording_digest):
-            raise SourceError(
-                "this is another recording than the one that was annotated",
-                where=uri,
-                remedy="Open it and annotate it, or leave it out",
-            )
-        digest = digest_with_truth(plan, planned.source, run.digest, truth)
-        return SearchRun(
-            uri, planned.held_out, digest, RunWithTruth(planned.source, run.digest, contents_of(truth))
-        )
-
-
-def _truth(planned: PlannedRun, own: TruthTrees | None) -> TruthTrees:
-    """Return the true trees of a run: those that were given, else those of the source with the annotations
-    applied.
-
-    Args:
-        planned: The run.
-        own: True trees of the source, or None.
-
-    Raises:
-        SourceError: There are no true trees.
-    """
-    uri = planned.source.uri
-    if planned.truth is not None:
-        return as_truth(planned.truth)
-    if planned.annotations is not None:
-        truth = laid_over(own, planned.annotations)
-        if truth is None:
-            remedy = "Open it and annotate some in the tab Annotate, or leave it out"
-            raise SourceError("no true trees are known of this run", where=uri, remedy=remedy)
-        return truth
-    if own is None:
-        remedy = f"Give them with --truth {uri}=trees.csv"
-        raise SourceError("the run brings no true trees", where=uri, remedy=remedy)
-    return own
 
 
 def check_start(uri: str, scores: MapScores, match_distance: float) -> None:
@@ -138,16 +70,16 @@ class _Attempt:
     Attributes:
         values: Its values by parameter name.
         parameters: All parameters, by stage.
-        waiting: Numbers of the runs that no worker has begun.
+        runs: Numbers of the runs on which it is scored.
+        begun: How many of these were given to a process.
         scores: Scores by number of the run.
-        losses: Number of workers that were lost with it.
     """
 
     values: dict[str, Value]
     parameters: dict[str, dict[str, Any]]
-    waiting: deque[int]
+    runs: list[int]
+    begun: int = 0
     scores: dict[int, RunScore] = field(default_factory=dict)
-    losses: int = 0
 
     def scores_of(self, runs: Sequence[int]) -> tuple[RunScore, ...]:
         """Return the scores of some runs; () unless all of them are known."""
@@ -155,57 +87,65 @@ class _Attempt:
         return tuple(known) if len(known) == len(runs) else ()
 
 
+_Tag = tuple[_Attempt, int]  # a set and the number of a run
+
+
 class Search:
-    """A search whose sets of parameters are scored by workers. The constructor opens every run of the plan
-    and the storage, but starts no job.
+    """A search whose sets of parameters are scored by processes. The constructor opens every run of the plan
+    and the journal, but starts no job.
 
     Args:
         plan: The search.
-        workers: Map and score the runs; the caller closes them.
-        known: Earlier trials, where the plan names no storage.
+        processes: Map and score the runs; the caller closes them.
+        known: Earlier trials, where the plan has no journal.
 
     Attributes:
         start: Scored start of the search; None before.
         study: Study of Optuna.
-        lost: Number of workers that were lost, by reason.
 
     Raises:
-        StemmapError: A run cannot be read, the search space has no set without contradictions, or the storage
+        StemmapError: A run cannot be read, the search space has no set without contradictions, or the journal
             cannot be used or belongs to another search.
     """
 
-    def __init__(self, plan: Plan, workers: Workers, known: Sequence[Trial] = ()) -> None:
+    def __init__(self, plan: Plan, processes: ScoringProcesses[_Tag], known: Sequence[Trial] = ()) -> None:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
-        self.plan, self._workers = plan, workers
+        self.plan, self._processes = plan, processes
         self._parameters = plan.parameters
         check(plan.axes, self._parameters)
-        self._runs = [_prepared(plan, planned) for planned in plan.runs]
-        self._training = [k for k, run in enumerate(self._runs) if not run.held_out]
-        self._held_out = [k for k, run in enumerate(self._runs) if run.held_out]
-        digests = [self._runs[k].digest for k in self._training]
-        self._trials = open_trials(plan.storage, identity(plan, digests), known)
+        self._runs = [prepare_run(planned).run for planned in plan.runs]
+        self._training = [k for k, planned in enumerate(plan.runs) if not planned.held_out]
+        self._held_out = [k for k, planned in enumerate(plan.runs) if planned.held_out]
+        digests = [digest_with_truth(plan, self._runs[k]) for k in self._training]
+        self._trials = Journal(Path(plan.journal), identity(plan, digests)) if plan.journal else Trials(known)
         self.study = optuna.create_study(direction="minimize")
         self.start: Trial | None = None
-        self.lost = Counter[str]()
         self._beginning = _Attempt(
-            self._start_values(), self._parameters.model_dump(), deque(range(len(self._runs)))
+            self._start_values(), self._parameters.model_dump(), list(range(len(self._runs)))
         )
         self._attempts = [self._beginning]
-        self._doing: dict[str, tuple[_Attempt, int]] = {}
         self._completed: list[Trial] = []
         self._learned = 0
         self._learn()
 
     def close(self) -> None:
-        """Close the storage; the workers remain open."""
+        """Close the journal; the processes remain open."""
         self._trials.close()
 
     @property
     def sources(self) -> list[tuple[str, str, bool]]:
         """URI, digest of the source and whether it is held out, by run."""
-        return [(run.uri, run.run.digest, run.held_out) for run in self._runs]
+        return [
+            (planned.source.uri, run.digest, planned.held_out)
+            for planned, run in zip(self.plan.runs, self._runs, strict=True)
+        ]
+
+    @property
+    def lost(self) -> Counter[str]:
+        """Number of processes that ended during a job, by reason."""
+        return self._processes.lost
 
     @property
     def is_complete(self) -> bool:
@@ -222,8 +162,8 @@ class Search:
         return best_of(self._trials.all, None)
 
     def advance(self, wait_s: float = 0.2) -> list[Trial]:
-        """Give jobs to the free workers and wait for results. The parameters with which the search begins are
-        scored first.
+        """Give jobs to the free processes and wait for results. The parameters with which the search begins
+        are scored first.
 
         Args:
             wait_s: Longest wait [s]. The call returns earlier with the first result, and at once if no job is
@@ -234,41 +174,30 @@ class Search:
                 contradicting values).
 
         Raises:
-            StemmapError: A run cannot be mapped or scored, one set lost `MOST_LOSSES` workers, or the trials
-                cannot be stored.
+            StemmapError: A run cannot be mapped or scored, or the trials cannot be stored.
         """
         self._completed = []
-        for worker in self._workers.free():
-            job = self._next_job()
-            if job is None:
-                break
-            self._doing[worker] = job
-            run = self._runs[job[1]].run
-            self._workers.give(worker, Job(run, job[0].parameters, code_digest()))
-        if self._doing:
-            for event in self._workers.events(wait_s):
-                self._receive(event)
+        for (attempt, run), result in self._processes.advance(self._next_job, wait_s):
+            self._receive(attempt, run, result)
         return self._completed
 
     # --- one trial ---------------------------------------------------------------------------------
 
-    def _next_job(self) -> tuple[_Attempt, int] | None:
-        """Return a set and the number of a run that are to be scored, and take them from the queue; a new set
-        is suggested if no known one waits. None if there is nothing to do now: before the start is scored,
-        and when all trials are made or in progress."""
-        for attempt in self._attempts:
-            if attempt.waiting:
-                return attempt, attempt.waiting.popleft()
-        if self.start is None:
+    def _next_job(self, _worker: int) -> tuple[_Tag, Job] | None:
+        """Return the next run to be mapped with a set, and take it from the queue; a new set is suggested if
+        no known one waits. None if there is nothing to do now: before the start is scored, and when all
+        trials are made or in progress."""
+        attempt = next((each for each in self._attempts if each.begun < len(each.runs)), None)
+        if attempt is None and self.start is not None:
+            while attempt is None and len(self._trials.all) + len(self._attempts) < self.plan.trials:
+                attempt = self._suggested()
+            if attempt is not None:
+                self._attempts.append(attempt)
+        if attempt is None:
             return None
-        self._trials.refresh()
-        self._learn()
-        while len(self._trials.all) + len(self._attempts) < self.plan.trials:
-            suggested = self._suggested()
-            if suggested is not None:
-                self._attempts.append(suggested)
-                return suggested, suggested.waiting.popleft()
-        return None
+        run = attempt.runs[attempt.begun]
+        attempt.begun += 1
+        return (attempt, run), Job(self._runs[run], attempt.parameters)
 
     def _suggested(self) -> _Attempt | None:
         """Return the next set to score. None for a set that needs no scoring: one whose values equal an
@@ -283,52 +212,39 @@ class Search:
         except ParameterError:
             self._complete(Trial(-1, values, None))
             return None
-        return _Attempt(values, parameters.model_dump(), deque(self._training))
+        return _Attempt(values, parameters.model_dump(), list(self._training))
 
     def _suggestion(self) -> dict[str, Value]:
-        """Return the values to try next: as the first of all (only on the first machine) those of the start,
-        if they are within the bounds; then those that Optuna suggests."""
+        """Return the values to try next: as the first of all those of the start, if they are within the
+        bounds; then those that Optuna suggests."""
         from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 
         axes, number = self.plan.axes, len(self._trials.all) + len(self._attempts)
         values = self._start_values()
-        if not number and not self._trials.slot and all(axis.holds(values[axis.name]) for axis in axes):
+        if not number and all(axis.holds(values[axis.name]) for axis in axes):
             return values
-        key = (self.plan.seed, number, self._trials.slot)
+        key = (self.plan.seed, number, 0)  # the 0 keeps the suggestions of earlier versions
         self.study.sampler = TPESampler(seed=int(np.random.SeedSequence(key).generate_state(1)[0]))
         trial = self.study.ask({axis.name: axis.distribution() for axis in axes})
         # Optuna learns of the set when it is scored, see `_learn`.
         self.study.tell(trial, state=TrialState.FAIL)
         return values_of(axes, trial.params)
 
-    def _receive(self, event: Done | Lost) -> None:
-        """Store the score of a run of a set, or queue the run again after a lost worker.
+    def _receive(self, attempt: _Attempt, run: int, result: JobResult) -> None:
+        """Store the score of a run of a set. When all its runs are scored, the set is complete, or becomes
+        `start`. If it is the best so far and has held-out runs without scores, these are queued first.
 
         Raises:
-            StemmapError: The job failed, the start cannot be scored (see `check_start`), or one set lost
-                `MOST_LOSSES` workers.
+            StemmapError: The job failed, or the start cannot be scored (see `check_start`).
         """
-        attempt, run = self._doing.pop(event.worker)
-        if isinstance(event, Lost):
-            self.lost[event.reason] += 1
-            attempt.losses += 1
-            if attempt.losses >= MOST_LOSSES:
-                raise StemmapError(f"{MOST_LOSSES} processes were lost with one set: {event.reason}")
-            attempt.waiting.appendleft(run)
-            return
-        scores = event.answer.scores
-        if scores is None:
-            raise StemmapError(event.answer.error)
+        if result.scores is None:
+            raise StemmapError(result.error)
         if attempt is self._beginning:
-            check_start(self._runs[run].uri, scores, self._parameters.evaluation.match_distance)
-        attempt.scores[run] = score_of(scores)
-        self._finish(attempt)
-
-    def _finish(self, attempt: _Attempt) -> None:
-        """Complete a set if all its runs are scored; otherwise do nothing. If it is the best so far and has
-        held-out runs without scores, these are queued first. The first set becomes `start`."""
-        if attempt.waiting or any(other is attempt for other, _ in self._doing.values()):
+            uri = self.plan.runs[run].source.uri
+            check_start(uri, result.scores, self._parameters.evaluation.match_distance)
+        attempt.scores[run] = score_of(result.scores)
+        if len(attempt.scores) < len(attempt.runs):
             return
         training, held_out = attempt.scores_of(self._training), attempt.scores_of(self._held_out)
         if attempt is self._beginning:
@@ -339,16 +255,14 @@ class Search:
             loss, best = self.plan.aim.loss(pool(training), pool(self.start.training)), self.best()
             is_best = best is None or best.loss is None or loss < best.loss
             if is_best and len(held_out) < len(self._held_out):
-                attempt.waiting.extend(self._held_out)
+                attempt.runs += self._held_out
                 return
             self._complete(Trial(-1, attempt.values, loss, training, held_out))
         self._attempts.remove(attempt)
 
     def _complete(self, trial: Trial) -> None:
-        """Store a trial, unless the search has all its trials, and let Optuna learn from it."""
-        added = self._trials.add(trial, self.plan.trials)
-        if added is not None:
-            self._completed.append(added)
+        """Store a trial, and let Optuna learn from it."""
+        self._completed.append(self._trials.add(trial))
         self._learn()
 
     def _learn(self) -> None:
@@ -387,14 +301,14 @@ def importances(study: Any) -> dict[str, float]:  # noqa: ANN401 - Optuna has no
     return {name: float(value) for name, value in found.items() if np.isfinite(value)}
 
 
-def search_processes(plan: Plan, number: int = 1) -> Processes:
+def search_processes(plan: Plan, number: int = 1) -> ScoringProcesses[_Tag]:
     """Return processes that score the sets of a search; each keeps all runs open. The caller closes them.
 
     Args:
         plan: The search.
         number: Number of processes.
     """
-    return Processes(number, python_module(SCORING, "--runs", str(len(plan.runs))))
+    return ScoringProcesses(number, (*COMMAND, "--runs", str(len(plan.runs))))
 
 
 _MESSAGE_INTERVAL_S = 0.25
@@ -407,8 +321,8 @@ def search_for_page(parent: ParentConnection) -> None:
     begin = parent.receive(SearchStart)
     try:
         with (
-            closing(search_processes(begin.plan)) as workers,
-            closing(Search(begin.plan, workers, begin.trials)) as search,
+            closing(search_processes(begin.plan)) as processes,
+            closing(Search(begin.plan, processes, begin.trials)) as search,
         ):
             _search_for_page(search, begin, parent)
     except StemmapError as error:

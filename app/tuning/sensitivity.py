@@ -11,20 +11,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from app.common.child_process import ChildProcess, ProtocolError, python_module
+from app.common.timers import cancel
 from app.sources.request import SourceRequest
 from app.tuning.grid import spec_of
-from app.tuning.jobs import Job, JobResult, RunWithTruth, check_run, code_digest
+from app.tuning.jobs import Job, JobResult, RunWithTruth, check_run
+from app.tuning.workers import COMMAND as SCORING
+from app.tuning.workers import ScoringProcesses
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.types.records import TruthTrees
 
-COMMAND = python_module("app.tuning.scoring", "--low-priority")
+COMMAND = (*SCORING, "--low-priority")
 MOST_VALUES = 65
-REMEMBERED = 4096  # answers
 IDLE_S = 120.0  # the process and its cache end after this time without a question
-_LONGEST_ANSWER = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +89,6 @@ class Sensitivity:
         self._tell, self._command, self._idle_s = tell, command, idle_s
         self._question: Question | None = None
         self._changed = asyncio.Event()
-        self._scorer: _ScoringProcess | None = None
         self._task: asyncio.Task[None] | None = None
         self._known: dict[str, JobResult] = {}
 
@@ -106,120 +105,71 @@ class Sensitivity:
         self._question = question
         self._changed.set()
         self._tell(_state_of(question, []))
-        if self._scorer is None:
-            self._scorer = _ScoringProcess(self._command)
-            self._task = asyncio.create_task(self._work(self._scorer), name="sensitivity")
+        if self._task is None:
+            self._task = asyncio.create_task(self._work(), name="sensitivity")
 
     async def leave(self) -> None:
         """Cancel the curve, wait until the process has ended, forget all results and send {}, because the run
         or the curve is closed. Without a curve only {} is sent."""
-        scorer, task = self._scorer, self._task
-        self._question = self._scorer = self._task = None
-        self._changed.set()
-        if scorer is not None and task is not None:
-            await scorer.end()
-            await asyncio.wait([task])
+        task, self._task, self._question = self._task, None, None
+        await cancel(task)
         self._known.clear()
         self._tell({})
 
-    async def _work(self, scorer: _ScoringProcess) -> None:
-        """Compute curves until none was requested for `idle_s`, or until `leave`; then end the process."""
-        while self._scorer is scorer and (question := self._question) is not None:
-            self._changed.clear()
-            await self._compute(question, scorer)
-            if self._question is question:
-                with contextlib.suppress(TimeoutError):
-                    await asyncio.wait_for(self._changed.wait(), self._idle_s)
-            if self._scorer is scorer and self._question is question:
-                self._scorer = None
-        await scorer.end()
+    async def _work(self) -> None:
+        """Compute curves until none was requested for `idle_s`; then end the process."""
+        process: ScoringProcesses[None] = ScoringProcesses(1, self._command)
+        try:
+            while (question := self._question) is not None:
+                self._changed.clear()
+                await self._compute(question, process)
+                if self._question is question:
+                    with contextlib.suppress(TimeoutError):
+                        await asyncio.wait_for(self._changed.wait(), self._idle_s)
+                    if self._question is question:
+                        break
+        finally:
+            if self._task is asyncio.current_task():
+                self._task = None
+            await asyncio.to_thread(process.close)
 
-    async def _compute(self, question: Question, scorer: _ScoringProcess) -> None:
+    async def _compute(self, question: Question, process: ScoringProcesses[None]) -> None:
         """Compute the points of a curve until it is complete or replaced, and send it after each point. A
         StemmapError is sent with the curve and ends it; it is not raised."""
         points: list[dict[str, Any]] = []
-        error = ""
         try:
-            code = await asyncio.to_thread(code_digest)
             for value in question.values:
-                point = await self._point(question, value, code, scorer)
+                points = [*points, await self._point(question, value, process)]
                 if self._question is not question:
                     return
-                points = [*points, point]
                 self._tell(_state_of(question, points))
         except StemmapError as failure:
-            error = str(failure)
-        if error and self._question is question:
-            self._tell(_state_of(question, points, error))
+            if self._question is question:
+                self._tell(_state_of(question, points, str(failure)))
 
     async def _point(
-        self, question: Question, value: Value, code: str, scorer: _ScoringProcess
+        self, question: Question, value: Value, process: ScoringProcesses[None]
     ) -> dict[str, Any]:
         """Return a point for the page: the value with its scores, or with an error if the value contradicts
-        other parameters or the job failed; {} after `leave`.
+        other parameters or the job failed.
 
         Args:
             question: The curve.
             value: Value of its parameter.
-            code: Digest of the code.
-            scorer: Computes the job, unless its result is known.
+            process: Computes the job, unless its result is known.
 
         Raises:
-            StemmapError: The recording is missing, or the process has other code or ended twice.
+            StemmapError: The process cannot be started, or ended too often.
         """
         try:
             parameters = question.parameters.replace({question.name: value})
         except ParameterError as error:  # it contradicts another one
             return {"value": value, "error": error.what}
-        job = Job(question.run, parameters.model_dump(), code)
+        job = Job(question.run, parameters.model_dump())
         key = job.key()
-        result = self._known.get(key) or await scorer.score(job)
-        if result is None:  # `leave` was called
-            return {}
-        if result.fault in ("worker", "version"):
-            raise StemmapError(result.error)
-        if len(self._known) < REMEMBERED:
-            self._known[key] = result
-        return {"value": value, **_figures(result)}
-
-
-class _ScoringProcess:
-    """The child process that scores jobs. It starts with the first job.
-
-    Args:
-        command: Program and arguments.
-    """
-
-    def __init__(self, command: Sequence[str]) -> None:
-        self._command = command
-        self._process: ChildProcess | None = None
-        self._is_ended = False
-
-    async def score(self, job: Job) -> JobResult | None:
-        """Return the result of a job; None after `end`. The process is restarted once if it ends.
-
-        Raises:
-            StemmapError: The process ended twice, or cannot be started.
-        """
-        for _ in range(2):
-            if self._process is None:
-                self._process = await ChildProcess.start(
-                    self._command, line_limit=_LONGEST_ANSWER, one_thread=True
-                )
-            result = None if self._is_ended else await _ask(self._process, job)
-            if result is not None:
-                return result
-            await self._process.end()
-            self._process = None
-            if self._is_ended:
-                return None
-        raise StemmapError("the process that maps the run ended twice", remedy="The terminal may show why")
-
-    async def end(self) -> None:
-        """End the process, if it runs. A call of `score` in progress returns None, as do later calls."""
-        self._is_ended = True
-        if self._process is not None:
-            await self._process.end()
+        if key not in self._known:
+            self._known[key] = await asyncio.wrap_future(process.submit(job))
+        return {"value": value, **_figures(self._known[key])}
 
 
 def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
@@ -238,15 +188,6 @@ def _state_of(question: Question, points: list[dict[str, Any]], error: str = "")
         "points": points,
         "error": error,
     }
-
-
-async def _ask(process: ChildProcess, job: Job) -> JobResult | None:
-    """Return the result of a job, without a time limit; None if the process ends or sends something else."""
-    await process.send(job)
-    try:
-        return await process.receive(JobResult)
-    except ProtocolError:
-        return None
 
 
 def _figures(answer: JobResult) -> dict[str, Any]:

@@ -101,7 +101,7 @@ def build(
         fleet: The fleet that the dashboard belongs to, if any.
     """
     parameter_state.check = Forests(settings.folder).check
-    dashboard = Dashboard(parameter_state, Broadcast(), AsyncStore(settings.folder, settings.database))
+    dashboard = Dashboard(parameter_state, Broadcast(), AsyncStore(settings.folder))
 
     learning = Learning(
         dashboard.store, settings.folder, lambda state: dashboard.live.publish("learning", state)

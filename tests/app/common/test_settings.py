@@ -23,7 +23,6 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         "STEMMAP_HOSTS": "Robot.local, tunnel ,",
         "STEMMAP_RECORDINGS": str(tmp_path),
         "STEMMAP_FOLDER": str(tmp_path / "kept"),
-        "STEMMAP_DATABASE": "postgresql://ann@server/stand",
         "STEMMAP_FILES": "folders",
         "STEMMAP_UPLOAD_GB": "2.5",
     }
@@ -35,7 +34,6 @@ def test_all_that_can_be_given(tmp_path: Path) -> None:
         ("robot.local", "tunnel"),
         tmp_path,
         folder=tmp_path / "kept",
-        database="postgresql://ann@server/stand",
         upload_limit=2_500_000_000,
         files="folders",
     )
@@ -69,6 +67,7 @@ def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str],
         ("STEMMAP_TOKEN", "öööööööööööööööööö"),
         ("STEMMAP_RECORDINGS", "/no/such/folder"),
         ("STEMMAP_FILES", "all"),
+        ("STEMMAP_DATABASE", "postgresql://ann@server/stand"),
     ],
 )
 def test_what_cannot_be_used_names_the_variable(name: str, value: str) -> None:

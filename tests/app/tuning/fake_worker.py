@@ -36,7 +36,7 @@ def score(job: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def work(parent: ParentConnection) -> None:
-    """JobResult jobs until the parent ends."""
+    """Answer jobs until the parent ends."""
     while True:
         parent.send(score(parent.receive(dict), Path(sys.argv[1])))
 

@@ -1,32 +1,36 @@
-"""A worker of a search or a comparison that scores each job in this process."""
+"""Scoring processes of a search or a comparison that score each job in this process."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
 
 from app.tuning.jobs import Job, JobResult
 from app.tuning.scoring import Scorer
-from app.tuning.workers import Done, Event, Lost
+from app.tuning.workers import ScoringProcesses
 
 
-class InlineWorker:
-    """A single worker; `does` gives the answer, or why the worker is lost. By default the run is mapped."""
+class InlineProcesses(ScoringProcesses[Any]):
+    """Some workers in this process; `does` gives the result of a job for a worker. By default the run is
+    mapped.
 
-    def __init__(self, does: Callable[[Job], JobResult | str] | None = None) -> None:
+    Attributes:
+        done: Workers and their jobs.
+    """
+
+    def __init__(self, does: Callable[[int, Job], JobResult] | None = None, count: int = 1) -> None:
+        super().__init__(count, ("false",))
         self._scorer = Scorer(runs=8)
-        self._does = does or self._scorer.score
-        self._events: list[Event] = []
+        self._does = does or (lambda _worker, job: self._scorer.score(job))
+        self.done: list[tuple[int, Job]] = []
 
-    def free(self) -> list[str]:
-        return [] if self._events else ["here"]
-
-    def give(self, worker: str, job: Job) -> None:
-        answer = self._does(job)
-        self._events.append(Lost(worker, answer) if isinstance(answer, str) else Done(worker, answer))
-
-    def events(self, _timeout_s: float, /) -> list[Event]:
-        events, self._events = self._events, []
-        return events
+    def submit(self, job: Job, worker: int = 0) -> Future[JobResult]:
+        self.done.append((worker, job))
+        future: Future[JobResult] = Future()
+        future.set_result(self._does(worker, job))
+        return future
 
     def close(self) -> None:
+        super().close()
         self._scorer.close()

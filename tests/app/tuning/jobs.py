@@ -6,7 +6,7 @@ import msgspec
 
 from app.sources.request import SourceRequest
 from app.store.records import Content
-from app.tuning.jobs import Job, RunWithTruth, code_digest
+from app.tuning.jobs import Job, RunWithTruth
 from pipeline.config import preset
 from pipeline.evaluation import MapScores
 from tests.app.tuning.scores import scores as plain_scores
@@ -22,4 +22,4 @@ def job(eps: float, *, seed: int = 0, digest: str = "d", particles: int = 100) -
     truth = [Content(1.0, 2.0)]
     parameters = preset("forest").replace({"clustering.eps": eps, "slam.particles": particles})
     run = RunWithTruth(SourceRequest("sim:nothing", seed=seed), digest, truth)
-    return Job(run, parameters.model_dump(), code_digest())
+    return Job(run, parameters.model_dump())

@@ -21,7 +21,8 @@ from app.tuning.report import (
     lines,
     page,
 )
-from app.tuning.sweep import PreparedRun, SweepPlan
+from app.tuning.scoring import PreparedRun
+from app.tuning.sweep import SweepPlan
 from pipeline.config.model import Value
 from tests.app.tuning.jobs import job, scores
 
@@ -41,7 +42,7 @@ def comparison() -> Comparison:
         (1, 0): JobResult(scores(0.9, found=4, wrong=2), seconds=2.0),
         (1, 1): JobResult(scores(None, found=4), seconds=2.0),
         (2, 0): JobResult(scores(1.0), seconds=2.0),
-        (2, 1): JobResult(None, error="the disk is full", fault="job"),
+        (2, 1): JobResult(None, error="the disk is full"),
     }
     return compare_results(SweepPlan(runs, sets, jobs, {}), answers)
 

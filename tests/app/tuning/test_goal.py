@@ -128,13 +128,13 @@ def test_bounds_come_from_the_declaration_and_can_be_narrowed():
     [
         ("detection.emin=1..5", "there is no parameter"),
         ("detection.e_min=5..1", "must be less"),
-        ("detection.e_min=0..5", "outside of the parameter's range"),
+        ("detection.e_min=0..5", "is not within 1 to 1000"),
         ("detection.e_min=1", "two numbers"),
-        ("detection.e_min=nan..5", "must be less"),
-        ("tracking.hits_to_confirm=1.5..4", "whole numbers"),
-        ("shape.centre=circle,square", "not one of its values"),
+        ("detection.e_min=nan..5", "is not within"),
+        ("tracking.hits_to_confirm=1.5..4", "should be a whole number"),
+        ("shape.centre=circle,square", "is not one of centroid, circle"),
         ("shape.centre=circle", "at least two values"),
-        ("classification.forest", "has no bounds"),
+        ("classification.forest", "at least two values"),
         ("classification.forest=package,any", "classification.forest"),
         ("evaluation.reach=1..50", "how a map is scored"),
         ("obstacles.width=1..2", "does not change the map"),
@@ -177,7 +177,7 @@ PLAN = Plan(
     ),
     axes=AXES,
     start=FOREST.model_dump(),
-    storage="unused",
+    journal="unused",
 )
 START = Trial(-1, {"detection.e_max": 60.0, "shape.centre": "circle"}, 0.3, (ONE,), (OTHER,))
 BEST = Trial(7, {"detection.e_max": 41.5, "shape.centre": "centroid"}, 0.2, (ONE,), (NOTHING,))

@@ -11,11 +11,11 @@ import pytest
 from app.store.forests import Forests
 from app.tuning.plan import RunScore, Trial
 from app.tuning.search import Search
-from app.tuning.storage import Journal
+from app.tuning.trials import Journal
 from pipeline.classification.forest import ALL_AROUND, FILE
 from pipeline.config import preset
 from pipeline.errors import StemmapError
-from tests.app.tuning.inline_worker import InlineWorker
+from tests.app.tuning.inline_worker import InlineProcesses
 from tests.app.tuning.test_search import plan
 
 SEARCH = {"format": 2, "seed": 0}
@@ -30,13 +30,13 @@ def test_a_disk_that_gets_full_is_reported_and_leaves_no_part_of_a_line(tmp_path
     resource = pytest.importorskip("resource")
     path = tmp_path / "a.journal"
     with closing(journal_of(path)) as journal:
-        first = journal.add(TRIAL, 9)
+        first = journal.add(TRIAL)
         before = resource.getrlimit(resource.RLIMIT_FSIZE)
         # What there is room for is a part of what is written.
         resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 50, before[1]))
         try:
             with pytest.raises(StemmapError, match="the trials cannot be kept"):
-                journal.add(TRIAL, 9)
+                journal.add(TRIAL)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, before)
     with closing(journal_of(path)) as journal:
@@ -47,15 +47,14 @@ def test_a_disk_that_gets_full_is_reported_and_leaves_no_part_of_a_line(tmp_path
 def test_what_a_killed_process_wrote_in_part_is_cut_off(tmp_path, half):
     path = tmp_path / "a.journal"
     with closing(journal_of(path)) as journal:
-        made = [journal.add(TRIAL, 9)]
+        made = [journal.add(TRIAL)]
     with path.open("a") as file:
         file.write(half)
     with closing(journal_of(path)) as journal:
-        made.append(journal.add(TRIAL, 9))
+        made.append(journal.add(TRIAL))
     with closing(journal_of(path)) as journal:
         assert journal.all == made
         assert [trial.number for trial in journal.all] == [0, 1]
-        assert journal.add(TRIAL, 2) is None
 
 
 @pytest.mark.parametrize("length", [0, 5])
@@ -72,7 +71,7 @@ def test_a_process_that_was_killed_while_it_began_leaves_an_empty_journal(tmp_pa
 def test_a_damaged_line_is_reported_and_nothing_is_changed(tmp_path, line):
     path = tmp_path / "a.journal"
     with closing(journal_of(path)) as journal:
-        journal.add(TRIAL, 9)
+        journal.add(TRIAL)
     path.write_bytes(path.read_bytes() + line.encode("latin-1") + b"\n")
     before = path.read_bytes()
     with pytest.raises(StemmapError, match="the journal is damaged"):
@@ -100,6 +99,6 @@ def test_a_search_begins_with_decision_trees_that_were_learned(tmp_path, monkeyp
     monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path))
     start = preset("forest").replace({"classification.forest": name})
     search_plan = plan(tmp_path, start=start.model_dump())
-    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker)) as search:
+    with closing(InlineProcesses()) as worker, closing(Search(search_plan, worker)) as search:
         search.advance()
         assert search.start is not None

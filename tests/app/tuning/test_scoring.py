@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import asdict, replace
 
 import msgspec
@@ -11,9 +10,9 @@ import pytest
 
 from app.cli import main
 from app.sources.request import SourceRequest
-from app.tuning.jobs import Job, JobResult, code_digest
-from app.tuning.scoring import Scorer, score_json
-from app.tuning.sweep import PreparedRun, prepare_run
+from app.tuning.jobs import Job
+from app.tuning.plan import PlannedRun
+from app.tuning.scoring import PreparedRun, Scorer, prepare_run
 from pipeline.config import preset
 
 RUN = "sim:paper?duration=1"
@@ -32,11 +31,11 @@ SETS: tuple[tuple[dict[str, float], bool], ...] = (
 
 def ready(name: str) -> PreparedRun:
     """A run as on the command line."""
-    return prepare_run(SourceRequest(name, seed=3), None)
+    return prepare_run(PlannedRun(SourceRequest(name, seed=3)))
 
 
 def test_scores_are_those_of_mapping(tmp_path, capsys):
-    job = Job(ready(RUN).run, preset("forest").replace({"slam.gate": 2.0}).model_dump(), code_digest())
+    job = Job(ready(RUN).run, preset("forest").replace({"slam.gate": 2.0}).model_dump())
     answer = Scorer().score(job)
     assert main(["map", RUN, "--seed", "3", "--out", str(tmp_path), "--set", "slam.gate=2"]) == 0
     mapped = json.loads((tmp_path / "run.json").read_text())
@@ -48,7 +47,7 @@ def test_scores_are_those_of_mapping(tmp_path, capsys):
 def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_looking_anew():
     run, one = ready(LONGER), Scorer()
     for changes, looks in SETS:
-        job = Job(run.run, preset("forest").replace(changes).model_dump(), code_digest())
+        job = Job(run.run, preset("forest").replace(changes).model_dump())
         answer, fresh = one.score(job), Scorer()
         assert answer.scores == fresh.score(job).scores is not None, changes
         assert answer.looked == looks, changes
@@ -58,7 +57,7 @@ def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_look
 
 def test_what_was_kept_and_is_damaged_is_looked_at_again(monkeypatch):
     run, scorer = ready(RUN), Scorer()
-    job = Job(run.run, preset("forest").model_dump(), code_digest())
+    job = Job(run.run, preset("forest").model_dump())
     first = scorer.score(job)
     monkeypatch.setattr("pipeline.remapping.scan_cache.ScanCache.read", lambda *_: None)
     second = scorer.score(job)
@@ -66,27 +65,17 @@ def test_what_was_kept_and_is_damaged_is_looked_at_again(monkeypatch):
     assert (second.scores, second.looked) == (first.scores, True)
 
 
-def test_a_worker_of_another_version_or_with_another_recording_says_so():
+def test_a_recording_that_is_gone_or_was_replaced_is_reported():
     run = ready(RUN)
-    fine = Job(run.run, preset("forest").model_dump(), code_digest())
-    older = msgspec.structs.replace(fine, code="0.0.1")
+    fine = Job(run.run, preset("forest").model_dump())
     other = msgspec.structs.replace(fine, run=msgspec.structs.replace(run.run, digest="another"))
     gone = msgspec.structs.replace(
         fine, run=msgspec.structs.replace(run.run, source=SourceRequest("gone.mcap"))
     )
-    for job, fault, says in (
-        (older, "version", "same version"),
-        (other, "worker", "another"),
-        (gone, "worker", "gone"),
-    ):
-        answer = msgspec.json.decode(score_json(msgspec.json.encode(job)), type=JobResult)
-        assert (answer.scores, answer.fault) == (None, fault)
+    for job, says in ((other, "replaced by another one"), (gone, "gone.mcap")):
+        answer = Scorer().score(job)
+        assert answer.scores is None
         assert says in answer.error
-
-
-@pytest.mark.parametrize("text", [b"", b"{}", b"[1]", b'{"run": 3}', b"\xff"])
-def test_what_is_no_job_is_answered(text):
-    assert msgspec.json.decode(score_json(text), type=JobResult).error.startswith("this is not a job")
 
 
 def test_truth_far_from_the_path_is_no_score():
@@ -94,7 +83,7 @@ def test_truth_far_from_the_path_is_no_score():
     far = [replace(content, x=content.x + 900.0) for content in run.run.truth]
     asked = msgspec.structs.replace(run.run, truth=far)
     scorer = Scorer()
-    answer = scorer.score(Job(asked, preset("forest").model_dump(), code_digest()))
+    answer = scorer.score(Job(asked, preset("forest").model_dump()))
     scorer.close()
     assert "no ground truth is within 10 m" in answer.problem
 
@@ -109,7 +98,6 @@ def test_truth_far_from_the_path_is_no_score():
         ([RUN, "--param-grid", "slam.gate=2,300"], 2, "0.5 to 20"),
         ([RUN, "--param-grid", "filters.x_min=1", "--param-grid", "filters.x_max=-1"], 2, "none of 1 set"),
         ([RUN, "--param-grid", "slam.gate=2", "--jobs", "0"], 2, "1 to 1024"),
-        ([RUN, "--param-grid", "slam.gate=2", "--dask", "http://x:1"], 2, "tcp://host:port"),
         ([RUN, "--out", "x"], 2, "--param-grid"),
         ([RUN, "--truth", "a", "--truth", "b"], 2, "2 tables of true trees for 1 run."),
     ],
@@ -120,9 +108,3 @@ def test_what_cannot_be_is_said_in_one_line(capsys, words, code, says):
     told = capsys.readouterr()
     assert (told.out, told.err.count("\n")) == ("", 1)
     assert says in told.err
-
-
-def test_without_the_extra_dask_is_named(capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    assert main(["evaluate", RUN, "--param-grid", "slam.gate=2", "--dask", "tcp://127.0.0.1:1"]) == 2
-    assert "stemmap[dask]" in capsys.readouterr().err

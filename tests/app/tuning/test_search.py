@@ -24,7 +24,7 @@ from app.tuning.result import result_of
 from app.tuning.search import Search, search_processes
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
-from tests.app.tuning.inline_worker import InlineWorker
+from tests.app.tuning.inline_worker import InlineProcesses
 from tests.app.tuning.provenance import provenance_in
 
 RUN, OTHER = "sim:stand?duration=1", "sim:stand?duration=1&seed=3"
@@ -37,7 +37,7 @@ def plan(folder: Path, name: str = "a", **changes: object) -> Plan:
         runs=(PlannedRun(SourceRequest(RUN)),),
         axes=axes_of(OVER),
         start=preset("forest").model_dump(),
-        storage=str(folder / f"{name}.journal"),
+        journal=str(folder / f"{name}.journal"),
         trials=9,
     )
     return msgspec.structs.replace(search_plan, **changes)
@@ -52,7 +52,7 @@ def exhaust(search: Search, most: int = 1000) -> None:
 
 def searched(search_plan: Plan, most: int = 1000) -> list[Trial]:
     """The trials of a search, after so many more."""
-    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker)) as search:
+    with closing(InlineProcesses()) as worker, closing(Search(search_plan, worker)) as search:
         exhaust(search, most)
         return search.trials()
 
@@ -74,19 +74,19 @@ def test_a_stopped_search_goes_on_to_the_same_trials(whole, tmp_path):
     assert searched(search_plan, 5) == whole[:5]
 
     # Stopped in the middle of a trial, and killed while it wrote.
-    def stopped(_job: Job) -> JobResult:
+    def stopped(_worker: int, _job: Job) -> JobResult:
         raise KeyboardInterrupt
 
-    with closing(Search(search_plan, InlineWorker(stopped))) as search, pytest.raises(KeyboardInterrupt):
+    with closing(Search(search_plan, InlineProcesses(stopped))) as search, pytest.raises(KeyboardInterrupt):
         exhaust(search)
-    with Path(search_plan.storage).open("ab") as journal:
+    with Path(search_plan.journal).open("ab") as journal:
         journal.write(b'{"number": 5, "val')
     assert searched(search_plan) == whole
 
 
 def test_a_search_goes_on_from_trials_in_memory(whole, tmp_path):
-    search_plan = plan(tmp_path, storage="")
-    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker, whole[:5])) as search:
+    search_plan = plan(tmp_path, journal="")
+    with closing(InlineProcesses()) as worker, closing(Search(search_plan, worker, whole[:5])) as search:
         exhaust(search)
         assert search.trials() == whole
 
@@ -111,7 +111,7 @@ def test_what_a_trial_scores_is_what_map_scores(whole, tmp_path):
 def test_a_journal_of_another_search_is_left_alone(tmp_path):
     search_plan = plan(tmp_path, trials=1)
     searched(search_plan)
-    before = Path(search_plan.storage).read_bytes()
+    before = Path(search_plan.journal).read_bytes()
     for changes, words in (
         ({"goal": "position"}, "another goal"),
         ({"axes": axes_of(OVER[:1])}, "other parameters or bounds"),
@@ -119,8 +119,8 @@ def test_a_journal_of_another_search_is_left_alone(tmp_path):
         ({"start": preset("paper").model_dump()}, "to begin with"),
     ):
         with pytest.raises(StemmapError, match=words):
-            Search(msgspec.structs.replace(search_plan, **changes), InlineWorker())
-    assert Path(search_plan.storage).read_bytes() == before
+            Search(msgspec.structs.replace(search_plan, **changes), InlineProcesses())
+    assert Path(search_plan.journal).read_bytes() == before
 
 
 def test_a_journal_of_another_version_is_reported(tmp_path, monkeypatch):
@@ -128,7 +128,7 @@ def test_a_journal_of_another_version_is_reported(tmp_path, monkeypatch):
     searched(search_plan)
     monkeypatch.setattr("app.tuning.plan.version", lambda: "9.9.9")
     with pytest.raises(StemmapError, match="another version of stemmap"):
-        Search(search_plan, InlineWorker())
+        Search(search_plan, InlineProcesses())
 
 
 @pytest.mark.parametrize(
@@ -136,17 +136,17 @@ def test_a_journal_of_another_version_is_reported(tmp_path, monkeypatch):
 )
 def test_a_file_that_is_no_journal_is_left_alone(tmp_path, text):
     search_plan = plan(tmp_path)
-    Path(search_plan.storage).write_bytes(text)
+    Path(search_plan.journal).write_bytes(text)
     with pytest.raises(StemmapError, match="journal"):
-        Search(search_plan, InlineWorker())
-    assert Path(search_plan.storage).read_bytes() == text
+        Search(search_plan, InlineProcesses())
+    assert Path(search_plan.journal).read_bytes() == text
 
 
 def test_sets_that_contradict_themselves_are_counted_and_left_out(tmp_path):
     search_plan = plan(
         tmp_path, axes=axes_of(["detection.e_min=1..100", "detection.e_max=10..100"]), trials=6
     )
-    with closing(InlineWorker()) as worker, closing(Search(search_plan, worker)) as search:
+    with closing(InlineProcesses()) as worker, closing(Search(search_plan, worker)) as search:
         exhaust(search)
         result = result_of(search)
     assert result.made == 6
@@ -154,17 +154,10 @@ def test_sets_that_contradict_themselves_are_counted_and_left_out(tmp_path):
     preset("forest").replace(dict(result.best.values))  # else it would say what contradicts
 
 
-def test_a_set_whose_worker_was_lost_is_scored_again_until_too_many_are_lost(whole, tmp_path):
-    lost = ["signal 9, SIGKILL"] * 2
-    with closing(InlineWorker()) as real:
-        worker = InlineWorker(lambda job: lost.pop() if lost else real._scorer.score(job))
-        with closing(Search(plan(tmp_path, trials=2), worker)) as search:
-            exhaust(search)
-            assert search.trials() == whole[:2]
-            assert search.lost == {"signal 9, SIGKILL": 2}
-    dead = InlineWorker(lambda _job: "exit code 1")
+def test_a_job_that_fails_ends_the_search(tmp_path):
+    dead = InlineProcesses(lambda *_: JobResult(None, error="exit code 1"))
     with (
-        closing(Search(plan(tmp_path, "b"), dead)) as search,
+        closing(Search(plan(tmp_path), dead)) as search,
         pytest.raises(StemmapError, match="exit code 1"),
     ):
         exhaust(search)
@@ -241,12 +234,11 @@ def test_ctrl_c_keeps_what_is_there(tmp_path):
     [
         (["sim:stand?duration=1", "--truth", "{far}"], 1, "no ground truth is within"),
         (["sim:stand?duration=1", "--truth", "{aside}"], 1, "has a mapped tree within"),
-        (["{room}"], 1, "brings no true trees"),
+        (["{room}"], 1, "has no true trees"),
         (["sim:nowhere"], 2, "nowhere"),
         ([RUN, RUN], 2, "named twice"),
         (["zenoh:tcp/127.0.0.1:7447"], 2, "live run"),
         ([RUN, "--over", "detection.e_min=9..1"], 2, "must be less"),
-        ([RUN, "--storage", "mysql://somewhere"], 2, "not the address of a PostgreSQL"),
         ([RUN, OTHER, "--truth", "{far}"], 2, "Name the run of each file"),
     ],
 )

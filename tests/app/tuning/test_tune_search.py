@@ -30,7 +30,7 @@ PLAN = Plan(
     runs=(PlannedRun(SourceRequest("sim:stand?duration=1")),),
     axes=axes_of(["classification.tree_share=0.1..0.9"]),
     start=preset("forest").model_dump(),
-    storage="",
+    journal="",
     trials=3,
 )
 POOR, GOOD = (
