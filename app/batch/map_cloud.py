@@ -61,12 +61,8 @@ def map_plot_run(
         StemmapError: The cloud cannot be read, or the forest that is named does not exist.
         OSError: The folder cannot be written; it is unchanged then.
     """
-    files = RunFiles(folder)
-    try:
+    with RunFiles(folder) as files:
         return _map(cloud, preset, parameters, truth, files)
-    except BaseException:
-        files.abandon()
-        raise
 
 
 def _map(

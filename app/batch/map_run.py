@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import islice
 from pathlib import Path as FilePath
@@ -117,16 +118,9 @@ def map_run(
             a continued map was not found.
         OSError: The folder cannot be written; it is unchanged then.
     """
-    files = RunFiles(folder, earlier)
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
-    try:
-        with on_compiling(stopwatch.disturb):
-            outcome, mapped = _map(plan, files, progress, stopwatch, earlier)
-    except BaseException:
-        files.abandon()
-        raise
-    finally:
-        progress.close()
+    with closing(progress), RunFiles(folder, earlier) as files, on_compiling(stopwatch.disturb):
+        outcome, mapped = _map(plan, files, progress, stopwatch, earlier)
     if plan.continued is None:  # the path of an earlier drive has no pictures here
         _keep_pictures(mapped, folder, outcome)
     return outcome

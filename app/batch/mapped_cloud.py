@@ -11,7 +11,7 @@ from pathlib import Path as FilePath
 import numpy as np
 
 from app.batch.georeference import heights_at, read_map_frame
-from app.batch.run_folder import read_run, read_run_record, read_terrain
+from app.batch.run_folder import read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 
@@ -104,11 +104,11 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     from pipeline.inventory.cloud import Thinned
     from pipeline.preprocessing.acquisition import acquire
 
-    run, record, terrain = read_run(folder), read_run_record(folder), read_terrain(folder)
-    if record.get("continued"):
+    run, terrain = read_run(folder), read_terrain(folder)
+    if run.record.get("continued"):
         raise StemmapError("a run that continues another one has no single cloud", where=str(folder))
-    odometry = str(record.get("odometry") or "auto")
-    request = request_of_kept(run.uri, odometry=odometry, seed=run.seed, choices=record.get("chosen"))
+    odometry = str(run.record.get("odometry") or "auto")
+    request = request_of_kept(run.uri, odometry=odometry, seed=run.seed, choices=run.record.get("chosen"))
     source, chosen = with_odometry(open_source(run.uri, request.options()), odometry)
     thinned = Thinned(1 << 22, 0.02)
     T_base_lidar, p = source.description.T_base_lidar, run.parameters

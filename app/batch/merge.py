@@ -82,8 +82,7 @@ def merge_runs(
     shift = 0 if b.start_ns > a.map.stamp_ns[-1] else int(a.map.stamp_ns[-1]) + PAUSE_NS - b.start_ns
     merged = merge_maps(a.map, b.map, match.pose, match.covariance, shift, chosen)
     saved = _joined(a, b, merged, match, shift, chosen)
-    files = RunFiles(out, folder_a)
-    try:
+    with RunFiles(out, folder_a) as files:
         files.add_rows(_moved_rows(folder_b / "detections.csv", match.pose, len(a.map.stamp_ns), shift, a, b))
         trees = merged.map.trees(chosen)
         path = _path(merged)
@@ -94,9 +93,6 @@ def merge_runs(
         if seen_a is not None and seen_b is not None:
             more["seen.csv"] = seen_text(seen_a.joined(seen_b, match.pose))
         files.finish(trees, path, a.start_ns, record, saved.as_bytes(), more)
-    except BaseException:
-        files.abandon()
-        raise
     both = sum(1 for row in table if row[1] and row[2])
     return MergeResult(sum(1 for row in table if row[1]), sum(1 for row in table if row[2]), both, match)
 

@@ -18,7 +18,7 @@ from pipeline.config import Parameters
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.io.atomic_files import write_beside
+from pipeline.io.atomic_files import write_texts
 from pipeline.io.ground_truth import read_truth_trees
 from pipeline.io.result_files import csv_text
 from pipeline.stand.plots import within_reach
@@ -251,10 +251,6 @@ def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, A
     }
 
 
-def _standard_error(values: Float) -> float:
-    return float(values.std(ddof=1) / math.sqrt(len(values)))
-
-
 _STATUS = ("same", "moved", "missing", "new", "not seen in a", "not seen in b")
 
 
@@ -299,10 +295,7 @@ def write_comparison(a: Visit, b: Visit, found: VisitComparison, folder: FilePat
         "comparison.geojson": _geojson(a, rows),
         "comparison.svg": comparison_map(rows),
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        with write_beside(folder / name) as partial:
-            partial.write_text(text, encoding="utf-8", newline="")
+    write_texts(folder, texts)
 
 
 def _geojson(a: Visit, rows: list[dict[str, Any]]) -> str:

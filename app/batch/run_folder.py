@@ -61,10 +61,12 @@ class FinishedRun:
     """The files of `stemmap map`.
 
     Attributes:
+        record: run.json; only "source", "seed" and "parameters" are checked.
         uri: URI of the source.
         of_cloud: Whether a whole cloud was mapped, which has an empty path.
     """
 
+    record: dict[str, Any]
     uri: str
     seed: int
     parameters: Parameters
@@ -80,13 +82,14 @@ def read_run(folder: FilePath) -> FinishedRun:
     Raises:
         SourceError: A file is missing, damaged or larger than 256 MB.
     """
+    record = read_run_record(folder)
     try:
-        record = json.loads(_text(folder / "run.json"))
         parameters = validated(dict(record["parameters"]))
         uri, seed = str(record["source"]["uri"]), int(record["seed"])
-    except (ValueError, KeyError, TypeError, RecursionError, ParameterError):
-        raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again") from None
+    except (ValueError, KeyError, TypeError, ParameterError):
+        raise _damaged(folder) from None
     return FinishedRun(
+        record,
         uri,
         seed,
         parameters,
@@ -166,7 +169,12 @@ def read_run_record(folder: FilePath) -> dict[str, Any]:
             return dict(record)
     except (ValueError, KeyError, TypeError, RecursionError):
         pass
-    raise SourceError("run.json is damaged", where=str(folder), remedy="Map the run again")
+    raise _damaged(folder)
+
+
+def _damaged(folder: FilePath) -> SourceError:
+    """Return the error of a folder with a damaged run.json."""
+    return SourceError("run.json is damaged", where=str(folder), remedy="Map the run again")
 
 
 def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:

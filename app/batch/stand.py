@@ -16,7 +16,6 @@ from app.batch.run_folder import FinishedRun, read_ground_area, read_run, read_s
 from app.common.text import count, version
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
-from pipeline.io.atomic_files import write_beside
 from pipeline.io.result_files import csv_text
 from pipeline.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
 from pipeline.stand.plots import SamplePlot, detection_function, figures_of, seen_plot, within_reach
@@ -191,23 +190,6 @@ def _number(value: float) -> str:
 def _cells(values: dict[str, Estimate]) -> list[str]:
     """Return value and standard error of each figure of FIGURES as cells."""
     return [_number(value) for name in FIGURES for value in values[name]]
-
-
-def write_stand(result: StandResult, folder: FilePath) -> list[FilePath]:
-    """Write the files of `stand_files` to a folder, which is created if necessary; return their paths.
-    Existing files are replaced.
-
-    Raises:
-        OSError: The folder cannot be created.
-        StemmapError: A file cannot be written; it is unchanged then.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for name, text in stand_files(result).items():
-        with write_beside(folder / name) as partial:
-            partial.write_text(text, encoding="utf-8", newline="")
-        written.append(folder / name)
-    return written
 
 
 def stand_summary(result: StandResult) -> list[str]:

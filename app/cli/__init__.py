@@ -101,6 +101,7 @@ def main(arguments: list[str] | None = None) -> int:
     if not words or (words[0] not in COMMANDS and words[0] not in ("-h", "--help", "--version")):
         words.insert(0, "serve")  # `stemmap run.mcap` is short for `stemmap serve run.mcap`
     parser, known = _build_parser(words[0])
+    parsed = argparse.Namespace()
     try:
         _check_command(words)
         parsed, unknown = parser.parse_known_args(words)
@@ -126,6 +127,11 @@ def main(arguments: list[str] | None = None) -> int:
     except BrokenPipeError:  # `stemmap params | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILED
+    except OSError as error:  # a full disk, a folder without rights
+        place = error.filename or getattr(parsed, "out", None) or ""
+        return _complain(
+            StemmapError(f"cannot read or write: {error.strerror or error}", where=str(place)), FAILED
+        )
 
 
 def _refuse(unknown: list[str], command: str, parser: argparse.ArgumentParser) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from app.cli.flags import add_dbh_unit_flag, cannot_write, positive_number
+from app.cli.flags import add_dbh_unit_flag, positive_number
 
 HELP = "compare two runs or surveys of one stand: growth, new, missing and moved trees"
 
@@ -52,9 +52,6 @@ def run(arguments: argparse.Namespace) -> int:
     )
     print("\n".join(comparison_lines(comparison_record(a, b, found))))
     if arguments.out is not None:
-        try:
-            write_comparison(a, b, found, arguments.out)
-        except OSError as error:
-            raise cannot_write(error, arguments.out) from None
+        write_comparison(a, b, found, arguments.out)
         print(f"files in {arguments.out}")
     return 0

@@ -335,8 +335,6 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
 def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
     """Compute all jobs of a plan with a progress bar, in --jobs processes (default: one per usable core, at
     most one per job). Return their results, and print warnings to standard error."""
-    from tqdm import tqdm
-
     from app.common.settings import from_environment
     from app.common.text import count
     from app.tuning.sweep import ResultStore, sweep
@@ -348,9 +346,7 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
     processes: ScoringProcesses[int] = ScoringProcesses(min(arguments.jobs or cores, len(plan.jobs)))
     with (
         contextlib.closing(processes),
-        tqdm(
-            total=len(plan.jobs), unit="set", file=sys.stderr, disable=not sys.stderr.isatty(), leave=False
-        ) as bar,
+        flags.progress_bar(len(plan.jobs), "set") as bar,
     ):
         outcome = sweep(list(plan.jobs.values()), processes, kept, bar.update)
     if outcome.known:
@@ -387,10 +383,7 @@ def _print_comparison(arguments: argparse.Namespace, comparison: Comparison, *, 
         for line in lines(comparison):
             print(flags.plain(line))
     if arguments.out is not None:
-        try:
-            names = files(comparison, arguments.out)
-        except OSError as error:
-            raise flags.cannot_write(error, arguments.out) from None
+        names = files(comparison, arguments.out)
         print(f"{', '.join(names)} in {arguments.out}", file=sys.stderr)
     failed = comparison.failed
     for why, times in Counter(row.error for row in failed).items():

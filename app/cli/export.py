@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from app.cli.flags import cannot_write, positive_number
+from app.cli.flags import positive_number
 from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, stand_parameters
 from pipeline.errors import StemmapError, UsageError
 
@@ -66,10 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     if file.suffix.lower() in (".las", ".laz"):
         return _cloud(arguments.run, file)
     exported = read_for_export(arguments.run, chosen_plots(arguments), stand_parameters(arguments))
-    try:
-        written = export_run(exported, file)
-    except OSError as error:
-        raise cannot_write(error, file) from None
+    written = export_run(exported, file)
     print(f"{len(exported.place)} trees in {exported.frame.name} coordinates: {', '.join(map(str, written))}")
     return 0
 
@@ -79,17 +76,14 @@ def _cloud(run: Path, file: Path) -> int:
     from app.batch.mapped_cloud import write_cloud
     from pipeline.io.atomic_files import write_beside
 
-    try:
-        with write_beside(file) as partial:
-            # laspy compresses by the name of the file
-            named = partial.with_name(partial.name + file.suffix.lower())
-            try:
-                points = write_cloud(run, named)
-                named.replace(partial)
-            finally:
-                named.unlink(missing_ok=True)
-    except OSError as error:
-        raise cannot_write(error, file) from None
+    with write_beside(file) as partial:
+        # laspy compresses by the name of the file
+        named = partial.with_name(partial.name + file.suffix.lower())
+        try:
+            points = write_cloud(run, named)
+            named.replace(partial)
+        finally:
+            named.unlink(missing_ok=True)
     print(f"{points:,} points in {file}")
     return 0
 

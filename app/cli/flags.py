@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from app.common.text import COMPILING
-from pipeline.errors import ParameterError, StemmapError
+from pipeline.errors import ParameterError
 
 if TYPE_CHECKING:
     from pipeline.config import Parameters
@@ -274,12 +274,6 @@ def share(text: str) -> float:
     return value
 
 
-def cannot_write(error: OSError, place: Path) -> StemmapError:
-    """Return the error of a file or folder that cannot be written; `place` is named if the error has no
-    file."""
-    return StemmapError(f"cannot write: {error.strerror}", where=str(error.filename or place))
-
-
 def chosen_parameters(
     arguments: argparse.Namespace, suggested: str, present: Parameters | None = None
 ) -> tuple[str, Parameters]:
@@ -315,6 +309,21 @@ def chosen_parameters(
 
         kept_forests().check(parameters)
     return name, parameters
+
+
+def progress_bar(total: int | None, unit: str, title: str = "") -> Any:  # noqa: ANN401 - tqdm has no types
+    """Return a progress bar of tqdm on standard error; a bar that shows nothing if that is no terminal.
+
+    Args:
+        total: Number of units; None if it is unknown.
+        unit: What is counted.
+        title: Text before the bar.
+    """
+    from tqdm import tqdm
+
+    return tqdm(
+        total=total, unit=unit, desc=title, file=sys.stderr, disable=not sys.stderr.isatty(), leave=False
+    )
 
 
 @contextmanager

@@ -6,7 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
-from app.cli.flags import cannot_write, positive_number
+from app.cli.flags import positive_number
 from pipeline.errors import StemmapError, UsageError
 
 HELP = "give a mapped run coordinates of the country, by control points, GNSS or by hand"
@@ -59,27 +59,24 @@ def run(arguments: argparse.Namespace) -> int:
     from app.batch.run_folder import read_run_record
 
     folder = arguments.run
-    try:
-        if arguments.remove:
-            read_run_record(folder)
-            (folder / georeference.FILE).unlink(missing_ok=True)
-            print("the map is local")
-            return 0
-        if arguments.control is None and not arguments.gnss and arguments.by_hand is None:
-            frame = georeference.read_map_frame(folder)
+    if arguments.remove:
+        read_run_record(folder)
+        (folder / georeference.FILE).unlink(missing_ok=True)
+        print("the map is local")
+        return 0
+    if arguments.control is None and not arguments.gnss and arguments.by_hand is None:
+        frame = georeference.read_map_frame(folder)
+    else:
+        if not arguments.crs:
+            raise UsageError("--crs is missing", remedy="Name the reference system, such as EPSG:25832")
+        crs = georeference.projected(arguments.crs)
+        if arguments.control is not None:
+            frame = georeference.by_control_points(folder, arguments.control, crs, arguments.point_sigma)
+        elif arguments.gnss:
+            frame = georeference.by_gnss(folder, crs)
         else:
-            if not arguments.crs:
-                raise UsageError("--crs is missing", remedy="Name the reference system, such as EPSG:25832")
-            crs = georeference.projected(arguments.crs)
-            if arguments.control is not None:
-                frame = georeference.by_control_points(folder, arguments.control, crs, arguments.point_sigma)
-            elif arguments.gnss:
-                frame = georeference.by_gnss(folder, crs)
-            else:
-                frame = georeference.by_hand(folder, crs, *_by_hand(arguments.by_hand))
-            georeference.write_map_frame(folder, frame)
-    except OSError as error:
-        raise cannot_write(error, folder) from None
+            frame = georeference.by_hand(folder, crs, *_by_hand(arguments.by_hand))
+        georeference.write_map_frame(folder, frame)
     for line in georeference.frame_lines(frame):
         print(line)
     return 0

@@ -119,10 +119,7 @@ def _run_plot(arguments: argparse.Namespace) -> int:
     name, parameters = flags.chosen_parameters(arguments, "forest")
     cloud = open_cloud(arguments.source)
     replaces = check_folder(arguments.out, cloud.description.digest, force=arguments.force)
-    try:
-        outcome = map_plot_run(cloud, name, parameters, truth, arguments.out)
-    except OSError as error:
-        raise flags.cannot_write(error, arguments.out) from None
+    outcome = map_plot_run(cloud, name, parameters, truth, arguments.out)
     return _tell(outcome.summary, arguments.out, outcome.warnings, outcome.losses, replaces=replaces)
 
 
@@ -136,8 +133,6 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         StemmapError: The source cannot be read, the start in the map was not found, or the folder has the map
             of another source or cannot be written.
     """
-    from tqdm import tqdm
-
     from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run
     from app.batch.run_folder import check_folder
@@ -186,14 +181,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
-        try:
-            bar = tqdm(
-                total=opened.description.scans, unit="scan", desc="mapping", file=sys.stderr,
-                disable=not sys.stderr.isatty(), leave=False,
-            )  # fmt: skip
-            outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
-        except OSError as error:
-            raise flags.cannot_write(error, arguments.out) from None
+        bar = flags.progress_bar(opened.description.scans, "scan", "mapping")
+        outcome = map_run(plan, arguments.out, progress=bar, earlier=arguments.continued)
     stages = ", ".join(f"{stage} {ms:.2f}" for stage, ms in outcome.stage_ms.items())
     times = f"median {outcome.scan_ms:.2f} ms per scan; stages: {stages}" if outcome.scan_ms else NOT_TIMED
     return _tell(

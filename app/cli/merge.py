@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from app.cli.flags import add_force_flag, add_set_flag, cannot_write, compilation_notice
+from app.cli.flags import add_force_flag, add_set_flag, compilation_notice
 
 HELP = "merge two mapped runs of one stand into one map"
 
@@ -44,10 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     parameters = None
     if arguments.assignments:
         parameters = assign(read_saved_run(arguments.a).chosen_parameters(), arguments.assignments)
-    try:
-        done = merge_runs(arguments.a, arguments.b, arguments.out, parameters, force=arguments.force)
-    except OSError as error:
-        raise cannot_write(error, arguments.out) from None
+    done = merge_runs(arguments.a, arguments.b, arguments.out, parameters, force=arguments.force)
     pose = done.match.pose
     assert pose is not None  # noqa: S101 - merge_runs refuses without one
     print(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from app.cli.flags import cannot_write
 from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, stand_parameters
 
 HELP = "write a report of a mapped run as one HTML page or PDF"
@@ -39,9 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
         plots=chosen_plots(arguments),
         parameters=stand_parameters(arguments),
     )
-    try:
-        write_report(page, arguments.out)
-    except OSError as error:
-        raise cannot_write(error, arguments.out) from None
+    write_report(page, arguments.out)
     print(f"report in {arguments.out}")
     return 0

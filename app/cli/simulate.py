@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import compilation_notice, seed
+from app.cli.flags import compilation_notice, progress_bar, seed
 
 if TYPE_CHECKING:
     from pipeline.io.readers.camera import Picture
@@ -100,12 +100,9 @@ def _refuse_to_overwrite(paths: list[Path], force: bool) -> None:
 
 def _with_progress(source: SimulatedSource) -> Iterator[Record]:
     """Yield the records of a source, with a progress bar of its scans if standard error is a terminal."""
-    from tqdm import tqdm
-
     from pipeline.types.records import Scan
 
-    # disable=None: a bar on a terminal only, nothing in a log.
-    with tqdm(total=source.description.scans, unit=" scans", disable=None) as bar:
+    with progress_bar(source.description.scans, "scan") as bar:
         for record in source.records():
             yield record
             bar.update(isinstance(record, Scan))

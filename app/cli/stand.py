@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.cli.flags import cannot_write, positive_number
+from app.cli.flags import positive_number
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
@@ -183,16 +183,14 @@ def run(arguments: argparse.Namespace) -> int:
     """
     import sys
 
-    from app.batch.stand import stand_of, stand_summary, write_stand
+    from app.batch.stand import stand_files, stand_of, stand_summary
+    from pipeline.io.atomic_files import write_texts
 
     result = stand_of(arguments.run, stand_parameters(arguments), chosen_plots(arguments))
     print("\n".join(stand_summary(result)))
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)
     if arguments.out is not None:
-        try:
-            write_stand(result, arguments.out)
-        except OSError as error:
-            raise cannot_write(error, arguments.out) from None
+        write_texts(arguments.out, stand_files(result))
         print(f"files in {arguments.out}")
     return 3 if result.warnings else 0

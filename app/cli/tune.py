@@ -254,11 +254,8 @@ def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool) -> 
 
     plan, result = search.plan, result_of(search)
     text = toml_of(plan, result, date.today().isoformat())
-    try:
-        with write_beside(arguments.out) as file:
-            file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise flags.cannot_write(error, arguments.out) from None
+    with write_beside(arguments.out) as file:
+        file.write_text(text, encoding="utf-8")
     for line in lines_of(plan, result):
         print(line)
     print(f"written to {arguments.out}; use it with --config {arguments.out}")
@@ -278,15 +275,9 @@ class _SearchProgress:
     """A progress bar, and a line for each set that is better than all before."""
 
     def __init__(self, plan: Plan) -> None:
-        from tqdm import tqdm
-
-        self._tqdm = tqdm
         self._goal = plan.aim
         self._best: float | None = None
-        self._bar = tqdm(
-            total=plan.trials, unit="trial", desc="first mapping", file=sys.stderr,
-            disable=not sys.stderr.isatty(), leave=False,
-        )  # fmt: skip
+        self._bar = flags.progress_bar(plan.trials, "trial", "first mapping")
 
     def begin(self, start: Trial, search: Search) -> None:
         """Print the score of the start and the number of earlier trials."""
@@ -321,5 +312,5 @@ class _SearchProgress:
 
     def _line(self, text: str) -> None:
         """Print a line to standard error, above the bar."""
-        self._tqdm.write(text, file=sys.stderr)
+        self._bar.write(text, file=sys.stderr)
         sys.stderr.flush()

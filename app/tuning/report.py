@@ -18,7 +18,7 @@ from app.tuning.grid import words_of
 from app.tuning.jobs import JobResult
 from app.tuning.sweep import SweepPlan
 from pipeline.evaluation import MapScores
-from pipeline.io.atomic_files import write_beside
+from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import csv_text
 
 Figures = dict[str, float | int | None]
@@ -270,7 +270,6 @@ def files(comparison: Comparison, folder: Path) -> list[str]:
         StemmapError: A file cannot be written. Each file is complete or unchanged.
         OSError: The folder cannot be created.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     texts = {
         "results.csv": _table(comparison, comparison.rows),
         "means.csv": _table(comparison, comparison.means),
@@ -278,9 +277,7 @@ def files(comparison: Comparison, folder: Path) -> list[str]:
         "times.csv": _times(comparison),
         "report.html": page(comparison),
     }
-    for name, text in texts.items():
-        with write_beside(folder / name) as partial:
-            partial.write_text(text, encoding="utf-8")
+    write_texts(folder, texts)
     return list(texts)
 
 

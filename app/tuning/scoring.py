@@ -19,7 +19,7 @@ from pathlib import Path as FilePath
 
 import msgspec
 
-from app.batch.run_folder import NO_PATH, as_written, read_run, read_run_record, score_map
+from app.batch.run_folder import NO_PATH, as_written, read_run, score_map
 from app.common.child_process import ParentConnection, run_child
 from app.dashboard.annotations import laid_over
 from app.sources.request import SourceRequest, request_of_kept, with_odometry
@@ -278,12 +278,12 @@ def _source_of(source: SourceRequest) -> SourceRequest:
     folder = FilePath(source.uri)
     if not (folder / "run.json").is_file():
         return source
-    run, record = read_run(folder), read_run_record(folder)
-    if record.get("continued"):
+    run = read_run(folder)
+    if run.record.get("continued"):
         raise SourceError(
             "this map was made of several sources", where=source.uri, remedy="Name the sources themselves"
         )
-    kept = request_of_kept(run.uri, odometry=source.odometry, seed=run.seed, choices=record.get("chosen"))
+    kept = request_of_kept(run.uri, odometry=source.odometry, seed=run.seed, choices=run.record.get("chosen"))
     return msgspec.structs.replace(
         kept, topics=source.topics or kept.topics, mount=source.mount or kept.mount
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -46,6 +46,25 @@ def write_beside(path: Path) -> Iterator[Path]:
         raise StemmapError(f"cannot write the file: {error.strerror or error}", where=str(path)) from error
     finally:
         partial.unlink(missing_ok=True)
+
+
+def write_texts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
+    """Write texts to files of a folder, each complete or unchanged; return their paths. The folder is created
+    if necessary, and existing files are replaced.
+
+    Args:
+        folder: The folder.
+        texts: Texts by name of the file.
+
+    Raises:
+        OSError: The folder cannot be created.
+        StemmapError: A file cannot be written.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        with write_beside(folder / name) as partial:
+            partial.write_text(text, encoding="utf-8", newline="")
+    return [folder / name for name in texts]
 
 
 def hold(file: IO[Any]) -> None:

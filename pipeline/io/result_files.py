@@ -247,6 +247,14 @@ class RunFiles:
         with contextlib.suppress(OSError):  # a network disk may not support locks
             hold(self._detections)
 
+    def __enter__(self) -> RunFiles:
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        """After an exception, remove the incomplete files, see `abandon`."""
+        if error is not None:
+            self.abandon()
+
     def add(self, frame: Frame, start_ns: int) -> None:
         """Write the clusters of a scan to the detections; seconds count from `start_ns` [ns]."""
         writer = csv.writer(self._detections, lineterminator="\n")

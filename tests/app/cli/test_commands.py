@@ -214,8 +214,8 @@ def test_a_table_of_truth_that_is_none_fails_before_the_mapping(capsys, tmp_path
 
 def test_a_folder_that_cannot_be_made_fails_in_one_line(capsys, tmp_path):
     (tmp_path / "file").write_text("x")
-    stemmap(capsys, "map", RUN, "--out", tmp_path / "file").refused(1, "cannot write")
-    stemmap(capsys, "map", RUN, "--out", tmp_path / "file" / "below").refused(1, "cannot write")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "file").refused(1, "cannot read or write")
+    stemmap(capsys, "map", RUN, "--out", tmp_path / "file" / "below").refused(1, "cannot read or write")
 
 
 @pytest.mark.parametrize(("word", "meant"), [("mpa", "map"), ("maps", "map"), ("evalute", "evaluate")])

@@ -200,7 +200,7 @@ def test_the_terrain_is_a_raster_in_its_place(runs, tmp_path, capsys, name):
     ("to", "code", "message"),
     [
         ("trees.kml", 1, ".gpkg, .shp"),
-        ("missing/trees.gpkg", 1, "cannot write"),
+        ("missing/trees.gpkg", 1, "cannot read or write"),
         ("tree-manager", 2, "--out"),
     ],
 )
