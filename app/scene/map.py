@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.common.arrays import first_difference, rows_of
+from app.common.arrays import rows_of
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
 from app.scene.labels import TREE_WIDTH, Label, LabelNodes, Place, apart
@@ -38,13 +38,11 @@ class MapNodes:
 
     def __init__(self, scene: viser.SceneApi, on_tree: Callable[[int], None]) -> None:
         self.ground = GroundNode(scene)
-        self._truth_trees: TruthTrees | None = None
         self._trees = Batch(scene, "/world/trees", nodes.cylinder(), opacity=0.55)
         self._circles = Circles(scene, "/world/breast", BREAST_HEIGHT, 4.0)
         self._truth = Circles(scene, "/world/truth", 0.04, 2.5)
         self._mark = Circles(scene, "/world/selection", 0.06, 5.0)
         self._labels = LabelNodes(scene, "/world/numbers", 1.0)
-        self._shown: NDArray[np.float64] = np.zeros((0, 5))
         self._numbers: list[int] = []
         self.labelled: list[Place] = []
 
@@ -55,8 +53,8 @@ class MapNodes:
                 on_tree(numbers[event.instance_index])
 
     def show(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
-        """Show the map after a scan. The trees are sent again only if one moved by about a centimetre, or
-        changed its radius, height or number. Unconfirmed trees are not shown.
+        """Show the map after a scan. Trees that move by less than a centimetre are not sent again;
+        unconfirmed trees are not shown.
 
         Args:
             frame: Results of the scan.
@@ -64,28 +62,11 @@ class MapNodes:
             ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
             view: Visible layers.
         """
-        if self.ground.show(frame.ground):
-            self.show_truth(self._truth_trees)
-        trees = rows_of(frame.trees, frame.trees.confirmed)
-        foot = np.round(self.ground.heights(trees.position, frame.base_z), 1)
-        radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS)
-        place = np.column_stack([trees.number, np.round(trees.position, 2), np.round(radius, 3), foot])
-        numbers = [int(number) for number in trees.number]
-        if not np.array_equal(place, self._shown) or numbers != self._numbers:
-            self._shown, self._numbers = place, numbers
-            self._show_trees(place, np.isfinite(trees.dbh), frame.of_cloud)
-        self.repaint(frame, selected, ring, view)
-
-    def repaint(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
-        """Update visibility, labels and selection of the map that `show` drew; arguments as in `show`.
-        Trees are not drawn again."""
-        self.ground.visible = view.layers["ground"]
-        self._trees.visible = view.layers["trees"]
-        self._circles.visible = view.layers["fits"]
-        self._truth.visible = view.layers["truth"]
-        trees = rows_of(frame.trees, frame.trees.confirmed)
-        pose = frame.estimate.T_map_base
+        self.ground.show(view.layers["ground"], frame.ground)
+        trees, pose = rows_of(frame.trees, frame.trees.confirmed), frame.estimate.T_map_base
         foot = self.ground.heights(trees.position, frame.base_z)
+        self._numbers = trees.number.tolist()
+        self._show_trees(trees, np.round(foot, 1), frame.of_cloud, view)
         self._show_mark(trees, selected, ring, frame.base_z)
         robot = np.array([pose.x, pose.y])
         named = view.layers["trees"] and view.layers["labels"]
@@ -104,16 +85,16 @@ class MapNodes:
         z = self.ground.heights(places[:1], frame.base_z)
         return float(places[0, 0]), float(places[0, 1]), float(z[0])
 
-    def show_truth(self, trees: TruthTrees | None) -> None:
+    def show_truth(self, trees: TruthTrees | None, view: ViewSettings) -> None:
         """Show rings at the objects of the ground truth, on the known ground; None removes them."""
-        self._truth_trees = trees
         if trees is None:
-            self._truth.show(np.zeros((0, 2, 3)), np.zeros((0, 3), dtype=np.uint8))
+            self._truth.update(False)
             return
         radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS) + 0.12
         is_tree = np.array([kind == "tree" for kind in trees.kind], dtype=bool)
         place = np.column_stack([trees.x, trees.y])
         self._truth.show_at(
+            view.layers["truth"],
             place,
             radius,
             colours.choose(is_tree, colours.TRUTH, colours.OTHER),
@@ -125,24 +106,29 @@ class MapNodes:
         """The visible labels."""
         return self._labels.texts
 
-    def _show_trees(self, place: NDArray[np.float64], measured: NDArray[np.bool_], of_cloud: bool) -> None:
+    def _show_trees(self, trees: Trees, foot: Float, of_cloud: bool, view: ViewSettings) -> None:
         """Send the trunks; those of a whole cloud are as thick as their circles, which are drawn on their
         upper ends.
 
         Args:
-            place: Number, x, y, radius and height of the ground of each tree, shape (N, 5) [m].
-            measured: Whether its diameter was measured, shape (N,).
+            trees: Confirmed trees.
+            foot: Height of the ground at each of them, shape (T,) [m].
             of_cloud: Whether the map is that of a whole cloud.
+            view: Visible layers.
         """
-        height = BREAST_HEIGHT if of_cloud else TREE_HEIGHT
+        measured = np.isfinite(trees.dbh)
+        place = np.round(trees.position, 2)
+        radius: Float = np.where(measured, 0.5 * trees.dbh, UNKNOWN_RADIUS).round(3)
+        height = np.full(len(radius), BREAST_HEIGHT if of_cloud else TREE_HEIGHT)
         each = colours.choose(measured, colours.TREE, colours.UNMEASURED)
         self._trees.show(
-            place[:, [1, 2, 4]],
-            np.column_stack([place[:, 3], place[:, 3], np.full(len(place), height)]),
+            view.layers["trees"],
+            np.column_stack([place, foot]),
+            np.column_stack([radius, radius, height]),
             each,
         )
-        rows = place[measured] if of_cloud else place[:0]
-        self._circles.show_at(rows[:, 1:3], rows[:, 3], each[measured][: len(rows)], rows[:, 4])
+        on = view.layers["fits"] and of_cloud
+        self._circles.show_at(on, place[measured], radius[measured], each[measured], foot[measured])
 
     def _show_mark(self, trees: Trees, selected: int | None, ring: Ring, base_z: float) -> None:
         """Show the ring of the selected cluster or, without one, a ring around the selected tree; none
@@ -162,7 +148,7 @@ class MapNodes:
         if ring is not None:
             places, radii = np.vstack([places, ring[:2]]), [*radii, ring[2] + 0.12]
         each = np.tile(np.array([colours.SELECTION], dtype=np.uint8), (len(radii), 1))
-        self._mark.show_at(places, np.array(radii), each, self.ground.heights(places, base_z))
+        self._mark.show_at(True, places, np.array(radii), each, self.ground.heights(places, base_z))
 
 
 def tree_labels(
@@ -226,28 +212,31 @@ class ErrorNode(Segments):
         super().__init__(scene, "/world/errors", 3.0)
         self.count = 0
 
-    def hide(self) -> None:
-        """Hide all errors."""
-        self.count = 0
-        self._update(False)
-
     def show_errors(
-        self, trees: Trees, truth: TruthTrees | None, path: Float, wanted: Evaluation, ground: GroundNode
+        self,
+        on: bool,
+        frame: Frame,
+        truth: TruthTrees | None,
+        path: Float,
+        wanted: Evaluation,
+        ground: GroundNode,
     ) -> None:
         """Show the errors of the map against the ground truth.
 
         Args:
-            trees: The map.
+            on: Whether the layer is on; otherwise nothing is computed.
+            frame: Results of the scan with the map.
             truth: Ground truth; None hides the errors.
             path: Positions of the robot, shape (N, 2) [m]; the ground truth within reach of them counts. An
                 empty path hides the errors.
             wanted: Distances of a match and of the ground truth from the path.
             ground: Ground with its heights.
         """
-        if truth is None or len(path) == 0:
-            self.hide()
+        if not on or truth is None or len(path) == 0:
+            self.count = 0
+            self.update(False)
             return
-        offsets, missed, false = errors(trees, truth, path, wanted)
+        offsets, missed, false = errors(frame.trees, truth, path, wanted)
         self.count = len(missed) + len(false)
         lines: list[NDArray[np.floating]] = [
             np.stack([offsets[:, 0], offsets[:, 0] + TIMES * (offsets[:, 1] - offsets[:, 0])], axis=1),
@@ -257,7 +246,7 @@ class ErrorNode(Segments):
         flat = np.concatenate(lines).reshape(-1, 2)
         xyz = np.column_stack([flat, ground.heights(flat, 0.0) + HEIGHT]).reshape(-1, 2, 3)
         each = np.array([colours.SELECTION, colours.ERROR, colours.ERROR], dtype=np.uint8)
-        self.show(xyz, np.repeat(each, [len(part) for part in lines], axis=0))
+        self.show(True, xyz, np.repeat(each, [len(part) for part in lines], axis=0))
 
 
 def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> tuple[Float, Float, Float]:
@@ -377,50 +366,23 @@ class Accumulated:
 
 
 class MapCloud:
-    """The accumulated points in the scene, in blocks; only changed blocks are sent.
+    """The accumulated points in the scene, in blocks.
 
     Args:
         scene: Scene of viser to which the nodes are added.
-        gathered: Accumulated points; they outlive the nodes when viser restarts.
     """
 
-    def __init__(self, scene: viser.SceneApi, gathered: Accumulated) -> None:
-        self._scene, self._gathered = scene, gathered
+    def __init__(self, scene: viser.SceneApi) -> None:
+        self._scene = scene
         self._blocks: list[CloudNode] = []
-        self._sent = np.zeros((0, 3), np.float32)
-        self._visible = False
 
-    @property
-    def count(self) -> int:
-        """Number of points."""
-        return len(self._gathered.points)
-
-    def show(self, frame: Frame, visible: bool) -> None:
-        """Add the filtered points of a scan (see `Accumulated.take`), and show all points if `visible`."""
-        self._gathered.take(frame)
-        self.repaint(visible)
-
-    def repaint(self, visible: bool) -> None:
-        """Show or hide the points."""
-        self._visible = visible
-        if visible:
-            self._send(self._gathered.points)
+    def show(self, on: bool, points: NDArray[np.float32]) -> None:
+        """Show points, shape (N, 3) [m]; only blocks that changed are sent."""
+        while on and len(self._blocks) * BLOCK < len(points):
+            self._blocks.append(CloudNode(self._scene, f"/world/gathered/{len(self._blocks)}", 0.05))
         for number, block in enumerate(self._blocks):
-            block.visible = visible and number * BLOCK < len(self._sent)
-
-    def _send(self, points: NDArray[np.float32]) -> None:
-        """Send the blocks of points, shape (N, 3) [m], from the first that changed on. Blocks beyond the last
-        point keep their content; `repaint` hides them. The array is kept and must not change afterwards."""
-        first = first_difference(self._sent, points)
-        if first == len(points) == len(self._sent):
-            return
-        self._sent = points
-        for number in range(first // BLOCK, -(-len(points) // BLOCK)):
-            if number == len(self._blocks):
-                name = f"/world/gathered/{number}"
-                self._blocks.append(CloudNode(self._scene, name, 0.05))
-            part = points[number * BLOCK : (number + 1) * BLOCK]
-            self._blocks[number].show(part, colours.ramp(part[:, 2], LOW, HIGH))
+            part = points[number * BLOCK : (number + 1) * BLOCK] if on else points[:0]
+            block.show(on, part, colours.ramp(part[:, 2], LOW, HIGH))
 
 
 def _keys(points: NDArray[np.floating]) -> NDArray[np.int64]:

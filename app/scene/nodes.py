@@ -1,6 +1,6 @@
 """Building blocks of the scene: meshes, batches of meshes, point clouds, lines, and the ground.
 
-Each block is sent to the browsers only when it changed. All coordinates are those of the map and part of the
+Of each block only what changed is sent to the browsers. All coordinates are those of the map and part of the
 content of a node: viser's client draws a new pose of a node one picture before new content, so a scan whose
 points move with a pose would be drawn away from the trees.
 """
@@ -14,7 +14,6 @@ import trimesh
 import viser
 from numpy.typing import NDArray
 
-from app.common.arrays import first_difference
 from app.scene import colours
 from app.scene.colours import Colours, Rgb
 from pipeline.geometry.poses import Pose2
@@ -90,32 +89,31 @@ def polyline(points: NDArray[np.floating]) -> NDArray[np.float32]:
     return np.stack([xyz[:-1], xyz[1:]], axis=1)
 
 
-class LayerNode(Generic[N]):
-    """A node of a layer. It is visible while the layer is on and has content, because viser's client logs an
-    error for an empty node."""
+class Node(Generic[N]):
+    """A node of the scene, of which only changes are sent. It is visible while its layer is on and it has
+    content, because viser's client logs an error for an empty node."""
 
     def __init__(self, node: N) -> None:
         self.node = node
-        self._on, self._filled = True, False
+        self._sent: dict[str, Any] = {}
 
-    @property
-    def visible(self) -> bool:
-        """Whether the layer is on."""
-        return self._on
+    def update(self, on: bool, **content: Any) -> None:  # noqa: ANN401 - the properties of the node
+        """Set properties of the node and show it, or hide it; a hidden node keeps its content.
 
-    @visible.setter
-    def visible(self, on: bool) -> None:
-        self._on = on
-        self._update(self._filled)
+        Args:
+            on: Whether it is visible.
+            content: Properties by name; those that are unchanged are not sent.
+        """
+        if on:
+            for name, value in content.items():
+                if name not in self._sent or not np.array_equal(self._sent[name], value):
+                    self._sent[name] = value
+                    setattr(self.node, name, value)
+        if self.node.visible != on:
+            self.node.visible = on
 
-    def _update(self, filled: bool) -> None:
-        """Set whether the node has content, and send its visibility if it changed."""
-        self._filled = filled
-        if self.node.visible != (self._on and filled):
-            self.node.visible = self._on and filled
 
-
-class Batch(LayerNode[viser.BatchedMeshHandle]):
+class Batch(Node[viser.BatchedMeshHandle]):
     """Copies of one mesh as one node, because viser is slow with a thousand nodes.
 
     Args:
@@ -140,12 +138,14 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
             **look,
         )
         super().__init__(node)
-        self.count, self._yaw = 0, 0.0
 
-    def show(self, positions: Points, scales: Points, colours: NDArray[np.uint8], yaw: float = 0.0) -> None:
-        """Replace the copies; without any the node is hidden.
+    def show(
+        self, on: bool, positions: Points, scales: Points, colours: NDArray[np.uint8], yaw: float = 0.0
+    ) -> None:
+        """Replace the copies.
 
         Args:
+            on: Whether they are visible.
             positions: Positions of the copies, shape (N, 3) [m].
             scales: Their sizes along x, y, z in units of the mesh, shape (N, 3).
             colours: Their colours, uint8, shape (N, 3).
@@ -156,15 +156,13 @@ class Batch(LayerNode[viser.BatchedMeshHandle]):
         """
         if not len(positions) == len(scales) == len(colours):
             raise ValueError("positions, scales and colours must have the same length")
-        if len(positions) > 0:
-            if (len(positions), yaw) != (self.count, self._yaw):
-                self.node.batched_wxyzs = _turned(len(positions), yaw)
-                self._yaw = yaw
-            self.node.batched_positions = positions.astype(np.float32)
-            self.node.batched_scales = scales.astype(np.float32)
-            self.node.batched_colors = colours
-        self.count = len(positions)
-        self._update(self.count > 0)
+        self.update(
+            on and len(positions) > 0,
+            batched_wxyzs=_turned(len(positions), yaw),
+            batched_positions=positions.astype(np.float32),
+            batched_scales=scales.astype(np.float32),
+            batched_colors=colours,
+        )
 
 
 def _turned(count: int, yaw: float = 0.0) -> NDArray[np.float32]:
@@ -172,8 +170,8 @@ def _turned(count: int, yaw: float = 0.0) -> NDArray[np.float32]:
     return np.tile(np.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)], dtype=np.float32), (count, 1))
 
 
-class CloudNode(LayerNode[viser.PointCloudHandle]):
-    """One point cloud. While it is hidden nothing is sent; when it is shown, the newest points are sent.
+class CloudNode(Node[viser.PointCloudHandle]):
+    """One point cloud.
 
     Args:
         scene: Scene of viser.
@@ -193,26 +191,15 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
             visible=False,
         )
         super().__init__(node)
-        self._waiting: tuple[Points, Colours] | None = None
-        self._size = size
 
-    @property
-    def size(self) -> float:
-        """Diameter of a point [m]."""
-        return self._size
-
-    @size.setter
-    def size(self, size: float) -> None:
-        if size != self._size:
-            self._size = self.node.point_size = size
-
-    def show(self, points: Points, colours: Colours | Rgb) -> None:
-        """Replace the points; without any the node is hidden. While the layer is off, they are kept and sent
-        when it is switched on.
+    def show(self, on: bool, points: Points, colours: Colours | Rgb, **look: float) -> None:
+        """Replace the points.
 
         Args:
+            on: Whether they are visible.
             points: shape (N, 3) [m] in the frame of the map.
             colours: One colour, or one for each point.
+            look: `point_size`, their diameter if it changes [m].
 
         Raises:
             ValueError: The number of colours differs from that of the points.
@@ -220,20 +207,11 @@ class CloudNode(LayerNode[viser.PointCloudHandle]):
         each = np.asarray(colours, dtype=np.uint8)
         if each.shape not in ((3,), points.shape):  # viser accepts a wrong length silently
             raise ValueError(f"{len(points)} points have colours of shape {each.shape}")
-        self._waiting = (points, np.broadcast_to(each, points.shape))
-        self._update(self._filled)
-
-    def _update(self, filled: bool) -> None:
-        """Send the newest points if they were not sent and the layer is on; then as `LayerNode._update`."""
-        if self._waiting is not None and self._on:
-            (points, colours), self._waiting = self._waiting, None
-            filled = len(points) > 0
-            if filled:
-                self.node.points, self.node.colors = points, colours
-        super()._update(filled)
+        each = np.broadcast_to(each, points.shape)
+        self.update(on and len(points) > 0, points=points, colors=each, **look)
 
 
-class Segments(LayerNode[viser.LineSegmentsHandle]):
+class Segments(Node[viser.LineSegmentsHandle]):
     """Line segments as one node. Unlike meshes they are not shaded, so they keep their colour.
 
     Args:
@@ -253,17 +231,18 @@ class Segments(LayerNode[viser.LineSegmentsHandle]):
         )
         super().__init__(node)
 
-    def show(self, segments: Points, each: Colours) -> None:
-        """Replace the segments; without any the node is hidden.
+    def show(self, on: bool, segments: Points, each: Colours | Rgb) -> None:
+        """Replace the segments.
 
         Args:
+            on: Whether they are visible.
             segments: Ends of the segments, shape (S, 2, 3) [m].
-            each: Colour of each segment, uint8, shape (S, 3).
+            each: One colour, or one for each segment, uint8, shape (S, 3).
         """
-        if len(segments):
-            self.node.points = segments.astype(np.float32)
-            self.node.colors = np.repeat(colours.of_lines(each), 2, axis=0).reshape(-1, 2, 3)
-        self._update(len(segments) > 0)
+        drawn = colours.of_lines(np.asarray(each, np.uint8))
+        if drawn.ndim > 1:
+            drawn = np.repeat(drawn, 2, axis=0).reshape(-1, 2, 3)
+        self.update(on and len(segments) > 0, points=segments.astype(np.float32), colors=drawn)
 
 
 class Circles(Segments):
@@ -280,23 +259,24 @@ class Circles(Segments):
         super().__init__(scene, name, thickness)
         self._height = height
 
-    def show_at(self, centres: Float, radii: Float, each: Colours, ground: Float) -> None:
+    def show_at(self, on: bool, centres: Float, radii: Float, each: Colours, ground: Float) -> None:
         """Replace the circles.
 
         Args:
+            on: Whether they are visible.
             centres: x, y, shape (N, 2) [m].
             radii: shape (N,) [m].
             each: Colours, uint8, shape (N, 3).
             ground: Heights of the ground, shape (N,) [m].
         """
-        self.show(circles(centres, radii, self._height + ground), np.repeat(each, SIDES, axis=0))
+        self.show(on, circles(centres, radii, self._height + ground), np.repeat(each, SIDES, axis=0))
 
 
 CHUNK = 200  # segments per node, so that a long path is not sent again with each scan
 
 
 class LineNode:
-    """A growing line in chunks; only the chunks that changed are sent.
+    """A growing line in chunks.
 
     Args:
         scene: Scene of viser.
@@ -306,79 +286,33 @@ class LineNode:
     """
 
     def __init__(self, scene: viser.SceneApi, name: str, colour: Rgb, height: float) -> None:
-        self._scene, self._name, self._height = scene, name, height
-        self._colour = colours.of_lines(np.array(colour, dtype=np.uint8))
-        self._chunks: list[viser.LineSegmentsHandle] = []
-        self._sent: Float = np.zeros((0, 3))
-        self._visible = True
+        self._scene, self._name, self._height, self._colour = scene, name, height, colour
+        self._chunks: list[Segments] = []
 
-    def show(self, places: Float, ground: Float | float = 0.0) -> None:
-        """Show the line through places; fewer than two hide it. Only chunks from the first change on are
-        sent.
+    def show(self, on: bool, places: Float, ground: Float | float = 0.0) -> None:
+        """Show the line through places; only chunks that changed are sent.
 
         Args:
+            on: Whether it is visible.
             places: Points of the line, shape (N, 2) [m].
             ground: Heights of the ground there, scalar or shape (N,) [m].
         """
-        places = np.array(places, dtype=np.float64).reshape(-1, 2)
-        points = np.column_stack([places, np.broadcast_to(self._height + ground, len(places))])
-        first = first_difference(self._sent, points)
-        if first == len(points) == len(self._sent):
-            return
-        self._sent = points
-        for number in range(max(first - 1, 0) // CHUNK, self._needed):
-            self._send(number, points[number * CHUNK : (number + 1) * CHUNK + 1])
-        for chunk in self._chunks[self._needed :]:
-            chunk.visible = False
-
-    @property
-    def visible(self) -> bool:
-        """Whether the layer is on."""
-        return self._visible
-
-    @visible.setter
-    def visible(self, visible: bool) -> None:
-        self._visible = visible
-        for chunk in self._chunks[: self._needed]:
-            chunk.visible = visible
-
-    @property
-    def _needed(self) -> int:
-        """Number of chunks of the line."""
-        return max(-(-(len(self._sent) - 1) // CHUNK), 0)
-
-    def _send(self, number: int, points: Float) -> None:
-        """Send one chunk, adding its node if necessary.
-
-        Args:
-            number: Number of the chunk.
-            points: Its points, shape (P, 3) [m].
-        """
-        segments = polyline(points)
-        if number < len(self._chunks):
-            self._chunks[number].points = segments
-            self._chunks[number].visible = self._visible
-            return
-        self._chunks.append(
-            self._scene.add_line_segments(
-                f"{self._name}/{number}",
-                segments,
-                self._colour,
-                thickness=2.5,
-                thickness_units="screen",
-                visible=self._visible,
-            )
-        )
+        segments = polyline(np.column_stack([places, np.broadcast_to(self._height + ground, len(places))]))
+        while len(self._chunks) * CHUNK < len(segments):
+            self._chunks.append(Segments(self._scene, f"{self._name}/{len(self._chunks)}", 2.5))
+        for number, chunk in enumerate(self._chunks):
+            chunk.show(on, segments[number * CHUNK : (number + 1) * CHUNK], self._colour)
 
 
 MOST_CELLS = 40_000  # of the mesh; in a larger map two by two cells are averaged
 NOTHING = np.full((1, 1), np.nan)
 
 
-class GroundNode(LayerNode[viser.MeshHandle]):
+class GroundNode(Node[viser.MeshHandle]):
     """The mesh of the ground over the known cells of the terrain map, and its heights for the other nodes.
 
-    The mesh is sent again only for another height map.
+    Attributes:
+        faces: Number of triangles of the mesh.
     """
 
     def __init__(self, scene: viser.SceneApi) -> None:
@@ -396,23 +330,18 @@ class GroundNode(LayerNode[viser.MeshHandle]):
         super().__init__(node)
         self.faces = 0
         self._shown: HeightMap | None = None
+        self._mesh: Mesh = node.vertices, node.faces
         self._raster, self._low, self._cell = NOTHING, np.zeros(2), 1.0
 
-    def show(self, ground: HeightMap | None) -> bool:
-        """Show a height map; None keeps the present one. Return whether it is another object than the present
-        one."""
-        if ground is None or ground is self._shown:
-            return False
-        self._shown = ground
-        self._raster, self._low, self._cell = raster(ground)
-        vertices, faces = surface(self._raster, self._low, self._cell)
-        self.faces = len(faces)
-        if self.faces:
-            self.node.vertices = vertices
-            if not np.array_equal(faces, self.node.faces):
-                self.node.faces = faces
-        self._update(self.faces > 0)
-        return True
+    def show(self, on: bool, ground: HeightMap | None) -> None:
+        """Show a height map; None keeps the present one."""
+        if ground is not None and ground is not self._shown:
+            self._shown = ground
+            self._raster, self._low, self._cell = raster(ground)
+            self._mesh = surface(self._raster, self._low, self._cell)
+            self.faces = len(self._mesh[1])
+        vertices, faces = self._mesh
+        self.update(on and self.faces > 0, vertices=vertices, faces=faces)
 
     def heights(self, places: NDArray[np.floating], otherwise: float) -> Float:
         """Return the heights of the ground, shape (N,) [m], of the cell at each position without

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
-from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Mesh, Segments
+from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Mesh, Node, Segments
 from pipeline.config.stages import Obstacles
 from pipeline.geometry.poses import Pose2
 from pipeline.types.clearance import Zone
@@ -32,46 +32,29 @@ class RobotNodes:
         self._odometry = LineNode(scene, "/world/odometry", colours.ODOMETRY, 0.03)
         self._dead_reckoning: list[tuple[int, float, float]] = []
         self._start = Pose2()
-        self._ground: GroundNode | None = None
 
     def show(self, frame: Frame, path: Float, view: ViewSettings, ground: GroundNode) -> None:
-        """Show a new pose. A scan with an index that was shown before, or a smaller one, removes the odometry
-        path from there on, because the run went back.
+        """Show a pose. A scan that was shown before, or an earlier one, removes the odometry path from there
+        on, because the run went back.
 
         Args:
             frame: Results of the scan.
             path: Positions at all scans so far in the frame of the map, shape (N, 2) [m].
             view: Visible layers.
-            ground: Ground with its heights; it is kept for `repaint`.
+            ground: Ground with its heights.
         """
-        self._ground = ground
         for part in self._body:
             part.show(frame)
         particles = frame.estimate.particles
         self._particles.show(
+            view.layers["particles"],
             np.column_stack([particles[:, :2], np.full(len(particles), frame.base_z + 0.05)]),
             colours.PARTICLES,
         )
-        self._path.show(path, self._stepped(path))
         self._follow_odometry(frame)
-        self.repaint(view)
-
-    def repaint(self, view: ViewSettings) -> None:
-        """Update the visibility of particles and paths after a change of layers. `show` must be called
-        before."""
-        self._particles.visible = view.layers["particles"]
-        self._path.visible = view.layers["path"]
-        self._odometry.visible = view.layers["odometry"]
-        if self._odometry.visible:
-            places = np.array(self._dead_reckoning)[:, 1:]
-            self._odometry.show(places, self._stepped(places))
-
-    def _stepped(self, places: Float) -> Float:
-        """Return heights of the ground at places (N, 2) [m], shape (N,) [m], rounded to STEP, so that small
-        changes do not send a line again. 0 where the ground is unknown and before the first scan."""
-        if self._ground is None:
-            return np.zeros(len(places))
-        return np.round(self._ground.heights(places, 0.0) / STEP) * STEP
+        self._path.show(view.layers["path"], path, _stepped(ground, path))
+        places = np.array(self._dead_reckoning)[:, 1:]
+        self._odometry.show(view.layers["odometry"], places, _stepped(ground, places))
 
     def _follow_odometry(self, frame: Frame) -> None:
         """Add the pose by odometry only of a scan. Both paths begin at the pose of the first scan that is
@@ -82,6 +65,12 @@ class RobotNodes:
             self._start = frame.estimate.T_map_base @ frame.T_odom_base.inverse()
         at = self._start @ frame.T_odom_base
         self._dead_reckoning.append((frame.index, at.x, at.y))
+
+
+def _stepped(ground: GroundNode, places: Float) -> Float:
+    """Return heights of the ground at places (N, 2) [m], shape (N,) [m], rounded to STEP, so that small
+    changes do not send a line again. 0 where the ground is unknown."""
+    return np.round(ground.heights(places, 0.0) / STEP) * STEP
 
 
 def _part(mesh: Mesh, size: tuple[float, float, float], place: tuple[float, float, float]) -> Mesh:
@@ -108,7 +97,7 @@ BODY: dict[str, tuple[colours.Rgb, list[Mesh]]] = {
 }
 
 
-class BodyNode:
+class BodyNode(Node[viser.MeshHandle]):
     """A part of the robot in one colour.
 
     Args:
@@ -120,7 +109,7 @@ class BodyNode:
         colour, parts = BODY[name]
         first = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
         self._vertices = np.vstack([vertices for vertices, _ in parts])
-        self._node = scene.add_mesh_simple(
+        node = scene.add_mesh_simple(
             f"{ROBOT}/{name}",
             self._vertices,
             np.vstack([faces + start for (_, faces), start in zip(parts, first[:-1], strict=True)]).astype(
@@ -132,11 +121,12 @@ class BodyNode:
             receive_shadow=False,
             visible=False,
         )
+        super().__init__(node)
 
     def show(self, frame: Frame) -> None:
         """Show the part at the pose of a scan; hide it for a whole cloud, which has no robot."""
-        self._node.vertices = nodes.placed(self._vertices, frame.estimate.T_map_base, frame.base_z)
-        self._node.visible = not frame.of_cloud
+        placed = nodes.placed(self._vertices, frame.estimate.T_map_base, frame.base_z)
+        self.update(not frame.of_cloud, vertices=placed)
 
 
 HEIGHT = 0.06  # m above the base
@@ -156,24 +146,24 @@ class WayNode(Segments):
     def __init__(self, scene: viser.SceneApi) -> None:
         super().__init__(scene, f"{ROBOT}/way", 3.0)
 
-    def show_ahead(self, frame: Frame, parameters: Obstacles, visible: bool) -> None:
+    def show_ahead(self, on: bool, frame: Frame, parameters: Obstacles) -> None:
         """Show the path ahead of the robot; nothing where the frame has no clearance.
 
         Args:
+            on: Whether the layer is on.
             frame: Results of the scan.
             parameters: Widths and lengths of the zones.
-            visible: Whether the layer is on.
         """
         clearance = frame.clearance
-        self.visible = visible and clearance is not None
-        if clearance is None or not visible:
+        if clearance is None or not on:
+            self.update(False)
             return
         segments = way_lines(clearance.curvature, clearance.backward, clearance.begins, parameters)
         if clearance.zone in (Zone.SLOW, Zone.STOP):
             place = np.array([(clearance.x, clearance.y)])
             segments = np.vstack([segments, nodes.circles(place, np.array([RING]), np.array([HEIGHT]))])
-        each = np.tile(np.array(OF_ZONE[clearance.zone], dtype=np.uint8), (len(segments), 1))
-        self.show(nodes.placed(segments, frame.estimate.T_map_base, frame.base_z), each)
+        placed = nodes.placed(segments, frame.estimate.T_map_base, frame.base_z)
+        self.show(True, placed, OF_ZONE[clearance.zone])
 
 
 def way_lines(curvature: float, backward: bool, begins: float, parameters: Obstacles) -> NDArray[np.float32]:

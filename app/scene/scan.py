@@ -25,7 +25,6 @@ HEIGHT_LOW, HEIGHT_HIGH = -1.0, 3.0
 SCAN = f"{ROBOT}/scan"
 FILTERED_SIZE, CLUSTER_SIZE = 0.03, 0.045  # diameter of a point of a scan [m]
 CLOUD_SIZES, POINTS_ACROSS = (0.02, 0.1), 700.0  # diameters of a point of a cloud [m]; points across a plot
-_NO_POINTS: NDArray[np.float32] = np.zeros((0, 3), np.float32)
 WIDEST_MARKER = 0.6  # [m], the radius of a thick trunk
 
 
@@ -44,50 +43,46 @@ class ScanNodes:
         self._clusters = CloudNode(scene, f"{SCAN}/clusters", CLUSTER_SIZE)
         self._fits = Batch(scene, f"{SCAN}/fits", nodes.cylinder(), opacity=0.4, side="double")
         self._markers = Batch(scene, f"{SCAN}/markers", nodes.cylinder(), opacity=0.14)
-        self._points = _NO_POINTS, _NO_POINTS
         self._axes: tuple[Float, Float, Float] = (np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
         self._labels = LabelNodes(scene, "/world/labels")
         self._cluster_numbers = ClusterNumbers()
-        self._numbers: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
 
         for batch in (self._markers, self._fits):
             _report(batch, self._markers, on_cluster)
 
     def show(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
-        """Show a new scan.
+        """Show a scan.
 
         Args:
             frame: Results of the scan.
             view: Visible layers, colours and labels.
             labelled: Places of the labels of trees, which those of clusters do not cover.
         """
+        layers, ends = view.layers, height_range(frame)
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
-        self._numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
-        self._points = nodes.scan_in_map(frame, frame.raw), nodes.scan_in_map(frame, frame.filtered)
-        for node, size in ((self._filtered, FILTERED_SIZE), (self._clusters, CLUSTER_SIZE)):
-            node.size = cloud_point_size(frame) if frame.of_cloud else size
-        self._show_fits(frame)
-        self._show_markers(frame)
-        self.repaint(frame, view, labelled)
-
-    def repaint(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
-        """Show the same scan after a change of the view; arguments as in `show`."""
-        self._raw.visible = view.layers["raw"]
-        self._filtered.visible = view.layers["filtered"]
-        self._clusters.visible = view.layers["clusters"]
-        self._fits.visible = view.layers["fits"]
-        self._markers.visible = view.layers["clusters"]
-        raw, filtered = self._points
-        ends = height_range(frame)
-        self._raw.show(raw, self._ramp_or(frame.raw, view, colours.RAW, ends))
+        numbers = self._cluster_numbers.follow(frame.estimate.T_map_base.apply(centroid))
+        raw, filtered = nodes.scan_in_map(frame, frame.raw), nodes.scan_in_map(frame, frame.filtered)
+        size = cloud_point_size(frame) if frame.of_cloud else None
+        self._raw.show(layers["raw"], raw, self._ramp_or(frame.raw, view, colours.RAW, ends))
         # The points of the trees of a cloud are those of the clusters, and are not drawn twice.
         rest = frame.labels < 0 if frame.of_cloud else slice(None)
-        plain = self._ramp_or(frame.filtered[rest], view, colours.FILTERED, ends)
-        self._filtered.show(filtered[rest], plain)
+        self._filtered.show(
+            layers["filtered"],
+            filtered[rest],
+            self._ramp_or(frame.filtered[rest], view, colours.FILTERED, ends),
+            point_size=size or FILTERED_SIZE,
+        )
         member = frame.labels >= 0
-        self._clusters.show(filtered[member], cluster_colours(frame, self._numbers, view.colour_by)[member])
-        named = view.layers["labels"] and not frame.of_cloud  # the trees have labels; others are too many
-        self._labels.show(cluster_labels(frame, self._numbers, view.label_by, labelled) if named else [])
+        self._clusters.show(
+            layers["clusters"],
+            filtered[member],
+            cluster_colours(frame, numbers, view.colour_by)[member],
+            point_size=size or CLUSTER_SIZE,
+        )
+        self._show_fits(frame, layers["fits"])
+        self._show_markers(frame, layers["clusters"])
+        named = layers["labels"] and not frame.of_cloud  # the trees have labels; others are too many
+        self._labels.show(cluster_labels(frame, numbers, view.label_by, labelled) if named else [])
 
     def meant(self, instance: int | None, origin: Float, direction: Float) -> int | None:
         """Return the row of the cluster of the newest scan that a click hit; None if there is none, see
@@ -120,7 +115,7 @@ class ScanNodes:
             return colours.ramp(points[:, 2], *ends)
         return plain
 
-    def _show_fits(self, frame: Frame) -> None:
+    def _show_fits(self, frame: Frame, on: bool) -> None:
         """Show a cylinder for each detected stem with a fitted circle; none for a whole cloud, whose circles
         are those of its trees."""
         rows = frame.detections.cluster if not frame.of_cloud else np.zeros(0, np.int64)
@@ -130,12 +125,13 @@ class ScanNodes:
         foot = clusters.centroid[rows, 2] - 0.5 * height
         radius = clusters.radius[rows]
         self._fits.show(
+            on,
             nodes.scan_in_map(frame, np.column_stack([clusters.centre[rows], foot])),
             np.column_stack([radius, radius, height]),
             colours.by_verdict(clusters.verdict[rows]),
         )
 
-    def _show_markers(self, frame: Frame) -> None:
+    def _show_markers(self, frame: Frame, on: bool) -> None:
         """Show a cylinder around each cluster that receives clicks, because point clouds do not.
 
         Its radius is limited, so that a wide cluster does not cover its neighbours.
@@ -150,7 +146,7 @@ class ScanNodes:
         size = np.column_stack([radius, radius, height])
         if frame.of_cloud:  # candidates without a circle are many
             size[np.isnan(c.radius)] = 0.0
-        self._markers.show(low, size, colours.by_verdict(c.verdict))
+        self._markers.show(on, low, size, colours.by_verdict(c.verdict))
         self._axes = (low, low + np.column_stack([np.zeros((len(height), 2)), height]), radius)
 
 
@@ -220,26 +216,25 @@ class VoxelNode:
         self._boxes = Batch(scene, f"{SCAN}/voxels", nodes.box(), opacity=0.5)
         self.count = 0
 
-    def show(self, frame: Frame, size: float, visible: bool) -> None:
+    def show(self, on: bool, frame: Frame, size: float) -> None:
         """Show the voxels that contain filtered points. `count` becomes their number, 0 while nothing is
         shown; at most MOST_VOXELS are drawn.
 
         Args:
+            on: Whether the layer is on; otherwise nothing is computed.
             frame: Results of the scan.
             size: Side of a voxel [m]; 0 shows none.
-            visible: Whether the layer is on.
         """
-        self._boxes.visible = visible
-        if not visible or size <= 0.0:
+        if not on or size <= 0.0:
             self.count = 0
-            self._boxes.show(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+            self._boxes.update(False)
             return
         low = size * np.unique(np.floor(np.asarray(frame.filtered, np.float64) / size), axis=0)
         self.count = len(low)
         drawn = low[:MOST_VOXELS]
         each = np.tile(np.array([colours.VOXELS], dtype=np.uint8), (len(drawn), 1))
         places, yaw = nodes.scan_in_map(frame, drawn), frame.estimate.T_map_base.yaw
-        self._boxes.show(places, np.full((len(drawn), 3), size), each, yaw)
+        self._boxes.show(True, places, np.full((len(drawn), 3), size), each, yaw)
 
 
 Int = NDArray[np.int64]

@@ -80,10 +80,11 @@ class Scene:
         self._frame, self._path = frame, np.asarray(path, dtype=np.float64).reshape(-1, 2)
         if first:
             self._follower.frame_plot(_extent(frame) if frame.of_cloud else 0.0)
+        self._accumulated.take(frame)
         if self.messages > RENEW_AFTER:
             self._renew()
-            return
-        self._show_frame()
+        else:
+            self._draw()
 
     def show_parameters(self, parameters: Parameters, preset_name: str) -> None:
         """Set the widgets to parameters, without a callback.
@@ -100,7 +101,7 @@ class Scene:
         """Show the ground truth; None removes it."""
         self._truth = trees
         with self._server.atomic():
-            self._map.show_truth(trees)
+            self._map.show_truth(trees, self._view)
 
     def select(self, tree: int | None, ring: Ring = None) -> Vector | None:
         """Highlight the selection in place of the one before. It is drawn with the next scan if none is
@@ -115,11 +116,8 @@ class Scene:
             ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
         """
         self._selected, self._ring = tree, ring
-        if self._frame is None:
-            return None
-        with self._server.atomic():  # the scan itself does not change
-            self._map.repaint(self._frame, tree, ring, self._view)
-        return self._map.place_of(self._frame, tree, ring)
+        self._draw()
+        return None if self._frame is None else self._map.place_of(self._frame, tree, ring)
 
     def suit(self, *, cloud: bool) -> None:
         """Choose how points are coloured when a run begins: a whole cloud by height, a scan by verdict. Other
@@ -140,7 +138,7 @@ class Scene:
         return {
             "ground": self._map.ground.faces,
             "voxels": self._voxels.count,
-            "gathered": self._gathered.count,
+            "gathered": len(self._accumulated.points),
             "errors": self._errors.count,
         }
 
@@ -151,7 +149,7 @@ class Scene:
             ParameterError: There is no such choice, or the value is not one of it; nothing changes.
         """
         self._view.choose(name, value)
-        self._repaint()
+        self._draw()
 
     def clear(self) -> None:
         """Remove run, ground truth and selection from the scene. The panel and the choices of the view
@@ -206,7 +204,7 @@ class Scene:
         self._scan = ScanNodes(scene, functools.partial(self._cross, self._on_cluster))
         self._map = MapNodes(scene, functools.partial(self._cross, self._on_tree))
         self._voxels = VoxelNode(scene)
-        self._gathered = MapCloud(scene, self._accumulated)
+        self._gathered = MapCloud(scene)
         self._errors = ErrorNode(scene)
         self._way = WayNode(scene)
 
@@ -215,8 +213,8 @@ class Scene:
         old = self._server
         # Browsers lose their connection when the old server stops, and reconnect to the new one by the proxy.
         self._build()
-        self._map.show_truth(self._truth)
-        self._show_frame()
+        self.show_truth(self._truth)
+        self._draw()
         with silenced():
             old.stop()
 
@@ -232,42 +230,27 @@ class Scene:
         """Height of the robot [m]; 0 before the first scan."""
         return 0.0 if self._frame is None else self._frame.base_z
 
-    def _show_frame(self) -> None:
-        """Send the newest scan in one group of messages; nothing without one."""
-        if self._frame is None:
+    def _draw(self) -> None:
+        """Draw the newest scan with the choices of the view in one group of messages; nothing without one.
+        Each node sends only what changed."""
+        frame, layers = self._frame, self._view.layers
+        if frame is None:
             return
+        parameters = self._parameters
         with self._server.atomic():  # otherwise the points would move before the robot
-            self._grid.visible = not self._frame.of_cloud  # its zero is far below or above the plot
+            self._grid.visible = not frame.of_cloud  # its zero is far below or above the plot
             self._follower.show(self._pose, self._base_z, self._view.follow)
             # First, because the other nodes use the heights of its ground.
-            self._map.show(self._frame, self._selected, self._ring, self._view)
-            self._robot.show(self._frame, self._path, self._view, self._map.ground)
-            self._scan.show(self._frame, self._view, self._map.labelled)
-            self._gathered.show(self._frame, self._view.layers["gathered"])
-            self._show_more(self._frame)
-
-    def _show_more(self, frame: Frame) -> None:
-        """Show the layers that are computed only while they are visible."""
-        size = self._parameters.filters.voxel_size
-        self._voxels.show(frame, size, self._view.layers["voxels"])
-        self._way.show_ahead(frame, self._parameters.obstacles, self._view.layers["way"])
-        if self._view.layers["errors"]:
-            wanted = self._parameters.evaluation
-            self._errors.show_errors(frame.trees, self._truth, self._path, wanted, self._map.ground)
-        else:
-            self._errors.hide()
-
-    def _repaint(self) -> None:
-        """Draw the newest scan after a change of the view; nothing without one."""
-        if self._frame is None:
-            return
-        with self._server.atomic():
-            self._follower.show(self._pose, self._base_z, self._view.follow)
-            self._robot.repaint(self._view)
-            self._map.repaint(self._frame, self._selected, self._ring, self._view)
-            self._scan.repaint(self._frame, self._view, self._map.labelled)
-            self._gathered.repaint(self._view.layers["gathered"])
-            self._show_more(self._frame)
+            self._map.show(frame, self._selected, self._ring, self._view)
+            self._map.show_truth(self._truth, self._view)
+            self._robot.show(frame, self._path, self._view, self._map.ground)
+            self._scan.show(frame, self._view, self._map.labelled)
+            self._gathered.show(layers["gathered"], self._accumulated.points)
+            self._voxels.show(layers["voxels"], frame, parameters.filters.voxel_size)
+            self._way.show_ahead(layers["way"], frame, parameters.obstacles)
+            self._errors.show_errors(
+                layers["errors"], frame, self._truth, self._path, parameters.evaluation, self._map.ground
+            )
 
     # --- callbacks in the thread of viser, passed to the loop -------------------------------------
 

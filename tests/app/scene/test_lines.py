@@ -12,7 +12,7 @@ from app.scene.nodes import CHUNK, LineNode
 
 def drawn(line: LineNode) -> np.ndarray:
     """The points of the line that are visible."""
-    pieces = [chunk.points for chunk in line._chunks if chunk.visible]
+    pieces = [chunk.node.points for chunk in line._chunks if chunk.node.visible]
     if not pieces:
         return np.zeros((0, 2))
     segments = np.concatenate(pieces)
@@ -27,7 +27,7 @@ async def test_a_line_is_what_was_shown_last(scene: Scene):
         for turn, length in enumerate(lengths):
             along = np.arange(float(length))
             points = np.column_stack([along, along * (turn if bent else 1)])
-            line.show(points)
+            line.show(True, points)
         if len(points) > 1:
             np.testing.assert_allclose(drawn(line), points, rtol=1e-6)
         else:
@@ -39,9 +39,9 @@ async def test_a_line_is_what_was_shown_last(scene: Scene):
 async def test_a_step_forward_sends_only_the_last_piece(scene: Scene):
     line = LineNode(scene._server.scene, "/step", (1, 2, 3), 0.0)
     points = np.column_stack([np.arange(1000.0), np.zeros(1000)])
-    line.show(points[:700])
+    line.show(True, points[:700])
     before = scene.messages
-    line.show(points[:701])
+    line.show(True, points[:701])
     assert scene.messages - before == 1
 
 

@@ -10,7 +10,6 @@ import pytest
 
 from app.scene import Scene
 from app.scene import scene as scene_module
-from app.scene.nodes import CloudNode
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import TruthTrees
 from tests.app.scene.frames import make_frame, make_trees
@@ -176,10 +175,6 @@ def test_selection_is_marked_and_named(scene: Scene):
 def test_a_click_or_a_look_around_sends_no_points(scene: Scene, monkeypatch: pytest.MonkeyPatch):
     scene.show(make_frame(0), PATH[:1])
     touched: list[str] = []
-    monkeypatch.setattr(CloudNode, "show", lambda self, *_: touched.append(self.node.name))
-    scene.select(7)
-    assert touched == []
-    monkeypatch.undo()
     handle = type(node(scene, "/world/robot/scan/raw"))
     queue = handle._queue_update
 
@@ -189,6 +184,7 @@ def test_a_click_or_a_look_around_sends_no_points(scene: Scene, monkeypatch: pyt
 
     monkeypatch.setattr(handle, "_queue_update", remember)
     scene.choose("follow", False)
+    scene.select(7)
     assert touched == []
     scene.choose("colour_by", "height")
     assert "points" not in touched
