@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -27,9 +28,8 @@ Float = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 
-# Maximum age of a record while the run plays.
+# Pause between two writes of a record, so that a slider or a fast replay costs few transactions.
 _PAUSE_S = 5.0
-_REVISE_PAUSE_S = 1.0
 MOST_PATH_POINTS = 3000
 
 
@@ -54,7 +54,17 @@ class RunState:
 
 @dataclass(slots=True, eq=False)
 class _Page:
-    """Record of one run; `best` is the state at the farthest scan that was reached."""
+    """Record of one run.
+
+    Attributes:
+        beginning, all_scans: The opened run, and the number of its scans; None if unknown.
+        record: Number of the record; None before it is written.
+        best: State at the farthest scan that was reached; newest: state that was shown last.
+        dirty: Whether `best` is not written.
+        changes: Changes of parameters that are not written.
+        writer: Task that writes the record.
+        ended: Set when the run is left.
+    """
 
     beginning: NewRun
     all_scans: int | None
@@ -63,9 +73,8 @@ class _Page:
     newest: RunState | None = None
     dirty: bool = False
     changes: list[Change] = field(default_factory=list)
-    reviser: asyncio.Task[None] | None = None
-    wake: asyncio.Event = field(default_factory=asyncio.Event)
-    lock: asyncio.Lock = field(default_factory=asyncio.Lock)
+    writer: asyncio.Task[None] | None = None
+    ended: asyncio.Event = field(default_factory=asyncio.Event)
 
 
 class RunRecorder:
@@ -79,7 +88,6 @@ class RunRecorder:
     def __init__(self, store: AsyncStore) -> None:
         self._store = store
         self._page: _Page | None = None
-        self._writer: asyncio.Task[None] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._problem = ""
 
@@ -110,15 +118,9 @@ class RunRecorder:
     def leave(self) -> None:
         """Write pending changes in the background and end the record, because the run is closed."""
         page, self._page = self._page, None
-        if self._writer is not None:
-            self._writer.cancel()
-            self._writer = None
-        if page is not None and page.changes:
-            page.wake.set()
-            if page.reviser is None or page.reviser.done():
-                page.reviser = self._start(self._revise_soon(page))
-        if page is not None and page.dirty:
-            self._start(self._write(page))
+        if page is not None:
+            page.ended.set()
+            self._soon(page)
 
     def shown(self, state: RunState) -> None:
         """Record a shown scan. The scan with the largest index counts, so that stepping back keeps the map.
@@ -157,8 +159,7 @@ class RunRecorder:
         if page is None or page.newest is None or not changes:
             return
         page.changes.append(Change(revision, page.newest.shown.time_s, who, preset, changes))
-        if page.reviser is None or page.reviser.done():
-            page.reviser = self._start(self._revise_soon(page))
+        self._soon(page)
 
     async def close(self) -> None:
         """Write pending changes and wait until they are stored."""
@@ -168,75 +169,56 @@ class RunRecorder:
 
     def _soon(self, page: _Page) -> None:
         """Start to write the record, unless it is being written."""
-        if self._writer is None or self._writer.done():
-            self._writer = asyncio.create_task(self._write_on(page), name="run_recorder")
+        if page.writer is None or page.writer.done():
+            page.writer = asyncio.create_task(self._write_on(page), name="run_recorder")
+            self._tasks.add(page.writer)
+            page.writer.add_done_callback(self._tasks.discard)
 
     async def _write_on(self, page: _Page) -> None:
-        """Write the record every 5 s as long as it changes."""
-        while page.dirty:
-            await asyncio.shield(self._start(self._write(page)))
-            await asyncio.sleep(_PAUSE_S)
-
-    async def _revise_soon(self, page: _Page) -> None:
-        """Write the parameter changes of a record after a pause, so that a slider costs few transactions; the
-        record is created if necessary. Changes that the store refuses stay pending until the next change or
-        the end of the run."""
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(page.wake.wait(), _REVISE_PAUSE_S)
-        if page.record is None:
-            await self._write(page)
-        record = page.record
-        if record is None or not page.changes:
-            return
-        changes, page.changes = page.changes, []
-        try:
-            await self._ask(lambda store: store.book.revise_all(record, changes))
-        except StemmapError:  # the error was logged
-            page.changes = changes + page.changes
+        """Write the record every 5 s as long as it changes, and once more when the run is left. What the
+        store refuses is written with the next attempt."""
+        while page.dirty or page.changes:
+            is_last = page.ended.is_set()
+            with contextlib.suppress(StemmapError):  # the error was logged
+                await self._write(page)
+            if is_last:
+                return
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(page.ended.wait(), _PAUSE_S)
 
     async def _write(self, page: _Page) -> None:
-        """Write the best state of a record, creating the record if necessary. After an error of the store it
-        stays pending."""
-        async with page.lock:
-            state, page.dirty = page.best, False
-            if state is None:
-                return
+        """Write the best state of a record and the changes of parameters, creating the record if necessary;
+        raises StemmapError if the store refuses, then they stay pending."""
+        state, changes = page.best, page.changes
+        page.dirty, page.changes = False, []
+        if state is None:
+            return
 
-            def work(store: Store) -> int:
-                figures = _figures_of(state, page.all_scans)
-                if page.record is None:
-                    return store.book.begin(page.beginning, figures)
+        def work(store: Store) -> None:
+            figures = _figures_of(state, page.all_scans)
+            if page.record is None:
+                page.record = store.book.begin(page.beginning, figures)
+            else:
                 store.book.update(page.record, figures)
-                return page.record
+            if changes:
+                store.book.revise_all(page.record, changes)
 
-            try:
-                page.record = await self._ask(work)
-            except StemmapError:  # the error was logged; the rest remains pending
-                page.dirty = True
+        try:
+            await self._ask(work)
+        except StemmapError:
+            page.dirty, page.changes = True, changes + page.changes
+            raise
 
-    async def _ask(self, work: Any) -> Any:  # noqa: ANN401 - as the store's
+    async def _ask(self, work: Callable[[Store], None]) -> None:
         """Run a function of the store; an error is logged, unless it equals the one before, and raised."""
         try:
-            done = await self._store.ask(work)
+            await self._store.ask(work)
         except StemmapError as error:
             if str(error) != self._problem:  # log once, not every five seconds
                 _log.warning("the run is not recorded: %s", error)
             self._problem = str(error)
             raise
         self._problem = ""
-        return done
-
-    def _start(self, work: Any) -> asyncio.Task[None]:  # noqa: ANN401 - any coroutine
-        """Run a coroutine as a task for which `close` waits; its StemmapErrors are dropped."""
-
-        async def quiet() -> None:
-            with contextlib.suppress(StemmapError):  # the error was logged
-                await work
-
-        task = asyncio.create_task(quiet(), name="run_recorder entry")
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-        return task
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:

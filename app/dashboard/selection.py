@@ -40,6 +40,13 @@ class NoStoryError(StemmapError):
     """The requested story, comparison or picture does not exist."""
 
 
+class NothingMappedError(NoStoryError):
+    """A request about the shown scan before the first scan."""
+
+    def __init__(self) -> None:
+        super().__init__("nothing is mapped yet", remedy="Press play, or open a run")
+
+
 class WorkerClient:
     """Sends questions about the shown run to the worker and waits for the answers.
 
@@ -72,7 +79,7 @@ class WorkerClient:
         """
         run = self._shown_run()
         if scan is None:
-            raise _nothing_mapped()
+            raise NothingMappedError
         answer = await self._ask(AskCluster(next(self._tickets), run, scan, cluster))
         return _known(answer.cluster)
 
@@ -106,7 +113,7 @@ class WorkerClient:
         """Return the number of the shown run; raises NoStoryError if there is none."""
         run = self._run()
         if run is None:
-            raise _nothing_mapped()
+            raise NothingMappedError
         return run
 
     async def _ask(self, question: Question) -> Answer:
@@ -136,11 +143,6 @@ def _known(found: T | None) -> T:
     if found is None:
         raise NoStoryError("there is no answer")
     return found
-
-
-def _nothing_mapped() -> NoStoryError:
-    """Return the error of a request before the first scan."""
-    return NoStoryError("nothing is mapped yet", remedy="Press play, or open a run")
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.dashboard.parameters import ParameterState
+from app.dashboard.selection import NoStoryError, NothingMappedError
 from app.store.async_store import AsyncStore, StoreBusyError
 from app.store.forests import Forests
 from app.store.records import UnknownError
@@ -33,7 +34,7 @@ from app.web.routes import annotations as annotation_routes
 from app.web.routes import page, parameters, results, run, runs, sockets, tuning
 from app.web.routes.access import Limits, TooManyRequestsError
 from app.web.routes.run import NotPermittedError
-from app.web.uploads import Uploads
+from app.web.uploads import UploadError, Uploads
 from app.worker.protocol import Open, WorkerBusyError
 from pipeline.errors import ParameterError, StemmapError
 
@@ -194,6 +195,8 @@ def _answer_errors(app: FastAPI) -> None:
         StoreBusyError: 503,
         ParameterError: 422,
         UnknownError: 404,
+        NothingMappedError: 409,
+        NoStoryError: 404,
         StemmapError: 409,
     }
 
@@ -201,6 +204,8 @@ def _answer_errors(app: FastAPI) -> None:
     async def for_people(_: Request, error: Exception) -> Response:
         assert isinstance(error, StemmapError)  # noqa: S101 - the handler is registered for it
         status = next(statuses[t] for t in type(error).__mro__ if t in statuses)
+        if isinstance(error, UploadError):
+            status = error.status
         return failure_reply(status, error, _RETRY_AFTER_S if status in (429, 503) else None)
 
     @app.exception_handler(RequestValidationError)

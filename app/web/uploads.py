@@ -19,7 +19,7 @@ from starlette.responses import Response
 from app.sources import inspection
 from app.store.async_store import AsyncStore
 from app.web.auth import UPLOADS
-from app.web.responses import failure_reply, json_reply
+from app.web.responses import json_reply
 from pipeline.errors import StemmapError
 
 # Free disk space that is reserved for the system and for annotations.
@@ -87,10 +87,7 @@ class Uploads:
 
     async def _take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
         """Receive a file; as `take`, without the limit of simultaneous uploads."""
-        free = await asyncio.to_thread(self._free)
-        room = max(
-            0, min(self.limit, free - self._awaited)
-        )  # includes space reserved by other uploads in the meantime
+        room = await asyncio.to_thread(self.room)
         if size > room:
             why = "the limit" if size > self.limit else "what the disk has free"
             raise UploadError(
@@ -249,10 +246,7 @@ async def room(request: Request) -> Response:
     upload [bytes], so that a browser does not send one that is refused. 409 or 507 without a usable folder.
     """
     uploads: Uploads = request.app.state.uploads
-    try:
-        return json_reply({"room": await asyncio.to_thread(uploads.room), "limit": uploads.limit})
-    except UploadError as error:
-        return failure_reply(error.status, error)
+    return json_reply({"room": await asyncio.to_thread(uploads.room), "limit": uploads.limit})
 
 
 @router.post(UPLOADS)
@@ -262,17 +256,14 @@ async def upload(request: Request, name: Annotated[str, Query(min_length=1, max_
     application/octet-stream (422), without a length (411), and where the file cannot be stored."""
     uploads: Uploads = request.app.state.uploads
     kind = request.headers.get("content-type", "")
-    try:
-        if kind != "application/octet-stream":  # what a form of another page cannot send
-            raise UploadError(
-                422, "the body must be the file", where="Content-Type", remedy="Send application/octet-stream"
-            )
-        size = request.headers.get("content-length", "")
-        if not size.isdecimal():
-            raise UploadError(411, "the length of the file is missing", where="Content-Length")
-        return json_reply(await uploads.take(name, int(size), _pieces(request)), 201)
-    except UploadError as error:
-        return failure_reply(error.status, error)
+    if kind != "application/octet-stream":  # what a form of another page cannot send
+        raise UploadError(
+            422, "the body must be the file", where="Content-Type", remedy="Send application/octet-stream"
+        )
+    size = request.headers.get("content-length", "")
+    if not size.isdecimal():
+        raise UploadError(411, "the length of the file is missing", where="Content-Length")
+    return json_reply(await uploads.take(name, int(size), _pieces(request)), 201)
 
 
 async def _pieces(request: Request) -> AsyncIterator[bytes]:

@@ -80,7 +80,6 @@ class WorkerProcess:
         self._codec_in, self._codec_out = protocol.from_worker(), protocol.to_worker()
         self._process: asyncio.subprocess.Process | None = None
         self._task: asyncio.Task[None] | None = None
-        self._closing = False
         self._open: protocol.Open | None = None
         self._settings: dict[type, protocol.ToWorker] = {}
         self._pauses_s = _PAUSES_S
@@ -90,7 +89,6 @@ class WorkerProcess:
         self._opening_limit_s = opening_limit_s
         self._opening: Literal["", "requested", "begun"] = ""
         self._opening_since = 0.0
-        self._opening_timer: asyncio.TimerHandle | None = None
         self._replaced = False
         self._gave_up = False
         self._silence_limit_s = silence_limit_s
@@ -138,8 +136,6 @@ class WorkerProcess:
     async def close(self) -> None:
         """Stop the supervision, ask the worker to end, and kill it if it does not within 0.7 s (10 s for a
         live run)."""
-        self._closing = True
-        self._stop_opening_timer()
         await cancel(self._task)
         await self._end()
 
@@ -183,7 +179,7 @@ class WorkerProcess:
         """Pass on the messages of the worker and restart it whenever it ends, until the task is cancelled."""
         while True:
             reason = await self._listen()
-            self._stop_opening_timer()
+            self._opening = ""
             await self._end()
             if self._replaced:  # another source was requested for while one did not finish opening
                 self._replaced = False
@@ -203,48 +199,26 @@ class WorkerProcess:
     # --- a source that does not finish opening ---------------------------------------------------
 
     def _await_opening(self) -> None:
-        """Start the time limit within which the source must be opened or refused."""
+        """Note that the source must be opened or refused in time."""
         self._opening, self._opening_since = "requested", self._clock()
-        self._restart_opening_timer()
-
-    def _restart_opening_timer(self) -> None:
-        """Start the time limit of the opening from now on."""
-        if self._opening_timer is not None:
-            self._opening_timer.cancel()
-        loop = asyncio.get_running_loop()
-        self._opening_timer = loop.call_later(self._opening_limit_s, self._give_up_opening)
-
-    def _stop_opening_timer(self) -> None:
-        """End the time limit: no source is being opened."""
-        self._opening = ""
-        if self._opening_timer is not None:
-            self._opening_timer.cancel()
-            self._opening_timer = None
 
     def _note_opening(self, message: protocol.FromWorker) -> None:
         """Update from a message of the worker whether the source is still being opened."""
         if not self._opening or self._open is None:
             return
         if isinstance(message, protocol.Opened) and message.requested in ("", self._open.uri):
-            self._stop_opening_timer()
+            self._opening = ""
         elif isinstance(message, protocol.Report) and message.status.source == self._open.uri:
             if message.status.state == "starting":
                 self._opening = "begun"
-                self._restart_opening_timer()
             elif self._opening == "begun":
-                self._stop_opening_timer()
-
-    def _give_up_opening(self) -> None:
-        """Kill the worker because the source did not finish opening in time."""
-        self._opening_timer = None
-        self._gave_up = True
-        self._kill()
+                self._opening = ""
 
     def _kill_while_opening(self) -> None:
         """Kill the worker because another source is requested; it is restarted at once."""
         self._replaced = True
         self._wanted.set()
-        self._stop_opening_timer()
+        self._opening = ""
         self._kill()
 
     def _kill(self) -> None:
@@ -273,6 +247,7 @@ class WorkerProcess:
             return exit_reason(await process.wait())
         except protocol.WireError as error:
             return f"protocol error: {error}"
+        self._gave_up = bool(self._opening)
         self._kill()
         return "it did not answer"
 
@@ -306,10 +281,10 @@ class WorkerProcess:
 
     def _limit_s(self) -> float | None:
         """Return the longest time [s] until the next message; None where no message is due."""
-        if self._opening or self._open is None:
-            return None  # the opening has a limit of its own
         status = self._status
-        if status.state == "starting" or status.compiling_since_s is not None:
+        if self._open is None:
+            return None
+        if self._opening or status.state == "starting" or status.compiling_since_s is not None:
             return self._opening_limit_s
         if status.state == "failed":  # Play opens the source again
             return self._opening_limit_s if self._has_command else None

@@ -7,13 +7,13 @@ from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
-from fastapi import APIRouter, Path, Query
+from fastapi import APIRouter, Depends, Path, Query
 from starlette.responses import Response
 
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.payload import comparison_payload, doubts_of, packed, stages_payload, trees_payload
 from app.dashboard.scores import pairs_payload
-from app.dashboard.selection import NoStoryError
+from app.dashboard.selection import NothingMappedError
 from app.web.responses import (
     LARGEST_NUMBER,
     Body,
@@ -26,16 +26,25 @@ from app.web.responses import (
     json_reply,
 )
 from app.web.routes.access import Bounds, Dash, ViewerTurn
-from app.worker.protocol import CloudFrame
+from app.worker.protocol import CloudFrame, Shown
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
-from pipeline.types.records import HeightMap, Trees
-from pipeline.types.records import Path as RobotPath
+from pipeline.types.records import Trees
 
 router = APIRouter(prefix="/api")
 
 _Scan = Annotated[int | None, Query(ge=0, le=LARGEST_NUMBER)]
 _Stamp = Annotated[int, Path(ge=-(2**63), le=2**63 - 1)]
+
+
+def newest_scan(dashboard: Dash) -> Shown:
+    """Return the newest results; NothingMappedError before the first scan."""
+    if dashboard.shown is None:
+        raise NothingMappedError
+    return dashboard.shown
+
+
+NewestScan = Annotated[Shown, Depends(newest_scan)]
 
 
 class _Compare(Body):
@@ -84,26 +93,13 @@ def path_table(dashboard: Dash) -> Response:
 
 @router.get("/export/{suffix}", dependencies=[ViewerTurn])
 async def export(
-    suffix: Literal["gpkg", "shp", "geojson", "dxf", "xlsx", "tif"], dashboard: Dash
+    suffix: Literal["gpkg", "shp", "geojson", "dxf", "xlsx", "tif"], dashboard: Dash, shown: NewestScan
 ) -> Response:
     """Return the map as a file for GIS, CAD or spreadsheets, in local coordinates or those of a whole cloud;
     a Shapefile as zip archive. For a run of scans, the bytes are those of `stemmap export` for a run with the
     same map. 409 before the first map; 422 if a package is missing or the map lacks what the format shows."""
-    shown, path = dashboard.shown, dashboard.path
-    if shown is None or path is None:
-        return _nothing_mapped()
-    uri = dashboard.source.uri
     try:
-        content, name = await asyncio.to_thread(
-            _exported,
-            uri,
-            shown.frame.trees,
-            path,
-            shown.frame.ground,
-            dashboard.start_ns,
-            f".{suffix}",
-            dashboard.status.cloud,
-        )
+        content, name = await asyncio.to_thread(_exported, dashboard, shown, f".{suffix}")
     except StemmapError as error:
         return failure_reply(422, error)
     headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
@@ -116,29 +112,24 @@ def _in_file(trees: Trees, cloud: CloudFrame | None) -> Trees:
     return trees if cloud is None else replace(trees, position=trees.position + cloud.offset[:2])
 
 
-def _exported(
-    uri: str,
-    trees: Trees,
-    path: RobotPath,
-    ground: HeightMap | None,
-    start_ns: int,
-    suffix: str,
-    cloud: CloudFrame | None,
-) -> tuple[bytes, str]:
-    """Return the bytes and the name of the exported file, see `export`."""
+def _exported(dashboard: Dashboard, shown: Shown, suffix: str) -> tuple[bytes, str]:
+    """Return the bytes and the name of the exported file, see `export`; NothingMappedError without a path."""
     from app.batch.export import export_bytes, for_export
     from app.batch.georeference import MapFrame
     from app.batch.run_folder import as_written
     from pipeline.io.result_files import terrain_rows
 
+    path, ground, cloud = dashboard.path, shown.frame.ground, dashboard.status.cloud
+    if path is None:
+        raise NothingMappedError
     cells = [] if ground is None else [[float(cell) for cell in row[:3]] for row in terrain_rows(ground)]
     terrain = np.array(cells, np.float64).reshape(-1, 3)
     frame = MapFrame()
     if cloud is not None:
         terrain += cloud.offset
         frame = MapFrame(cloud.crs, how="the cloud's own" if cloud.crs else "")
-    written = as_written(_in_file(trees, cloud), path, start_ns)
-    return export_bytes(for_export(uri, *written, terrain, frame), suffix)
+    written = as_written(_in_file(shown.frame.trees, cloud), path, dashboard.start_ns)
+    return export_bytes(for_export(dashboard.source.uri, *written, terrain, frame), suffix)
 
 
 @router.get("/evaluation")
@@ -181,29 +172,21 @@ async def cluster_story(number: Number, dashboard: Dash, scan: _Scan = None) -> 
         dashboard: The dashboard.
         scan: Index of a recent scan; by default the newest.
     """
-    try:
-        return json_reply(await dashboard.selector.story(scan, number))
-    except NoStoryError as error:
-        return failure_reply(404, error)
+    return json_reply(await dashboard.selector.story(scan, number))
 
 
 @router.get("/story/tree/{number}", dependencies=[ViewerTurn])
 async def tree_story(number: Number, dashboard: Dash) -> Response:
     """Return votes, DBH, coverage and history of a tree by its number (`TreeStory`); 404 if the map has no
     such tree, 503 if the worker is busy."""
-    try:
-        return json_reply(await dashboard.worker_client.tree(number))
-    except NoStoryError as error:
-        return failure_reply(404, error)
+    return json_reply(await dashboard.worker_client.tree(number))
 
 
 @router.get("/camera", dependencies=[ViewerTurn])
-async def camera(dashboard: Dash) -> Response:
+async def camera(dashboard: Dash, shown: NewestScan) -> Response:
     """Return the stamp of the camera picture of the current scan, and the boxes of trees and clusters in it,
-    see `CameraView.look`; 409 before the first map and without a picture, 503 if the worker is busy."""
-    if dashboard.shown is None:
-        return _nothing_mapped()
-    return json_reply(await dashboard.camera.look(dashboard.shown.frame, dashboard.path))
+    see `CameraView.look`; 404 without a picture, 409 before the first map, 503 if the worker is busy."""
+    return json_reply(await dashboard.camera.look(shown.frame, dashboard.path))
 
 
 @router.get("/camera/{stamp_ns}.jpg")
@@ -217,36 +200,27 @@ async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
 
 
 @router.get("/camera/tree/{number}.jpg", dependencies=[ViewerTurn])
-async def tree_picture(number: Number, dashboard: Dash) -> Response:
+async def tree_picture(number: Number, dashboard: Dash, shown: NewestScan) -> Response:
     """Return the part of the camera picture that shows a tree best, as JPEG; 404 if no picture shows it, 409
     before the first map, 503 if the worker is busy."""
-    if dashboard.shown is None:
-        return _nothing_mapped()
-    try:
-        content = await dashboard.camera.tree(number, dashboard.shown.frame.trees, dashboard.path)
-    except NoStoryError as error:
-        return failure_reply(404, error)
+    content = await dashboard.camera.tree(number, shown.frame.trees, dashboard.path)
     return Response(content, 200, {"Cache-Control": "no-store"}, media_type="image/jpeg")
 
 
-@router.get("/section", dependencies=[ViewerTurn])
+@router.get("/section", dependencies=[ViewerTurn, Depends(newest_scan)])
 async def section(dashboard: Dash) -> Response:
     """Return the accumulated points at breast height seen from above as a binary block: side of a cell and
     lower left corner of cell (0, 0) [m], and the occupied cells along x and y; 409 before the first map, 503
     if the worker is busy."""
-    if dashboard.shown is None:
-        return _nothing_mapped()
     found = await dashboard.worker_client.section()
     return block_reply(packed({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
 
 
 @router.get("/stages", dependencies=[ViewerTurn])
-async def stages(dashboard: Dash) -> Response:
+async def stages(shown: NewestScan) -> Response:
     """Return the points of the current scan, stage by stage (Fig. 3), as a binary block; 409 before the first
     map."""
-    if dashboard.shown is None:
-        return _nothing_mapped()
-    return block_reply(await asyncio.to_thread(stages_payload, dashboard.shown.frame))
+    return block_reply(await asyncio.to_thread(stages_payload, shown.frame))
 
 
 @router.post("/compare", dependencies=[ViewerTurn])
@@ -268,8 +242,3 @@ def _parameters_of(dashboard: Dashboard, name: str) -> Parameters:
     """Return the parameters of a preset or saved set; those in force for "". Raises UnknownError for an
     unknown name."""
     return dashboard.sets.named(name)[1] if name else dashboard.parameters.parameters
-
-
-def _nothing_mapped() -> Response:
-    """Return 409 for a request before the first scan."""
-    return error_reply(409, "nothing is mapped yet", remedy="Press play, or open a run")

@@ -26,6 +26,9 @@ class RefusingStore:
             raise StemmapError("the disk is full")
         return function(SimpleNamespace(book=self))
 
+    def update(self, _record: int, _figures: Any) -> None:
+        pass
+
     def revise_all(self, _record: int, changes: list[Any]) -> None:
         self.written += changes
 
@@ -34,14 +37,15 @@ def recorder_of(store: RefusingStore) -> RunRecorder:
     """A recorder of an open run that has a record and has shown a scan."""
     recorder = RunRecorder(cast(Any, store))
     page = run_recorder._Page(cast(Any, None), None, record=1)
-    page.newest = cast(Any, SimpleNamespace(shown=SimpleNamespace(time_s=2.0)))
+    page.best = page.newest = cast(Any, SimpleNamespace(shown=SimpleNamespace(time_s=2.0)))
     recorder._page = page
     return recorder
 
 
 @pytest.mark.parametrize("refusals", [0, 1, 2])
 def test_parameter_changes_that_the_store_refuses_are_written_later(refusals, monkeypatch):
-    monkeypatch.setattr(run_recorder, "_REVISE_PAUSE_S", 0.0)
+    monkeypatch.setattr(run_recorder, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(run_recorder, "_figures_of", lambda *_: None)
     store = RefusingStore(refusals)
 
     async def drive() -> None:

@@ -244,7 +244,7 @@ async def test_the_page_asks_for_the_picture_and_its_marks(both: Running) -> Non
     assert jpeg.headers["content-type"] == "image/jpeg"
     assert Image.open(io.BytesIO(jpeg.content)).size == (960, 540)
     bad = await client.get("/api/camera")
-    assert bad.status_code == 409
+    assert bad.status_code == 404
     assert "cannot be decoded" in bad.text
     assert (await client.get("/api/camera/5260000000.jpg")).status_code == 404
     unplaced = (await client.get("/api/camera")).json()
