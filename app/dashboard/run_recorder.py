@@ -197,7 +197,7 @@ class RunRecorder:
         def work(store: Store) -> None:
             figures = _figures_of(state, page.all_scans)
             if page.record is None:
-                page.record = store.book.begin(page.beginning, figures)
+                page.record = store.book.begin(_named(page.beginning, store), figures)
             else:
                 store.book.update(page.record, figures)
             if changes:
@@ -219,6 +219,12 @@ class RunRecorder:
             self._problem = str(error)
             raise
         self._problem = ""
+
+
+def _named(beginning: NewRun, store: Store) -> NewRun:
+    """Return the start of a run; that of an uploaded file has the name that the file had before."""
+    uploaded = store.book.uploads().get(beginning.name)
+    return beginning if uploaded is None else replace(beginning, name=uploaded["name"])
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:

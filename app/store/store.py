@@ -270,9 +270,13 @@ def _revise(connection: Connection, record: int, change: Change, now: int) -> No
     last = connection.execute(query.limit(1)).one_or_none()
     values = {"revision": change.revision, "at_ns": now, "time_s": change.time_s, "preset": change.preset}
     if last is not None and _is_one_move(last, change, now):
-        changes = {name: [last.changes[name][0], after] for name, (_, after) in change.changes.items()}
+        changed = {name: [last.changes[name][0], after] for name, (_, after) in change.changes.items()}
+        changes = {name: [before, after] for name, (before, after) in changed.items() if before != after}
         same = _revisions.c.id == last.id
-        connection.execute(update(_revisions).where(same).values(**values, changes=changes))
+        if changes:
+            connection.execute(update(_revisions).where(same).values(**values, changes=changes))
+        else:  # the slider is back where it was
+            connection.execute(delete(_revisions).where(same))
         return
     inserted = {"record": record, "who": change.who, "changes": change.changes}
     connection.execute(insert(_revisions).values(**values, **inserted))

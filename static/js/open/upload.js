@@ -4,7 +4,7 @@ import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital, count } from "../core/format.js";
 
-const SHOWN_FOR = 8000; // [ms] of the message after an upload
+const SHOWN_FOR = 8000; // [ms] of a message that is no error
 let sending = null; // request in progress
 const size = (bytes) => (bytes >= 1e9 ? `${(bytes / 1e9).toFixed(2)} GB` : bytes >= 1e6 ? `${(bytes / 1e6).toFixed(1)} MB` : `${Math.ceil(bytes / 1e3)} kB`);
 
@@ -55,6 +55,7 @@ function say(text, error = true) {
   const made = box();
   made.append(el("p", { class: error ? "error" : "", role: error ? "alert" : "status", text }),
     el("div", { class: "row end" }, el("button", { type: "button", class: "small", text: "Close", onclick: () => made.remove() })));
+  if (!error) setTimeout(() => made.remove(), SHOWN_FOR);
 }
 
 async function send(file, done) {
@@ -87,7 +88,6 @@ async function finish(request, file, made, done) {
   if (request.status === 201) {
     const answer = JSON.parse(request.responseText);
     say(`${answer.name} was uploaded (${answer.kind}).`, false);
-    setTimeout(() => byId("upload")?.querySelector("[role=status]") && byId("upload").remove(), SHOWN_FOR);
     try {
       await done(answer);
     } catch (error) {

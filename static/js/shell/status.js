@@ -22,7 +22,7 @@ const FIGURES = {
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  sigma: ["pose sigma", "cm", () => [state.map ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
+  sigma: ["pose sigma", "cm", (s) => [state.map && s.health !== "static" ? figure(100 * state.map.sigma_xy) : NONE], "minor"], // a pose that was never tested has none
   f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
 const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
@@ -57,6 +57,7 @@ function reason({ health }) {
 function healthFigures() {
   const h = state.map?.health;
   if (!h) return "";
+  if (state.status.health === "static") return SOON.static;
   return [h.reason && `${h.state}: ${h.reason}`, `N_eff ${figure(h.n_eff)}, ${h.ancestors} ancestors`,
     `${h.detections} detections, ${figure(h.recognised)} associated, ${figure(h.ambiguous)} ambiguous`,
     `normalised innovation ${figure(h.innovation)} (1 expected)`, `pose sigma ${figure(100 * h.sigma_xy_m)} cm, ${figure(h.sigma_yaw_deg)}°`,

@@ -478,7 +478,7 @@ def dashboard_app(both: Running) -> Any:
 async def test_stories_are_told_and_refused_in_words(both: Running) -> None:
     client, dashboard = both
     refused = await client.get("/api/story/tree/3")
-    assert refused.status_code == 404
+    assert refused.status_code == 409
     assert "nothing is mapped yet" in refused.json()["error"]["what"]
     await show(dashboard)
     worker_client = asyncio.create_task(client.get("/api/story/cluster/4?scan=231"))
