@@ -242,7 +242,7 @@ class ResultReceiver:
             self._known.add(publisher.topic)
             number = len(self._topics) + 1
             self._topics[number] = found
-            self._link.subscribe([Channel(number, publisher.topic, publisher.msgtype, "cdr", "", "", 0)])
+            self._link.subscribe([Channel(number, publisher.topic, publisher.msgtype, "cdr")])
 
     def take(self, now_s: float) -> None:
         """Read all messages that arrived into the results of their robots; `now_s` is the present time [s]

@@ -105,9 +105,7 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
     transforms = sorted({p.topic: p for p in mine if p.msgtype == TRANSFORMS}.values(), key=lambda p: p.topic)
     chosen = [p for p in (scan, odometry, imu, gnss, pose, *transforms) if p is not None]
     camera = _camera(mine, topics, where)
-    channels = tuple(
-        Channel(k, p.topic, p.msgtype, "cdr", "", "", 0) for k, p in enumerate([*chosen, *camera], 1)
-    )
+    channels = tuple(Channel(k, p.topic, p.msgtype, "cdr") for k, p in enumerate([*chosen, *camera], 1))
     warnings = tuple(_warnings(scans, scan, robot, named))
     return Choice(scan.robot, channels[: len(chosen)], warnings, channels[len(chosen) :])
 
@@ -240,7 +238,7 @@ def countable(publishers: Sequence[Publisher], most: int) -> list[Channel]:
         most: Maximum number of publishers that are considered.
     """
     return [
-        Channel(k, each.topic, each.msgtype, "cdr", "", "", 0)
+        Channel(k, each.topic, each.msgtype, "cdr")
         for k, each in enumerate(publishers[:most])
         if each.msgtype in READ_TYPES
     ]

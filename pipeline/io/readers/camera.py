@@ -13,7 +13,7 @@ from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers.base import FileSource
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import header_stamp
-from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, MessageDecoder
+from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, decode
 from pipeline.io.readers.transforms import TransformTree, frame_name
 from pipeline.types.records import Bool, Int
 
@@ -75,13 +75,13 @@ class Picture:
 
 
 def find_camera(
-    container: Container, decoder: MessageDecoder, tree: TransformTree, base: str, topic: str
+    container: Container, tree: TransformTree, base: str, topic: str
 ) -> tuple[Camera | None, str]:
     """Return the camera of a topic and "", or None and the reason. Of the CameraInfo topics, the one with the
     most similar name is used, and of its first 20 messages the first valid one.
 
     Args:
-        container, decoder: The recording and the decoder of its messages.
+        container: The recording.
         tree: Fixed transforms.
         base: Name of the base frame.
         topic: Topic of its pictures.
@@ -95,7 +95,7 @@ def find_camera(
         return None, f"there is no CameraInfo for {topic}"
     for message in islice(container.messages({near[0].number}, None, {}), 20):
         try:
-            info = decoder.decode(channels[message.channel], message.payload)
+            info = decode(channels[message.channel], message.payload)
             K = np.asarray(info.k if hasattr(info, "k") else info.K, dtype=np.float64).reshape(3, 3)
             width, height = int(info.width), int(info.height)
         except Exception:  # noqa: S112 - whatever the generated decoders of rosbags raise
@@ -118,23 +118,20 @@ def shared_parts(first: str, second: str) -> int:
     return next((k for k, (a, b) in enumerate(parts) if a != b), 99)
 
 
-def picture_of(
-    message: Message, channels: Mapping[int, Channel], decoder: MessageDecoder, stamp_ns: int
-) -> Picture | None:
+def picture_of(message: Message, channels: Mapping[int, Channel], stamp_ns: int) -> Picture | None:
     """Return the picture in a message; None if it cannot be decoded, or its sizes contradict each other or
     exceed BYTES_LIMIT or PIXEL_LIMIT.
 
     Args:
         message: Image or CompressedImage.
         channels: Channels by number.
-        decoder: Decoder of the messages.
         stamp_ns: Time of the picture [ns].
     """
     if len(message.payload) > BYTES_LIMIT:
         return None
     channel = channels[message.channel]
     try:
-        decoded = decoder.decode(channel, message.payload)
+        decoded = decode(channel, message.payload)
         if channel.msgtype == COMPRESSED_IMAGE:
             return Picture(stamp_ns, "", 0, 0, 0, decoded.data.tobytes())
         image: ros2.sensor_msgs__msg__Image = decoded
@@ -207,14 +204,13 @@ def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
 class MessageSource(FileSource):
     """Parts that sources of recorded messages share: losses, pictures, and closing the recording.
 
-    A subclass sets `_picture_channels`, `_decoder`, `_offset_ns` and `_time_of`.
+    A subclass sets `_picture_channels`, `_offset_ns` and `_time_of`.
 
     Args:
         container: The recording; the source closes it.
     """
 
     _picture_channels: Mapping[int, Channel]  # by number
-    _decoder: MessageDecoder
     _offset_ns: int  # time minus time of recording, roughly
 
     def __init__(self, container: Container) -> None:
@@ -256,7 +252,7 @@ class MessageSource(FileSource):
 
     def _picture(self, message: Message, stamp_ns: int) -> Picture | None:
         """Return the picture in a message with this time [ns]; None if it cannot be decoded."""
-        return picture_of(message, self._picture_channels, self._decoder, stamp_ns)
+        return picture_of(message, self._picture_channels, stamp_ns)
 
     def _nearest(self, stamp_ns: int, within_ns: int) -> tuple[int, Message] | None:
         """Return the time [ns] and message of the picture nearest to a time; None if none is within

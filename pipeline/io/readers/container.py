@@ -1,4 +1,4 @@
-"""Recordings of stamped messages: the interface, compressed blocks, and chunked files in the order of time.
+"""Recordings of stamped messages: the interface, an index of all messages, and files of compressed chunks.
 
 The readers of MCAP files and ROS 1 bags are our own. rosbags refuses bags without an index and trusts the
 sizes in a file; mcap decompresses without a limit and gives up at the first damaged record.
@@ -7,27 +7,25 @@ sizes in a file; mcap decompresses without a limit and gives up at the first dam
 from __future__ import annotations
 
 import bz2
-import contextlib
-import heapq
 import struct
 import zlib
-from collections import Counter, deque
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, replace
-from operator import attrgetter
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap.exceptions import McapError
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
+from pipeline.types.records import Int
 
 #: Largest block that is unpacked. Recorders write blocks of 1 to 4 MB; a file of 16 kB can claim 512 MB.
 BLOCK_LIMIT = 256 << 20
-#: Most messages of one chunk, and the memory that a message takes besides its payload [bytes].
-MOST_IN_CHUNK, _MESSAGE_BYTES = 1 << 20, 200
+#: Most records of a chunk without an index, which are counted one by one.
+MOST_IN_CHUNK = 1 << 20
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 #: What damaged records raise when they are parsed.
 DAMAGE = (McapError, struct.error, ValueError, KeyError, OverflowError)
@@ -36,6 +34,8 @@ STRANGE_LIMIT = 1000
 #: A channel whose times of recording go back by more shows that the clock of the recorder was set [ns].
 STEP_BACK_NS = 2_000_000_000
 MOST_STEPS = 100
+#: Number of messages that are left behind `Container.tail_ns`.
+TAIL = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,6 @@ class Channel:
         topic: e.g. "/velodyne_points".
         msgtype: In the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
         encoding: "cdr" (ROS 2), "ros1", or "" when the file does not name it.
-        definition: Text of the message definition, "" when the file has none.
-        definition_format: "ros2msg", "ros1msg", "ros2idl" or "".
         count: Number of messages.
     """
 
@@ -56,9 +54,7 @@ class Channel:
     topic: str
     msgtype: str
     encoding: str
-    definition: str
-    definition_format: str
-    count: int
+    count: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,13 +94,13 @@ class Container:
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield messages in the order of recording. Parts that cannot be read are left out; a payload that
+        """Yield messages in the order of recording. Messages that cannot be read are left out; a payload that
         cannot be unpacked is b"".
 
         Args:
             numbers: Numbers of the channels that are read.
             start_ns: Earlier times of recording [ns] are left out; None for none.
-            losses: Counts the parts that are left out, by reason; changed in place.
+            losses: Counts the messages that are left out, by reason; changed in place.
         """
         raise NotImplementedError
 
@@ -119,6 +115,74 @@ class Container:
 
     def close(self) -> None:
         """Close the files; safe to call twice."""
+
+
+class IndexedContainer(Container):
+    """A recording with an index of all its messages. A format calls `_set_index` and implements
+    `_payload`."""
+
+    #: What is counted for a message whose bytes cannot be read.
+    unreadable: str
+
+    def tail_ns(self, numbers: Collection[int]) -> int:
+        """Return the time of the last message but two of some channels [ns]; 0 without one."""
+        rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
+        return int(self.index[rows[-TAIL:][0], 1]) if len(rows) else 0
+
+    def messages(
+        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
+    ) -> Iterator[Message]:
+        """Yield messages, see `Container.messages`."""
+        first = 0 if start_ns is None else int(np.searchsorted(self.index[:, 1], start_ns))
+        for row in first + np.flatnonzero(np.isin(self.index[first:, 0], list(numbers))):
+            number, log_ns, place = self.index[row].tolist()
+            payload = self._payload(number, place)
+            if payload is None:
+                count_loss(losses, self.unreadable)
+            else:
+                yield Message(number, log_ns, plain(payload))
+
+    def _set_index(self, channels: Iterable[Channel], index: Int) -> None:
+        """Store the channels, with their numbers of messages, and the index.
+
+        Args:
+            channels: All channels.
+            index: Channel, time of recording [ns] and place of each message in the order of the file, int64,
+                shape (N, 3).
+        """
+        self.index = index[np.argsort(index[:, 1], kind="stable")]
+        counts = dict(
+            zip(*(each.tolist() for each in np.unique(index[:, 0], return_counts=True)), strict=True)
+        )
+        self.channels = [replace(channel, count=counts.get(channel.number, 0)) for channel in channels]
+
+    def _payload(self, number: int, place: int) -> bytes | None:
+        """Return the bytes of a message of a channel by its place in the index; None if they cannot be read.
+        Subclasses implement it."""
+        raise NotImplementedError
+
+
+def shift_after_steps(index: Int) -> int:
+    """Shift times behind steps back of the recorder's clock, see `Container.clock_steps`; return the number
+    of steps, at most MOST_STEPS. A step is a time that is more than STEP_BACK_NS earlier than one of its
+    channel before; the times then continue behind all messages before.
+
+    Args:
+        index: As in `IndexedContainer._set_index`; its times are changed in place.
+    """
+    channel, time = index[:, 0], index[:, 1]
+    for steps in range(MOST_STEPS):
+        back = np.zeros(len(time), dtype=np.bool_)
+        for number in np.unique(channel):
+            own = np.flatnonzero(channel == number)
+            back[own[1:]] = time[own[1:]] < np.maximum.accumulate(time[own])[:-1] - STEP_BACK_NS
+        if not back.any():
+            return steps
+        first = int(np.argmax(back))
+        own = time[:first][channel[:first] == channel[first]]
+        due_ns = 2 * own[-1] - own[-2] if len(own) > 1 else own[-1]
+        time[first:] += max(due_ns, time[:first].max()) - time[first]
+    return MOST_STEPS
 
 
 def ros2_type_name(name: str) -> str:
@@ -189,113 +253,80 @@ def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
         raise BrokenChunkError(str(error)) from error
 
 
-def plain(message: Message) -> Message:
-    """Return a message of a ROS 2 recorder without its own compression (zstd): up to BLOCK_LIMIT bytes of
-    payload, b"" if it is damaged. Other messages are returned as they are."""
-    if message.payload[:4] != _ZSTD_MAGIC:
-        return message
+def plain(payload: bytes) -> bytes:
+    """Return a payload without the compression of ROS 2 recorders by message (zstd): up to BLOCK_LIMIT bytes,
+    b"" if it is damaged. Other payloads are returned as they are."""
+    if payload[:4] != _ZSTD_MAGIC:
+        return payload
     try:
-        return replace(message, payload=_unpack_up_to(message.payload, "zstd", BLOCK_LIMIT)[:BLOCK_LIMIT])
+        return _unpack_up_to(payload, "zstd", BLOCK_LIMIT)[:BLOCK_LIMIT]
     except BrokenChunkError:
-        return replace(message, payload=b"")
+        return b""
 
 
 # --- files of chunks -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Chunk:
-    """Position of a run of messages in a file.
+    """A run of records in a file.
 
     Attributes:
         offset, length: Of the packed bytes.
-        start_ns, end_ns: Time of recording of the first and the last message.
         compression: As the file names it, "" for none.
         size: Bytes after unpacking.
         crc: CRC-32 of the unpacked bytes, 0 when the file has none.
-        counts: Number of messages by channel, None when it is not known yet.
-        shifts: What is added to the times of recording [ns], each from a message of the chunk on; `start_ns`
-            and `end_ns` include it.
+        index: Channel, time of recording [ns] and offset in the unpacked bytes of its messages, int64, shape
+            (N, 3) each; empty if the file has no index of the chunk.
     """
 
     offset: int
     length: int
-    start_ns: int
-    end_ns: int
     compression: str
     size: int
-    crc: int
-    counts: dict[int, int] | None
-    shifts: tuple[tuple[int, int], ...] = ((0, 0),)
+    crc: int = 0
+    index: list[Int] = field(default_factory=list)
 
 
-class ChunkedFile(Container):
-    """A file with messages in compressed chunks, indexed by reading the headers of its records.
+class ChunkedFile(IndexedContainer):
+    """A file with messages in compressed chunks.
 
-    The index of the file itself is not needed, so a file that was cut during a recording gives all its whole
-    chunks, and a wrong index does no harm. A format reads the records (`_read_index`, `_parse`).
+    The headers of all records are read, so a file that was cut during a recording gives all its whole chunks.
+    A format reads the records (`_read_index`, `_record`). The place of a message in the index is the number
+    of its chunk (upper 32 bits) and its offset in the unpacked chunk.
 
     Raises:
         SourceError: The file cannot be opened, has another format, or holds no messages that can be read.
     """
 
+    unreadable = "messages in damaged chunks of the recording"
+
     def __init__(self, path: Path) -> None:
-        """Open the file and read its index; chunks without valid counts are unpacked."""
+        """Open the file and read its index; chunks without a valid index are unpacked."""
         self.damage = {}
         self._path = path
         self._known: dict[int, Channel] = {}
         self._chunks: list[Chunk] = []
-        self._unpacked: tuple[int, bytes] = (-1, b"")  # offset and bytes of the last chunk
+        self._unpacked: dict[int, bytes] = {}  # by offset, the chunk that was read last is the last one
         try:
             self._file = path.open("rb", buffering=0)
         except OSError as error:
             raise SourceError(f"cannot open the file: {error.strerror}", where=str(path)) from error
         try:
             self._read_index(self._file.seek(0, 2))
-            # Chunks without an index, and those with channels that are not defined elsewhere, are unpacked.
-            self._chunks = [
-                chunk if chunk.counts is not None and chunk.counts.keys() <= self._known.keys()
-                else self._survey(chunk)
-                for chunk in self._chunks
-            ]  # fmt: skip
+            index = [np.zeros((0, 3), np.int64)]
+            for number, chunk in enumerate(self._chunks):
+                rows = self._rows_of(chunk)
+                rows[:, 2] += number << 32
+                index.append(rows)
             if not self._known:
                 raise damaged("the recording holds no messages that can be read", path)
-            self._shift_after_steps()
+            table = np.concatenate(index)
+            self.clock_steps = shift_after_steps(table)
+            self._set_index((self._known[number] for number in sorted(self._known)), table)
         except BaseException:
             self.close()
             raise
-        total = Counter[int]()
-        for chunk in self._chunks:
-            total.update(chunk.counts or {})
-        self.channels = [replace(self._known[number], count=total[number]) for number in sorted(self._known)]
-
-    def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the start of the last chunk with messages of some channels [ns]; 0 without one."""
-        last = max(self._needed(frozenset(numbers), None), key=attrgetter("end_ns"), default=None)
-        return 0 if last is None else last.start_ns
-
-    def messages(
-        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
-    ) -> Iterator[Message]:
-        """Yield messages, see `Container.messages`. Chunks may overlap in time; each is unpacked when its
-        first message is due. Damaged chunks are left out and counted."""
-        wanted = frozenset(numbers)
-        heap: list[tuple[int, int, Message]] = []
-        serial = held = 0
-        for chunk in sorted(self._needed(wanted, start_ns), key=attrgetter("start_ns", "offset")):
-            while heap and (heap[0][0] <= chunk.start_ns or held > BLOCK_LIMIT):
-                held -= len(heap[0][2].payload) + _MESSAGE_BYTES
-                yield plain(heapq.heappop(heap)[2])
-            try:
-                for message in self._contents(chunk, define=False):
-                    if message.channel in wanted and (start_ns is None or message.log_ns >= start_ns):
-                        heapq.heappush(heap, (message.log_ns, serial, message))
-                        serial += 1
-                        held += len(message.payload) + _MESSAGE_BYTES
-            except BrokenChunkError:
-                count_loss(losses, "damaged chunks of the recording")
-        while heap:
-            yield plain(heapq.heappop(heap)[2])
 
     def close(self) -> None:
         """Close the file; safe to call twice."""
@@ -315,12 +346,13 @@ class ChunkedFile(Container):
         """
         raise NotImplementedError
 
-    def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
-        """Yield the messages of an unpacked chunk; with `define`, add the channels that it defines to
-        `_known`. Subclasses implement it.
+    def _record(self, raw: bytes, at: int) -> tuple[Message | None, int]:
+        """Return the message of the record at an offset in an unpacked chunk and the end of the record. Of
+        other records the message is None; channels that they define are added to `_known`. Subclasses
+        implement it.
 
         Raises:
-            BrokenChunkError: The rest cannot be read.
+            BrokenChunkError: It cannot be read.
             DAMAGE: The same.
         """
         raise NotImplementedError
@@ -339,118 +371,60 @@ class ChunkedFile(Container):
         except OSError as error:
             raise damaged(f"cannot read on: {error.strerror}", self._path) from error
 
-    def _needed(self, wanted: frozenset[int], start_ns: int | None) -> Iterable[Chunk]:
-        """Return the chunks with messages of some channels that do not end before a time [ns] (None: all), in
-        the order of the file."""
-        for chunk in self._chunks:
-            if start_ns is not None and chunk.end_ns < start_ns:
-                continue
-            if chunk.counts is None or not wanted.isdisjoint(chunk.counts):
-                yield chunk
-
     def _bytes_of(self, chunk: Chunk) -> bytes:
-        """Return the unpacked bytes of a chunk; the last one is kept in memory.
+        """Return the unpacked bytes of a chunk. The last chunks stay in memory, up to BLOCK_LIMIT bytes,
+        because chunks may overlap in time.
 
         Raises:
-            BrokenChunkError: It is damaged.
+            BrokenChunkError: It is damaged or empty.
         """
-        if chunk.offset != self._unpacked[0]:
-            if chunk.length > BLOCK_LIMIT:
-                raise BrokenChunkError
-            raw = unpack(self._read(chunk.offset, chunk.length), chunk.compression, chunk.size)
-            if chunk.crc and zlib.crc32(raw) != chunk.crc:
-                raise BrokenChunkError
-            self._unpacked = (chunk.offset, raw)
-        return self._unpacked[1]
+        raw = self._unpacked.pop(chunk.offset, None)
+        if raw is None:
+            raw = self._unpack(chunk)
+            while self._unpacked and sum(map(len, self._unpacked.values())) + len(raw) > BLOCK_LIMIT:
+                del self._unpacked[next(iter(self._unpacked))]
+        self._unpacked[chunk.offset] = raw
+        if not raw:
+            raise BrokenChunkError
+        return raw
 
-    def _contents(self, chunk: Chunk, *, define: bool) -> Iterator[Message]:
-        """Yield the messages of a chunk, at most MOST_IN_CHUNK; with `define`, channels that it defines are
-        added. Times of recording include the shifts of the chunk.
-
-        Raises:
-            BrokenChunkError: It is damaged, or has more messages; those before the damage were yielded.
-        """
+    def _unpack(self, chunk: Chunk) -> bytes:
+        """Return the unpacked bytes of a chunk, b"" if it is damaged."""
         try:
-            shifts, shift_ns = deque(chunk.shifts), 0
-            for number, message in enumerate(self._parse(self._bytes_of(chunk), define=define)):
-                if number >= MOST_IN_CHUNK:
-                    raise BrokenChunkError
-                while shifts and number >= shifts[0][0]:
-                    shift_ns = shifts.popleft()[1]
-                yield replace(message, log_ns=message.log_ns + shift_ns) if shift_ns else message
-        except DAMAGE as error:
-            raise BrokenChunkError from error
-
-    def _shift_after_steps(self) -> None:
-        """Shift the times of chunks behind steps back of the recorder's clock, in place, and count the steps
-        in `clock_steps`, up to MOST_STEPS. Only chunks that begin earlier than others before them, and their
-        predecessors, are unpacked."""
-        shift_ns, newest_ns = 0, 0
-        before: Chunk | None = None
-        for place, chunk in enumerate(self._chunks):
-            if not chunk.counts:
-                continue
-            shifted = chunk
-            if shift_ns:
-                start_ns, end_ns = chunk.start_ns + shift_ns, chunk.end_ns + shift_ns
-                shifted = replace(chunk, start_ns=start_ns, end_ns=end_ns, shifts=((0, shift_ns),))
-            # The first chunk is read anyway.
-            is_back = shifted.start_ns < (shifted.end_ns if before is None else newest_ns) - STEP_BACK_NS
-            if is_back and self.clock_steps < MOST_STEPS:
-                shifted = self._after_step(shifted, before)
-                shift_ns = shifted.shifts[-1][1]
-                self.clock_steps += len(shifted.shifts) - 1
-            self._chunks[place] = before = shifted
-            newest_ns = max(newest_ns, shifted.end_ns)
-
-    def _after_step(self, chunk: Chunk, before: Chunk | None) -> Chunk:
-        """Return a chunk with a further shift from each message on that is STEP_BACK_NS or more earlier than
-        one of its channel before; its times then continue behind all messages before. Unchanged if there is
-        no such message, as in files that are sorted by topic.
-
-        Args:
-            chunk: The chunk.
-            before: The chunk with messages before it, None for the first one.
-        """
-        newest, pause_ns = dict[int, int](), dict[int, int]()
-
-        def note(channel: int, time_ns: int) -> None:
-            """Store the newest time of a channel [ns] and the pause before it; an earlier time is ignored."""
-            if time_ns > newest.get(channel, -1):
-                pause_ns[channel] = time_ns - newest.get(channel, time_ns)
-                newest[channel] = time_ns
-
-        with contextlib.suppress(BrokenChunkError):
-            for message in self._contents(before, define=False) if before is not None else ():
-                note(message.channel, message.log_ns)
-        first_shift_ns = chunk.shifts[0][1]
-        shifts, further_ns, times = [(0, first_shift_ns)], 0, list[int]()
-        with contextlib.suppress(BrokenChunkError):
-            for number, message in enumerate(self._contents(chunk, define=False)):
-                time_ns = message.log_ns + further_ns
-                if time_ns < newest.get(message.channel, 0) - STEP_BACK_NS:
-                    due_ns = newest[message.channel] + pause_ns[message.channel]
-                    further_ns += max(due_ns, *newest.values()) - time_ns
-                    time_ns = message.log_ns + further_ns
-                    shifts.append((number, first_shift_ns + further_ns))
-                note(message.channel, time_ns)
-                times.append(time_ns)
-        if not further_ns:
-            return chunk
-        return replace(chunk, shifts=tuple(shifts), start_ns=min(times), end_ns=max(times))
-
-    def _survey(self, chunk: Chunk) -> Chunk:
-        """Return a chunk with the number and times of its messages, which are counted by unpacking it.
-        Channels that it defines are added. Of a damaged chunk the messages before the damage count, and the
-        damage is counted."""
-        counts = Counter[int]()
-        first_ns, last_ns = 2**64, -1
-        try:
-            for message in self._contents(chunk, define=True):
-                counts[message.channel] += 1
-                first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
+            packed = self._read(chunk.offset, chunk.length) if chunk.length <= BLOCK_LIMIT else b""
+            raw = unpack(packed, chunk.compression, chunk.size)
         except BrokenChunkError:
+            return b""
+        return raw if not chunk.crc or zlib.crc32(raw) == chunk.crc else b""
+
+    def _payload(self, number: int, place: int) -> bytes | None:
+        """Return the bytes of a message, see `IndexedContainer._payload`; None also if there is no message of
+        this channel."""
+        try:
+            message, _ = self._record(self._bytes_of(self._chunks[place >> 32]), place & 0xFFFFFFFF)
+        except (BrokenChunkError, *DAMAGE):
+            return None
+        return None if message is None or message.channel != number else message.payload
+
+    def _rows_of(self, chunk: Chunk) -> Int:
+        """Return the index of a chunk in the order of the file, int64, shape (N, 3); it is made anew if the
+        file has none, or an impossible one."""
+        if chunk.index:
+            rows = np.concatenate(chunk.index)
+            rows = rows[np.argsort(rows[:, 2], kind="stable")]
+            known = np.isin(rows[:, 0], list(self._known)).all()
+            if known and (rows >= 0).all() and (rows[:, 2] < chunk.size).all():
+                return rows
+        found, at = list[tuple[int, int, int]](), 0
+        try:
+            raw = self._bytes_of(chunk)
+            while at < len(raw):
+                if len(found) >= MOST_IN_CHUNK:
+                    raise BrokenChunkError
+                message, end = self._record(raw, at)
+                if message is not None:
+                    found.append((message.channel, message.log_ns, at))
+                at = end
+        except (BrokenChunkError, *DAMAGE):
             count_loss(self.damage, "chunks of the recording damaged in part")
-        if counts:
-            chunk = replace(chunk, start_ns=first_ns, end_ns=last_ns)
-        return replace(chunk, counts=counts)
+        return np.array(found, np.int64).reshape(-1, 3)

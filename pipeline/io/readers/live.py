@@ -33,7 +33,7 @@ from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import SECOND_NS, header_stamp
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
-from pipeline.io.readers.ros_messages import MessageDecoder, standard_types
+from pipeline.io.readers.ros_messages import standard_types
 from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed
 from pipeline.io.readers.transforms import Extrinsics
 from pipeline.types.records import Notice, Record
@@ -215,7 +215,6 @@ class LiveCamera:
         self._pictures_of = channels[0]
         self._channels = {channel.number: channel for channel in (*channels, *fixed)}
         self._numbers = {channel.number for channel in channels}
-        self._decoder = MessageDecoder(self._channels.values())
         self._held: deque[tuple[int | None, Message]] = deque()
         self._bytes = 0
         self._fixed: list[Message] = []
@@ -249,7 +248,7 @@ class LiveCamera:
         if self._found is None or self._found[0] != base:
             known = [*self._fixed, *([] if self._info is None else [self._info])]
             messages = MessageList("", list(self._channels.values()), known)
-            self._found = (base, *find_live_camera(messages, self._decoder, self._pictures_of.topic, base))
+            self._found = (base, *find_live_camera(messages, self._pictures_of.topic, base))
         return self._found[1:]
 
     def near(self, stamp_ns: int, offset_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
@@ -265,7 +264,7 @@ class LiveCamera:
         taken_ns, k = min(times, key=lambda each: abs(each[0] - stamp_ns), default=(0, -1))
         if k < 0 or abs(taken_ns - stamp_ns) > within_ns:
             return None
-        return picture_of(self._held[k][1], self._channels, self._decoder, taken_ns)
+        return picture_of(self._held[k][1], self._channels, taken_ns)
 
     def _is_other(self, info: Message) -> bool:
         """Return whether a CameraInfo differs from the known one in more than its time."""
@@ -280,19 +279,17 @@ class LiveCamera:
             self._found = None
 
 
-def find_live_camera(
-    container: Container, decoder: MessageDecoder, topic: str, base: str
-) -> tuple[Camera | None, str]:
+def find_live_camera(container: Container, topic: str, base: str) -> tuple[Camera | None, str]:
     """Return the camera of a topic by the fixed transforms and the CameraInfo, or None and the reason.
 
     Args:
-        container, decoder: The messages and their decoder.
+        container: The messages.
         topic: Topic of its pictures.
         base: Name of the base frame.
     """
-    mounting = Extrinsics(container, decoder)
+    mounting = Extrinsics(container)
     mounting.read(frozenset(c.number for c in container.channels if is_fixed(c.topic)), frozenset())
-    return find_camera(container, decoder, mounting.tree, base, topic)
+    return find_camera(container, mounting.tree, base, topic)
 
 
 NAME, VERSION = "stemmap_live.json", 1
@@ -374,8 +371,7 @@ class LiveRecording(MessageSource):
         self._numbers = [channel.number for channel in self._channels]
         self._skipped = self._read_skipped()
         self._found_camera: tuple[Camera | None, str] | None = None
-        self._camera = tuple(_with_standard_type(c) for c in container.channels if c.topic in run.camera)
-        self._decoder = MessageDecoder(())
+        self._camera = tuple(c for c in container.channels if c.topic in run.camera)
         pictures = [c for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
         self._picture_channels = {channel.number: channel for channel in pictures}
         reader = self._opened_reader()
@@ -405,7 +401,7 @@ class LiveRecording(MessageSource):
             topic = next((c.topic for c in self._picture_channels.values()), None)
             self._found_camera = (
                 (None, "") if topic is None
-                else find_live_camera(self._container, self._decoder, topic, self._base)
+                else find_live_camera(self._container, topic, self._base)
             )  # fmt: skip
         return self._found_camera
 
@@ -526,12 +522,7 @@ def _channels(container: Container, run: LiveRunHeader, where: str) -> list[Chan
     channels = [by_topic[topic] for topic in run.topics]
     if channels[0].msgtype not in TYPES_BY_ROLE["scan"]:
         raise SourceError("the recording's first topic is of no scans", where=where)
-    return [replace(_with_standard_type(channel), count=0) for channel in channels]
-
-
-def _with_standard_type(channel: Channel) -> Channel:
-    """Return a channel with the standard definition of its type, which the live run used."""
-    return replace(channel, definition="", definition_format="")
+    return [replace(channel, count=0) for channel in channels]
 
 
 def open_recording(uri: str, path: Path, options: SourceOptions) -> Source:

@@ -6,8 +6,8 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import replace
 
+import numpy as np
 from mcap import records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -129,6 +129,8 @@ class McapFile(ChunkedFile):
                 count_loss(self.damage, "bytes between damaged records", read - at)
             elif end > at:
                 count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
+                if self._chunks:  # a part of its index may be missing
+                    self._chunks[-1].index.clear()
             else:
                 count_loss(self.damage, NOT_FINISHED)
 
@@ -187,13 +189,22 @@ class McapFile(ChunkedFile):
                 head = records.Chunk.read(ReadDataStream(io.BytesIO(self._read(body, min(length, 128)))))
                 before = _CHUNK_HEAD + len(head.compression.encode())
                 self._chunks.append(
-                    Chunk(body + before, length - before, head.message_start_time, head.message_end_time,
-                          head.compression, head.uncompressed_size, head.uncompressed_crc, None)
-                )  # fmt: skip
+                    Chunk(
+                        body + before,
+                        length - before,
+                        head.compression,
+                        head.uncompressed_size,
+                        head.uncompressed_crc,
+                    )
+                )
             case Opcode.MESSAGE:
                 self._add_loose(body - RECORD.size, body + length)
-            case Opcode.MESSAGE_INDEX:
-                self._count(*struct.unpack("<HI", self._read(body, 6)))
+            case Opcode.MESSAGE_INDEX if self._chunks:
+                content = self._read(body, length)
+                (number,) = struct.unpack_from("<H", content)
+                times = np.frombuffer(content, "<i8", offset=6).reshape(-1, 2)
+                rows = np.column_stack([np.full(len(times), number), times])
+                self._chunks[-1].index.append(rows.astype(np.int64))
             case Opcode.ATTACHMENT | Opcode.METADATA:
                 self._further.append((opcode, body, length))
 
@@ -211,55 +222,37 @@ class McapFile(ChunkedFile):
             self._add_channel(records.Channel.read(stream))
 
     def _add_channel(self, channel: records.Channel) -> None:
-        """Add a channel; without a known schema its type and definition are "". An earlier one of this number
-        is replaced."""
-        schema = self._schemas.get(channel.schema_id) or records.Schema(0, b"", "", "")
-        text = schema.data[:DEFINITION_LIMIT].decode(errors="replace")
+        """Add a channel; without a known schema its type is "". An earlier one of this number is replaced."""
+        schema = self._schemas.get(channel.schema_id)
+        msgtype = "" if schema is None else ros2_type_name(schema.name)
         self._definitions[channel.id] = channel
-        self._known[channel.id] = Channel(
-            channel.id, channel.topic, ros2_type_name(schema.name), channel.message_encoding, text,
-            schema.encoding, 0,
-        )  # fmt: skip
+        self._known[channel.id] = Channel(channel.id, channel.topic, msgtype, channel.message_encoding)
 
     def _add_loose(self, start: int, end: int) -> None:
         """Add a message between two positions [bytes] outside of chunks to a run, which is an uncompressed
         chunk of up to about LOOSE_RUN bytes."""
         last = self._chunks[-1] if self._chunks else None
-        is_run = last is not None and last.offset + last.length == start and last.counts is None
-        if last is not None and is_run and not last.crc and last.length == last.size < LOOSE_RUN:
-            size = end - last.offset
-            self._chunks[-1] = replace(last, length=size, size=size)
+        is_run = last is not None and last.offset + last.length == start and not (last.index or last.crc)
+        if last is not None and is_run and last.length == last.size < LOOSE_RUN:
+            last.length = last.size = end - last.offset
         else:
-            self._chunks.append(Chunk(start, end - start, 0, 0, "", end - start, 0, None))
+            self._chunks.append(Chunk(start, end - start, "", end - start))
 
-    def _count(self, number: int, size: int) -> None:
-        """Store the number of messages of a channel in the chunk before; nothing without one.
-
-        Args:
-            number: Number of the channel.
-            size: Bytes of the entries of its index record.
-        """
-        if self._chunks:
-            chunk = self._chunks[-1]
-            counts = {**(chunk.counts or {}), **({number: size // 16} if size else {})}
-            self._chunks[-1] = replace(chunk, counts=counts)
-
-    # --- chunks ------------------------------------------------------------------------------------
-
-    def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
-        """Yield the messages of an unpacked chunk, see `ChunkedFile._parse`."""
-        view, at = memoryview(raw), 0
-        while at < len(raw):
-            opcode, length = RECORD.unpack_from(raw, at)
-            at += RECORD.size
-            if at + length > len(raw) or opcode == 0:
+    def _record(self, raw: bytes, at: int) -> tuple[Message | None, int]:
+        """Return the message of a record and its end, see `ChunkedFile._record`."""
+        opcode, length = RECORD.unpack_from(raw, at)
+        at += RECORD.size
+        end = at + length
+        if end > len(raw) or opcode == 0:
+            raise BrokenChunkError
+        if opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
+            number, _sequence, log_ns, _publish_ns = MESSAGE_HEAD.unpack_from(raw, at)
+            if log_ns >= 1 << 63:
                 raise BrokenChunkError
-            if opcode == Opcode.MESSAGE and length >= MESSAGE_HEAD.size:
-                number, _sequence, log_ns, _publish_ns = MESSAGE_HEAD.unpack_from(raw, at)
-                yield Message(number, log_ns, bytes(view[at + MESSAGE_HEAD.size : at + length]))
-            elif define and opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._define(opcode, bytes(view[at : at + min(length, DEFINITION_LIMIT)]))
-            at += length
+            return Message(number, log_ns, raw[at + MESSAGE_HEAD.size : end]), end
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._define(opcode, raw[at : at + min(length, DEFINITION_LIMIT)])
+        return None, end
 
 
 def _check_crc(attachment: bytes) -> None:

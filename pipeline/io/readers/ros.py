@@ -24,7 +24,7 @@ from pipeline.io.readers.message_time import (
     by_stamp,
     header_stamp,
 )
-from pipeline.io.readers.ros_messages import LASER_SCAN, MessageDecoder
+from pipeline.io.readers.ros_messages import LASER_SCAN
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
 from pipeline.io.readers.topics import choose_topics
@@ -63,11 +63,10 @@ class RosSource(MessageSource):
         super().__init__(container)
         self._uri = uri
         self._channels = {channel.number: channel for channel in container.channels}
-        self._decoder = MessageDecoder(self._channels.values())
         self._topics = topics = choose_topics(self._channels.values(), options.topics, uri)
-        self._extrinsics = Extrinsics(container, self._decoder)
+        self._extrinsics = Extrinsics(container)
         self._extrinsics.read(topics.transforms(fixed=True), topics.transforms(fixed=False))
-        self._records = RecordDecoder(self._channels, self._decoder, self._extrinsics.tree)
+        self._records = RecordDecoder(self._channels, self._extrinsics.tree)
         self._warnings: list[str] = []
         self._camera: tuple[Camera | None, str] | None = None
         self._picture_channels = {number: self._channels[number] for number in topics.numbers("camera")}
@@ -143,9 +142,7 @@ class RosSource(MessageSource):
             return None, ""
         if self._camera is None:  # needed for each picture
             topic = self._topics.chosen["camera"].name
-            self._camera = find_camera(
-                self._container, self._decoder, self._extrinsics.tree, self._records.base, topic
-            )
+            self._camera = find_camera(self._container, self._extrinsics.tree, self._records.base, topic)
         return self._camera
 
     @property
@@ -313,11 +310,7 @@ class RosSource(MessageSource):
         self._records.base = base = self._extrinsics.base_frame(self._odometry_base())
         has_odometry = "odometry" in chosen or bool(self._moving)
         linked = options.T_base_lidar or self._extrinsics.tree.find(base, frame)
-        warnings = [
-            f"the definition of {topic} in the file is not used: it is not valid"
-            for topic in self._decoder.refused
-        ]
-        warnings += self._warnings
+        warnings = self._warnings
         if linked is None and has_odometry and base != frame:
             warnings.append(
                 f"no fixed transform from {frame or 'the LiDAR'} to {base or 'the base'}: "

@@ -3,12 +3,9 @@
 
 from __future__ import annotations
 
-import heapq
 import sqlite3
 import struct
-from collections.abc import Collection, Iterator
 from dataclasses import replace
-from operator import attrgetter
 from pathlib import Path
 from urllib.parse import quote
 
@@ -18,26 +15,24 @@ from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
     DAMAGE,
-    MOST_STEPS,
-    STEP_BACK_NS,
     STRANGE_LIMIT,
     BrokenChunkError,
     Channel,
     Chunk,
     ChunkedFile,
-    Container,
+    IndexedContainer,
     Message,
     damaged,
-    plain,
     ros2_type_name,
-)  # fmt: skip
+    shift_after_steps,
+)
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.types.records import Int
 
 MESSAGE_LIMIT = 256 << 20
 
 
-class Db3File(Container):
+class Db3File(IndexedContainer):
     """A SQLite bag as a container of messages. The file is opened for reading only.
 
     Raises:
@@ -45,6 +40,7 @@ class Db3File(Container):
     """
 
     kind = "ROS 2 bag (db3)"
+    unreadable = "messages that the database cannot give"
 
     def __init__(self, path: Path) -> None:
         """Open the database and read the index of all messages."""
@@ -58,9 +54,10 @@ class Db3File(Container):
         try:
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MESSAGE_LIMIT)
             self._database.execute("PRAGMA trusted_schema = OFF")
-            self._tables = self._plain_tables()
-            self._row, self._topic, self._stamp = self._read_index()
-            self.channels = self._read_channels()
+            self._check_tables()
+            index = self._read_index()
+            self.clock_steps = shift_after_steps(index)
+            self._set_index(self._read_channels(), index)
         except (sqlite3.Error, OverflowError, UnicodeDecodeError, ValueError, TypeError) as error:
             self.close()
             raise damaged(f"the database cannot be read: {error}", path) from error
@@ -68,38 +65,21 @@ class Db3File(Container):
             self.close()
             raise
 
-    def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of the last message of some channels [ns]; 0 without one."""
-        found = np.flatnonzero(np.isin(self._topic, list(numbers)))
-        return int(self._stamp[found[-1]]) if len(found) else 0
-
-    def messages(
-        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
-    ) -> Iterator[Message]:
-        """Yield messages, see `Container.messages`."""
-        first = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
-        chosen = first + np.flatnonzero(np.isin(self._topic[first:], list(numbers)))
-        for index in chosen:
-            payload = self._payload(int(self._row[index]))
-            if payload is None:
-                count_loss(losses, "messages that the database cannot give")
-            else:
-                yield plain(Message(int(self._topic[index]), int(self._stamp[index]), payload))
-
     def close(self) -> None:
         """Close the database."""
         self._database.close()
 
-    def _payload(self, row: int) -> bytes | None:
+    def _payload(self, number: int, place: int) -> bytes | None:
         """Return the bytes of the message in a row of the table; None if they cannot be read."""
+        del number
         try:
-            found = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
+            found = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (place,)).fetchone()
         except (sqlite3.Error, MemoryError):
             return None
         return found[0] if found is not None and isinstance(found[0], bytes) else None
 
-    def _plain_tables(self) -> set[str]:
-        """Return the names of the plain tables.
+    def _check_tables(self) -> None:
+        """Check that the tables are plain.
 
         Views, virtual tables and computed columns can compute without end; recorders write none.
 
@@ -110,72 +90,27 @@ class Db3File(Container):
             "SELECT name FROM pragma_table_list AS t WHERE schema = 'main' AND type = 'table'"
             " AND NOT EXISTS (SELECT 1 FROM pragma_table_xinfo(t.name) WHERE hidden)"
         )
-        plain = {name for (name,) in found}
-        if not {"messages", "topics"} <= plain:
+        if not {"messages", "topics"} <= {name for (name,) in found}:
             raise damaged("the database holds no tables of messages and topics", self._path)
-        return plain
 
-    def _read_index(self) -> tuple[Int, Int, Int]:
-        """Return row, topic and time [ns] of all messages in the order of time, shape (N,) each. Damaged ones
-        are left out; damaged pages end the list and are counted. Times behind steps of the recorder's clock
-        are shifted and counted in `clock_steps`."""
+    def _read_index(self) -> Int:
+        """Return topic, time [ns] and row of all messages, int64, shape (N, 3). Damaged ones are left out;
+        damaged pages end the list and are counted."""
         rows: list[tuple[int, int, int]] = []
-        cursor = self._database.execute("SELECT rowid, topic_id, timestamp FROM messages")
+        cursor = self._database.execute("SELECT topic_id, timestamp, rowid FROM messages")
         try:
             rows.extend(row for row in cursor if all(isinstance(cell, int) for cell in row))
         except sqlite3.Error:
             count_loss(self.damage, "pages of the database that cannot be read")
-        table = np.array(rows, dtype=np.int64).reshape(-1, 3)
-        self.clock_steps = _shift_after_steps(table[:, 1], table[:, 2])
-        table = table[np.argsort(table[:, 2], kind="stable")]
-        return table[:, 0], table[:, 1], table[:, 2]
+        return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
     def _read_channels(self) -> list[Channel]:
-        """Return the channels by number, with their numbers of messages."""
-        definitions = self._definitions()
-        channels = []
-        for number, topic, msgtype, encoding in self._database.execute(
-            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
-        ):
-            form, text = definitions.get(msgtype, ("", ""))
-            count = int(np.count_nonzero(self._topic == int(number)))
-            name = ros2_type_name(str(msgtype))
-            channels.append(Channel(int(number), str(topic), name, str(encoding or ""), text, form, count))
-        return channels
-
-    def _definitions(self) -> dict[str, tuple[str, str]]:
-        """Return the format and text of message definitions by type, stored since ROS 2 Iron; empty without
-        them, or if they cannot be read."""
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-        if "message_definitions" not in self._tables:
-            return {}
-        try:
-            return {str(name): (str(kind), str(text)) for name, kind, text in self._database.execute(query)}
-        except sqlite3.Error:
-            return {}
-
-
-def _shift_after_steps(topic: Int, stamp: Int) -> int:
-    """Shift times behind steps back of the recorder's clock, see `Container.clock_steps`; return the number
-    of steps, at most MOST_STEPS. A step is a time that is more than STEP_BACK_NS earlier than one of its
-    topic before.
-
-    Args:
-        topic: Topic of each message in the order of the file, int64, shape (N,).
-        stamp: Time of recording [ns], int64, shape (N,); changed in place.
-    """
-    for steps in range(MOST_STEPS):
-        back = np.zeros(len(stamp), dtype=np.bool_)
-        for number in np.unique(topic):
-            own = np.flatnonzero(topic == number)
-            back[own[1:]] = stamp[own[1:]] < np.maximum.accumulate(stamp[own])[:-1] - STEP_BACK_NS
-        if not back.any():
-            return steps
-        first = int(np.argmax(back))
-        own = stamp[:first][topic[:first] == topic[first]]
-        due_ns = 2 * own[-1] - own[-2] if len(own) > 1 else own[-1]
-        stamp[first:] += max(due_ns, stamp[:first].max()) - stamp[first]
-    return MOST_STEPS
+        """Return the channels by number."""
+        rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id")
+        return [
+            Channel(int(number), str(topic), ros2_type_name(str(msgtype)), str(encoding or ""))
+            for number, topic, msgtype, encoding in rows
+        ]
 
 
 #: The channels of the n-th file are numbered from n times this value.
@@ -213,7 +148,7 @@ def _natural(path: Path) -> tuple[int, str]:
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
 
 
-class BagFolder(Container):
+class BagFolder(IndexedContainer):
     """The files of a recording as one container of messages.
 
     Args:
@@ -223,11 +158,13 @@ class BagFolder(Container):
         SourceError: None of the files can be read.
     """
 
+    unreadable = "messages in damaged parts of the recording"
+
     def __init__(self, files: list[Path]) -> None:
         """Open all files; one that cannot be read is counted in `damage`. Channels of the n-th file (from 0)
         are numbered from n times _STRIDE."""
         self.damage = {}
-        self._parts: list[Container] = []
+        self._parts: list[IndexedContainer] = []
         for path in files:
             try:
                 self._parts.append(open_bag(path))
@@ -239,25 +176,13 @@ class BagFolder(Container):
             raise SourceError("none of the files of the recording can be read", where=str(files[0].parent))
         self.kind = self._parts[0].kind
         self.clock_steps = sum(part.clock_steps for part in self._parts)
-        self.channels = []
-        for index, part in enumerate(self._parts):
-            self.channels += [replace(c, number=c.number + _STRIDE * index) for c in part.channels]
+        channels, index = list[Channel](), list[Int]()
+        for number, part in enumerate(self._parts):
+            channels += [replace(c, number=c.number + _STRIDE * number) for c in part.channels]
+            index.append(part.index + np.array([_STRIDE * number, 0, 0]))
             for reason, count in part.damage.items():
                 count_loss(self.damage, reason, count)
-
-    def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the latest of the times of all files [ns], see `Container.tail_ns`."""
-        return max(part.tail_ns(_own(numbers, index)) for index, part in enumerate(self._parts))
-
-    def messages(
-        self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
-    ) -> Iterator[Message]:
-        """Yield messages of all files, merged by their times of recording, see `Container.messages`."""
-        streams = [
-            _renumbered(part.messages(_own(numbers, index), start_ns, losses), index)
-            for index, part in enumerate(self._parts)
-        ]
-        return heapq.merge(*streams, key=attrgetter("log_ns"))
+        self._set_index(channels, np.concatenate(index))
 
     def attachment(self, name: str, limit: int) -> bytes | None:
         """Return the bytes of an attachment of any file, see `Container.attachment`. None if no file has
@@ -270,17 +195,10 @@ class BagFolder(Container):
         for part in self._parts:
             part.close()
 
-
-def _own(numbers: Collection[int], index: int) -> list[int]:
-    """Return the numbers of the channels of one file, as numbered in that file."""
-    return [number - _STRIDE * index for number in numbers if number // _STRIDE == index]
-
-
-def _renumbered(messages: Iterator[Message], index: int) -> Iterator[Message]:
-    """Return the messages of the file with this index, with the numbers of its channels in the folder."""
-    if index == 0:
-        return messages
-    return (replace(message, channel=message.channel + _STRIDE * index) for message in messages)
+    def _payload(self, number: int, place: int) -> bytes | None:
+        """Return the bytes of a message of the file to which its channel belongs."""
+        part, own = divmod(number, _STRIDE)
+        return self._parts[part]._payload(own, place)
 
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -325,6 +243,8 @@ class BagFile(ChunkedFile):
             at = body + length
         if at < end:
             count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
+            if self._chunks:  # a part of its index may be missing
+                self._chunks[-1].index.clear()
 
     def _take(self, header: Header, body: int, length: int) -> None:
         """Store the contents of a record: a connection, a chunk, or the counts of a chunk; other kinds are
@@ -347,9 +267,12 @@ class BagFile(ChunkedFile):
         elif opcode == CHUNK:
             size = LENGTH.unpack(header[b"size"])[0]
             method = header[b"compression"].decode()
-            self._chunks.append(Chunk(body, length, 0, 0, method, size, 0, None))
+            self._chunks.append(Chunk(body, length, method, size))
         elif opcode == INDEX and self._chunks:
-            self._count(LENGTH.unpack(header[b"conn"])[0], self._read(body, length))
+            table = np.frombuffer(self._read(body, length), "<u4").reshape(-1, 3).astype(np.int64)
+            channel = np.full(len(table), LENGTH.unpack(header[b"conn"])[0])
+            times = table[:, 0] * 1_000_000_000 + table[:, 1]
+            self._chunks[-1].index.append(np.column_stack([channel, times, table[:, 2]]))
 
     def _define(self, header: Header, content: bytes) -> None:
         """Add the channel of a connection, by the header and the contents of its record.
@@ -361,45 +284,24 @@ class BagFile(ChunkedFile):
         (number,) = LENGTH.unpack(header[b"conn"])
         topic = header.get(b"topic", fields.get(b"topic", b"")).decode()
         msgtype = ros2_type_name(fields[b"type"].decode())
-        text = fields.get(b"message_definition", b"").decode()
-        self._known[number] = Channel(number, topic, msgtype, "ros1", text, "ros1msg", 0)
+        self._known[number] = Channel(number, topic, msgtype, "ros1")
 
-    def _count(self, number: int, table: bytes) -> None:
-        """Store times and number of messages of a connection in the chunk before, from an index record.
-
-        Args:
-            number: Number of the connection.
-            table: Entries of the index record.
-        """
-        times = np.frombuffer(table[: len(table) // 12 * 12], "<u4").reshape(-1, 3).astype(np.int64)
-        if not len(times):
-            return
-        stamps = times[:, 0] * 1_000_000_000 + times[:, 1]
-        first, last = int(stamps.min()), int(stamps.max())
-        chunk = self._chunks[-1]
-        if chunk.counts is not None:
-            first, last = min(first, chunk.start_ns), max(last, chunk.end_ns)
-        counts = {**(chunk.counts or {}), number: len(times)}
-        self._chunks[-1] = replace(chunk, start_ns=first, end_ns=last, counts=counts)
-
-    def _parse(self, raw: bytes, *, define: bool) -> Iterator[Message]:
-        """Yield the messages of an unpacked chunk, see `ChunkedFile._parse`."""
-        at = 0
-        while at < len(raw):
-            (header_size,) = LENGTH.unpack_from(raw, at)
-            (length,) = LENGTH.unpack_from(raw, at + 4 + header_size)
-            body = at + 8 + header_size
-            header = _fields(raw[at + 4 : body - 4])
-            if body + length > len(raw) or not header:
-                raise BrokenChunkError
-            opcode = header.get(b"op")
-            if opcode == bytes([MESSAGE]):
-                (number,) = LENGTH.unpack(header[b"conn"])
-                seconds, nanoseconds = struct.unpack("<II", header[b"time"])
-                yield Message(number, seconds * 1_000_000_000 + nanoseconds, raw[body : body + length])
-            elif define and opcode == bytes([CONNECTION]):
-                self._define(header, raw[body : body + length])
-            at = body + length
+    def _record(self, raw: bytes, at: int) -> tuple[Message | None, int]:
+        """Return the message of a record and its end, see `ChunkedFile._record`."""
+        (header_size,) = LENGTH.unpack_from(raw, at)
+        (length,) = LENGTH.unpack_from(raw, at + 4 + header_size)
+        body = at + 8 + header_size
+        header, end = _fields(raw[at + 4 : body - 4]), body + length
+        if end > len(raw) or not header:
+            raise BrokenChunkError
+        opcode = header.get(b"op")
+        if opcode == bytes([MESSAGE]):
+            (number,) = LENGTH.unpack(header[b"conn"])
+            seconds, nanoseconds = struct.unpack("<II", header[b"time"])
+            return Message(number, seconds * 1_000_000_000 + nanoseconds, raw[body:end]), end
+        if opcode == bytes([CONNECTION]):
+            self._define(header, raw[body:end])
+        return None, end
 
 
 def _fields(header: bytes) -> Header:
@@ -422,7 +324,7 @@ def _fields(header: bytes) -> Header:
     return fields
 
 
-def open_bag(path: Path) -> Container:
+def open_bag(path: Path) -> IndexedContainer:
     """Open a file of recorded messages by its contents.
 
     Raises:

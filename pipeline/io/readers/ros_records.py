@@ -19,7 +19,7 @@ from pipeline.io.readers.ros_messages import (
     NAV_SAT_FIX,
     ODOMETRY,
     POINT_CLOUD,
-    MessageDecoder,
+    decode,
 )
 from pipeline.io.readers.scan_columns import (
     OFFSET_LIMIT_NS,
@@ -152,7 +152,6 @@ class RecordDecoder:
 
     Args:
         channels: Channels of the recording by number.
-        decoder: Decoder of the messages.
         tree: Fixed transforms.
 
     Attributes:
@@ -162,9 +161,9 @@ class RecordDecoder:
         poses: Numbers of the channels with poses of another SLAM.
     """
 
-    def __init__(self, channels: Mapping[int, Channel], decoder: MessageDecoder, tree: TransformTree) -> None:
+    def __init__(self, channels: Mapping[int, Channel], tree: TransformTree) -> None:
         """Create a decoder without a base frame and frames of measured poses."""
-        self._channels, self._decoder, self._tree = channels, decoder, tree
+        self._channels, self._tree = channels, tree
         self._packets = PacketDecoder()
         self.base = ""
         self.frames: dict[str, GnssFrame | OtherFrame] = {}
@@ -236,7 +235,7 @@ class RecordDecoder:
         Raises:
             Exception: Of many kinds, when it is damaged.
         """
-        return self._decoder.decode(self._channels[message.channel], message.payload)
+        return decode(self._channels[message.channel], message.payload)
 
     def fix(self, message: Message, stamp_ns: int) -> tuple[Fix | None, str]:
         """Return a GNSS fix, None if the receiver had no fix, and the name of the frame of its antenna.

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import Channel, Container, Message
-from pipeline.io.readers.ros_messages import MessageDecoder
+from pipeline.io.readers.ros_messages import decode
 
 if TYPE_CHECKING:
     from rosbags.typesys.stores import ros2_jazzy as ros2
@@ -95,10 +95,9 @@ class Extrinsics:
         odometry_link: (parent, child) of the moving transform with the pose of the robot, or None.
     """
 
-    def __init__(self, container: Container, decoder: MessageDecoder) -> None:
+    def __init__(self, container: Container) -> None:
         """Begin without transforms; nothing is read."""
         self._container = container
-        self._decoder = decoder
         self._channels: dict[int, Channel] = {c.number: c for c in container.channels}
         self.tree = TransformTree()
         self.odometry_link: tuple[str, str] | None = None
@@ -157,9 +156,8 @@ class Extrinsics:
     def decode(self, message: Message) -> list[Link]:
         """Return the finite transforms of a message, in its order; [] if it is damaged."""
         try:
-            decoded: ros2.tf2_msgs__msg__TFMessage = self._decoder.decode(
-                self._channels[message.channel], message.payload
-            )
+            channel = self._channels[message.channel]
+            decoded: ros2.tf2_msgs__msg__TFMessage = decode(channel, message.payload)
         except Exception:  # the generated decoders of rosbags raise many kinds
             return []
         with np.errstate(all="ignore"):

@@ -95,7 +95,7 @@ def test_nothing_is_known_before_a_scan_and_memory_is_bounded(drive: Path):
 
 
 def test_scans_that_nobody_can_read_are_an_error_in_the_end():
-    channel = Channel(1, "/points", POINT_CLOUD, "cdr", "", "", 0)
+    channel = Channel(1, "/points", POINT_CLOUD, "cdr")
     reader = ArrivalReader("here", "live", [channel], SourceOptions())
 
     def send() -> None:

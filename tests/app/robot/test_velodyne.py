@@ -88,9 +88,7 @@ def test_packets_as_they_come_give_the_scans_of_their_capture(shared_data: Path)
     for offset, stamp_ns in zip(packets.offset.tolist(), packets.stamp_ns.tolist(), strict=True):
         messages.append(sweeps.add(stamp_ns, content[offset : offset + PACKET_BYTES]))
     messages.append(sweeps.end())
-    reader = ArrivalReader(
-        "here", "live", [Channel(1, "/p", VELODYNE_SCAN, "cdr", "", "", 0)], SourceOptions()
-    )
+    reader = ArrivalReader("here", "live", [Channel(1, "/p", VELODYNE_SCAN, "cdr")], SourceOptions())
     records: list[Record] = []
     for k, message in enumerate(m for m in messages if m is not None):
         records += reader.add(Message(1, int(packets.stamp_ns[0]) + k, message))
