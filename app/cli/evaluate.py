@@ -40,16 +40,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=flags.source,
         help="folders that `stemmap map` wrote; with --param-grid recordings and simulated runs too",
     )
-    parser.add_argument(
-        "--truth",
-        metavar="FILE",
-        type=Path,
-        action="append",
-        default=[],
-        help="true trees (CSV) in the frame of the map, one FILE for all runs or one each "
-        "(default: those of the source)",
-    )
-    flags.add_dbh_unit_flag(parser)
+    flags.add_truth_flags(parser)
     parser.add_argument(
         "--match-distance", metavar="M", help="largest distance between a tree and its ground truth [m]"
     )
@@ -68,13 +59,11 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         StemmapError: The arguments contradict each other, or a single run cannot be scored.
     """
-    if len(arguments.truth) not in (0, 1, len(arguments.runs)):
-        from app.common.text import count
-
-        raise ParameterError(
-            f"{count(len(arguments.truth), 'table')} of true trees for {count(len(arguments.runs), 'run')}",
-            remedy="Give --truth once for all of them, or once for each in their order",
-        )
+    one_for_all = len(arguments.truths) == 1 and not any(
+        arguments.truths[0].startswith(f"{uri}=") for uri in arguments.runs
+    )
+    truths = arguments.truths * len(arguments.runs) if one_for_all else arguments.truths
+    arguments.files = flags.files_of(arguments.runs, truths)
     if arguments.param_grid:
         return run_grid(arguments)
     refuse_without_grid(arguments)
@@ -144,17 +133,6 @@ def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]
     return evaluation, finished.of_cloud
 
 
-def _given_truth(arguments: argparse.Namespace, number: int) -> TruthTrees | None:
-    """Return the true trees that --truth gives for a run: its own file, or the only one; None without
-    --truth. Raises StemmapError if the file cannot be read."""
-    from pipeline.io.ground_truth import read_truth_trees
-
-    if not arguments.truth:
-        return None
-    file = arguments.truth[number if len(arguments.truth) > 1 else 0]
-    return read_truth_trees(file, dbh_unit=arguments.dbh_unit)
-
-
 def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) -> TruthTrees:
     """Return the true trees of a run: those of --truth, else those of its source, which is opened again.
 
@@ -168,11 +146,12 @@ def _truth(arguments: argparse.Namespace, finished: FinishedRun, number: int) ->
     """
     from contextlib import closing
 
+    from pipeline.io.ground_truth import read_truth_trees
     from pipeline.io.readers import SourceOptions, open_source
 
-    given = _given_truth(arguments, number)
-    if given is not None:
-        return given
+    file = arguments.files.get(arguments.runs[number])
+    if file is not None:
+        return read_truth_trees(Path(file), dbh_unit=arguments.dbh_unit)
     uri = finished.uri
     if finished.of_cloud:
         raise StemmapError(
@@ -288,24 +267,12 @@ def run_grid(arguments: argparse.Namespace) -> int:
 def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
     """Return the runs that can be scored, and the number of the others, which are reported on standard
     error."""
-    from app.sources.request import SourceRequest, mount_of_degrees
-    from app.store.records import contents_of
-    from app.tuning.plan import PlannedRun
     from app.tuning.scoring import prepare_run
 
     runs, refused = [], 0
-    for number, name in enumerate(arguments.runs):
+    for name in arguments.runs:
         try:
-            truth = _given_truth(arguments, number)
-            source = SourceRequest(
-                name,
-                arguments.odometry,
-                arguments.seed,
-                dict(arguments.topics),
-                mount_of_degrees(arguments.mount),
-            )
-            planned = PlannedRun(source, None if truth is None else tuple(contents_of(truth)))
-            runs.append(prepare_run(planned))
+            runs.append(prepare_run(flags.planned_run(arguments, name, arguments.files.get(name))))
         except StemmapError as error:
             print(f"stemmap: left out: {flags.plain(str(error))}", file=sys.stderr)
             refused += 1

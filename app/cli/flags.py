@@ -11,10 +11,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.common.text import COMPILING
+from app.common.text import COMPILING, count
 from pipeline.errors import ParameterError
 
 if TYPE_CHECKING:
+    from app.tuning.plan import PlannedRun
     from pipeline.config import Parameters
     from pipeline.io.readers import SourceOptions
 
@@ -25,6 +26,9 @@ SOURCE_HELP = (
     "a live robot (zenoh:tcp/host:7447, dds:?domain=0, velodyne:ADDRESS:PORT?from=SENSOR), "
     "or a simulated run such as sim:stand"
 )
+
+
+MOUNT = "X,Y,Z,ROLL,PITCH,YAW"
 
 
 def program() -> str:
@@ -57,6 +61,52 @@ def add_set_flag(parser: argparse.ArgumentParser, help_text: str) -> None:
     parser.add_argument(
         "--set", metavar="STAGE.NAME=VALUE", dest="assignments", action="append", default=[], help=help_text
     )
+
+
+def add_truth_flags(parser: argparse.ArgumentParser) -> None:
+    """Add --truth, for several runs, and --dbh-unit; see `truths_of`."""
+    parser.add_argument(
+        "--truth",
+        metavar="[RUN=]FILE",
+        dest="truths",
+        action="append",
+        default=[],
+        help="true trees (CSV) of a run, in the frame of its map; repeated for each run, in their order or "
+        "with RUN= in front (default: those of the source)",
+    )
+    add_dbh_unit_flag(parser)
+
+
+def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
+    """Return the file with the true trees by run; runs without a file are missing.
+
+    Args:
+        uris: The runs in their order, held-out runs last.
+        truths: `FILE` or `RUN=FILE`. Files without a run belong to the remaining runs in their order; there
+            must be one for each of these, or none.
+
+    Raises:
+        ParameterError: A file cannot be assigned to a run, or a run has two.
+    """
+    named: dict[str, str] = {}
+    bare = []
+    for text in truths:
+        # The name of a run may contain =; the longest match is used.
+        run = max((uri for uri in uris if text.startswith(f"{uri}=")), key=len, default=None)
+        if run is None:
+            bare.append(text)
+        elif run in named:
+            raise ParameterError("a run has two files of true trees", where=run, remedy="Give one")
+        else:
+            named[run] = text.removeprefix(f"{run}=")
+    others = [uri for uri in uris if uri not in named]
+    if bare and len(bare) != len(others):
+        raise ParameterError(
+            f"{count(len(bare), 'file')} of true trees for {count(len(others), 'run')}",
+            where=bare[0],
+            remedy="Name the run of each file: --truth RUN=FILE",
+        )
+    return {**named, **dict(zip(others, bare, strict=False))}
 
 
 def add_dbh_unit_flag(parser: argparse.ArgumentParser) -> None:
@@ -101,8 +151,8 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--mount",
-        metavar="X,Y,Z,ROLL,PITCH,YAW",
-        type=_mount,
+        metavar=MOUNT,
+        type=numbers(MOUNT, 360.0),
         help="pose of the LiDAR on the robot, in metres and degrees (default: that of the source)",
     )
 
@@ -185,16 +235,28 @@ def _topic(text: str) -> tuple[str, str]:
     return role, name
 
 
-def _mount(text: str) -> tuple[float, ...]:
-    """Parse x, y, z [m], roll, pitch, yaw [deg]; raises argparse.ArgumentTypeError unless these are six
-    numbers of at most 360."""
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 6 or not all(abs(number) <= 360.0 for number in numbers):
-        raise argparse.ArgumentTypeError(f"{text!r} is not six numbers x,y,z,roll,pitch,yaw")
-    return numbers
+def numbers(shape: str, largest: float = 1e8) -> Callable[[str], tuple[float, ...]]:
+    """Return a parser of numbers with commas between them, for argparse; it raises ArgumentTypeError for
+    other texts. An optional number that is not given is 0.
+
+    Args:
+        shape: Names of the numbers, the optional ones in brackets, such as "X,Y[,TURN]".
+        largest: Largest magnitude of a number.
+    """
+    least, most = shape.partition("[")[0].count(",") + 1, shape.count(",") + 1
+
+    def parse(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(part) for part in text.split(","))
+        except ValueError:
+            values = ()
+        if not least <= len(values) <= most or not all(abs(value) <= largest for value in values):
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is not {shape}: numbers up to {largest:g} with commas between them"
+            )
+        return (*values, *[0.0] * (most - len(values)))
+
+    return parse
 
 
 def source_options(arguments: argparse.Namespace) -> SourceOptions:
@@ -212,6 +274,34 @@ def source_options(arguments: argparse.Namespace) -> SourceOptions:
         seed=arguments.seed,
         as_live=getattr(arguments, "as_live", False),
     )
+
+
+def planned_run(
+    arguments: argparse.Namespace, uri: str, truth: str | None, *, held_out: bool = False
+) -> PlannedRun:
+    """Return a run that is mapped and scored as the flags of `add_run_flags`, `add_source_flags` and
+    `add_truth_flags` give.
+
+    Args:
+        arguments: Parsed arguments.
+        uri: The run.
+        truth: File of its true trees; None for those of the source.
+        held_out: See `PlannedRun`.
+
+    Raises:
+        StemmapError: The file of true trees cannot be read.
+    """
+    from app.sources.request import SourceRequest, mount_of_degrees
+    from app.store.records import contents_of
+    from app.tuning.plan import PlannedRun
+    from pipeline.io.ground_truth import read_truth_trees
+
+    mount = mount_of_degrees(arguments.mount)
+    source = SourceRequest(uri, arguments.odometry, arguments.seed, dict(arguments.topics), mount)
+    if truth is None:
+        return PlannedRun(source, held_out=held_out)
+    trees = read_truth_trees(Path(truth), dbh_unit=arguments.dbh_unit)
+    return PlannedRun(source, tuple(contents_of(trees)), truth, held_out)
 
 
 def source(text: str) -> str:

@@ -6,9 +6,10 @@ import argparse
 import math
 from pathlib import Path
 
-from app.cli.flags import positive_number
-from pipeline.errors import StemmapError, UsageError
+from app.cli.flags import numbers, positive_number
+from pipeline.errors import UsageError
 
+BY_HAND = "EAST,NORTH,TURN[,Z]"
 HELP = "give a mapped run coordinates of the country, by control points, GNSS or by hand"
 
 
@@ -28,7 +29,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     how.add_argument(
         "--by-hand",
-        metavar="EAST,NORTH,TURN[,Z]",
+        metavar=BY_HAND,
+        type=numbers(BY_HAND),
         help="position of the map's origin, angle of its x axis from east to north in degrees, and height",
     )
     how.add_argument("--remove", action="store_true", help="make the map local again")
@@ -75,25 +77,9 @@ def run(arguments: argparse.Namespace) -> int:
         elif arguments.gnss:
             frame = georeference.by_gnss(folder, crs)
         else:
-            frame = georeference.by_hand(folder, crs, *_by_hand(arguments.by_hand))
+            east, north, turn, z = arguments.by_hand
+            frame = georeference.by_hand(folder, crs, east, north, math.radians(turn), z)
         georeference.write_map_frame(folder, frame)
     for line in georeference.frame_lines(frame):
         print(line)
     return 0
-
-
-def _by_hand(text: str) -> tuple[float, float, float, float]:
-    """Parse east, north [m], angle [deg] and optionally height [m]; the angle is returned in radians, a
-    missing height is 0.
-
-    Raises:
-        StemmapError: The text is not three or four numbers below 1e8.
-    """
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (3, 4) or not all(abs(number) < 1e8 for number in numbers):
-        raise StemmapError(f"--by-hand {text!r} is not three or four numbers with commas between them")
-    east, north, turn, z = (*numbers, 0.0)[:4]
-    return east, north, math.radians(turn), z

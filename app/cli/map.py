@@ -232,16 +232,14 @@ def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
 
 def _start(text: str) -> str | tuple[float, float, float]:
     """Parse --start: auto, last, resume, or x, y [m], yaw [deg], which is returned in radians; raises
-    argparse.ArgumentTypeError for other texts and for values beyond 1e6 m or 360 degrees."""
+    argparse.ArgumentTypeError for other texts and for numbers beyond 1e6."""
     if text in ("auto", "last", "resume"):
         return text
     try:
-        x, y, yaw = (float(part) for part in text.split(","))
-        if max(abs(x), abs(y)) <= 1e6 and abs(yaw) <= 360.0:
-            return x, y, math.radians(yaw)
-    except ValueError:
-        pass
-    raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or three numbers x,y,yaw")
+        x, y, yaw = flags.numbers("X,Y,YAW", 1e6)(text)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not auto, last, resume or X,Y,YAW") from None
+    return x, y, math.radians(yaw)
 
 
 # --- live sources ------------------------------------------------------------------------------------

@@ -7,13 +7,14 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.cli.flags import positive_number
+from app.cli.flags import numbers, positive_number
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from pipeline.config.stages import Stand
     from pipeline.stand.plots import SamplePlot
 
+CIRCLE, RECTANGLE = "X,Y,R", "X,Y,LENGTH,WIDTH[,TURN]"
 HELP = "stems and basal area per hectare, diameters and density of a mapped run"
 
 
@@ -45,10 +46,18 @@ def add_plot_flags(parser: argparse.ArgumentParser) -> None:
         metavar="CRS",
         help="reference system of --plots if the file has none: EPSG:CODE, or local for that of the map",
     )
-    group.add_argument("--circle", metavar="X,Y,R", action="append", default=[], help="a circle; repeatable")
+    group.add_argument(
+        "--circle",
+        metavar=CIRCLE,
+        type=numbers(CIRCLE),
+        action="append",
+        default=[],
+        help="a circle; repeatable",
+    )
     group.add_argument(
         "--rectangle",
-        metavar="X,Y,LENGTH,WIDTH[,TURN]",
+        metavar=RECTANGLE,
+        type=numbers(RECTANGLE),
         action="append",
         default=[],
         help="a rectangle by its centre; TURN of its length from x to y in degrees; repeatable",
@@ -131,45 +140,17 @@ def chosen_plots(arguments: argparse.Namespace) -> list[SamplePlot]:
         from app.batch.plot_files import read_plots
 
         plots += read_plots(arguments.plots, arguments.run, crs=arguments.plots_crs)
-    shapes = [("--circle", text) for text in arguments.circle]
-    shapes += [("--rectangle", text) for text in arguments.rectangle]
-    for flag, text in shapes:
-        numbers, name = _numbers(flag, text), str(len(plots) + 1)
-        if flag == "--circle":
-            plots.append(circle(name, *numbers))
-        else:
-            x, y, length, width, turn = (*numbers, 0.0)[:5]
-            plots.append(rectangle(name, x, y, length, width, math.radians(turn)))
+    for sizes in (*(c[2:] for c in arguments.circle), *(r[2:4] for r in arguments.rectangle)):
+        if min(sizes) <= 0.0:
+            raise StemmapError("a plot has an area of 0", remedy="Give sizes above 0, in metres")
+    for x, y, radius in arguments.circle:
+        plots.append(circle(str(len(plots) + 1), x, y, radius))
+    for x, y, length, width, turn in arguments.rectangle:
+        plots.append(rectangle(str(len(plots) + 1), x, y, length, width, math.radians(turn)))
     if arguments.along is not None:
         path = read_run(arguments.run).path
         plots += along(np.stack([path.x, path.y], axis=1), arguments.along, arguments.radius)
     return plots
-
-
-def _numbers(flag: str, text: str) -> list[float]:
-    """Parse the numbers of --circle (x, y, radius) or --rectangle (x, y, length, width, and optionally an
-    angle).
-
-    Args:
-        flag: "--circle" or "--rectangle".
-        text: Numbers with commas between them.
-
-    Raises:
-        StemmapError: The number of numbers is wrong, one is 1e8 or larger or no number, or a size is not
-            above 0.
-    """
-    sizes = (3,) if flag == "--circle" else (4, 5)
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in sizes or not all(abs(number) < 1e8 for number in numbers):
-        raise StemmapError(
-            f"{flag} {text!r} is not {' or '.join(map(str, sizes))} numbers with commas between them"
-        )
-    if min(numbers[2:4]) <= 0.0:
-        raise StemmapError(f"{flag} {text!r} has an area of 0", remedy="Give sizes above 0, in metres")
-    return numbers
 
 
 def run(arguments: argparse.Namespace) -> int:

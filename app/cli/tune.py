@@ -24,16 +24,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "runs", metavar="RUN", nargs="+", type=flags.source, help="recordings, folders, clouds or sim:"
     )
-    parser.add_argument(
-        "--truth",
-        metavar="[RUN=]FILE",
-        dest="truths",
-        action="append",
-        default=[],
-        help="true trees (CSV) of a run, in the frame of its map; repeated for each run, in their order "
-        "or with RUN= in front (default: those of the source)",
-    )
-    flags.add_dbh_unit_flag(parser)
+    flags.add_truth_flags(parser)
     parser.add_argument(
         "--held-out",
         metavar="RUN",
@@ -84,6 +75,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     flags.add_parameter_flags(parser)
     flags.add_run_flags(parser)
+    flags.add_source_flags(parser)
     parser.epilog = "Ctrl-C stops the search and writes the best set so far; the same command continues it."
 
 
@@ -119,7 +111,6 @@ def _plan(arguments: argparse.Namespace) -> Plan:
             exist.
     """
     from app.robot.address import is_live
-    from app.sources.request import SourceRequest
     from app.tuning.plan import SENSIBLE, Plan, axes_of
     from app.tuning.scoring import open_run
 
@@ -130,12 +121,13 @@ def _plan(arguments: argparse.Namespace) -> Plan:
                 where=uri,
                 remedy="Record it, and name the recording",
             )
-    with closing(open_run(SourceRequest(arguments.runs[0]))) as first:
+    runs = _planned(arguments)
+    with closing(open_run(runs[0].source)) as first:
         preset_name, parameters = flags.chosen_parameters(arguments, first.preset)
     if not arguments.out.absolute().parent.is_dir():
         raise StemmapError("the folder for --out does not exist", where=str(arguments.out.absolute().parent))
     return Plan(
-        runs=_planned(arguments),
+        runs=runs,
         axes=axes_of(arguments.over or SENSIBLE),
         start=parameters.model_dump(),
         journal=str((arguments.journal or arguments.out.with_suffix(".journal")).absolute()),
@@ -155,57 +147,15 @@ def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
     Raises:
         StemmapError: A run is named twice, or a file of true trees cannot be read or assigned.
     """
-    from app.sources.request import SourceRequest
-    from app.store.records import contents_of
-    from app.tuning.plan import PlannedRun
-    from pipeline.io.ground_truth import read_truth_trees
-
     uris = [*arguments.runs, *arguments.held_out]
-    files = files_of(uris, arguments.truths)
-    planned = []
+    files = flags.files_of(uris, arguments.truths)
     for k, uri in enumerate(uris):
         if uri in uris[:k]:
             raise ParameterError("a run is named twice", where=uri, remedy="Name it once")
-        truth = None
-        if uri in files:
-            truth = tuple(contents_of(read_truth_trees(Path(files[uri]), dbh_unit=arguments.dbh_unit)))
-        source = SourceRequest(uri, arguments.odometry, arguments.seed)
-        planned.append(PlannedRun(source, truth, files.get(uri, ""), k >= len(arguments.runs)))
-    return tuple(planned)
-
-
-def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
-    """Return the file with the true trees by run; runs without a file are missing.
-
-    Args:
-        uris: The runs in their order, held-out runs last.
-        truths: `FILE` or `RUN=FILE`. Files without a run belong to the remaining runs in their order; there
-            must be one for each of these, or none.
-
-    Raises:
-        ParameterError: A file cannot be assigned to a run, or a run has two.
-    """
-    named: dict[str, str] = {}
-    bare = []
-    for text in truths:
-        # The name of a run may contain =; the longest match is used.
-        run = max((uri for uri in uris if text.startswith(f"{uri}=")), key=len, default=None)
-        if run is None:
-            bare.append(text)
-        elif run in named:
-            raise ParameterError("a run has two files of true trees", where=run, remedy="Give one")
-        else:
-            named[run] = text.removeprefix(f"{run}=")
-    others = [uri for uri in uris if uri not in named]
-    if bare and len(bare) != len(others):
-        from app.common.text import count
-
-        raise ParameterError(
-            f"{count(len(bare), 'file')} of true trees for {count(len(others), 'run')}",
-            where=bare[0],
-            remedy="Name the run of each file: --truth RUN=FILE",
-        )
-    return {**named, **dict(zip(others, bare, strict=False))}
+    return tuple(
+        flags.planned_run(arguments, uri, files.get(uri), held_out=k >= len(arguments.runs))
+        for k, uri in enumerate(uris)
+    )
 
 
 def _search(search: Search) -> bool:

@@ -8,7 +8,7 @@ import contextlib
 import logging
 import socket
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,23 @@ LEAST_TREES = 6
 Map = dict[str, Any]
 
 
+@dataclass(frozen=True, slots=True)
+class _MapFrame:
+    """The frame of a map.
+
+    Attributes:
+        digest: Digest of its run.
+        trees: Number of its trees when it was aligned.
+        pose: Pose in the common frame; None if the alignment failed.
+        how: How the pose was found, or why it is unknown.
+    """
+
+    digest: str
+    trees: int
+    pose: Pose2 | None
+    how: str
+
+
 class Frames:
     """Poses of the maps of a fleet in one common frame; one map is aligned at a time.
 
@@ -49,21 +66,19 @@ class Frames:
     """
 
     def __init__(self) -> None:
-        self._pose: dict[str, Pose2] = {}
-        self._how: dict[str, str] = {}
-        self._of: dict[str, str] = {}  # digest of the run that the two above were found for
-        self._tried: dict[str, int] = {}  # trees at the last try
+        self._found: dict[str, _MapFrame] = {}
         self._few: set[str] = set()  # names of maps with too few trees
-        self._first: tuple[str, str] | None = None
+        self._first = ""  # name of the map whose frame is the common one
 
     def pose(self, name: str) -> Pose2 | None:
         """Return the pose of the frame of a map in the common frame; None if it is unknown."""
-        return self._pose.get(name)
+        return self._found[name].pose if name in self._found else None
 
     def how(self, name: str) -> str:
         """Return how the pose of a map was found, or why it is unknown, as text; also for unknown names."""
-        why = ": too few trees" if name in self._few else ""
-        return self._how.get(name, f"its frame is not known yet{why}")
+        if name in self._found:
+            return self._found[name].how
+        return f"its frame is not known yet{': too few trees' if name in self._few else ''}"
 
     async def try_one(self, maps: dict[str, tuple[str, Map]]) -> bool:
         """Try to align one more map; return whether an alignment was computed, successful or not. Maps that
@@ -75,50 +90,30 @@ class Frames:
         Args:
             maps: By name: digest of the run, and the map with a list of trees as on the page.
         """
-        self._forget(maps)
+        self._found = {
+            name: frame
+            for name, frame in self._found.items()
+            if name in maps and maps[name][0] == frame.digest
+        }
+        if self._first not in self._found:  # all other frames are poses in this one
+            self._first, self._found = "", {}
         self._few = {name for name, (_, shown) in maps.items() if len(shown["trees"]) < LEAST_TREES}
         for name, (digest, shown) in maps.items():
-            count = len(shown["trees"])
-            if self._first is None and count >= LEAST_TREES:
-                self._first = (name, digest)
-                self._set(name, digest, Pose2(), "the common frame")
-            if self._first is None or name in self._pose:
+            known, count = self._found.get(name), len(shown["trees"])
+            if not self._first and count >= LEAST_TREES:
+                self._first = name
+                self._found[name] = _MapFrame(digest, count, Pose2(), "the common frame")
+            elif not self._first or (known is not None and known.pose is not None):
                 continue
-            first, first_digest = self._first
-            if digest and digest == first_digest:
-                self._set(name, digest, Pose2(), f"the same recording as {first}")
-                continue
-            tried = self._tried.get(name)
-            if count < LEAST_TREES or (tried is not None and count < tried + MORE_TREES):
-                continue
-            self._tried[name], self._of[name] = count, digest
-            pose, how = await align({"map": maps[first][1]}, {"map": shown})
-            self._set(name, digest, pose, how if pose is None else f"{how} of {first}")
-            return True
+            elif digest and digest == self._found[self._first].digest:
+                how = f"the same recording as {self._first}"
+                self._found[name] = _MapFrame(digest, count, Pose2(), how)
+            elif count >= (LEAST_TREES if known is None else known.trees + MORE_TREES):
+                pose, how = await align({"map": maps[self._first][1]}, {"map": shown})
+                how = how if pose is None else f"{how} of {self._first}"
+                self._found[name] = _MapFrame(digest, count, pose, how)
+                return True
         return False
-
-    def _set(self, name: str, digest: str, pose: Pose2 | None, how: str) -> None:
-        """Store how the pose of a map was found.
-
-        Args:
-            name: Name of the map.
-            digest: Digest of its run.
-            pose: Pose of its frame in the common one; None stores no pose.
-            how: How it was found, or why not.
-        """
-        self._of[name], self._how[name] = digest, how
-        if pose is not None:
-            self._pose[name] = pose
-
-    def _forget(self, maps: dict[str, tuple[str, Map]]) -> None:
-        """Remove the poses of runs that were closed; if the common frame was closed, remove all."""
-        if self._first is not None and maps.get(self._first[0], ("", {}))[0] != self._first[1]:
-            self.__init__()  # type: ignore[misc]
-            return
-        for name, digest in list(self._of.items()):
-            if maps.get(name, ("", {}))[0] != digest:
-                for kept in (self._pose, self._how, self._of, self._tried):
-                    kept.pop(name, None)
 
 
 #: The name of a robot without a namespace; a namespace contains no spaces.

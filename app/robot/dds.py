@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 from rosbags.interfaces import Nodetype
 
 from app.robot.address import DdsAddress
-from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, Inbox, Link, first_line
-from app.robot.topics import MAX_ENDPOINTS, NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
+from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, Inbox, Link, first_line
+from app.robot.topics import NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel
 from pipeline.io.readers.ros_messages import standard_types
@@ -62,89 +62,46 @@ _PREFIX, _LONGEST = "rt/", 256
 
 
 @dataclass(frozen=True, slots=True)
-class Offer:
+class Offer(Publisher):
     """What a writer announces about itself.
 
     Attributes:
-        topic, msgtype: In the ROS 2 spelling.
         reliable: Whether it repeats lost messages.
         latched: Whether it repeats its last messages for late subscribers.
     """
 
-    topic: str
-    msgtype: str
     reliable: bool
     latched: bool
 
-    @classmethod
-    def of(cls, topic: str, type_name: str, *, reliable: bool, latched: bool) -> Offer | None:
-        """Return the offer of a writer; None if its topic is not a topic of ROS, its type is not a ROS
-        message, or a name is longer than 256 characters.
 
-        Args:
-            topic: Name of the topic on the network.
-            type_name: Name of the type on the network.
-            reliable, latched: See `Offer`.
-        """
-        if len(topic) > _LONGEST or len(type_name) > _LONGEST or not topic.startswith(_PREFIX):
-            return None
-        name, kind = topic[len(_PREFIX) - 1 :], TYPE.fullmatch(type_name)
-        if kind is None or not NAME.fullmatch(name):
-            return None
-        return cls(name, f"{kind[1]}/msg/{kind[2]}", reliable, latched)
-
-
-class DdsGraph:
-    """The writers that are alive now.
+def offer_of(topic: str, type_name: str, robot: str, *, reliable: bool, latched: bool) -> Offer | None:
+    """Return the offer of a writer; None if its topic is not a topic of ROS, its type is not a ROS message,
+    or a name is longer than 256 characters.
 
     Args:
+        topic: Name of the topic on the network.
+        type_name: Name of the type on the network.
         robot: Name of the robot of the topics below `/robot/`; other topics are of no robot (""). "" for all
             topics as those of one robot.
+        reliable, latched: See `Offer`.
     """
+    if len(topic) > _LONGEST or len(type_name) > _LONGEST or not topic.startswith(_PREFIX):
+        return None
+    name, kind = topic[len(_PREFIX) - 1 :], TYPE.fullmatch(type_name)
+    if kind is None or not NAME.fullmatch(name):
+        return None
+    owner = robot if robot and name.startswith(f"/{robot}/") else ""
+    return Offer(owner, name, f"{kind[1]}/msg/{kind[2]}", reliable, latched)
 
-    def __init__(self, robot: str) -> None:
-        self._robot = robot
-        self._alive: dict[str, Offer] = {}
 
-    def add(self, key: str, offer: Offer | None, losses: dict[str, int]) -> bool:
-        """Add or update a writer that was announced; return whether anything changed. Beyond MAX_ENDPOINTS
-        writers it is counted in `losses` and ignored.
-
-        Args:
-            key: Identifier of the writer.
-            offer: Its offer; None if it is not a writer of ROS.
-            losses: Counts writers for which there is no room.
-        """
-        if offer is None or self._alive.get(key) == offer:
-            return False
-        if len(self._alive) >= MAX_ENDPOINTS:
-            count_loss(losses, TOO_MANY)
-            return False
-        self._alive[key] = offer
-        return True
-
-    def remove(self, key: str) -> bool:
-        """Remove a writer; return whether it was known."""
-        return self._alive.pop(key, None) is not None
-
-    def publishers(self) -> list[Publisher]:
-        """Return each pair of topic and type that is written, once, sorted by robot, topic and type; see the
-        class for the robot of a topic."""
-        found = {(self._owner(offer.topic), offer.topic, offer.msgtype) for offer in self._alive.values()}
-        return [Publisher(*each) for each in sorted(found)]
-
-    def common(self, topic: str, msgtype: str) -> Offer | None:
-        """Return what all writers of a topic offer: reliable or latched only if all of them are; None if
-        there is no writer."""
-        there = [o for o in self._alive.values() if (o.topic, o.msgtype) == (topic, msgtype)]
-        if not there:
-            return None
-        reliable = all(offer.reliable for offer in there)
-        return Offer(topic, msgtype, reliable, reliable and all(offer.latched for offer in there))
-
-    def _owner(self, topic: str) -> str:
-        """Return the robot of a topic: the configured one if the topic is below it, else ""."""
-        return self._robot if self._robot and topic.startswith(f"/{self._robot}/") else ""
+def common_offer(alive: Iterable[Publisher], topic: str, msgtype: str) -> Offer | None:
+    """Return what all writers of a topic offer: reliable or latched only if all of them are; None if there is
+    no writer."""
+    there = [o for o in alive if isinstance(o, Offer) and (o.topic, o.msgtype) == (topic, msgtype)]
+    if not there:
+        return None
+    reliable = all(offer.reliable for offer in there)
+    return replace(there[0], reliable=reliable, latched=reliable and all(offer.latched for offer in there))
 
 
 _WAIT_NS = 50_000_000
@@ -186,7 +143,6 @@ class DdsLink(Link):
     def __init__(self, address: DdsAddress, inbox: Inbox) -> None:
         super().__init__(inbox, "dds")
         self._address = address
-        self._graph = DdsGraph(address.robot)
         self._channels: Sequence[Channel] = ()
         self.thread.start()
 
@@ -203,11 +159,6 @@ class DdsLink(Link):
         there = f" (there are: {', '.join(others)})" if others else ""
         elsewhere = "" if self._address.interface else "; interface=ADDRESS listens on a network"
         return f"no scans{wanted} are announced{there}{elsewhere}"
-
-    def publishers(self) -> list[Publisher]:
-        """Return all topics that are written now."""
-        with self.lock:
-            return self._graph.publishers()
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
         """Receive the messages of these channels from now on, in place of earlier ones."""
@@ -231,7 +182,7 @@ class DdsLink(Link):
         waiting = WaitSet(participant)
         readers: dict[int, _Reader] = {}
         with self.lock:  # writers of an earlier participant may have ended
-            self._graph = DdsGraph(self._address.robot)
+            self.alive.clear()
             self.version += 1
         self.problem = ""
         while not self.closing.is_set():
@@ -248,13 +199,10 @@ class DdsLink(Link):
         from cyclonedds.core import InstanceState
 
         for found in announced.take(100):
-            alive = found.sample_info.instance_state == InstanceState.Alive
-            with self.lock:
-                if alive:
-                    changed = self._graph.add(str(found.key), _offer(found), self.losses)
-                else:
-                    changed = self._graph.remove(str(found.key))
-                self.version += changed
+            if found.sample_info.instance_state == InstanceState.Alive:
+                self.announce(str(found.key), _offer(found, self._address.robot))
+            else:
+                self.withdraw(str(found.key))
 
     def _adjust(self, participant: Any, waiting: Any, readers: dict[int, _Reader]) -> None:  # noqa: ANN401
         """Create and replace readers, so that each channel has one that requests no more than all writers of
@@ -267,7 +215,7 @@ class DdsLink(Link):
         """
         for channel in self._channels:
             with self.lock:
-                offer = self._graph.common(channel.topic, channel.msgtype)
+                offer = common_offer(self.alive.values(), channel.topic, channel.msgtype)
             known = readers.get(channel.number)
             if offer is None or (known is not None and known.offer == offer):
                 continue
@@ -294,14 +242,15 @@ class DdsLink(Link):
             self.take(reader.channel, payload, len(payload))
 
 
-def _offer(found: Any) -> Offer | None:  # noqa: ANN401
-    """Return topic, type and quality of service of a writer that cyclonedds announced; None if it is no topic
-    of ROS."""
+def _offer(found: Any, robot: str) -> Offer | None:  # noqa: ANN401
+    """Return the offer of a writer that cyclonedds announced; None if it is no topic of ROS. `robot` is as in
+    `offer_of`."""
     from cyclonedds.core import Policy
 
     reliable = isinstance(found.qos[Policy.Reliability], Policy.Reliability.Reliable)
     latched = found.qos[Policy.Durability] in (Policy.Durability.TransientLocal, Policy.Durability.Persistent)
-    return Offer.of(found.topic_name or "", found.type_name or "", reliable=reliable, latched=latched)
+    topic, kind = found.topic_name or "", found.type_name or ""
+    return offer_of(topic, kind, robot, reliable=reliable, latched=latched)
 
 
 class _Sample:

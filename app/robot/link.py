@@ -266,9 +266,10 @@ class Link(ABC):
 
     Attributes:
         problem: Reason why there is no connection, "" while there is one.
+        alive: What is published now, by the identifier of the writer; `lock` guards it.
         losses: Number of messages lost before the inbox, by reason.
         scans: Number of scans that arrived.
-        version: Number of changes among the publishers so far.
+        version: Number of changes of `alive` so far.
         session: Session on which results can be published, None if there is none.
     """
 
@@ -277,6 +278,7 @@ class Link(ABC):
     def __init__(self, inbox: Inbox, name: str) -> None:
         self.problem = "not connected yet"
         self.losses: dict[str, int] = {}
+        self.alive: dict[str, Publisher] = {}
         self.scans = self.version = 0
         self.inbox, self.times = inbox, ArrivalTimes()
         self.lock, self.closing = threading.Lock(), threading.Event()
@@ -292,10 +294,6 @@ class Link(ABC):
     @abstractmethod
     def nothing(self) -> str:
         """Reason why no scan topic is chosen, as text for the user."""
-
-    @abstractmethod
-    def publishers(self) -> list[Publisher]:
-        """Return all topics that are published now, each once."""
 
     @abstractmethod
     def subscribe(self, channels: Sequence[Channel]) -> None:
@@ -314,6 +312,34 @@ class Link(ABC):
     def silence_s(self) -> float | None:
         """Seconds since the last scan arrived, None before the first."""
         return None if self.heard_s is None else time.monotonic() - self.heard_s
+
+    def announce(self, key: str, publisher: Publisher | None) -> None:
+        """Add or update a writer that was announced. Beyond MAX_ENDPOINTS writers it is counted in `losses`
+        and ignored.
+
+        Args:
+            key: Identifier of the writer.
+            publisher: What it publishes; None, for another entity than a writer of ROS, is ignored.
+        """
+        with self.lock:
+            if publisher is None or self.alive.get(key) == publisher:
+                return
+            if key not in self.alive and len(self.alive) >= MAX_ENDPOINTS:
+                count_loss(self.losses, TOO_MANY)
+                return
+            self.alive[key] = publisher
+            self.version += 1
+
+    def withdraw(self, key: str) -> None:
+        """Remove a writer that ended; nothing happens for an unknown one."""
+        with self.lock:
+            self.version += self.alive.pop(key, None) is not None
+
+    def publishers(self) -> list[Publisher]:
+        """Return all topics that are published now, each once, sorted by robot, topic and type."""
+        with self.lock:
+            found = {(each.robot, each.topic, each.msgtype) for each in self.alive.values()}
+        return [Publisher(*each) for each in sorted(found)]
 
     def robots(self) -> list[str]:
         """The namespaces from which scans are published, sorted."""

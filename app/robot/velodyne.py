@@ -100,7 +100,6 @@ class VelodyneLink(Link):
         self._address = address
         self._sweeps = Sweeps()
         self._product: int | None = None
-        self._there = False
         self._number: int | None = None
         self.thread.start()
 
@@ -116,10 +115,6 @@ class VelodyneLink(Link):
         refused = self.losses.get(OTHERS, 0)
         others = f"; {refused} packets of other senders were refused" if refused else ""
         return f"no data packet of a known sensor came{others}"
-
-    def publishers(self) -> list[Publisher]:
-        """Return the topic of the sensor; [] while it does not send."""
-        return [Publisher("", TOPIC, VELODYNE_SCAN)] if self._there else []
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
         """Put sweeps into the inbox from now on, under the number of the first channel."""
@@ -160,9 +155,8 @@ class VelodyneLink(Link):
         if self._sweeps.is_stale(self.times.now_ns()):
             self._hand_over(self._sweeps.end())
         silence_s = self.silence_s
-        if self._there and silence_s is not None and silence_s > _LOST_S:
-            self._there = False
-            self.version += 1
+        if silence_s is not None and silence_s > _LOST_S:
+            self.withdraw(TOPIC)
 
     def _take(self, packet: bytes, sender: str) -> None:
         """Process a packet. Packets of other senders or sensors, and those that are no data packets, are
@@ -180,9 +174,7 @@ class VelodyneLink(Link):
             count_loss(self.losses, OTHER_SENSOR)
             return
         self.heard_s = time.monotonic()
-        if not self._there:
-            self._there = True
-            self.version += 1
+        self.announce(TOPIC, Publisher("", TOPIC, VELODYNE_SCAN))
         self._hand_over(self._sweeps.add(self.times.now_ns(), packet))
 
     def _hand_over(self, sweep: bytes | None) -> None:

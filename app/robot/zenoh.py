@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from app.robot.address import ROOT, ZenohAddress
-from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, TOO_MANY, Inbox, Link, first_line
-from app.robot.topics import MAX_ENDPOINTS, NAME, SCAN_TYPES, TYPE, Publisher
+from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, Inbox, Link, first_line
+from app.robot.topics import NAME, SCAN_TYPES, TYPE, Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel
 from pipeline.io.recording import outputs
@@ -53,32 +53,6 @@ def data_key(domain: int, topic: str, msgtype: str, type_hash: str = "*") -> str
     """
     package, _, name = msgtype.split("/")
     return f"{domain}/{topic.lstrip('/')}/{package}::msg::dds_::{name}_/{type_hash}"
-
-
-class RosGraph:
-    """The present publishers, by liveliness token."""
-
-    def __init__(self) -> None:
-        self._alive: dict[str, Publisher] = {}
-
-    def add(self, token: str) -> bool:
-        """Add a token; return False if there is no room. Known tokens, and those of other entities than
-        publishers, are ignored."""
-        publisher = publisher_of(token)
-        if publisher is None or token in self._alive:
-            return True
-        if len(self._alive) >= MAX_ENDPOINTS:
-            return False
-        self._alive[token] = publisher
-        return True
-
-    def remove(self, token: str) -> None:
-        """Remove a token; nothing happens for an unknown one."""
-        self._alive.pop(token, None)
-
-    def publishers(self) -> list[Publisher]:
-        """Return all publishers, each once, sorted by robot and topic."""
-        return sorted(set(self._alive.values()), key=lambda p: (p.robot, p.topic, p.msgtype))
 
 
 _WATCH_S = 1.0
@@ -126,7 +100,6 @@ class ZenohLink(Link):
     def __init__(self, address: ZenohAddress, inbox: Inbox) -> None:
         super().__init__(inbox, "zenoh")
         self._address = address
-        self._graph = RosGraph()
         self._channels: Sequence[Channel] = ()
         self._subscriptions: list[Any] = []
         self._sequences: dict[int, tuple[bytes, int]] = {}
@@ -147,11 +120,6 @@ class ZenohLink(Link):
         others = [robot or "(no namespace)" for robot in self.robots()]
         there = f" (there are: {', '.join(others[:10])})" if others else ""
         return f"no scans of {wanted} are announced in ROS domain {self._address.domain}{there}"
-
-    def publishers(self) -> list[Publisher]:
-        """Return all present publishers."""
-        with self.lock:
-            return self._graph.publishers()
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
         """Receive the messages of further channels; publishers of fixed transforms repeat their last
@@ -195,7 +163,7 @@ class ZenohLink(Link):
         session: Any = zenoh.open(zenoh.Config.from_json5(config))
         with self.lock:
             self.session = session
-            self._graph = RosGraph()
+            self.alive.clear()
         if self.closing.is_set():
             return
         key = f"{ADMIN}/{self._address.domain}/**"
@@ -220,15 +188,14 @@ class ZenohLink(Link):
                 session.close()
 
     def _note_token(self, sample: Any) -> None:  # noqa: ANN401
-        """Process the announcement or withdrawal of a publisher; without room it is counted in `losses`."""
+        """Process the announcement or withdrawal of a publisher."""
         import zenoh
 
-        with self.lock:
-            self.version += 1
-            if sample.kind == zenoh.SampleKind.DELETE:
-                self._graph.remove(str(sample.key_expr))
-            elif not self._graph.add(str(sample.key_expr)):
-                count_loss(self.losses, TOO_MANY)
+        token = str(sample.key_expr)
+        if sample.kind == zenoh.SampleKind.DELETE:
+            self.withdraw(token)
+        else:
+            self.announce(token, publisher_of(token))
 
     def _take(self, sample: Any, channel: Channel) -> None:  # noqa: ANN401
         """Put a message into the inbox, and count the messages lost before it."""

@@ -24,15 +24,31 @@ from pipeline.evaluation import MapScores
 # --- goal -------------------------------------------------------------------------------------------
 
 GoalName = Literal["f1", "ta", "position", "pairs"]
-GOALS: dict[GoalName, str] = {
-    "f1": "F1",
-    "ta": "true acceptance (TA), false trees bounded",
-    "position": "position RMSE, F1 not below that of the start",
-    "pairs": "mean pair error, F1 not below that of the start",
+
+
+@dataclass(frozen=True, slots=True)
+class GoalTexts:
+    """How a goal is shown.
+
+    Attributes:
+        words: Description.
+        label, unit: Short name of the score and its unit; the unit is empty for F1 and TA.
+        broken: Loss from which on a set breaks the bound of the goal; larger than any TA, RMSE [m] or pair
+            error [%] of a set that keeps it. Every set keeps that of "f1".
+    """
+
+    words: str
+    label: str
+    unit: str
+    broken: float
+
+
+GOALS: dict[GoalName, GoalTexts] = {
+    "f1": GoalTexts("F1", "F1", "", math.inf),
+    "ta": GoalTexts("true acceptance (TA), false trees bounded", "TA", "", 2.0),
+    "position": GoalTexts("position RMSE, F1 not below that of the start", "RMSE", "cm", 1e3),
+    "pairs": GoalTexts("mean pair error, F1 not below that of the start", "pair error", "%", 1e6),
 }
-# Loss from which on a set breaks the bound of its goal; larger than any TA, RMSE [m] or pair error [%] of a
-# set that keeps it.
-_BROKEN: dict[GoalName, float] = {"f1": 1.0, "ta": 2.0, "position": 1e3, "pairs": 1e6}
 
 
 class RunScore(msgspec.Struct, frozen=True):
@@ -103,32 +119,29 @@ class Goal:
             return 1.0 - pooled.f1
         if self.name == "ta":
             beyond = pooled.false_share - self.false_max
-            return 1.0 - pooled.ta if beyond <= 0.0 else _BROKEN["ta"] + beyond
+            return 1.0 - pooled.ta if beyond <= 0.0 else self.texts.broken + beyond
         error = pooled.position_rmse if self.name == "position" else pooled.pair_error
         short = start.f1 - pooled.f1
-        return _BROKEN[self.name] + max(short, 0.0) if error is None or short > 1e-12 else error
+        return self.texts.broken + max(short, 0.0) if error is None or short > 1e-12 else error
 
     def is_kept(self, loss: float) -> bool:
         """Return whether a loss is that of a set that satisfies the bound of the goal; True for "f1"."""
-        return self.name == "f1" or loss < _BROKEN[self.name]
+        return loss < self.texts.broken
 
     def figure(self, loss: float) -> float:
-        """Return the score, in `unit`, of a loss that satisfies the bound: 1 - loss for "f1" and "ta", cm for
-        "position", % for "pairs". The result has no meaning for other losses, see `is_kept`."""
+        """Return the score, in the unit of the goal, of a loss that satisfies the bound: 1 - loss for "f1"
+        and "ta", cm for "position", % for "pairs". The result has no meaning for other losses, see
+        `is_kept`."""
         if self.name in ("f1", "ta"):
             return 1.0 - loss
         return 100.0 * loss if self.name == "position" else loss
 
     def figure_of(self, pooled: Pooled) -> float | None:
-        """Return the score of the goal, in `unit`, from pooled scores; None if it is unknown."""
-        value = {
-            "f1": pooled.f1,
-            "ta": pooled.ta,
-            "position": pooled.position_rmse,
-            "pairs": pooled.pair_error,
-        }
-        figure = value[self.name]
-        return 100.0 * figure if self.name == "position" and figure is not None else figure
+        """Return the score, in the unit of the goal, from pooled scores; None if it is unknown."""
+        if self.name in ("f1", "ta"):
+            return pooled.f1 if self.name == "f1" else pooled.ta
+        error = pooled.position_rmse if self.name == "position" else pooled.pair_error
+        return None if error is None else self.figure(error)
 
     def shown(self, loss: float) -> str:
         """Return a loss as text, for example "RMSE 3.20 cm" or "F1 0.912"; "outside the bound" if the goal
@@ -136,23 +149,18 @@ class Goal:
         if not self.is_kept(loss):
             return "outside the bound"
         digits = 2 if self.name == "position" else 3
-        return f"{self.label} {self.figure(loss):.{digits}f} {self.unit}".rstrip()
+        return f"{self.texts.label} {self.figure(loss):.{digits}f} {self.texts.unit}".rstrip()
 
     @property
-    def label(self) -> str:
-        """Short name of the score."""
-        return {"f1": "F1", "ta": "TA", "position": "RMSE", "pairs": "pair error"}[self.name]
-
-    @property
-    def unit(self) -> str:
-        """Unit of the score; empty for F1 and TA."""
-        return {"position": "cm", "pairs": "%"}.get(self.name, "")
+    def texts(self) -> GoalTexts:
+        """How the goal is shown."""
+        return GOALS[self.name]
 
     @property
     def words(self) -> str:
         """Description of the goal with its bound."""
         bound = f" (at most {100.0 * self.false_max:g} % of the mapped trees)" if self.name == "ta" else ""
-        return GOALS[self.name] + bound
+        return self.texts.words + bound
 
 
 def score_of(e: MapScores) -> RunScore:

@@ -287,8 +287,8 @@ def for_page(
     every = -(-len(points) // _POINTS_LIMIT) or 1
     return {
         "goal": goal.words,
-        "label": goal.label,
-        "unit": goal.unit,
+        "label": goal.texts.label,
+        "unit": goal.texts.unit,
         "over": [axis.words for axis in plan.axes],
         "wanted": plan.trials,
         "made": len(trials),

@@ -39,7 +39,7 @@ async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile)
         runs = []
     choices = {
         "sensible": SENSIBLE,
-        "goals": [{"name": n, "words": words} for n, words in GOALS.items()],
+        "goals": [{"name": name, "words": goal.words} for name, goal in GOALS.items()],
         "runs": runs,
         "most_runs": MOST_OTHERS,
     }

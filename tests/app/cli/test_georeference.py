@@ -114,7 +114,7 @@ def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, mes
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4326"], 1, "degrees"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:2263"], 1, "foot"),
         (["--by-hand", "50,5,0", "--crs", "EPSG:25832"], 1, "do not fit"),
-        (["--by-hand", "50,5", "--crs", "EPSG:25832"], 1, "three or four numbers"),
+        (["--by-hand", "50,5", "--crs", "EPSG:25832"], 2, "EAST,NORTH,TURN[,Z]"),
         (["--gnss", "--crs", "EPSG:25832"], 1, "no GNSS fixes"),
     ],
 )

@@ -93,9 +93,6 @@ def test_points_with_a_radius_are_circles(run, tmp_path, capsys):
     [
         (["--circle", "500,500,5"], "outside of what the run observed"),
         (["--circle", "10,10,0"], "area of 0"),
-        (["--circle", "10,10"], "not 3 numbers"),
-        (["--circle", "nan,10,2"], "not 3 numbers"),
-        (["--rectangle", "10,10,5,inf"], "not 4 or 5 numbers"),
         (["--along", "200"], "no plots every 200 m"),
         (["--plots", "missing.gpkg"], "cannot read the plots"),
         (["--plots", "plots.txt"], ".gpkg, .shp or .geojson"),
@@ -109,6 +106,9 @@ def test_plots_that_cannot_be_used_are_refused(run, capsys, words, message):
     ("words", "message"),
     [
         (["--dbh-min", "7"], "--dbh-min 7"),
+        (["--circle", "10,10"], "is not X,Y,R"),
+        (["--circle", "nan,10,2"], "is not X,Y,R"),
+        (["--rectangle", "10,10,5,inf"], "is not X,Y,LENGTH,WIDTH[,TURN]"),
         (["--reach", "far"], "--reach"),
         (["--correction", "x"], "--correction"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,8 @@ import numpy as np
 import pytest
 
 from app.robot.address import DdsAddress, parse_address
-from app.robot.dds import DdsGraph, Offer
+from app.robot.dds import Offer, common_offer, offer_of
 from app.robot.source import LiveSource
-from app.robot.topics import Publisher
 from pipeline.errors import SourceError
 from pipeline.io.readers.ros_messages import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
 from pipeline.types.records import Odometry, Record, Scan
@@ -64,30 +64,20 @@ def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch):
 
 def test_topics_of_ros_are_told_from_others():
     kind = "sensor_msgs::msg::dds_::PointCloud2_"
-    offer = Offer.of("rt/red/points", kind, reliable=True, latched=False)
-    assert offer == Offer("/red/points", POINT_CLOUD, reliable=True, latched=False)
+    offer = offer_of("rt/red/points", kind, "red", reliable=True, latched=False)
+    assert offer == Offer("red", "/red/points", POINT_CLOUD, reliable=True, latched=False)
+    other = offer_of("rt/tf", "tf2_msgs::msg::dds_::TFMessage_", "red", reliable=True, latched=False)
+    assert other == Offer("", "/tf", TRANSFORMS, reliable=True, latched=False)
     for topic, type_name in [("red/points", kind), ("rr/red/reply", kind), ("rt/a b", kind), ("rt/a", "Foo")]:
-        assert Offer.of(topic, type_name, reliable=True, latched=False) is None
+        assert offer_of(topic, type_name, "", reliable=True, latched=False) is None
 
 
 def test_a_reader_asks_for_no_more_than_all_writers_offer():
-    graph, losses = DdsGraph("red"), dict[str, int]()
-    one = Offer("/red/points", POINT_CLOUD, reliable=True, latched=True)
-    assert graph.add("a", one, losses)
-    assert not graph.add("a", one, losses)
-    assert graph.common("/red/points", POINT_CLOUD) == one
-    graph.add("b", Offer("/red/points", POINT_CLOUD, reliable=False, latched=False), losses)
-    assert graph.common("/red/points", POINT_CLOUD) == Offer(
-        "/red/points", POINT_CLOUD, reliable=False, latched=False
-    )
-    graph.add("c", Offer("/tf", TRANSFORMS, reliable=True, latched=False), losses)
-    assert graph.publishers() == [
-        Publisher("", "/tf", TRANSFORMS),
-        Publisher("red", "/red/points", POINT_CLOUD),
-    ]
-    assert graph.remove("b")
-    assert not graph.remove("b")
-    assert graph.common("/red/points", ODOMETRY) is None
+    one = Offer("red", "/red/points", POINT_CLOUD, reliable=True, latched=True)
+    assert common_offer([one], "/red/points", POINT_CLOUD) == one
+    less = replace(one, reliable=False, latched=False)
+    assert common_offer([one, less], "/red/points", POINT_CLOUD) == less
+    assert common_offer([one], "/red/points", ODOMETRY) is None
 
 
 def test_the_types_are_those_that_recordings_are_written_with(drive: Path):

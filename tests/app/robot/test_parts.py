@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+from collections.abc import Sequence
 from contextlib import closing
 
 import pytest
@@ -11,12 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.robot.address import VelodyneAddress, ZenohAddress, is_live, parse_address
-from app.robot.link import MAX_BYTES, MAX_OTHERS, MAX_SCANS, SKIPPED, Inbox
+from app.robot.link import MAX_BYTES, MAX_OTHERS, MAX_SCANS, SKIPPED, TOO_MANY, Inbox, Link
 from app.robot.topics import Publisher, choose
 from app.robot.velodyne import VelodyneLink
-from app.robot.zenoh import RosGraph, ZenohLink, data_key, publisher_of
+from app.robot.zenoh import ZenohLink, data_key, publisher_of
 from pipeline.errors import SourceError
-from pipeline.io.readers.container import Message
+from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.ros_messages import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS
 from tests.app.robot.conftest import free_port, until
 
@@ -82,25 +83,43 @@ def test_tokens_and_keys_are_those_of_another_library(robot: str, node: str, top
     )
 
 
+class IdleLink(Link):
+    """A link that connects to nothing."""
+
+    place = nothing = ""
+
+    def subscribe(self, channels: Sequence[Channel]) -> None:
+        """Nothing is received."""
+
+    def receive(self) -> None:
+        """Nothing is received."""
+
+    def failure(self, error: Exception) -> str:
+        return str(error)
+
+
 @given(st.text(max_size=200))
 def test_any_text_is_a_token_or_none(text: str):
-    graph = RosGraph()
-    graph.add(text)
-    graph.add(f"@ros2_lv/{text}")
-    graph.remove(text)
-    assert graph.publishers() == []
+    link = IdleLink(Inbox(), "idle")
+    link.announce(text, publisher_of(text))
+    link.announce(f"@ros2_lv/{text}", publisher_of(f"@ros2_lv/{text}"))
+    link.withdraw(text)
+    assert link.publishers() == []
 
 
 def test_a_network_with_too_many_topics_is_told_of_and_room_comes_back(monkeypatch):
-    monkeypatch.setattr("app.robot.zenoh.MAX_ENDPOINTS", 2)
+    monkeypatch.setattr("app.robot.link.MAX_ENDPOINTS", 2)
     token = "@ros2_lv/0/abc/0/{}/MP/%/%/driver/%topic{}/std_msgs::msg::dds_::Empty_/RIHS01_00/::,10:,:,:,,"
     first, second, third = (token.format(k, k) for k in range(3))
-    graph = RosGraph()
-    assert [graph.add(each) for each in (first, second, first, third)] == [True, True, True, False]
-    assert graph.add("no token of a publisher")
-    graph.remove(first)
-    assert graph.add(third)
-    assert len(graph.publishers()) == 2
+    link = IdleLink(Inbox(), "idle")
+    for each in (first, second, first, "no token of a publisher"):
+        link.announce(each, publisher_of(each))
+    assert (len(link.publishers()), link.losses) == (2, {})
+    link.announce(third, publisher_of(third))
+    assert (len(link.publishers()), link.losses) == (2, {TOO_MANY: 1})
+    link.withdraw(first)
+    link.announce(third, publisher_of(third))
+    assert [publisher.topic for publisher in link.publishers()] == ["/topic1", "/topic2"]
 
 
 ODD = st.text(st.sampled_from("%ab0_*$#?~. -é"), min_size=1, max_size=12)

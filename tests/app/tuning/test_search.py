@@ -14,7 +14,7 @@ import pytest
 
 from app.batch.run_folder import read_run_record
 from app.cli import main
-from app.cli.tune import files_of
+from app.cli.flags import files_of
 from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
 from app.store.records import Content, as_truth, contents_of
