@@ -175,21 +175,18 @@ class AnnotationEditor:
         """
         self.leave()
 
-        def work(store: Store) -> tuple[int, _Rows, TruthTrees | None]:
+        def work(store: Store) -> tuple[int, _Rows]:
             run = store.open_run(source, uri, Path(uri).name[:200] or uri[:200])
-            rows = _rows_of(store, run)
-            return run, rows, truth_of(own, rows[0], "both")
+            return run, _rows_of(store, run)
 
         self._own = self.truth = own
         generation = self._generation
         try:
-            run, rows, truth = await self._store.ask(work)
+            run, (rows, skipped) = await self._store.ask(work)
             if generation != self._generation:  # another run was opened meanwhile
                 return
-            self.run, (self.rows, self.skipped) = run, rows
-            # The choice may have changed meanwhile.
-            self.truth = truth if self.against == "both" else truth_of(own, self.rows, self.against)
-            self.problem = ""
+            self.run, self.rows, self.skipped, self.problem = run, rows, skipped, ""
+            self.truth = truth_of(own, rows, self.against)
         except StemmapError as error:
             if generation != self._generation:
                 return
@@ -231,22 +228,21 @@ class AnnotationEditor:
                 "another run was opened",
                 remedy="Your edit was not saved; repeat it in the run that is open now",
             )
-        own, against, generation = self._own, self.against, self._generation
+        generation = self._generation
 
-        def work(store: Store) -> tuple[T | StaleError, _Rows, TruthTrees | None]:
+        def work(store: Store) -> tuple[T | StaleError, _Rows]:
             done: T | StaleError
             try:
                 done = function(store)
             except StaleError as error:  # the current state is shown to the person
                 done = error
-            rows = _rows_of(store, run)
-            return done, rows, truth_of(own, rows[0], against)
+            return done, _rows_of(store, run)
 
-        done, (rows, skipped), truth = await self._store.ask(work)
+        done, (rows, skipped) = await self._store.ask(work)
         if generation == self._generation:  # else another run was opened meanwhile
             who, number = _edits(self.rows, rows)
             self.rows, self.skipped = rows, skipped
-            self.truth = truth if against == self.against else truth_of(own, rows, self.against)
+            self.truth = truth_of(self._own, rows, self.against)
             self.serial += 1
             self.changed()
             if number:

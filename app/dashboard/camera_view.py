@@ -12,6 +12,7 @@ import numpy as np
 
 from app.batch.tree_pictures import stem_corners
 from app.common.draw_picture import Drawing, draw_safely
+from app.common.request_queue import RequestQueue
 from app.dashboard.payload import clusters_payload
 from app.dashboard.selection import NoStoryError, WorkerClient
 from app.worker.protocol import CameraPicture
@@ -21,6 +22,7 @@ from pipeline.types.records import Float, Frame, Path, Trees
 
 #: All browsers together get so many pictures a second at most.
 _PAUSE_S = 0.3
+_MOST_WAITING = 100  # the browsers of all roles
 _MOST_KEPT = 8
 
 
@@ -34,8 +36,7 @@ class CameraView:
     def __init__(self, worker_client: WorkerClient) -> None:
         self._client = worker_client
         self._kept: OrderedDict[int, bytes] = OrderedDict()
-        self._turn = asyncio.Lock()
-        self._next_at = 0.0
+        self._queue = RequestQueue(_PAUSE_S, _MOST_WAITING)
         # Number of the run: simulated runs have pictures of equal times. It differs after a restart as well.
         self._of = time.time_ns() // 1_000_000
 
@@ -63,10 +64,10 @@ class CameraView:
             NoStoryError: There is no picture, it cannot be decoded, or another run was opened; the message
                 has the reason.
             WorkerBusyError: The worker did not answer in time.
+            TooManyRequestsError: Too many calls wait.
         """
-        async with self._turn:
+        async with self._queue.turn():
             of = self._of
-            await asyncio.sleep(max(0.0, self._next_at - time.monotonic()))
             found = await self._client.camera(frame.stamp_ns)
             self._check(of)
             picture = found.picture
@@ -80,7 +81,6 @@ class CameraView:
                 self._kept[picture.stamp_ns] = content
                 while len(self._kept) > _MOST_KEPT:
                     self._kept.popitem(last=False)
-            self._next_at = time.monotonic() + _PAUSE_S
         camera, moved = found.camera, motion(path, frame.stamp_ns, picture.stamp_ns)
         return {
             "index": frame.index,
@@ -104,11 +104,9 @@ class CameraView:
             NoStoryError: No picture shows the tree, or it cannot be decoded.
             WorkerBusyError: The worker did not answer in time.
         """
-        async with self._turn:
-            await asyncio.sleep(max(0.0, self._next_at - time.monotonic()))
+        async with self._queue.turn():
             found = await self._client.tree_picture(number)
             content = await asyncio.to_thread(drawn_tree, found, number, trees, path)
-            self._next_at = time.monotonic() + _PAUSE_S
         if content is None:
             raise NoStoryError(f"no picture shows tree {number}", remedy="Select another")
         return content

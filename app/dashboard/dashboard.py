@@ -385,7 +385,7 @@ class Dashboard:
         self.path_xy = np.zeros((0, 2))
         self.live.forget_map()
         self.scores.forget()
-        self._before_after.forget()
+        self._before_after = BeforeAfter()
         self.events.forget()
         self._broadcast_events()
         self.loop.choose(None)
@@ -439,7 +439,7 @@ class Dashboard:
         counted = await asyncio.to_thread(counts_of, shown.frame, self.truth, distance)
         if number != self._opens:  # another source was requested meanwhile
             return
-        counts = self._before_after.shown(counted)
+        counts = self._before_after.shown(shown.frame.index, counted)
         payload["layers"] |= self.scene.counts
         self.live.show({**payload, **counts}, path_xy)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import msgspec
@@ -177,29 +176,10 @@ def _finite(values: Float) -> list[float | None]:
     return [round(v, 2) if math.isfinite(v) else None for v in values.tolist()]
 
 
-@dataclass(frozen=True, slots=True)
-class Counts:
-    """Verdict counts of a scan.
-
-    Attributes:
-        index: Index of the scan.
-        verdicts: Number of clusters by verdict.
-        right, wrong: Clusters with the verdict tree that are at a true tree, and those that are not; None
-            without ground truth.
-    """
-
-    index: int
-    verdicts: dict[str, int]
-    right: int | None
-    wrong: int | None
-
-    def as_plain(self) -> dict[str, Any]:
-        """Return the counts for the page."""
-        return {"verdicts": self.verdicts, "right": self.right, "wrong": self.wrong}
-
-
-def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> Counts:
-    """Return the verdict counts of a scan.
+def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
+    """Return the verdict counts of a scan: `verdicts`, the number of clusters by verdict, and `right` and
+    `wrong`, the clusters with the verdict tree that are at a true tree, and those that are not; None without
+    ground truth.
 
     Args:
         frame: Results of the scan.
@@ -208,38 +188,33 @@ def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> 
     """
     verdicts = verdict_counts(frame.clusters.verdict)
     if truth is None:
-        return Counts(frame.index, verdicts, None, None)
+        return {"verdicts": verdicts, "right": None, "wrong": None}
     from pipeline.evaluation import match
 
     found = frame.estimate.T_map_base.apply(frame.detections.centre)
     truth_of = match(found, np.column_stack([truth.x, truth.y]), match_distance)
     right = sum(row >= 0 and truth.kind[row] == "tree" for row in truth_of.tolist())
-    return Counts(frame.index, verdicts, right, len(found) - right)
+    return {"verdicts": verdicts, "right": right, "wrong": len(found) - right}
 
 
 class BeforeAfter:
     """Keeps the verdict counts of the current scan before the last change of parameters."""
 
     def __init__(self) -> None:
-        self._now: Counts | None = None
-        self._before: Counts | None = None
-
-    def forget(self) -> None:
-        """Remove the counts, because another run begins."""
-        self._now = self._before = None
+        self._now: tuple[int, dict[str, Any] | None] = (-1, None)  # index of the scan, and its counts
+        self._before: tuple[int, dict[str, Any] | None] = self._now
 
     def step(self) -> None:
         """Keep the present counts as those before a change that is a step of its own."""
         self._before = self._now
 
-    def shown(self, counts: Counts) -> dict[str, Any]:
-        """Set the counts of the displayed scan and return the message for the page; `before` is None if
-        another scan was displayed since the change."""
-        self._now = counts
-        if self._before is not None and self._before.index != counts.index:
-            self._before = None  # from another scan
-        before = None if self._before is None else self._before.as_plain()
-        return {"right": counts.right, "wrong": counts.wrong, "before": before}
+    def shown(self, index: int, counts: dict[str, Any]) -> dict[str, Any]:
+        """Set the counts of the displayed scan, by its index, and return the message for the page; `before`
+        is None if another scan was displayed since the change."""
+        self._now = (index, counts)
+        if self._before[0] != index:
+            self._before = (-1, None)
+        return {"right": counts["right"], "wrong": counts["wrong"], "before": self._before[1]}
 
 
 REACH = 0.45  # m; maximum distance between a tree and its column
@@ -310,11 +285,10 @@ def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
 def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
     """Return the description of the clusters of a frame for the header of a binary block: index of the scan,
     clusters, verdict counts, and numbers of points by stage. Arguments as in `counts_of`."""
-    counts = counts_of(frame, truth, match_distance)
     return {
         "index": frame.index,
         "clusters": clusters_payload(frame),
-        **counts.as_plain(),
+        **counts_of(frame, truth, match_distance),
         "counts": dict(frame.counts),
     }
 

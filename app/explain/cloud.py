@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from app.common.arrays import evenly_spaced
-from app.explain.history import TreeHistory, half_axes
+from app.explain.history import half_axes
 from app.explain.records import CheckResult, ClusterStory, CrossSection, TreeStory
 from app.worker.inventory_run import InventoryRun
 from pipeline.config import field_specs
@@ -48,7 +48,6 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
     return TreeStory(
         tree=number,
         scan=0,
-        time_s=0.0,
         confirmed=True,
         position=(float(trees.position[row, 0]), float(trees.position[row, 1])),
         ellipse=(major, minor, angle),
@@ -56,15 +55,8 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
         dbh_sigma=float(trees.dbh_sigma[row]),
         coverage_deg=float(np.degrees(trees.coverage[row])),
         dbh_arc_deg=run.parameters_at(0).tracking.dbh_arc_min,
-        sides=[],
-        eccentricity=float("nan"),
         observations=int(trees.observations[row]),
-        first_seen_s=0.0,
-        last_seen_s=0.0,
         cluster=candidate,
-        column=None,
-        points=[],  # the cross-sections have them
-        history=TreeHistory().of(number, 0),
         height=float(plot.crowns.height[row]),
         height_sigma=float(plot.crowns.sigma[row]),
         height_hidden=plot.crowns.hidden[row],
@@ -94,21 +86,12 @@ def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
     return ClusterStory(
         scan=0,
         cluster=row,
-        time_s=0.0,
         verdict=Verdict(int(c.verdict[row])).label,
         checks=check_results(checks, row) if row < len(c.stems) else [],
         size=int(frame.clusters.size[row]),
-        eccentricity=float("nan"),
         position=(float(place[0]), float(place[1])),
-        distance=float("nan"),
-        sensor_sigma=float("nan"),
-        points=[],
-        residual=[],
-        circle=None,
-        axes=[],
         tree=int(frame.trees.number[tree[0]]) if len(tree) else None,
         tree_distance=0.0 if len(tree) else float("nan"),
-        column=None,
         sections=cross_sections(plot, row),
     )
 

@@ -140,21 +140,21 @@ class ClusterStory(msgspec.Struct, frozen=True):
 
     scan: int
     cluster: int
-    time_s: float
     verdict: str
     checks: list[CheckResult]
     size: int
-    eccentricity: float
     position: tuple[float, float]
-    distance: float
-    sensor_sigma: float
-    points: list[tuple[float, float]]
-    residual: list[float]
-    circle: Circle | None
-    axes: list[tuple[float, float]]
-    tree: int | None
-    tree_distance: float
-    column: ColumnStory | None
+    time_s: float = 0.0
+    eccentricity: float = math.nan
+    distance: float = math.nan
+    sensor_sigma: float = math.nan
+    points: list[tuple[float, float]] = []
+    residual: list[float] = []
+    circle: Circle | None = None
+    axes: list[tuple[float, float]] = []
+    tree: int | None = None
+    tree_distance: float = math.nan
+    column: ColumnStory | None = None
     sections: list[CrossSection] | None = None
 
 
@@ -163,14 +163,14 @@ class History(msgspec.Struct, frozen=True):
     scan of the run [s], position [m], half axes [m] and direction [rad] of its 1-sigma ellipse, DBH and its
     sigma [m]."""
 
-    time_s: list[float]
-    x: list[float]
-    y: list[float]
-    major: list[float]
-    minor: list[float]
-    angle: list[float]
-    dbh: list[float]
-    dbh_sigma: list[float]
+    time_s: list[float] = []
+    x: list[float] = []
+    y: list[float] = []
+    major: list[float] = []
+    minor: list[float] = []
+    angle: list[float] = []
+    dbh: list[float] = []
+    dbh_sigma: list[float] = []
 
 
 class MapSection(msgspec.Struct, frozen=True):
@@ -215,7 +215,6 @@ class TreeStory(msgspec.Struct, frozen=True):
 
     tree: int
     scan: int
-    time_s: float
     confirmed: bool
     position: tuple[float, float]
     ellipse: tuple[float, float, float]
@@ -223,15 +222,16 @@ class TreeStory(msgspec.Struct, frozen=True):
     dbh_sigma: float
     coverage_deg: float
     dbh_arc_deg: float
-    sides: list[bool]
-    eccentricity: float
     observations: int
-    first_seen_s: float
-    last_seen_s: float
     cluster: int | None
-    column: ColumnStory | None
-    points: list[tuple[float, float, float]]
-    history: History
+    time_s: float = 0.0
+    sides: list[bool] = []
+    eccentricity: float = math.nan
+    first_seen_s: float = 0.0
+    last_seen_s: float = 0.0
+    column: ColumnStory | None = None
+    points: list[tuple[float, float, float]] = []
+    history: History = History()
     height: float = math.nan
     height_sigma: float = math.nan
     height_hidden: str = ""

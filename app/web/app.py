@@ -18,6 +18,7 @@ from starlette.middleware import Middleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from app.common.request_queue import TooManyRequestsError
 from app.common.settings import Settings
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
@@ -32,7 +33,7 @@ from app.web.auth import Guard, viewer_token
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
 from app.web.routes import page, parameters, results, run, runs, sockets, tuning
-from app.web.routes.access import Limits, TooManyRequestsError
+from app.web.routes.access import Limits
 from app.web.routes.run import NotPermittedError
 from app.web.uploads import UploadError, Uploads
 from app.worker.protocol import Open, WorkerBusyError

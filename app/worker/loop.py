@@ -1,5 +1,16 @@
 """Main loop of the mapping process: executes commands between two scans, keeps the time of the replay, and
-sends results to the web process."""
+sends results to the web process.
+
+The way of a scan from the source to the browsers, from `WorkerLoop.run` on:
+
+1. `WorkerLoop._map_next` calls `Session.work`, which calls `Run.map_next` (`run.py`).
+2. `Cursor.take` (`cursor.py`) returns the next step: scan, odometry and tilt, joined by the synchroniser.
+3. `Mapper.process` (`pipeline/mapper.py`) maps it; `RunMap.add` (`remap.py`) stores the resulting `Frame`.
+4. `WorkerLoop._show` puts the frame with the path as `Shown` (`protocol.py`) into the `Outbox` (`outbox.py`),
+   whose thread writes it to the pipe.
+5. In the web process `WorkerProcess` (`supervisor.py`) reads it and awaits `Dashboard.receive`
+   (`app/dashboard/dashboard.py`), which draws it in the scene and broadcasts it to the pages.
+"""
 
 from __future__ import annotations
 
@@ -96,28 +107,62 @@ class WorkerLoop:
             try:
                 command = self._next_command()
             except queue.Empty:
-                self._guarded(self._map)
+                self._guarded(self._work)
                 continue
             if command is None:
                 self._session.close()
                 return
-            if isinstance(command, protocol.AskCompare):
-                while self._session.is_shown:  # the mapper is on its way to this scan
-                    self._guarded(self._map)
             if isinstance(command, protocol.Question):
-                self._put(answer(self._session, self._recent, command, self._run))
-                if self._is_compiling_reported:  # an answer may compile other kernels than the run
-                    self._report()
+                self._answer(command)
             else:
                 self._execute(command)
+
+    def _work(self) -> None:
+        """Do the next piece of work: a part of a rerun, live messages, the preparation, or a scan."""
+        if self._session.is_remapping and (self._mapped >= _SCANS_A_REMAP or self._due_in() != 0.0):
+            self._mapped = 0
+            self._remap()
+        elif self._session.pace == "live" and self._session.next_ns() is None:
+            self._listen()
+        elif not self._prepared:
+            self._prepare()
+        else:
+            self._mapped += 1
+            self._map_next()
+
+    def _map_next(self) -> None:
+        """Map the next scan and show it. Frames of a seek are shown at most every `_GLIMPSE_S`."""
+        session = self._session
+        hurried = session.pace == "hurry"
+        frame = session.work()
+        now = self._clock()
+        if frame is not None:
+            self._replay.mapped(frame.stamp_ns, now)
+        if hurried and session.pace != "hurry":  # arrived: time counts from here
+            self._replay.release()
+        elif hurried and (now < self._glimpse_at or session.is_shown):
+            return
+        self._glimpse_at = now + _GLIMPSE_S
+        self._show(session.frame)
+        if session.pace == "idle":
+            self._report()
+        else:
+            self._report_when_due(now)
+
+    def _answer(self, question: protocol.Question) -> None:
+        """Answer a question; a comparison waits until the mapper has reached the shown scan."""
+        while isinstance(question, protocol.AskCompare) and self._session.is_shown:
+            self._guarded(self._work)
+        self._put(answer(self._session, self._recent, question, self._run))
+        if self._is_compiling_reported:  # an answer may compile other kernels than the run
+            self._report()
 
     def _next_command(self) -> protocol.ToWorker | None:
         """Return the next command, and wait for it until the next scan is due; None ends the worker. Of
         successive parameter changes (a slider drag) or seeks (the timeline) the last one is returned.
 
         Raises:
-            queue.Empty: Work is due (see `_map`): a scan, a part of a rerun, the preparation, or listening in
-                a live run.
+            queue.Empty: Work is due, see `_work`.
         """
         if not self._taken:
             self._taken.append(self._await_command())
@@ -146,13 +191,15 @@ class WorkerLoop:
         return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
-        """Return the time until the next scan is due [s]: that until `_RESTORE_S` after a command if a sought
-        scan is shown from stored results, 0 while a rerun works or a scan is overdue, the
-        interval `_LISTEN_S` for a live run without a queued scan, and None if only a command can start work.
-        An error of the source sets the state to "failed" and is reported."""
+        """Return the time until work is due [s]: 0 while a rerun works, else as `_due_in`."""
+        return 0.0 if self._session.is_remapping else self._due_in()
+
+    def _due_in(self) -> float | None:
+        """Return the time until the next scan is due [s]: 0 if it is overdue, during a seek, and as long as
+        nothing is prepared; that until `_RESTORE_S` after a command if a sought scan is shown from stored
+        results; the interval `_LISTEN_S` for a live run without a queued scan; None if only a command can
+        start work. An error of the source sets the state to "failed" and is reported."""
         pace = self._session.pace
-        if self._session.is_remapping:
-            return 0.0
         if self._session.is_shown:
             return max(0.0, self._restore_at - self._clock())
         if pace == "idle":
@@ -163,49 +210,6 @@ class WorkerLoop:
             return 0.0
         stamp_ns = self._guarded(self._session.next_ns)
         return 0.0 if stamp_ns is None else self._replay.delay(stamp_ns, self._clock())
-
-    def _map(self) -> None:
-        """Do the next piece of work: part of a rerun, live messages, preparation, or a scan. Frames of a seek
-        are sent at most every `_GLIMPSE_S`."""
-        if self._session.is_remapping:
-            if self._mapped >= _SCANS_A_REMAP or not self._is_due():
-                self._mapped = 0
-                self._remap()
-                return
-            self._mapped += 1
-        if self._session.pace == "live" and self._session.next_ns() is None:
-            self._listen()
-            return
-        if not self._prepared:
-            self._prepare()
-            return
-        hurried = self._session.pace == "hurry"
-        frame = self._session.work()
-        now = self._clock()
-        if frame is not None:
-            self._replay.mapped(frame.stamp_ns, now)
-        if hurried and self._session.pace != "hurry":  # arrived: time counts from here
-            self._replay.release()
-        if hurried and self._session.pace == "hurry" and (now < self._glimpse_at or self._session.is_shown):
-            return
-        self._glimpse_at = now + _GLIMPSE_S
-        self._show(self._session.frame)
-        current = self._session.pace == "idle"
-        if current:
-            self._report()
-        else:
-            self._report_when_due(now)
-
-    def _is_due(self) -> bool:
-        """Return whether a scan is due now: never while idle, on arrival in a live run, and in a replay at
-        its time, or at once as long as nothing is prepared or no time is known."""
-        pace = self._session.pace
-        if pace == "idle":
-            return False
-        stamp_ns = self._session.next_ns()
-        if pace == "live":
-            return stamp_ns is not None
-        return not self._prepared or stamp_ns is None or self._replay.delay(stamp_ns, self._clock()) <= 0.0
 
     def _remap(self) -> None:
         """Continue a rerun for up to `_REMAP_S`, and send the new map when the rerun is complete."""

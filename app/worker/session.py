@@ -644,6 +644,14 @@ def has_camera(description: SourceDescription) -> bool:
     return any(t.read_as == "camera" and t.type in (IMAGE, COMPRESSED_IMAGE) for t in description.topics)
 
 
+def pictures_of(source: Source | None) -> PictureSource:
+    """Return the camera pictures of an open source; raises StemmapError without a source or a camera."""
+    origin: object = source.source if isinstance(source, OdometryOverride) else source
+    if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
+        raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
+    return origin
+
+
 def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     """Return the camera picture of a source that is closest to a time, with its camera model if that is
     known.
@@ -655,9 +663,7 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     Raises:
         StemmapError: The source has no camera, or no picture within `SHOWN_NS` of the time.
     """
-    origin: object = source.source if isinstance(source, OdometryOverride) else source
-    if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
-        raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
+    origin = pictures_of(source)
     picture = origin.picture_near(stamp_ns, SHOWN_NS)
     if picture is None:
         raise StemmapError(
@@ -684,9 +690,7 @@ def tree_picture(run: Run | InventoryRun | None, number: int) -> CameraPicture:
     frame = None if run is None else run.frame
     if run is None or frame is None:
         raise StemmapError("nothing is mapped yet", remedy="Press play, or open a run")
-    origin: object = run.source.source if isinstance(run.source, OdometryOverride) else run.source
-    if not has_camera(run.source.description) or not isinstance(origin, PictureSource):
-        raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
+    origin = pictures_of(run.source)
     camera, why = origin.camera()
     if camera is None:
         raise StemmapError(f"trees cannot be found in the pictures: {why}")

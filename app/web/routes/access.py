@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
-from contextlib import asynccontextmanager, contextmanager, nullcontext
-from typing import Annotated
+from contextlib import contextmanager, nullcontext
+from typing import Annotated, Any
 
 from fastapi import Depends
 from starlette.requests import HTTPConnection
 
+from app.common.request_queue import RequestQueue
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
+from app.dashboard.learning import Learning
 from app.web.auth import Role, is_local, role_of
-from pipeline.errors import StemmapError
 
 MOST: dict[Role, int] = {"owner": 50, "viewer": 50}
-# Pause between two requests of viewers that cost work, so that the run keeps most of the machine.
-_PAUSE_S = 0.5
-_MOST_WAITING = 4
-
-
-class TooManyRequestsError(StemmapError):
-    """Too many requests of this kind wait. The same request may succeed later."""
 
 
 class ConnectionLimit:
@@ -47,66 +40,28 @@ class ConnectionLimit:
             self._taken[role] -= free
 
 
-class RequestQueue:
-    """Runs requests one after the other with a pause in between, and refuses those beyond a short queue.
-
-    Args:
-        pause_s: Pause between two requests [s].
-        most_waiting: Maximum length of the queue.
-    """
-
-    def __init__(self, pause_s: float = _PAUSE_S, most_waiting: int = _MOST_WAITING) -> None:
-        self._pause_s, self._most_waiting = pause_s, most_waiting
-        self._lock = asyncio.Lock()
-        self._waiting = 0
-        self._free_at = 0.0
-
-    @asynccontextmanager
-    async def turn(self) -> AsyncIterator[None]:
-        """Wait for a turn, which lasts as long as the context. Turns follow each other with the pause of the
-        queue in between.
-
-        Raises:
-            TooManyRequestsError: `most_waiting` other requests wait already.
-        """
-        if self._waiting >= self._most_waiting:
-            raise TooManyRequestsError("too many requests wait", remedy="Try again in some seconds")
-        loop = asyncio.get_running_loop()
-        self._waiting += 1
-        try:
-            await self._lock.acquire()
-        finally:
-            self._waiting -= 1
-        try:
-            await asyncio.sleep(max(0.0, self._free_at - loop.time()))
-            yield
-        finally:
-            self._free_at = loop.time() + self._pause_s
-            self._lock.release()
-
-
 class Limits:
     """The limits of one dashboard."""
 
     def __init__(self) -> None:
         self.pages, self.scenes = ConnectionLimit(), ConnectionLimit()
-        self.viewers = RequestQueue()
-        self.comparisons = RequestQueue(pause_s=0.0)
+        # The pause leaves most of the machine to the run.
+        self.viewers, self.comparisons = RequestQueue(pause_s=0.5), RequestQueue()
 
 
-def _dashboard(connection: HTTPConnection) -> Dashboard:
-    dashboard: Dashboard = connection.app.state.dashboard
-    return dashboard
+def _of_app(name: str) -> Any:  # noqa: ANN401 - what `Depends` returns
+    """Return the dependency on an object of the application, by its name in `app.state`."""
+
+    def get(connection: HTTPConnection) -> object:
+        return getattr(connection.app.state, name)
+
+    return Depends(get)
 
 
-def _settings(connection: HTTPConnection) -> Settings:
-    settings: Settings = connection.app.state.settings
-    return settings
-
-
-def _limits(connection: HTTPConnection) -> Limits:
-    limits: Limits = connection.app.state.limits
-    return limits
+Dash = Annotated[Dashboard, _of_app("dashboard")]
+Deployment = Annotated[Settings, _of_app("settings")]
+Bounds = Annotated[Limits, _of_app("limits")]
+Trainer = Annotated[Learning, _of_app("learning")]
 
 
 def _role(connection: HTTPConnection) -> Role:
@@ -117,7 +72,7 @@ def _may_open_any_file(connection: HTTPConnection) -> bool:
     """Return whether the request may name any file of this machine; otherwise only recordings in the data
     folders. It may as an owner, if the settings allow any file, or allow it locally and the request is local.
     """
-    settings = _settings(connection)
+    settings: Settings = connection.app.state.settings
     if role_of(connection.scope) != "owner" or settings.files == "folders":
         return False
     return settings.files == "any" or (settings.loopback and is_local(connection.headers))
@@ -127,13 +82,11 @@ async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
     """Wait for a turn if the request is that of a viewer, because the request costs work; raises
     TooManyRequestsError if too many wait. Owners do not wait."""
     viewer = role_of(connection.scope) == "viewer"
-    async with _limits(connection).viewers.turn() if viewer else nullcontext():
+    limits: Limits = connection.app.state.limits
+    async with limits.viewers.turn() if viewer else nullcontext():
         yield
 
 
-Dash = Annotated[Dashboard, Depends(_dashboard)]
-Deployment = Annotated[Settings, Depends(_settings)]
-Bounds = Annotated[Limits, Depends(_limits)]
 CallerRole = Annotated[Role, Depends(_role)]
 AnyFile = Annotated[bool, Depends(_may_open_any_file)]
 #: For routes that cost the mapping process or this one more than some milliseconds.

@@ -5,18 +5,17 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.learning import Learning
 from app.tuning.job import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
 from app.tuning.plan import GOALS, SENSIBLE, Plan
 from app.tuning.sensitivity import MOST_VALUES
 from app.web.responses import Body, Value, Word, json_reply
-from app.web.routes.access import AnyFile, Dash, Deployment
+from app.web.routes.access import AnyFile, Dash, Deployment, Trainer
 from app.web.routes.parameters import SaveSet
 from app.web.routes.run import permitted_uri
 from pipeline.errors import StemmapError
@@ -111,44 +110,39 @@ async def stop_sensitivity(dashboard: Dash) -> Response:
 
 
 @router.get("/learning")
-async def learning_state(request: Request, dashboard: Dash) -> Response:
+async def learning_state(learning: Trainer, dashboard: Dash) -> Response:
     """GET /api/learning: return the numbers of annotations that a training can use, and its progress, see
     `Learning.known`."""
     in_force = dashboard.parameters.parameters.classification.forest
-    return json_reply(await _learning(request).known(in_force))
+    return json_reply(await learning.known(in_force))
 
 
 @router.post("/learning")
-async def start_learning(request: Request, dashboard: Dash) -> Response:
+async def start_learning(learning: Trainer, dashboard: Dash) -> Response:
     """POST /api/learning: start to train new decision trees with all annotations, and return the progress,
     with 202. They are not used before `POST /api/learning/use`. 409 while a training runs or without a data
     folder."""
-    await _learning(request).begin(dashboard.parameters.parameters)
-    return json_reply(_learning(request).as_plain(), 202)
+    await learning.begin(dashboard.parameters.parameters)
+    return json_reply(learning.as_plain(), 202)
 
 
 @router.delete("/learning")
-async def stop_learning(request: Request) -> Response:
+async def stop_learning(learning: Trainer) -> Response:
     """Stop the training, or discard its result, and return the progress; the decision trees in force stay,
     and so does the file of trained ones."""
-    await _learning(request).forget()
-    return json_reply(_learning(request).as_plain())
+    await learning.forget()
+    return json_reply(learning.as_plain())
 
 
 @router.post("/learning/use")
-async def use_learned(request: Request, dashboard: Dash) -> Response:
+async def use_learned(learning: Trainer, dashboard: Dash) -> Response:
     """POST /api/learning/use: classify with the new decision trees, as a change of parameters; return the
     progress of the training. 409 if there are none."""
-    learned = _learning(request).learned
+    learned = learning.learned
     if learned is None:
         raise StemmapError("no decision trees were grown", remedy="Grow them first")
     await dashboard.change_parameters({"classification.forest": learned["name"]})
-    return json_reply(_learning(request).as_plain())
-
-
-def _learning(request: Request) -> Learning:
-    learning: Learning = request.app.state.learning
-    return learning
+    return json_reply(learning.as_plain())
 
 
 async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted: SearchRequest) -> Plan:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.cli.flags import chosen_parameters
-from app.dashboard.payload import BeforeAfter, Counts, counts_of
+from app.dashboard.payload import BeforeAfter, counts_of
 from app.worker.protocol import Shown
 from pipeline.config import preset
 from tests.app.fakes import frame, opened, path, truth_trees
@@ -93,17 +93,19 @@ async def test_the_page_is_told_what_stood_before_a_change(both: Running) -> Non
 
 def test_before_is_of_the_same_scan_and_of_the_last_step():
     watch = BeforeAfter()
-    assert watch.shown(Counts(1, {"tree": 1}, None, None))["before"] is None
+    assert watch.shown(1, {"verdicts": {"tree": 1}, "right": None, "wrong": None})["before"] is None
     watch.step()
-    assert watch.shown(Counts(1, {"tree": 2}, 2, 0))["before"] == {
+    assert watch.shown(1, {"verdicts": {"tree": 2}, "right": 2, "wrong": 0})["before"] == {
         "verdicts": {"tree": 1},
         "right": None,
         "wrong": None,
     }
-    watch.shown(Counts(1, {"tree": 3}, 2, 1))  # the slider moves on
+    watch.shown(1, {"verdicts": {"tree": 3}, "right": 2, "wrong": 1})  # the slider moves on
     watch.step()
-    assert watch.shown(Counts(1, {"tree": 4}, 2, 2))["before"]["verdicts"] == {"tree": 3}
-    assert watch.shown(Counts(2, {"tree": 4}, 2, 2))["before"] is None
+    assert watch.shown(1, {"verdicts": {"tree": 4}, "right": 2, "wrong": 2})["before"]["verdicts"] == {
+        "tree": 3
+    }
+    assert watch.shown(2, {"verdicts": {"tree": 4}, "right": 2, "wrong": 2})["before"] is None
 
 
 def test_detections_are_held_against_the_truth_where_they_stand():
@@ -114,5 +116,5 @@ def test_detections_are_held_against_the_truth_where_they_stand():
     near = [
         min(np.hypot(x - truth.x, y - truth.y)) <= 0.5 and truth.kind[0] == "tree" for x, y in places.tolist()
     ]
-    assert (counts.right, counts.wrong) == (sum(near), len(near) - sum(near))
-    assert counts_of(picture, None, 0.5).right is None
+    assert (counts["right"], counts["wrong"]) == (sum(near), len(near) - sum(near))
+    assert counts_of(picture, None, 0.5)["right"] is None

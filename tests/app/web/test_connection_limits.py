@@ -10,9 +10,10 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
+from app.common.request_queue import RequestQueue
 from app.web.auth import Role, viewer_token
 from app.web.routes import access
-from app.web.routes.access import ConnectionLimit, RequestQueue
+from app.web.routes.access import ConnectionLimit
 from tests.app.server_for_tests import BEARER, TOKEN, served
 
 VIEWER = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
