@@ -13,6 +13,7 @@ import json
 import math
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
@@ -258,7 +259,7 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
     return columns
 
 
-def _table(rows: list[list[str]], names: tuple[str, ...]) -> dict[str, Float]:
+def _table(rows: Sequence[Sequence[str]], names: tuple[str, ...]) -> dict[str, Float]:
     """Return the columns of a CSV table by name, shape (rows,) each; an empty cell is NaN.
 
     Args:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
+import itertools
 import json
 import math
 import shutil
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -18,90 +19,113 @@ import numpy as np
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED, hold
 from pipeline.stand.seen_area import SeenArea
-from pipeline.types.records import Frame, HeightMap, Path, Trees, Verdict
+from pipeline.types.records import Bool, Frame, HeightMap, Int, Path, Trees, Verdict
 
 ROWS = "detections.csv"  # written during the run
-TREE_COLUMNS = (
-    "tree",
-    "x_m",
-    "y_m",
-    "sigma_x_m",
-    "sigma_y_m",
-    "dbh_cm",
-    "sigma_dbh_cm",
-    "eccentricity",
-    "observations",
-    "coverage_deg",
-    "first_seen_s",
-    "last_seen_s",
-    "height_m",
-    "sigma_height_m",
-    "lean_deg",
-)
-#: Columns that earlier versions did not write.
-NEW_TREE_COLUMNS = TREE_COLUMNS[-3:]
-PATH_COLUMNS = ("t_s", "x_m", "y_m", "yaw_rad", "sigma_xy_m")
+NEW_TREE_COLUMNS = ("height_m", "sigma_height_m", "lean_deg")  # earlier versions did not write them
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
 SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
-DETECTION_COLUMNS = (
-    "scan",
-    "t_s",
-    "x_m",
-    "y_m",
-    "verdict",
-    "eccentricity",
-    "radius_m",
-    "radial_std_m",
-    "arc_deg",
-    "points",
-    "width_m",
-    "height_m",
-)
 
 
-def tree_rows(trees: Trees, start_ns: int) -> list[list[str]]:
+def _number(value: float, digits: int) -> str:
+    """Return a decimal text with `digits` decimals, without exponent and without minus zero; empty for values
+    that are not finite."""
+    if not math.isfinite(value):
+        return ""
+    text = f"{value:.{digits}f}"
+    return text.lstrip("-") if float(text) == 0.0 else text
+
+
+def _numbers(values: Iterable[float] | None, digits: int) -> Iterable[str]:
+    """Yield the texts of numbers, see `_number`; empty ones without end for None."""
+    return itertools.repeat("") if values is None else (_number(value, digits) for value in values)
+
+
+def _seconds(stamp_ns: Int, start_ns: int) -> Iterable[str]:
+    """Return the times from `start_ns` to stamps [s] as texts; empty for a stamp below 0, which is
+    unknown."""
+    return _numbers(np.where(stamp_ns >= 0, (stamp_ns - start_ns) * 1e-9, math.nan), 3)
+
+
+#: Columns of trees.csv: name, and the texts for trees and the time from which the seconds count [ns].
+_TREES: dict[str, Callable[[Trees, int], Iterable[str]]] = {
+    "tree": lambda trees, _: map(str, trees.number),
+    "x_m": lambda trees, _: _numbers(trees.position[:, 0], 3),
+    "y_m": lambda trees, _: _numbers(trees.position[:, 1], 3),
+    "sigma_x_m": lambda trees, _: _numbers(np.sqrt(trees.covariance[:, 0, 0]), 3),
+    "sigma_y_m": lambda trees, _: _numbers(np.sqrt(trees.covariance[:, 1, 1]), 3),
+    "dbh_cm": lambda trees, _: _numbers(100.0 * trees.dbh, 1),
+    "sigma_dbh_cm": lambda trees, _: _numbers(100.0 * trees.dbh_sigma, 1),
+    "eccentricity": lambda trees, _: _numbers(trees.eccentricity, 3),
+    "observations": lambda trees, _: map(str, trees.observations),
+    "coverage_deg": lambda trees, _: _numbers(_known_degrees(trees.coverage, trees.coverage > 0), 0),
+    "first_seen_s": lambda trees, start_ns: _seconds(trees.first_seen_ns, start_ns),
+    "last_seen_s": lambda trees, start_ns: _seconds(trees.last_seen_ns, start_ns),
+    "height_m": lambda trees, _: _numbers(trees.height, 2),
+    "sigma_height_m": lambda trees, _: _numbers(trees.height_sigma, 2),
+    "lean_deg": lambda trees, _: _numbers(None if trees.lean is None else np.degrees(trees.lean), 1),
+}
+TREE_COLUMNS = tuple(_TREES)
+_PATH: dict[str, Callable[[Path, int], Iterable[str]]] = {
+    "t_s": lambda path, start_ns: _seconds(path.stamp_ns, start_ns),
+    "x_m": lambda path, _: _numbers(path.x, 4),
+    "y_m": lambda path, _: _numbers(path.y, 4),
+    "yaw_rad": lambda path, _: _numbers(path.yaw, 5),
+    "sigma_xy_m": lambda path, _: _numbers(path.sigma_xy, 4),
+}
+PATH_COLUMNS = tuple(_PATH)
+#: Columns of detections.csv: name, and the texts for a frame and the time of its scan [s].
+_DETECTIONS: dict[str, Callable[[Frame, str], Iterable[str]]] = {
+    "scan": lambda frame, _: itertools.repeat(str(frame.index)),
+    "t_s": lambda _, time: itertools.repeat(time),
+    "x_m": lambda frame, _: _numbers(_centres(frame)[:, 0], 3),
+    "y_m": lambda frame, _: _numbers(_centres(frame)[:, 1], 3),
+    "verdict": lambda frame, _: (Verdict(int(verdict)).label for verdict in frame.clusters.verdict),
+    "eccentricity": lambda frame, _: _numbers(frame.clusters.eccentricity, 3),
+    "radius_m": lambda frame, _: _numbers(frame.clusters.radius, 3),
+    "radial_std_m": lambda frame, _: _numbers(frame.clusters.radial_std, 4),
+    "arc_deg": lambda frame, _: _numbers(
+        _known_degrees(frame.clusters.arc, np.isfinite(frame.clusters.radius)), 0
+    ),
+    "points": lambda frame, _: map(str, frame.clusters.size),
+    "width_m": lambda frame, _: _numbers(frame.clusters.extent[:, 1], 3),
+    "height_m": lambda frame, _: _numbers(frame.clusters.extent[:, 2], 3),
+}
+DETECTION_COLUMNS = tuple(_DETECTIONS)
+
+
+def tree_rows(trees: Trees, start_ns: int) -> list[tuple[str, ...]]:
     """Return the confirmed trees as rows of TREE_COLUMNS; unknown values are empty. Seconds count from
     `start_ns` [ns]; a stamp below 0 is unknown."""
-    unknown = np.full(len(trees.number), math.nan)
-    height, height_sigma, lean = (
-        unknown if column is None else column for column in (trees.height, trees.height_sigma, trees.lean)
-    )
-    return [
-        [
-            str(trees.number[k]),
-            _number(trees.position[k, 0], 3),
-            _number(trees.position[k, 1], 3),
-            _number(math.sqrt(trees.covariance[k, 0, 0]), 3),
-            _number(math.sqrt(trees.covariance[k, 1, 1]), 3),
-            _number(100.0 * trees.dbh[k], 1),
-            _number(100.0 * trees.dbh_sigma[k], 1),
-            _number(trees.eccentricity[k], 3),
-            str(trees.observations[k]),
-            _number(math.degrees(trees.coverage[k]), 0) if trees.coverage[k] > 0 else "",
-            _number(_seconds(trees.first_seen_ns[k], start_ns), 3),
-            _number(_seconds(trees.last_seen_ns[k], start_ns), 3),
-            _number(height[k], 2),
-            _number(height_sigma[k], 2),
-            _number(math.degrees(lean[k]), 1),
-        ]
-        for k in np.flatnonzero(trees.confirmed)
-    ]
+    rows = zip(*(column(trees, start_ns) for column in _TREES.values()), strict=False)
+    return list(itertools.compress(rows, trees.confirmed))
 
 
-def path_rows(path: Path, start_ns: int) -> list[list[str]]:
+def path_rows(path: Path, start_ns: int) -> list[tuple[str, ...]]:
     """Return the path as rows of PATH_COLUMNS, one per scan; seconds count from `start_ns`."""
-    return [
-        [
-            _number(_seconds(stamp, start_ns), 3),
-            _number(x, 4),
-            _number(y, 4),
-            _number(yaw, 5),
-            _number(sigma, 4),
-        ]
-        for stamp, x, y, yaw, sigma in zip(
-            path.stamp_ns, path.x, path.y, path.yaw, path.sigma_xy, strict=True
-        )
-    ]
+    return list(zip(*(column(path, start_ns) for column in _PATH.values()), strict=True))
+
+
+def detection_rows(frame: Frame, start_ns: int) -> list[tuple[str, ...]]:
+    """Return all clusters of a scan with their verdicts, in the frame of the map, as rows of
+    DETECTION_COLUMNS; unknown values are empty.
+
+    Args:
+        frame: Results of the scan.
+        start_ns: Time from which the seconds count [ns].
+    """
+    time = _number((frame.stamp_ns - start_ns) * 1e-9, 3) if frame.stamp_ns >= 0 else ""
+    return list(zip(*(column(frame, time) for column in _DETECTIONS.values()), strict=False))
+
+
+def _centres(frame: Frame) -> Float:
+    """Return the centres of the clusters in the frame of the map, shape (N, 2) [m]."""
+    return frame.estimate.T_map_base.apply(frame.clusters.centre + frame.sensor_offset[:2])
+
+
+def _known_degrees(angle: Float, known: Bool) -> Float:
+    """Return angles [rad] in degrees, shape (N,); NaN where they are not known."""
+    return np.where(known, np.degrees(angle), math.nan)
 
 
 def terrain_text(ground: HeightMap) -> str:
@@ -129,36 +153,6 @@ def seen_text(area: SeenArea) -> str:
             for (x, y), nearest, views in zip(area.centres, area.nearest, area.views, strict=True)
         ),
     )
-
-
-def detection_rows(frame: Frame, start_ns: int) -> list[list[str]]:
-    """Return all clusters of a scan with their verdicts, in the frame of the map, as rows of
-    DETECTION_COLUMNS; unknown values are empty.
-
-    Args:
-        frame: Results of the scan.
-        start_ns: Time from which the seconds count [ns].
-    """
-    c = frame.clusters
-    centre = frame.estimate.T_map_base.apply(c.centre + frame.sensor_offset[:2])
-    fitted = np.isfinite(c.radius)
-    return [
-        [
-            str(frame.index),
-            _number(_seconds(frame.stamp_ns, start_ns), 3),
-            _number(centre[k, 0], 3),
-            _number(centre[k, 1], 3),
-            Verdict(int(c.verdict[k])).label,
-            _number(c.eccentricity[k], 3),
-            _number(c.radius[k], 3),
-            _number(c.radial_std[k], 4),
-            _number(math.degrees(c.arc[k]), 0) if fitted[k] else "",
-            str(c.size[k]),
-            _number(c.extent[k, 1], 3),
-            _number(c.extent[k, 2], 3),
-        ]
-        for k in range(len(c.size))
-    ]
 
 
 ROBOTS_FRAME = {"type": "local", "unit": "m", "origin": "first pose of the robot, x along its heading"}
@@ -321,17 +315,3 @@ class RunFiles:
         self._staging.rmdir()
         if self._made_folder:
             self._folder.rmdir()
-
-
-def _seconds(stamp_ns: int, start_ns: int) -> float:
-    """Return the time from `start_ns` to a stamp [s]; NaN for a stamp below 0, which is unknown."""
-    return (int(stamp_ns) - start_ns) * 1e-9 if stamp_ns >= 0 else math.nan
-
-
-def _number(value: float, digits: int) -> str:
-    """Return a decimal text with `digits` decimals, without exponent and without minus zero; empty for values
-    that are not finite."""
-    if not math.isfinite(value):
-        return ""
-    text = f"{value:.{digits}f}"
-    return text.lstrip("-") if float(text) == 0.0 else text

@@ -140,8 +140,7 @@ def _opener(module: str, function: str) -> Opener:
 
 
 _recording = _opener("live", "open_recording")
-_kitti = _opener("scan_folder", "open_kitti")
-_point_files = _opener("scan_folder", "open_point_files")
+_scans = _opener("scan_folder", "ScanFolder")
 _victoria_park = _opener("victoria_park", "VictoriaParkSource")
 _cloud = _opener("simulated", "open_cloud_drive")
 _tree_manager = _opener("tree_manager", "TreeManagerSource")
@@ -175,12 +174,12 @@ FILES = (
     Format("ROS 1 .bag", (b"#ROSBAG V",), (".bag",), _recording),
     Format("Velodyne .pcap", _PCAP, (".pcap",), _opener("velodyne", "PcapSource")),
     Format("Victoria Park .zip (LASER.txt, DRS.txt)", (b"PK\x03\x04",), (".zip",), _victoria_park),
-    Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _point_files),
+    Format(".pcd", (b"# .PCD", b"VERSION", b"FIELDS"), (".pcd",), _scans),
     Format("whole cloud .laz or .las", (b"LASF",), (".laz", ".las"), _cloud, is_cloud=True),
     Format("whole cloud .e57", (b"ASTM-E57",), (".e57",), _cloud, is_cloud=True),
     Format("whole cloud .ply", (b"ply\n", b"ply\r"), (".ply",), _cloud, is_cloud=True),
     Format("whole cloud .npy or .npz", (b"\x93NUMPY",), (".npy", ".npz"), _cloud, is_cloud=True),
-    Format("KITTI .bin", (), (".bin",), _kitti),
+    Format("KITTI .bin", (), (".bin",), _scans),
 )
 
 _MOST_NAMED = 5
@@ -231,8 +230,7 @@ def named(names: list[str]) -> str:
 
 def folder_opener(folder: Path) -> Opener | None:
     """Return the opener of a folder by the names of the files in it, and of `velodyne/*.bin`; None if nothing
-    in it can be read. Where several formats fit, the order is TreeManager, ROS recording, KITTI, other point
-    files."""
+    in it can be read. Where several formats fit, the order is TreeManager, ROS recording, scans."""
     names = {path.name for path in folder.iterdir() if path.is_file()}
     if any(name.startswith("TreeManagerState_") for name in names):
         return _tree_manager
@@ -240,6 +238,5 @@ def folder_opener(folder: Path) -> Opener | None:
     if suffixes & {".mcap", ".db3", ".zstd"}:
         return _recording
     inside = folder / "velodyne"
-    if ".bin" in suffixes or (inside.is_dir() and any(inside.glob("*.bin"))):
-        return _kitti
-    return _point_files if suffixes & {".pcd", ".ply", ".npy", ".npz", ".las", ".laz"} else None
+    is_kitti = inside.is_dir() and any(inside.glob("*.bin"))
+    return _scans if is_kitti or suffixes & {".bin", ".pcd", ".ply", ".npy", ".npz", ".las", ".laz"} else None

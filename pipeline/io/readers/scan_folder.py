@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
@@ -33,23 +32,6 @@ T = TypeVar("T")
 Loader = Callable[[Path, int, dict[str, int]], Scan]
 
 
-@dataclass(frozen=True, slots=True)
-class ScanFormat:
-    """A format of scan files.
-
-    Attributes:
-        kind: Name of the format.
-        suffix: Suffix in lower case, with the dot.
-        load: Reads one file.
-        sensor: Infers the LiDAR from the first scan.
-    """
-
-    kind: str
-    suffix: str
-    load: Loader
-    sensor: Callable[[Scan], Sensor]
-
-
 class ScanFolder(FileSource):
     """Source of scans from files, in the order of the numbers in their names.
 
@@ -61,8 +43,8 @@ class ScanFolder(FileSource):
 
     Args:
         uri: As the user wrote it.
-        path: One file, the folder with the files, or a folder with a folder `velodyne`.
-        form: Format of the files.
+        path: One file, the folder with the files, or a folder with a folder `velodyne`. Of several formats
+            .bin is read, else .pcd, else the one with the most files.
         options: Extrinsics.
 
     Raises:
@@ -70,22 +52,20 @@ class ScanFolder(FileSource):
         OSError: The folder cannot be read.
     """
 
-    def __init__(self, uri: str, path: Path, form: ScanFormat, options: SourceOptions) -> None:
+    def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
         """Find the scan files, read the files of times and poses, and load the first scan that can be
         read."""
         super().__init__()
-        self._form = form
+        self._suffix, self._files = _scan_files(path)
+        self._kind, self._load, sensor_of_first = FORMATS[self._suffix]
         self._warnings: list[str] = []
         self._texts: list[Path] = []
-        self._files = _scan_files(path, form.suffix)
-        if not self._files:
-            raise SourceError(f"the folder has no {form.suffix} files", where=uri)
         numbers = np.array([_number(file) for file in self._files], dtype=np.int64)
         by_time = all(_TIME_NAME.fullmatch(file.stem) for file in self._files)
         if by_time or len(np.unique(numbers)) < len(numbers) or (numbers < 0).any():
             numbers = np.arange(len(numbers), dtype=np.int64)
         folder = self._files[0].parent
-        others = [name for name in recordings_in(folder) if Path(name).suffix.lower() != form.suffix]
+        others = [name for name in recordings_in(folder) if Path(name).suffix.lower() != self._suffix]
         if others and not path.is_file():
             self._warnings.append(f"not part of this run are {named(others)}: open each of them by its name")
         places = [] if path.is_file() else [folder, folder.parent]
@@ -96,8 +76,8 @@ class ScanFolder(FileSource):
         first = self._first_scan(uri)
         self._description = SourceDescription(
             uri=uri,
-            kind=form.kind,
-            sensor=form.sensor(first),
+            kind=self._kind,
+            sensor=sensor_of_first(first),
             T_base_lidar=self._T_base_lidar,
             has_odometry=self._poses is not None,
             has_imu=False,
@@ -119,7 +99,7 @@ class ScanFolder(FileSource):
             if pose is not None:
                 yield Odometry(stamp_ns, pose @ self._T_base_lidar.inverse())
             try:
-                scan = self._form.load(self._files[index], stamp_ns, losses)
+                scan = self._load(self._files[index], stamp_ns, losses)
             except (ScanFileError, OSError):
                 count_loss(losses, "scan files that cannot be read")
                 continue
@@ -137,14 +117,14 @@ class ScanFolder(FileSource):
         reason = ""
         for file in self._files[:_TRIES]:
             try:
-                scan = self._form.load(file, 0, {})
+                scan = self._load(file, 0, {})
             except (ScanFileError, OSError) as error:
                 reason = reason or f"{file.name} cannot be read: {error}"
                 continue
             if len(scan.points):
                 return scan
             reason = reason or f"{file.name} holds no points"
-        raise SourceError(reason, where=uri, remedy=f"Files must be {self._form.kind} scans.")
+        raise SourceError(reason, where=uri, remedy=f"Files must be {self._kind} scans.")
 
     def _read_texts(
         self, places: list[Path], names: Iterable[str], read: Callable[[Path], T]
@@ -238,19 +218,24 @@ class ScanFolder(FileSource):
         return None
 
 
-def _scan_files(path: Path, suffix: str) -> list[Path]:
-    """Return the files with a suffix in a folder, or in its folder `velodyne` if it has none itself, by
-    number or time; only `path` if that is a file. May be empty."""
+def _scan_files(path: Path) -> tuple[str, list[Path]]:
+    """Return the suffix of the scans in a folder, or in its folder `velodyne` if it has no .bin file itself,
+    and the files with this suffix by number or time; only `path` if that is a file."""
     if path.is_file():
-        return [path]
-    folder = path
-    if not any(file.suffix.lower() == suffix for file in path.iterdir()) and (path / "velodyne").is_dir():
-        folder = path / "velodyne"
-    files = (file for file in folder.iterdir() if file.suffix.lower() == suffix and file.is_file())
-    found = sorted(files, key=lambda file: (_number(file), file.name))
-    if all(_TIME_NAME.fullmatch(file.stem) for file in found):  # not sorted by their last digits
-        found.sort(key=lambda file: (_name_ns(file.stem), file.name))
-    return found
+        return path.suffix.lower() if path.suffix.lower() == ".bin" else ".pcd", [path]
+    inside = path / "velodyne"
+    for folder in (path, inside) if inside.is_dir() else (path,):
+        if bins := [file for file in folder.iterdir() if file.suffix.lower() == ".bin" and file.is_file()]:
+            return ".bin", _in_order(bins)
+    suffixes = [file.suffix.lower() for file in path.iterdir() if file.is_file()]
+    suffix = ".pcd" if ".pcd" in suffixes else max(FORMATS, key=suffixes.count)
+    return suffix, _in_order([f for f in path.iterdir() if f.suffix.lower() == suffix and f.is_file()])
+
+
+def _in_order(files: list[Path]) -> list[Path]:
+    """Return files by the times or else the numbers in their names, not by the last digits of times."""
+    by_time = all(_TIME_NAME.fullmatch(file.stem) for file in files)
+    return sorted(files, key=lambda f: (_name_ns(f.stem) if by_time else _number(f), f.name))
 
 
 def _times_in_names(files: list[Path]) -> Int | None:
@@ -281,31 +266,6 @@ def _number(file: Path) -> int:
 
 _KITTI_ROW = 16  # bytes: four little-endian float32, x, y, z [m] and reflectance
 HDL_64 = Sensor("HDL-64", 64, float(np.radians(0.4)), float(np.radians(0.17)), 0.03, 120.0)
-_TABLES = {".pcd": "PCD", ".ply": "PLY", ".npy": "NumPy", ".npz": "NumPy", ".las": "LAS", ".laz": "LAS"}
-
-
-def open_kitti(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
-    """Open a .bin file, a folder of .bin files, or a folder with a folder `velodyne` of .bin files.
-
-    Raises:
-        SourceError: None of the first files holds a scan.
-        OSError: The folder cannot be read.
-    """
-    return ScanFolder(uri, path, ScanFormat("KITTI .bin", ".bin", load_bin, _kitti_sensor), options)
-
-
-def open_point_files(uri: str, path: Path, options: SourceOptions) -> ScanFolder:
-    """Open a .pcd file, or a folder of PCD, PLY, NumPy or LAS files. Of several formats PCD is read, else the
-    one with the most files.
-
-    Raises:
-        SourceError: None of the first files holds a scan.
-        OSError: The folder cannot be read.
-    """
-    suffixes = [".pcd"] if path.is_file() else [file.suffix.lower() for file in path.iterdir()]
-    suffix = ".pcd" if ".pcd" in suffixes else max(_TABLES, key=suffixes.count)
-    load = load_las if suffix in (".las", ".laz") else load_table
-    return ScanFolder(uri, path, ScanFormat(_TABLES[suffix], suffix, load, sensor_of), options)
 
 
 def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
@@ -378,3 +338,15 @@ def _kitti_sensor(scan: Scan) -> Sensor:
     sectors = len(np.unique(np.floor(np.arctan2(points[:, 1], points[:, 0]) / np.radians(10.0))))
     dense = len(points) > 50_000 and sectors >= 30
     return HDL_64 if dense and -27.0 < low < -20.0 and 1.0 < high < 6.0 else sensor_of(scan)
+
+
+#: Name, function that reads a file, and function that infers the LiDAR from the first scan, by suffix.
+FORMATS: dict[str, tuple[str, Loader, Callable[[Scan], Sensor]]] = {
+    ".bin": ("KITTI .bin", load_bin, _kitti_sensor),
+    ".pcd": ("PCD", load_table, sensor_of),
+    ".ply": ("PLY", load_table, sensor_of),
+    ".npy": ("NumPy", load_table, sensor_of),
+    ".npz": ("NumPy", load_table, sensor_of),
+    ".las": ("LAS", load_las, sensor_of),
+    ".laz": ("LAS", load_las, sensor_of),
+}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -162,29 +161,10 @@ _IP, _UDP = struct.Struct(">B5xHxB2xI"), 17
 _CUT = "bytes at the end of a capture that was cut"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Packets:
-    """The data packets of a capture as columns of length N, in the order of the file.
-
-    Attributes:
-        offset: Position of the 1206 bytes in the file.
-        stamp_ns: Time of arrival.
-        azimuth: Azimuth of the first block [0.01 degrees].
-        product: Product number of the sensor.
-        sender: Address and destination port.
-    """
-
-    offset: Int
-    stamp_ns: Int
-    azimuth: Int
-    product: Int
-    sender: Int
-
-    def only(self, keep: Bool) -> Packets:
-        """Return the packets of the rows where a mask, shape (N,), is true."""
-        return Packets(
-            self.offset[keep], self.stamp_ns[keep], self.azimuth[keep], self.product[keep], self.sender[keep]
-        )
+#: A data packet of a capture: position of its 1206 bytes in the file, time of arrival, azimuth of the first
+#: block [0.01 degrees], product number of the sensor, and address with destination port of the sender.
+PACKET = np.dtype([(name, np.int64) for name in ("offset", "stamp_ns", "azimuth", "product", "sender")])
+Packets = NDArray[np.void]  # of PACKET, in the order of the file
 
 
 class PcapSource(FileSource):
@@ -207,16 +187,16 @@ class PcapSource(FileSource):
         self._path = path
         packets, self._damage = find_packets(path)
         self._packets = packets = self._one_sensor(packets, uri)
-        rotation, columns = Rotation(), (packets.azimuth.tolist(), packets.stamp_ns.tolist())
+        rotation, columns = Rotation(), (packets["azimuth"].tolist(), packets["stamp_ns"].tolist())
         starts = [row for row, each in enumerate(zip(*columns, strict=True)) if rotation.begins(*each)]
         self._first = np.array([0, *starts], np.int64)
-        self._last = np.append(self._first[1:], len(packets.offset)) - 1
-        self._stamp = packets.stamp_ns[self._last]
+        self._last = np.append(self._first[1:], len(packets)) - 1
+        self._stamp = packets["stamp_ns"][self._last]
         self._file = path.open("rb", buffering=0)
         self._description = SourceDescription(
             uri=uri,
             kind="Velodyne capture (pcap)",
-            sensor=SENSORS[int(packets.product[0])],
+            sensor=SENSORS[int(packets["product"][0])],
             T_base_lidar=options.T_base_lidar or Pose3.identity(),
             has_odometry=False,
             has_imu=False,
@@ -238,7 +218,7 @@ class PcapSource(FileSource):
         begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
         for sweep in range(begin, len(self._first)):
             rows = range(int(self._first[sweep]), int(self._last[sweep]) + 1)
-            stamps = self._packets.stamp_ns[rows.start : rows.stop].tolist()
+            stamps = self._packets["stamp_ns"][rows.start : rows.stop].tolist()
             try:
                 scan = decoder.decode(int(self._stamp[sweep]), stamps, self._read(rows))
             except PacketError:
@@ -263,7 +243,7 @@ class PcapSource(FileSource):
         Raises:
             SourceError: The file cannot be read.
         """
-        offsets = self._packets.offset[rows.start : rows.stop]
+        offsets = self._packets["offset"][rows.start : rows.stop]
         start = int(offsets[0])
         try:
             self._file.seek(start)
@@ -279,23 +259,23 @@ class PcapSource(FileSource):
         Raises:
             SourceError: There are no packets.
         """
-        if not len(packets.offset):
+        if not len(packets):
             raise SourceError(
                 f"the capture has no data packets of a known Velodyne sensor to port {DATA_PORT}",
                 where=uri,
                 remedy="HDL-32E, VLP-16, VLP-32, Puck Hi-Res and VLS-128 can be read.",
             )
         for name, reason in (("sender", "packets of other senders"), ("product", "packets of other sensors")):
-            column: Int = getattr(packets, name)
+            column: Int = packets[name]
             numbers, counts = np.unique(column, return_counts=True)
             packets = self._keep(packets, column == numbers[int(np.argmax(counts))], reason)
-        if len(packets.offset) >= 3:
-            stamp = packets.stamp_ns
+        if len(packets) >= 3:
+            stamp = packets["stamp_ns"]
             middle = np.median(np.stack([stamp[:-2], stamp[1:-1], stamp[2:]]).astype(np.float64), axis=0)
             middle = np.concatenate([middle[:1], middle, middle[-1:]])
             steady = np.abs(stamp - middle) <= _JUMP_NS
             packets = self._keep(packets, steady, "packets with an impossible time")
-        ahead = packets.stamp_ns >= np.maximum.accumulate(packets.stamp_ns)
+        ahead = packets["stamp_ns"] >= np.maximum.accumulate(packets["stamp_ns"])
         return self._keep(packets, ahead, "packets that came before their predecessor")
 
     def _keep(self, packets: Packets, keep: Bool, reason: str) -> Packets:
@@ -304,7 +284,7 @@ class PcapSource(FileSource):
         refused = len(keep) - int(np.count_nonzero(keep))
         if refused:
             count_loss(self._damage, reason, refused)
-        return packets.only(keep) if refused else packets
+        return packets[keep]
 
 
 def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
@@ -339,8 +319,7 @@ def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
         cut = path.stat().st_size - start
     if cut > 0:
         count_loss(losses, _CUT, cut)
-    table = np.array(found, np.int64).reshape(-1, 5)
-    return Packets(*(np.ascontiguousarray(column) for column in table.T)), losses
+    return np.array(found, PACKET), losses
 
 
 def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]) -> tuple[int, int]:

@@ -85,13 +85,13 @@ def test_packets_as_they_come_give_the_scans_of_their_capture(shared_data: Path)
     packets, _ = find_packets(capture)
     content = capture.read_bytes()
     sweeps, messages = Sweeps(), []
-    for offset, stamp_ns in zip(packets.offset.tolist(), packets.stamp_ns.tolist(), strict=True):
+    for offset, stamp_ns in zip(packets["offset"].tolist(), packets["stamp_ns"].tolist(), strict=True):
         messages.append(sweeps.add(stamp_ns, content[offset : offset + PACKET_BYTES]))
     messages.append(sweeps.end())
     reader = ArrivalReader("here", "live", [Channel(1, "/p", VELODYNE_SCAN, "cdr")], SourceOptions())
     records: list[Record] = []
     for k, message in enumerate(m for m in messages if m is not None):
-        records += reader.add(Message(1, int(packets.stamp_ns[0]) + k, message))
+        records += reader.add(Message(1, int(packets["stamp_ns"][0]) + k, message))
     records += reader.finish()
     ours = [record for record in records if isinstance(record, Scan)]
     with closing(open_source(str(capture))) as source:
@@ -134,7 +134,7 @@ def real_or_made(shared: Callable[[], Path]) -> list[bytes]:
         return turn() * 4
     packets, _ = find_packets(capture)
     content = capture.read_bytes()
-    return [content[at : at + PACKET_BYTES] for at in packets.offset.tolist()]
+    return [content[at : at + PACKET_BYTES] for at in packets["offset"].tolist()]
 
 
 def test_a_sensor_is_heard_over_the_network_and_lost(request):

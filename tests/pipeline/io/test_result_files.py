@@ -119,7 +119,7 @@ def test_the_path_has_a_row_a_scan_from_time_zero():
     rows = path_rows(a_path(), START)
     assert [row[0] for row in rows] == ["0.000", "0.100", "0.200"]
     assert all(len(row) == len(PATH_COLUMNS) for row in rows)
-    assert rows[0] == ["0.000", "0.0000", "0.0000", "0.00000", "0.0000"]
+    assert rows[0] == ("0.000", "0.0000", "0.0000", "0.00000", "0.0000")
 
 
 def test_every_cluster_is_a_row_with_its_verdict_in_the_frame_of_the_map():
