@@ -1,7 +1,7 @@
 """Compilation of the kernels of the mapper before the first scan.
 
-The front end and the mapping of trees share few kernels, so that two processes compile one half each:
-`python -m app.worker.numba_warmup warm_front_end` and `... warm_tree_map`.
+Two processes compile them: `python -m app.worker.numba_warmup map_scene` begins with the front end, while
+`... warm_tree_map` compiles SLAM and the filters of the trees, which the first one then finds in the cache.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ import numpy as np
 
 from app.common.child_process import BlockingChildProcess, python_module, run_child
 from app.common.settings import data_folder
-from app.store.forests import kept_forests
 from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 #: Longest wait for another process that compiles. Kernels that are compiled until then are cached.
 PATIENCE_S = 1800.0
-_HALVES = ("warm_front_end", "warm_tree_map")
+_HALVES = ("map_scene", "warm_tree_map")
 _POLL_S = 0.2
 _KERNELS = 238  # that both halves compile; only the displayed progress depends on it
 
@@ -117,62 +116,26 @@ _SCENE = "sim:stand?duration=1"
 
 
 def warm_up() -> None:
-    """Compile or load all kernels of the mapper by mapping one second of a simulated stand in this process.
-    The first time on a machine this takes minutes."""
-    from pipeline.io.readers import open_source
-    from pipeline.odometry.synchroniser import steps
-
+    """Compile or load all kernels of the mapper. The first time on a machine this takes minutes."""
     compile_ahead()
-    source = open_source(_SCENE)
-    mapper = mapper_of(source.description, Parameters(), seed=0)
-    for step in steps(source.records()):
-        mapper.process(step)
+    map_scene()
 
 
-def warm_front_end() -> None:
-    """Compile the kernels of all stages except SLAM and the Kalman filters of the trees.
-
-    The scans of `_SCENE` are segmented, cached, and integrated into voxel columns and terrain at the poses of
-    the odometry.
-    """
-    from contextlib import closing
-
-    from pipeline.classification import ColumnClassifier, ScanView
-    from pipeline.front_end import detect, segment
-    from pipeline.geometry.poses import Pose2
-    from pipeline.ground.terrain_map import HeightMapper
+def map_scene() -> None:
+    """Compile or load all kernels by mapping one second of a simulated stand in this process, with a step
+    back and a preview."""
     from pipeline.io.readers import open_source
     from pipeline.odometry.synchroniser import steps
-    from pipeline.remapping import ScanCaches
-    from pipeline.tracking.track_classification import nearest_other
+    from pipeline.remapping import ClusterTable, KnownMap, preview_trees
 
-    source = open_source(_SCENE)
-    known, parameters = source.description, Parameters()
-    gathering = ColumnClassifier(
-        parameters.classification, all_around=known.sensor.rings > 0, forests=kept_forests()
-    )
-    heights = HeightMapper()
-    with closing(ScanCaches()) as caches:
-        cache = caches.of(parameters)
-        for step in steps(source.records()):
-            cache.put(step, segment(step, known.sensor, known.T_base_lidar, parameters))
-        for index in range(len(cache)):
-            cached = cache.read(index)
-            if cached is None:
-                continue
-            step, scan = cached
-            detect(scan, parameters.detection)
-            pose, given = step.T_odom_base or Pose2(), scan.column_input
-            if given is not None:
-                view = ScanView(
-                    pose, scan.sensor_offset, scan.free, given.steepest, given.depth, given.terrain
-                )
-                gathering.add(given.points, given.height, step.index, view)
-            if scan.terrain is not None:
-                heights.add(scan.terrain, pose, scan.sensor_offset)
-    gathering.snapshot().folded()  # as a step back does
-    place = gathering.columns.axis[:, :2].copy()
-    nearest_other(place, place, 1.0)  # as the preview does
+    source, parameters, clusters, columns = open_source(_SCENE), Parameters(), ClusterTable(), None
+    mapper = mapper_of(source.description, parameters, seed=0)
+    for step in steps(source.records()):
+        frame = mapper.process(step)
+        clusters.record(frame)
+        columns = frame.columns
+    mapper.snapshot().gathering.folded()  # as a step back does
+    preview_trees(KnownMap(parameters, clusters, mapper.path, columns), parameters)
 
 
 def warm_tree_map() -> None:
@@ -212,5 +175,5 @@ def _stems() -> Iterator[Step]:
 
 
 if __name__ == "__main__":
-    _programs = {"warm_up": warm_up, "warm_front_end": warm_front_end, "warm_tree_map": warm_tree_map}
+    _programs = {"warm_up": warm_up, "map_scene": map_scene, "warm_tree_map": warm_tree_map}
     run_child(lambda _: _programs[sys.argv[1]]())

@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[3]
 PROGRAM = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from app.worker.numba_warmup import compiled_share, is_compiled, warm_front_end, warm_tree_map, warm_up
+from app.worker.numba_warmup import compiled_share, is_compiled, map_scene, warm_tree_map, warm_up
 from app.worker.process import new_session
 from pipeline.config import Parameters
 
@@ -30,7 +30,7 @@ def seen():
         for signature in kernel.signatures
     }
 
-warm_front_end()
+map_scene()
 warm_tree_map()
 assert is_compiled()
 assert compiled_share() > 0.95, compiled_share()
@@ -79,7 +79,7 @@ def test_both_halves_are_waited_for_and_told(monkeypatch, tmp_path):
     told = []
     with on_compiling(lambda: told.append(1)):
         numba_warmup.compile_ahead()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["warm_front_end", "warm_tree_map"]
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["map_scene", "warm_tree_map"]
     assert [process.returncode for process in started] == [0, 0]
     assert told
 
