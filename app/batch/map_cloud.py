@@ -25,6 +25,7 @@ from pipeline.evaluation import MapScores
 from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap, map_plot
 from pipeline.inventory.cloud import WholeCloud
+from pipeline.inventory.cross_sections import slice_heights
 from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson
 from pipeline.types.records import Trees, TruthTrees, Verdict
@@ -134,30 +135,29 @@ def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
         plot: The map in local coordinates.
         offset: Origin of the local coordinates in those of the cloud, x, y, z [m].
     """
-    c = plot.candidates
-    for k in range(len(c.verdict)):
-        x, y = c.place[k] + offset[:2]
+    for stem, place, verdict in zip(plot.stems, plot.place, plot.verdict, strict=True):
+        x, y = place + offset[:2]
         yield [
             "0",
             "",
             _text(x, 3),
             _text(y, 3),
-            Verdict(int(c.verdict[k])).label,
+            Verdict(int(verdict)).label,
             "",
-            _text(c.radius[k], 3),
-            _text(c.radial_std[k], 4),
-            _text(math.degrees(c.arc[k]), 0),
-            str(int(c.points[k])) if np.isfinite(c.points[k]) else "",
-            _text(2.0 * c.radius[k], 3),
-            _text(c.height[k], 3),
+            _text(stem["radius"], 3),
+            _text(stem["scatter"], 4),
+            _text(math.degrees(stem["coverage"]), 0),
+            _text(stem["points"], 0),
+            _text(2.0 * stem["radius"], 3),
+            _text(stem["last"] - stem["first"], 3),
         ]
 
 
 def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
     """Yield a row of SLICE_COLUMNS for each cross-section with a known radius; arguments as in
     `_detection_rows`."""
-    for number, slices in zip(plot.trees.number, plot.slices, strict=True):
-        for height, s in zip(plot.slice_height, slices, strict=True):
+    for number, circles in zip(plot.trees.number, plot.circles[plot.tree_candidate], strict=True):
+        for height, s in zip(slice_heights(), circles, strict=True):
             if np.isfinite(s[2]):
                 yield [
                     str(number),
@@ -206,7 +206,7 @@ def _run_record(
         losses: Number of left-out points by reason.
     """
     about = cloud.description
-    verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict)
+    verdicts = Counter(Verdict(int(v)).label for v in plot.verdict)
     return {
         "stemmap": version(),
         "source": {
@@ -248,7 +248,7 @@ def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None
     """
     dbh = 100.0 * trees.dbh[np.isfinite(trees.dbh)]
     wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} measured)" if len(dbh) else ", no DBH"
-    verdicts = Counter(Verdict(int(v)).label for v in plot.candidates.verdict if v != Verdict.TREE)
+    verdicts = Counter(Verdict(int(v)).label for v in plot.verdict if v != Verdict.TREE)
     refused = ", ".join(f"{n} {label}" for label, n in sorted(verdicts.items()))
     lines = [
         f"{uri}: {count(plot.counts['read'], 'point')}, {count(len(trees.number), 'tree')}{wide}",

@@ -15,8 +15,8 @@ from pipeline.detection.verdicts import Check
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap
-from pipeline.inventory.cross_sections import STEP, THICK
-from pipeline.inventory.stem_model import LEAN_X, LEAN_Y, X, Y, stem_checks
+from pipeline.inventory.cross_sections import STEP, THICK, slice_heights
+from pipeline.inventory.stem_model import stem_checks
 from pipeline.inventory.stem_tracing import BREAST
 from pipeline.types.records import Verdict
 
@@ -60,7 +60,7 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
         height=float(plot.crowns.height[row]),
         height_sigma=float(plot.crowns.sigma[row]),
         height_hidden=plot.crowns.hidden[row],
-        lean_deg=float(np.degrees(np.arctan(np.hypot(*plot.lean[row])))),
+        lean_deg=float(np.degrees(trees.lean[row])) if trees.lean is not None else float("nan"),
         sections=cross_sections(plot, candidate),
     )
 
@@ -76,18 +76,17 @@ def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
         StemmapError: There is no such candidate.
     """
     plot, frame = run.plot, run.frame
-    if plot is None or frame is None or not 0 <= row < len(plot.candidates.verdict):
+    if plot is None or frame is None or not 0 <= row < len(plot.verdict):
         raise StemmapError(f"there is no candidate {row + 1} in the cloud", remedy="Select another")
-    c = plot.candidates
-    place = c.place[row]
+    place = plot.place[row]
     tree = np.flatnonzero(plot.tree_candidate == row)
     detection = run.parameters_at(0).detection
-    checks = stem_checks(c.stems, detection.radius_min, detection.radius_max)
+    checks = stem_checks(plot.stems, plot.share, detection.radius_min, detection.radius_max)
     return ClusterStory(
         scan=0,
         cluster=row,
-        verdict=Verdict(int(c.verdict[row])).label,
-        checks=check_results(checks, row) if row < len(c.stems) else [],
+        verdict=Verdict(int(plot.verdict[row])).label,
+        checks=check_results(checks, row) if np.isfinite(plot.stems["radius"][row]) else [],
         size=int(frame.clusters.size[row]),
         position=(float(place[0]), float(place[1])),
         tree=int(frame.trees.number[tree[0]]) if len(tree) else None,
@@ -124,25 +123,23 @@ def cross_sections(plot: PlotMap, row: int) -> list[CrossSection]:
         plot: The map.
         row: Row of the candidate.
     """
-    c = plot.candidates
-    if row >= len(c.stems) or not np.isfinite(c.slices[row, :, 2]).any():
-        points = _points_around(plot, BREAST, c.place[row], _UNKNOWN_RADIUS)
+    circles, place, heights = plot.circles[row], plot.place[row], slice_heights()
+    rows = np.flatnonzero(np.isfinite(circles[:, 2]))
+    if not len(rows):
+        points = _points_around(plot, BREAST, place, _UNKNOWN_RADIUS)
         nan = float("nan")
         return [CrossSection(BREAST, 0.0, 0.0, nan, nan, 0.0, nan, points)]
-    slices = c.slices[row]
-    rows = np.flatnonzero(np.isfinite(slices[:, 2]))
-    breast = int(np.argmin(np.abs(plot.slice_height[rows] - BREAST)))
+    breast = int(np.argmin(np.abs(heights[rows] - BREAST)))
     pictures = {*evenly_spaced(len(rows), _PICTURES - 1).tolist(), breast}
-    axis = c.stems[row, [X, Y]] if np.isfinite(c.stems[row, LEAN_X : LEAN_Y + 1]).all() else c.place[row]
     sections = []
     for k, slab in enumerate(rows.tolist()):
-        circle, height = slices[slab], float(plot.slice_height[slab])
+        circle, height = circles[slab], float(heights[slab])
         points = _points_around(plot, height, circle[:2], float(circle[2])) if k in pictures else []
         sections.append(
             CrossSection(
                 height=round(height, 2),
-                x=round(float(circle[0] - axis[0]), 4),
-                y=round(float(circle[1] - axis[1]), 4),
+                x=round(float(circle[0] - place[0]), 4),
+                y=round(float(circle[1] - place[1]), 4),
                 radius=float(circle[2]),
                 radius_sigma=float(np.sqrt(circle[6])),
                 coverage_deg=float(np.degrees(circle[8])),

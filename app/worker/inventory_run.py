@@ -21,7 +21,7 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.inventory import PARAMETERS, Inventory, PlotMap, finish
 from pipeline.inventory.cloud import CloudDescription, WholeCloud
-from pipeline.inventory.stem_model import LAST
+from pipeline.inventory.stem_tracing import BREAST
 from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.io.readers.base import FileSource, SourceDescription
 from pipeline.types.records import (
@@ -320,30 +320,29 @@ def _clusters_of(plot: PlotMap, middle: Float, base_z: float, labels: Int32) -> 
         middle, base_z: Origin of the frame of the clusters in that of the map [m].
         labels: Candidate of each thinned point, -1 for none.
     """
-    c = plot.candidates
-    n = len(c.verdict)
+    stems, n = plot.stems, len(plot.stems)
     nan = np.full(n, np.nan)
-    foot = plot.ground.at(c.place[:, 0], c.place[:, 1]) - base_z
-    low = np.full(n, 0.3)
-    low[: len(c.stems)] = np.nan_to_num(c.stems[:, LAST], nan=1.3) - np.nan_to_num(c.height[: len(c.stems)])
-    width = 2.0 * np.nan_to_num(c.radius, nan=0.1)
-    height = np.nan_to_num(c.height, nan=1.0)
-    size = np.maximum(np.bincount(labels[labels >= 0], minlength=n), np.nan_to_num(c.points))
+    foot = plot.ground.at(plot.place[:, 0], plot.place[:, 1]) - base_z
+    # A candidate without a circle is shown as a thin box at breast height.
+    low = np.nan_to_num(stems["first"], nan=BREAST - 1.0)
+    width = 2.0 * np.nan_to_num(stems["radius"], nan=0.1)
+    height = np.nan_to_num(stems["last"] - stems["first"], nan=1.0)
+    size = np.maximum(np.bincount(labels[labels >= 0], minlength=n), np.nan_to_num(stems["points"]))
     return Clusters(
         size=size.astype(np.int64),
-        centroid=np.column_stack([c.place - middle, foot + low + 0.5 * height]),
+        centroid=np.column_stack([plot.place - middle, foot + low + 0.5 * height]),
         eigenvalues=np.full((n, 3), np.nan),
         eccentricity=nan,
-        centre=c.place - middle,
+        centre=plot.place - middle,
         covariance=np.tile(np.eye(2) * np.nan, (n, 1, 1)),
-        radius=c.radius,
+        radius=stems["radius"].copy(),
         radius_sigma=nan,
-        radial_std=c.radial_std,
-        arc=c.arc,
+        radial_std=stems["scatter"].copy(),
+        arc=stems["coverage"].copy(),
         extent=np.column_stack([width, width, height]),
         hidden=np.zeros(n, np.bool_),
         cut=np.zeros(n, np.bool_),
-        verdict=c.verdict,
+        verdict=plot.verdict,
     )
 
 

@@ -1,5 +1,4 @@
-"""Circles in the horizontal slices of a plot, which may be cross-sections of stems, with branches and bark
-next to them.
+"""Horizontal slices of a plot, and circles in them.
 
 The positions of the scanner are unknown, so the residual of a point is its distance from the circle. The
 start is the best of many circles through three points; then follows a robust geometric fit (Gauss-Newton with
@@ -8,24 +7,22 @@ Tukey weights).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.detection.clustering import dbscan_grid
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import Bool, Float32, Int
+from pipeline.types.records import Float32, Int
 
-TRIES = 160  # circles through three points
-MOST_POINTS = 250  # of a cluster that vote
-TUKEY = 4.7  # sigma
+TRIES = 500  # circles through three points
+MOST_POINTS = 500  # points that vote
+TUKEY = 4.7  # sigma; 95 % efficiency for normal errors (Holland and Welsch 1977)
 BARK = 0.004  # m; roughness of a trunk, the smallest scatter
 SECTORS = 36
 FIGURES = 11  # cx, cy, r, var x, cov xy, var y, var r, scatter, coverage, inliers, contrast
-BESIDE, BESIDE_OF_RADIUS = 0.1, 0.5  # m, and share of the radius; width of the ring around a circle
+RING = 0.5  # width of the ring around a circle, as a share of the radius; at least a tenth of a metre
 
 
 @compiled
@@ -35,32 +32,37 @@ def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Fl
     without a circle with a positive result.
 
     Points inside count against a circle, because the cross-section of a trunk is hollow and that of a bush is
-    not. TRIES circles are tried; of many points only some are counted, and the result is scaled up. The same
-    points give the same circle.
+    not. TRIES circles are tried, the first ones through the points next to the origin, the last ones through
+    any points; of many points only some are counted, and the result is scaled up. The same points give the
+    same circle.
 
     Args:
-        xy: Points, shape (N, 2) [m], N at least 1.
-        tolerance: Maximum distance of a point on the circle [m].
+        xy: Points, shape (N, 2) [m], N at least 1. The origin is inside of the circle, or at most `tolerance`
+            outside of it.
+        tolerance: Maximum distance of a point on the circle [m]; at most a third of its radius.
         r_min, r_max: Minimum and maximum radius [m].
         out: Its first three values receive x, y and radius of the circle [m]; unchanged if the result is 0.
     """
     n = xy.shape[0]
     best = 0.0
     stride = max(n // MOST_POINTS, 1)
+    nearest = np.argsort(xy[:, 0] ** 2 + xy[:, 1] ** 2)
     draw = np.uint64(0x9E3779B97F4A7C15)
     pick = np.empty(3, np.int64)
-    for _ in range(TRIES):
+    for attempt in range(TRIES):
+        among = np.uint64(max(n * (attempt + 1) // TRIES, min(n, 3)))
         for k in range(3):  # own random numbers: the same points give the same circle
             draw = draw * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-            pick[k] = np.int64((draw >> np.uint64(33)) % np.uint64(n))
+            pick[k] = nearest[np.int64((draw >> np.uint64(33)) % among)]
         x, y, r = _through_three(xy[pick[0]], xy[pick[1]], xy[pick[2]])
-        if not r_min <= r <= r_max:
+        if not r_min <= r <= r_max or np.sqrt(x * x + y * y) > r + tolerance:
             continue
+        near = min(tolerance, r / 3.0)
         votes = 0.0
         for i in range(0, n, stride):
             off = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) - r
-            if abs(off) < tolerance:
-                votes += 1.0 - abs(off) / tolerance
+            if abs(off) < near:
+                votes += 1.0 - abs(off) / near
             elif off < 0.0:
                 votes -= 1.0
         if votes > best:
@@ -193,7 +195,7 @@ def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered
         xy, x, y, r, tolerance: As in `_coverage`.
         covered, on: Result of `_coverage`.
     """
-    near, far = r + tolerance, r + tolerance + max(BESIDE, BESIDE_OF_RADIUS * r)
+    near, far = r + tolerance, r + tolerance + max(0.1, RING * r)
     in_ring = 0.0
     for i in range(xy.shape[0]):
         in_ring += near <= np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) < far
@@ -219,59 +221,36 @@ def share_inside(xy: Float, x: float, y: float, r: float) -> float:
     return inside / max(all_of_it, 1)
 
 
-@compiled
-def on_circle(xy: Float, x: float, y: float, r: float, tolerance: float) -> Bool:
-    """Return which points, shape (N, 2) [m], are on or inside a circle, closer to its centre than r +
-    tolerance, shape (N,); arguments as in `_coverage`."""
-    on = np.empty(xy.shape[0], np.bool_)
-    for i in range(xy.shape[0]):
-        on[i] = np.sqrt((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) < r + tolerance
-    return on
-
-
 LOWEST, HIGHEST = 0.2, 6.2  # m above the ground; heights in which stems are traced
 STEP = 0.2  # m; between slices
 THICK = 2  # thickness of a slice in steps; neighbours overlap
-LEAST = 8  # points on a circle
-WINDOW = 0.6  # m; wider clusters are searched in windows of twice this width
-WIDE = 1.6  # m
-CIRCLES = 3  # in one cluster
-HOLLOW = 0.25  # largest share of points inside of a circle
-SCATTER, SCATTER_OF_RADIUS = 0.05, 0.3  # m, and share of the radius
-ARC = np.radians(70.0)  # least arc of a circle of a stem
-NEAREST, EPS_MIN, EPS_MAX = 8, 0.05, 0.25  # neighbours; m
-SLAB, INSIDE = FIGURES, FIGURES + 1  # further columns of a circle
+BUCKET = 0.5  # m
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Slices:
-    """The points between LOWEST and HIGHEST above the ground, sorted into slices.
+class Slices(NamedTuple):
+    """The points between LOWEST and HIGHEST above the ground by step of height and horizontal square bucket.
+
+    A slice has THICK steps, so that neighbours overlap.
 
     Attributes:
-        points: x, y [m], height above the ground [m], lowest slice first, shape (N, 3).
-        bounds: First row of each step of height, shape (S + 1,).
-        spacing: Median distance to the eighth neighbour [m].
+        xy: Points sorted by step and bucket, shape (N, 2) [m].
+        start: First point of each bucket of each step, and N, shape (steps * buckets + 1,).
+        low: Corner of the first bucket, shape (2,) [m].
+        across: Number of buckets along x and y, shape (2,).
     """
 
-    points: Float
-    bounds: Int
-    spacing: float
+    xy: Float
+    start: Int
+    low: Float
+    across: Int
 
-    def slab(self, k: int) -> Float:
-        """Return the points of slice k (THICK steps from step k on, so that neighbours overlap): x, y, height
-        above the ground, shape (M, 3) [m], a view."""
-        return self.points[self.bounds[k] : self.bounds[min(k + THICK, len(self.bounds) - 1)]]
 
-    @property
-    def count(self) -> int:
-        """Number of slices."""
-        return len(self.bounds) - THICK
+def slice_heights() -> Float:
+    """Return the heights above the ground of the middles of all slices, shape (S,) [m]."""
+    return np.asarray(LOWEST + STEP * (np.arange(_STEPS - THICK + 1) + 0.5 * THICK), np.float64)
 
-    @staticmethod
-    def middle(k: Float | Int) -> Float:
-        """Return the height above the ground of the middle of slice `k` [m], for one number or an array of
-        them."""
-        return LOWEST + STEP * (np.asarray(k, np.float64) + 0.5 * THICK)
+
+_STEPS = round((HIGHEST - LOWEST) / STEP)
 
 
 def cut(points: Float32) -> Slices:
@@ -281,148 +260,40 @@ def cut(points: Float32) -> Slices:
     Args:
         points: x, y, z, height above the ground [m], shape (N, 4); may be empty.
     """
-    steps = round((HIGHEST - LOWEST) / STEP)
-    step = np.floor((points[:, 3] - LOWEST) / STEP).astype(np.int64)
-    order, bounds = group_rows(np.where(step < steps, step, -1), steps)
-    chosen = points[order][:, [0, 1, 3]].astype(np.float64)
-    return Slices(chosen, bounds, _spacing(chosen))
-
-
-def _spacing(points: Float) -> float:
-    """Return the median distance of points, shape (N, 3) [m], to their eighth neighbour, estimated from a
-    part of them [m]; EPS_MAX with too few points."""
-    from scipy.spatial import cKDTree
-
-    if len(points) <= NEAREST:
-        return EPS_MAX
-    part = points[:400_000] if len(points) <= 400_000 else points[:: len(points) // 400_000 + 1]
-    thinned = (len(points) / len(part)) ** 0.5  # points are on surfaces
-    some = part[:: max(len(part) // 2000, 1)]
-    distance: Float = cKDTree(part).query(some, k=NEAREST + 1)[0][:, -1]
-    return float(np.median(distance) / thinned)
-
-
-def find_circles(slices: Slices, r_min: float, r_max: float) -> Iterator[Float]:
-    """Yield the circles of each slice, lowest first, that may be stems: at least LEAST points on the arc ARC
-    or more, hollow, and with little scatter.
-
-    Each array has the values of `fit_circle`, the slice, and the share of the points inside, shape (K,
-    FIGURES + 2); K may be 0. One trunk may give several circles in a slice.
-
-    Args:
-        slices: Slices of the plot.
-        r_min, r_max: Smallest and largest radius [m].
-    """
-    eps = float(np.clip(1.3 * slices.spacing, EPS_MIN, EPS_MAX))
-    tolerance = float(np.clip(0.3 * slices.spacing, 0.01, 0.03))
-    for k in range(slices.count):
-        xy = np.ascontiguousarray(slices.slab(k)[:, :2])
-        label = dbscan_grid(xy, eps, 4)[0]
-        order, bounds = group_rows(label, int(label.max(initial=-1)) + 1)
-        yield _circles(xy[order], bounds, tolerance, r_min, r_max, float(k))
+    step = np.floor((points[:, 3] - LOWEST) / STEP)
+    chosen = (step >= 0) & (step < _STEPS)
+    xy, step = points[chosen, :2].astype(np.float64), step[chosen].astype(np.int64)
+    low = xy.min(axis=0) if len(xy) else np.zeros(2)
+    across = np.floor((xy.max(axis=0) - low) / BUCKET).astype(np.int64) + 1 if len(xy) else np.ones(2, int)
+    cell = np.floor((xy - low) / BUCKET).astype(np.int64)
+    each = int(across[0] * across[1])
+    order, start = group_rows(step * each + cell[:, 0] * across[1] + cell[:, 1], _STEPS * each)
+    return Slices(np.ascontiguousarray(xy[order]), start, low, across)
 
 
 @compiled
-def _circles(xy: Float, bounds: Int, tolerance: float, r_min: float, r_max: float, k: float) -> Float:
-    """Return the circles of the clusters of one slice, shape (K, FIGURES + 2). Clusters with fewer than LEAST
-    points are skipped; those wider than WIDE are searched in overlapping windows.
+def points_around(slices: Slices, first: int, last: int, x: float, y: float, reach: float) -> Float:
+    """Return the points of steps of height within a reach of a position, shape (M, 2), M may be 0.
 
     Args:
-        xy: Points sorted by cluster, shape (N, 2) [m].
-        bounds: First point of each cluster, and N, shape (clusters + 1,).
-        tolerance: Maximum distance of a point on the circle [m].
-        r_min, r_max: Minimum and maximum radius [m].
-        k: Number of the slice, which is written into the result.
+        slices: Points of the plot.
+        first, last: First step, and one past the last.
+        x, y: The position [m]; may be outside of the plot.
+        reach: Radius, exclusive [m].
     """
-    out = np.empty((64, FIGURES + 2))
+    xy, start, low, across = slices
+    a0, a1 = int((x - reach - low[0]) / BUCKET), int((x + reach - low[0]) / BUCKET)
+    b0, b1 = int((y - reach - low[1]) / BUCKET), int((y + reach - low[1]) / BUCKET)
+    a0, a1, b0, b1 = max(a0, 0), min(a1, across[0] - 1), max(b0, 0), min(b1, across[1] - 1)
+    near = np.empty((64, 2))
     n = 0
-    for c in range(bounds.shape[0] - 1):
-        members = xy[bounds[c] : bounds[c + 1]]
-        if members.shape[0] < LEAST:
-            continue
-        x0, y0 = members[:, 0].min(), members[:, 1].min()
-        wide = max(members[:, 0].max() - x0, members[:, 1].max() - y0)
-        if wide <= WIDE:
-            n, out = _peel(members, tolerance, r_min, r_max, k, n, out)
-            continue
-        order, cells, across = _in_windows(members, x0, y0, wide)
-        for a in range(across):
-            for b in range(across):
-                part = _window(members, order, cells, across, a, b)
-                if part.shape[0] >= LEAST:
-                    n, out = _peel(part, tolerance, r_min, r_max, k, n, out)
-    return out[:n]
-
-
-@compiled
-def _in_windows(xy: Float, x0: float, y0: float, wide: float) -> tuple[Int, Int, int]:
-    """Return the order of points by square cells with sides of WINDOW, the first row of each cell in this
-    order, and the number of cells per side of the grid.
-
-    Args:
-        xy: Points, shape (N, 2) [m].
-        x0, y0: Corner of the grid [m].
-        wide: Side of the grid [m].
-    """
-    across = int(wide / WINDOW) + 1
-    cell = np.empty(xy.shape[0], np.int64)
-    for i in range(xy.shape[0]):
-        cell[i] = int((xy[i, 0] - x0) / WINDOW) * across + int((xy[i, 1] - y0) / WINDOW)
-    order, cells = group_rows(cell, across * across)
-    return order, cells, across
-
-
-@compiled
-def _window(xy: Float, order: Int, cells: Int, across: int, a: int, b: int) -> Float:
-    """Return the points of cell (a, b) and of the next cells along x and y, shape (M, 2) [m].
-
-    Args:
-        xy: Points, shape (N, 2) [m].
-        order, cells, across: Results of `_in_windows`.
-        a, b: Column and row of the cell.
-    """
-    n = 0
-    for i in range(a, min(a + 2, across)):
-        n += cells[i * across + min(b + 2, across)] - cells[i * across + b]
-    part = np.empty((n, 2))
-    n = 0
-    for i in range(a, min(a + 2, across)):
-        for m in range(cells[i * across + b], cells[i * across + min(b + 2, across)]):
-            part[n] = xy[order[m]]
-            n += 1
-    return part
-
-
-@compiled
-def _peel(
-    xy: Float, tolerance: float, r_min: float, r_max: float, k: float, n: int, out: Float
-) -> tuple[int, Float]:
-    """Find the circles of a cluster one after the other, at most CIRCLES; the points on or inside a circle
-    are removed before the next is sought. Circles that cannot be stems (see `find_circles`) are not added.
-    Return the number of circles in `out`, and `out`, which may have been enlarged.
-
-    Args:
-        xy: Points of the cluster, shape (N, 2) [m].
-        tolerance: Maximum distance of a point on the circle [m].
-        r_min, r_max: Minimum and maximum radius [m].
-        k: Number of the slice.
-        n: Number of circles in `out`.
-        out: Circles so far, shape (M, FIGURES + 2); changed in place.
-    """
-    rest = xy
-    row = np.zeros(FIGURES + 2)
-    for _ in range(CIRCLES):
-        if rest.shape[0] < LEAST or best_circle(rest, tolerance, r_min, r_max, row) < 0.5 * LEAST:
-            break
-        x, y, r = row[0], row[1], row[2]
-        if fit_circle(rest, max(3.0 * tolerance, 0.25 * r), r_min, r_max, row):
-            x, y, r = row[0], row[1], row[2]
-            row[SLAB], row[INSIDE] = k, share_inside(rest, x, y, r)
-            clear = row[7] <= min(SCATTER, max(SCATTER_OF_RADIUS * r, 0.01))
-            if row[9] >= LEAST and row[8] >= ARC and row[INSIDE] <= HOLLOW and clear:
-                if n == out.shape[0]:
-                    out = np.concatenate((out, np.empty_like(out)))
-                out[n] = row
-                n += 1
-        rest = rest[~on_circle(rest, x, y, r, 2.0 * tolerance)]
-    return n, out
+    for step in range(first, last):
+        for a in range(a0, a1 + 1):
+            at = (step * across[0] + a) * across[1]
+            for i in range(start[at + b0], start[at + max(b1 + 1, b0)]):
+                if (xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2 < reach * reach:
+                    if n == near.shape[0]:
+                        near = np.concatenate((near, np.empty_like(near)))
+                    near[n] = xy[i]
+                    n += 1
+    return near[:n]

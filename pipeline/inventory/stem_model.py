@@ -2,161 +2,184 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pipeline.classification.forest import CLASSES
 from pipeline.detection.verdicts import Check
 from pipeline.geometry.poses import Float
-from pipeline.inventory.cross_sections import STEP, Slices, without_scatter
-from pipeline.inventory.stem_tracing import BREAST, lines
+from pipeline.inventory.cross_sections import STEP, TUKEY, slice_heights, without_scatter
+from pipeline.inventory.stem_tracing import ALIKE, BREAST
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Int32, Verdict
 
 _MIN: Final = "at least"
 _MAX: Final = "at most"
 
-LOCAL = 1.2  # m above and below breast height in which the taper is nearly constant
-CLOSE = 0.5  # m; largest distance of a slice from breast height for a diameter
+LOCAL = 1.0  # m above and below breast height in which the taper is nearly constant
 MODEL = 0.003  # m; deviation of a trunk from a circle
-LEAST_HIGH, LEAST_SLICES = 1.2, 8  # least height of a stem [m], and least number of slices
-BEGINS_BELOW = 2.2  # m; a stem begins below this height
-FILLED = 0.7  # least share of the slices between the lowest and the highest with a circle
-# Largest scatter of the points and unevenness of the slices, as shares of the radius, and offset of the
-# centres from the axis, as a share of the radius and in m. They apply to a stem of `USUAL` slices and grow
-# with the number of slices.
-ROUGH, UNEVEN, CROOKED, WOBBLE = 0.2, 0.08, 0.2, 0.04
-USUAL, FORGIVEN = 15.0, (0.8, 1.4)
+LEAST_HIGH = 1.2  # m; least height of a stem
+FILLED = 2.0 / 3.0  # least share of the slices between the lowest and the highest with a circle
+STRAIGHT = 0.1  # largest offset from a straight axis and an even taper, as a share of the radius
 LEAST_CONTRAST = 2.5  # ratio of densities on the surface and next to it; uniform points give 1 to 1.5
-LEAST_POINTS = 14  # median points on a circle; with fewer, chance places circles above one another
-UNSURE = 0.08  # largest sigma of the radius as a share of it
-LEAN = np.radians(25.0)
-WIDENS, NARROWS = 0.015, -0.03  # m of radius per metre of height, over the whole stem
-(X, Y, LEAN_X, LEAN_Y, RADIUS, TAPER, VAR_X, VAR_Y, SIGMA_R, COVERAGE, FIRST, LAST, SLICES, SCATTER, SPREAD,
- EVEN, NEAR, TAPER_ALL, POINTS, CONTRAST) = range(20)  # fmt: skip
-COLUMNS = 20
+WIDENS = 0.02  # m of radius per metre of height; stems become thinner upwards
+SURE = 0.5  # share of the votes for pole, person or wall that rejects a stem
+
+#: Model of a stem. Position [m], lean (shift per metre of height), radius [m] and taper (change of the radius
+#: per metre of height) are those at breast height; `near` is the distance of the nearest slice from it [m].
+#: `first` and `last` are the heights of the lowest and highest slice [m], `slices` their number. The visible
+#: arc `coverage` [rad], `points`, `scatter` [m] and `contrast` are medians over the slices, see `fit_circle`;
+#: `crooked` and `uneven` are the median distances of the centres from a straight axis and of the radii from a
+#: cone [m].
+STEM = np.dtype(
+    [
+        (name, np.float64)
+        for name in (
+            "x", "y", "lean_x", "lean_y", "radius", "taper", "var_x", "var_y", "radius_sigma", "near",
+            "first", "last", "slices", "coverage", "points", "scatter", "contrast", "crooked", "uneven",
+        )
+    ]
+)  # fmt: skip
+Stems = NDArray[Any]  # of the type STEM
 
 
 @compiled
-def describe_stems(slices: Float, height: Float) -> Float:
-    """Return the model of each stem, shape (K, COLUMNS), columns as named by the constants X to CONTRAST.
-    Position and radius are those at breast height [m]. A stem with circles in fewer than two slices has NaN
+def fit_line(height: Float, value: Float, weight: Float) -> tuple[float, float, float, float]:
+    """Fit a line through values over height robustly. Return the value at breast height, its change per
+    metre, and the standard deviations of both. A weak prior keeps the slope near 0.
+
+    Args:
+        height: Heights above the ground, shape (N,) [m], N at least 1.
+        value, weight: Values and their weights, shape (N,); the sum of weights is positive.
+    """
+    n = height.shape[0]
+    a, b, scale = np.median(value), 0.0, 1.0
+    saa, sab, sbb = 1.0, 0.0, 1.0
+    for turn in range(12):
+        off = np.abs(value - a - b * (height - BREAST))
+        scale = max(np.median(off) / 0.6745, 0.001)
+        saa, sab, sbb, ta, tb = 0.0, 0.0, (scale / 0.1) ** 2, 0.0, 0.0
+        for i in range(n):
+            u2 = (off[i] / (TUKEY * scale)) ** 2 if turn > 0 else 0.0
+            if u2 >= 1.0:
+                continue
+            w, t = weight[i] * (1.0 - u2) ** 2, height[i] - BREAST
+            saa += w
+            sab += w * t
+            sbb += w * t * t
+            ta += w * value[i]
+            tb += w * t * value[i]
+        D = saa * sbb - sab * sab
+        a, b = (sbb * ta - sab * tb) / D, (saa * tb - sab * ta) / D
+    D = saa * sbb - sab * sab
+    return a, b, scale * np.sqrt(sbb / D), scale * np.sqrt(saa / D)
+
+
+def describe_stems(circles: Float) -> Stems:
+    """Return the model of each stem, STEM of shape (K,). A stem with circles in fewer than two slices has NaN
     in all columns except the number of slices.
 
     Args:
-        slices: Result of `follow`, shape (K, S, FIGURES).
-        height: Heights of the slices, shape (S,) [m].
+        circles: Result of `trace`, shape (K, S, FIGURES).
     """
-    out = np.full((slices.shape[0], COLUMNS), np.nan)
-    for s in range(slices.shape[0]):
-        there = np.isfinite(slices[s, :, 2])
-        n = np.count_nonzero(there)
-        out[s, 12] = n
-        if n < 2:
-            continue
-        rows, h = slices[s][there], height[there]
-        near = np.abs(h - BREAST) <= LOCAL
-        if np.count_nonzero(near) < 3:
-            # The stem is only visible higher up or lower down: use the slices nearest to breast height.
-            order = np.argsort(np.abs(h - BREAST))
-            near[order[:5]] = True
-        local, at = rows[near], h[near]
-        weight = local[:, 8] * np.exp(-(((at - BREAST) / 0.8) ** 2)) + 1e-3
-        x, lean_x, sigma_x, _ = lines(at, local[:, 0], weight)
-        y, lean_y, sigma_y, _ = lines(at, local[:, 1], weight)
-        r, taper, sigma_r, _ = lines(at, local[:, 2], weight)
-        out[s, 0], out[s, 1], out[s, 2], out[s, 3], out[s, 4], out[s, 5] = x, y, lean_x, lean_y, r, taper
-        # Neighbours share half of their points; the sigma of the fit is that of a single slice.
-        floor = np.median(local[:, 3] + local[:, 5]) / (2.0 * local.shape[0]) + MODEL * MODEL
-        out[s, 6], out[s, 7] = 2.0 * sigma_x**2 + floor, 2.0 * sigma_y**2 + floor
-        out[s, 8] = np.sqrt(2.0 * sigma_r**2 + np.median(local[:, 6]) / local.shape[0] + MODEL * MODEL)
-        out[s, 9] = np.median(local[:, 8])
-        out[s, 10], out[s, 11] = h.min(), h.max()
-        out[s, 13], out[s, 18] = np.median(rows[:, 7]), np.median(rows[:, 9])
-        out[s, 19] = np.median(rows[:, 10])
-        _evenness(rows, h, out[s])
-        out[s, 16] = np.abs(at - BREAST).min()
+    out = np.full(len(circles), np.nan, STEM)
+    height = slice_heights()
+    for stem, rows in zip(out, circles, strict=True):
+        there = np.isfinite(rows[:, 2])
+        stem["slices"] = np.count_nonzero(there)
+        if stem["slices"] >= 2:
+            _describe(stem, rows[there], height[there])
     return out
 
 
-@compiled
-def _evenness(rows: Float, h: Float, out: Float) -> None:
-    """Write into `out` the median distances of the centres from a straight axis and of the radii from a cone
-    [m], and the change of the radius per metre of height.
+def _describe(stem: Any, rows: Float, h: Float) -> None:  # noqa: ANN401 - a row of a structured array
+    """Fill the model of a stem.
 
     Args:
-        rows: Circles of a stem, shape (M, FIGURES).
-        h: Their heights, shape (M,) [m].
-        out: Model of the stem, shape (COLUMNS,), modified in place.
+        stem: Row of the type STEM.
+        rows: Its circles, shape (N, FIGURES), N at least 2.
+        h: Their heights, shape (N,) [m].
     """
-    even = np.ones(h.shape[0])
-    off_x = rows[:, 0].copy()
-    off_y, off_r = rows[:, 1].copy(), rows[:, 2].copy()
-    for column in (off_x, off_y, off_r):
-        a, b, _, _ = lines(h, column, even)
-        column -= a + b * (h - BREAST)
-        out[17] = b
-    out[14] = np.median(np.hypot(off_x, off_y))
-    out[15] = np.median(np.abs(off_r))
+    away = np.abs(h - BREAST)
+    # A stem that is only visible higher up or lower down is described by the slices nearest to breast height.
+    width = max(LOCAL, 1.5 * float(np.sort(away)[:5][-1]))
+    near = away < width
+    local, at = rows[near], h[near]
+    weight = local[:, 8] * (1.0 - (away[near] / width) ** 2) ** 2
+    stem["x"], stem["lean_x"], sigma_x, _ = fit_line(at, local[:, 0].copy(), weight)
+    stem["y"], stem["lean_y"], sigma_y, _ = fit_line(at, local[:, 1].copy(), weight)
+    stem["radius"], stem["taper"], sigma_r, _ = fit_line(at, local[:, 2].copy(), weight)
+    # Neighbours share half of their points; the sigma of the fit is that of a single slice.
+    floor = np.median(local[:, 3] + local[:, 5]) / (2.0 * len(local)) + MODEL**2
+    stem["var_x"], stem["var_y"] = 2.0 * sigma_x**2 + floor, 2.0 * sigma_y**2 + floor
+    stem["radius_sigma"] = np.sqrt(2.0 * sigma_r**2 + np.median(local[:, 6]) / len(local) + MODEL**2)
+    stem["near"], stem["first"], stem["last"] = away.min(), h.min(), h.max()
+    stem["coverage"] = np.median(local[:, 8])
+    stem["scatter"], stem["points"], stem["contrast"] = np.median(rows[:, [7, 9, 10]], axis=0)
+    axis = np.array([stem["x"], stem["y"], stem["radius"]])
+    off = local[:, :3] - axis - (at[:, None] - BREAST) * [stem["lean_x"], stem["lean_y"], stem["taper"]]
+    stem["crooked"], stem["uneven"] = np.median(np.hypot(*off[:, :2].T)), np.median(np.abs(off[:, 2]))
 
 
-def classify_stems(stems: Float, r_min: float, r_max: float) -> Int32:
+def classify_stems(stems: Stems, share: Float, r_min: float, r_max: float) -> Int32:
     """Return the verdict of each stem, int32, shape (K,): that of the first of its checks that fails, else
-    TREE; TOO_FEW_POINTS for a stem without a radius (NaN).
+    TREE. A column without a circle has the class of most votes, NO_ARC in place of TREE.
 
     Args:
         stems: Result of `describe_stems`.
+        share: Votes of the random forest, in the order of CLASSES, shape (K, 6).
         r_min, r_max: Minimum and maximum radius of a tree [m].
     """
     verdict = np.full(len(stems), Verdict.TREE, np.int32)
-    for check in reversed(stem_checks(stems, r_min, r_max)):  # the first check that fails is written last
+    for check in reversed(stem_checks(stems, share, r_min, r_max)):  # the first that fails is written last
         verdict[check.fails] = check.verdict
+    unknown = np.isnan(stems["radius"])
+    strongest = np.array(CLASSES, np.int32)[share.argmax(axis=1)]
+    verdict[unknown] = np.where(strongest == Verdict.TREE, Verdict.NO_ARC, strongest)[unknown]
     return verdict
 
 
-def stem_checks(stems: Float, r_min: float, r_max: float) -> tuple[Check, ...]:
+def stem_checks(stems: Stems, share: Float, r_min: float, r_max: float) -> tuple[Check, ...]:
     """Return the checks of `classify_stems` in their order, with all values and limits, as an explanation.
     Limits that differ from stem to stem are 1, and the values are shares of them."""
-    r, slices = stems[:, RADIUS], stems[:, SLICES]
-    span = stems[:, LAST] - stems[:, FIRST]
-    taper, lean = stems[:, TAPER_ALL], np.hypot(stems[:, LEAN_X], stems[:, LEAN_Y])
-    often = np.clip(slices / USUAL, *FORGIVEN)
-    every = span / STEP + 1.0
-    points, first = stems[:, POINTS], stems[:, FIRST]
-    few = ~np.isfinite(r) | (points < LEAST_POINTS)
+    r, span, contrast = stems["radius"], stems["last"] - stems["first"], stems["contrast"]
+    taper = stems["taper"]
+    filled = stems["slices"] / (span / STEP + 1.0)
     checks = [
-        Check(Verdict.TOO_FEW_POINTS, "points per circle", "", points, _MIN, LEAST_POINTS, "", few),
         Check(Verdict.TOO_THIN, "radius", "m", r, _MIN, r_min, "detection.radius_min", r < r_min),
         Check(Verdict.TOO_THICK, "radius", "m", r, _MAX, r_max, "detection.radius_max", r > r_max),
         Check(Verdict.TOO_LOW, "traced height", "m", span, _MIN, LEAST_HIGH, "", span < LEAST_HIGH),
-        Check(Verdict.TOO_LOW, "slices", "", slices, _MIN, LEAST_SLICES, "", slices < LEAST_SLICES),
-        Check(Verdict.OTHER, "lowest slice", "m", first, _MAX, BEGINS_BELOW, "", first > BEGINS_BELOW),
-        Check(Verdict.BUSH, "share of slices", "", slices / every, _MIN, FILLED, "", slices < FILLED * every),
-    ]
-    for figure, value, limit in (
-        ("scatter of the points", stems[:, SCATTER], often * np.maximum(ROUGH * r, 0.01)),
-        ("unevenness of the radii", stems[:, EVEN], often * np.maximum(UNEVEN * r, 0.008)),
-        ("offset from a straight axis", stems[:, SPREAD], often * np.maximum(WOBBLE, CROOKED * r)),
-        ("sigma of the radius", stems[:, SIGMA_R], UNSURE * r + MODEL),
-    ):
-        name = f"{figure}, share of the limit"
-        checks.append(Check(Verdict.NOT_ROUND, name, "", value / limit, _MAX, 1.0, "", value > limit))
-    contrast, leans = stems[:, CONTRAST], lean > np.tan(LEAN)
-    lean_deg = np.degrees(np.arctan(lean))
-    return (
-        *checks,
+        Check(
+            Verdict.OTHER, "distance of a slice from breast height", "m", stems["near"], _MAX, LOCAL, "",
+            stems["near"] > LOCAL,
+        ),
+        Check(Verdict.BUSH, "share of slices", "", filled, _MIN, FILLED, "", filled < FILLED),
+        Check(
+            Verdict.BUSH, "contrast", "", contrast, _MIN, LEAST_CONTRAST, "", contrast < LEAST_CONTRAST
+        ),
         Check(Verdict.BUSH, "radius gained per metre", "m", taper, _MAX, WIDENS, "", taper > WIDENS),
-        Check(Verdict.BUSH, "radius lost per metre", "m", -taper, _MAX, -NARROWS, "", taper < NARROWS),
-        Check(Verdict.BUSH, "contrast", "", contrast, _MIN, LEAST_CONTRAST, "", contrast < LEAST_CONTRAST),
-        Check(Verdict.OTHER, "lean", "deg", lean_deg, _MAX, float(np.degrees(LEAN)), "", leans),
-    )
+    ]  # fmt: skip
+    for figure, value, limit in (
+        ("unevenness of the radii", stems["uneven"], STRAIGHT * r + MODEL),
+        ("offset from a straight axis", stems["crooked"], STRAIGHT * r + MODEL),
+        ("sigma of the radius", stems["radius_sigma"], STRAIGHT * r + MODEL),
+    ):
+        value = value / limit
+        name = f"{figure}, share of the limit"
+        checks.append(Check(Verdict.NOT_ROUND, name, "", value, _MAX, 1.0, "", value > 1.0))
+    for kind in (Verdict.POLE, Verdict.PERSON, Verdict.WALL):
+        votes = share[:, CLASSES.index(kind)]
+        checks.append(Check(kind, f"votes for {kind.label}", "", votes, _MAX, SURE, "", votes > SURE))
+    return tuple(checks)
 
 
-def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
+def diameters(stems: Stems, arc_min: float) -> tuple[Float, Float]:
     """Return diameter at breast height and its sigma [m], shape (K,) each.
 
-    Both are NaN for a stem whose visible arc is less than `arc_min`, with fewer than three slices, without a
-    slice within CLOSE of breast height, or with a sigma of the diameter above half of the radius.
+    Both are NaN for a stem whose visible arc is less than `arc_min`, without a slice within half of LOCAL of
+    breast height, or with a sigma of the radius above a quarter of the radius.
 
     The diameter is measured across the axis: a level slice of a trunk with lean theta is an ellipse, wider by
     1 / cos theta along the lean, and the circle through it has the mean of both. The bias by the scatter of
@@ -166,56 +189,41 @@ def diameters(stems: Float, arc_min: float) -> tuple[Float, Float]:
         stems: Result of `describe_stems`.
         arc_min: Least visible arc [rad].
     """
-    known = (stems[:, COVERAGE] >= arc_min) & (stems[:, NEAR] <= CLOSE) & (stems[:, SLICES] >= 3)
-    known &= 2.0 * stems[:, SIGMA_R] < 0.5 * stems[:, RADIUS]
-    across = 2.0 / (1.0 + np.sqrt(1.0 + stems[:, LEAN_X] ** 2 + stems[:, LEAN_Y] ** 2))
-    radius = without_scatter(stems[:, RADIUS], stems[:, SCATTER])
-    dbh, sigma = 2.0 * across * radius, 2.0 * stems[:, SIGMA_R]
+    known = (stems["coverage"] >= arc_min) & (stems["near"] <= 0.5 * LOCAL) & (stems["slices"] >= 3)
+    known &= stems["radius_sigma"] < 0.25 * stems["radius"]
+    across = 2.0 / (1.0 + np.sqrt(1.0 + stems["lean_x"] ** 2 + stems["lean_y"] ** 2))
+    radius = without_scatter(stems["radius"], stems["scatter"])
+    dbh, sigma = 2.0 * across * radius, 2.0 * stems["radius_sigma"]
     return np.where(known, dbh, np.nan), np.where(known, sigma, np.nan)
 
 
-def is_repeated(stems: Float, verdict: Int32) -> Bool:
+def is_repeated(stems: Stems, axes: Float, verdict: Int32) -> Bool:
     """Return which stems are duplicates, shape (K,): of stems at the same place, the trees come first, then
-    those with more slices, then the earlier ones; the others are repeated. A stem whose position is unknown
-    (NaN) is not repeated.
+    those with more slices, then the earlier ones; the others are repeated.
+
+    Two stems are at the same place if the axis of one is inside of the other at the middle of the heights
+    that both have, or half-way between them. A column without a circle is at its own axis.
 
     Args:
-        stems: Result of `describe_stems`, shape (K, COLUMNS); where there is no model, X and Y may be known.
+        stems: Result of `describe_stems`, shape (K,).
+        axes: Axes of their columns, see `find_columns`, shape (K, 5).
         verdict: Result of `classify_stems`, shape (K,).
     """
-    order = np.lexsort((np.arange(len(stems)), -stems[:, SLICES], verdict != Verdict.TREE))
-    order = order[np.isfinite(stems[order, X])]
+    order = np.lexsort((np.arange(len(stems)), -stems["slices"], verdict != Verdict.TREE))
+    known = np.isfinite(stems["radius"])
+    columns = ("x", "y", "lean_x", "lean_y", "radius", "first", "last")
+    x, y, lean_x, lean_y, radius, first, last = (stems[name].copy() for name in columns)
+    for column, of_axis in zip((x, y, lean_x, lean_y), axes.T, strict=False):
+        column[~known] = of_axis[~known]
+    radius[~known], first[~known], last[~known] = 0.0, BREAST, BREAST
     again = np.zeros(len(stems), np.bool_)
-    again[order] = _again(np.nan_to_num(stems[order]), verdict[order] == Verdict.TREE)
+    kept = np.zeros(0, np.int64)
+    for i in order:
+        at = 0.5 * (np.maximum(first[i], first[kept]) + np.minimum(last[i], last[kept])) - BREAST
+        dx = x[i] - x[kept] + at * (lean_x[i] - lean_x[kept])
+        dy = y[i] - y[kept] + at * (lean_y[i] - lean_y[kept])
+        reach = np.maximum(radius[i], radius[kept]) + (0.0 if verdict[i] == Verdict.TREE else ALIKE)
+        again[i] = (dx * dx + dy * dy < reach * reach).any()
+        if not again[i]:
+            kept = np.append(kept, i)
     return again
-
-
-@compiled
-def _again(stems: Float, tree: Bool) -> Bool:
-    """Return whether each stem is at the place of an earlier one that is not repeated itself, shape (K,).
-
-    Args:
-        stems: Models in the order of precedence, without NaN, shape (K, COLUMNS).
-        tree: Whether each is a tree; a tree is repeated only within the radius of the earlier stem, another
-            stem also next to it.
-    """
-    again = np.zeros(stems.shape[0], np.bool_)
-    for i in range(stems.shape[0]):
-        for j in range(i):
-            if again[j]:
-                continue
-            # At the middle of the heights that both have, else half-way between them.
-            low, high = max(stems[i, 10], stems[j, 10]), min(stems[i, 11], stems[j, 11])
-            at = 0.5 * (low + high) - BREAST
-            dx = stems[i, 0] - stems[j, 0] + at * (stems[i, 2] - stems[j, 2])
-            dy = stems[i, 1] - stems[j, 1] + at * (stems[i, 3] - stems[j, 3])
-            near = max(stems[j, 4], 0.05) if tree[i] else max(stems[i, 4], stems[j, 4]) + 0.1
-            if dx * dx + dy * dy < near * near:
-                again[i] = True
-                break
-    return again
-
-
-def middles(slices: Slices) -> Float:
-    """Return the heights above the ground of the middles of all slices, shape (S,) [m]."""
-    return Slices.middle(np.arange(slices.count))

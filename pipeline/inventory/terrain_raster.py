@@ -1,9 +1,9 @@
 """Ground height of a plot: a raster below a whole cloud, computed in one pass over its points.
 
-The lowest returns of each cell are kept. A single return below the others is noise, and so is a single cell
-below its neighbours. A cell that is steeper above a lower one than the terrain can be is a stem, a bush or a
-crown. Planes are fitted to the other cells, and holes are interpolated. Heights are relative to the plane of
-the plot, so that the checks have the same limits on a hillside and on flat ground.
+The lowest returns of each cell are kept. A single return below the others is noise, and so are few returns
+below the neighbouring cells. A cell that is steeper above a lower one than the terrain can be is a stem, a
+bush or a crown. The other cells are interpolated and smoothed. Heights are relative to the plane of the plot,
+so that the checks have the same limits on a hillside and on flat ground.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.types.records import Bool, Float32, Int32
+from pipeline.types.records import Bool, Float32, Int, Int32
 
 UInt64 = NDArray[np.uint64]
 
@@ -24,7 +24,6 @@ KEPT = 8  # lowest returns of a cell
 TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
 PIT = 0.5  # m; a cell this far below its neighbours is noise
 TOLERANCE = 0.15  # m; grass and noise above the steepest slope
-WINDOW = 2  # cells to each side to which a plane is fitted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +53,17 @@ class TerrainRaster:
         Outside of the raster, the values at its border are returned."""
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         return _evaluate(self.height, self.low, self.cell, np.ascontiguousarray(x), np.ascontiguousarray(y))
+
+    def cells_seen_around(self, places: Float) -> Int:
+        """Return the number of cells with ground returns among the 3 x 3 cells around each position, shape
+        (N,); `places` have the shape (N, 2) [m]."""
+        from scipy.ndimage import convolve
+
+        count = convolve(self.seen.astype(np.int64), np.ones((3, 3), np.int64), mode="constant")
+        cell = np.floor((places - self.low) / self.cell).astype(np.int64)
+        column, row = np.clip(cell, 0, np.array(self.seen.shape) - 1).T
+        found: Int = count[column, row]
+        return found
 
 
 class LowestReturns:
@@ -89,17 +99,16 @@ class LowestReturns:
             slope_max: Largest slope of the terrain against the plane of the plot [rad].
         """
         ground = _supported(self._lowest, self._count)
-        continuous = _continues_upwards(ground, self._occupied)
+        upright = _continues_upwards(ground[:, :, 2], self._occupied)
         trend = _trend(ground)
-        ground[:, :, 2] -= ground[:, :, 0] * trend[0] + ground[:, :, 1] * trend[1] + trend[2]
+        z = ground[:, :, 2] - ground[:, :, :2] @ trend[:2] - trend[2]
         for _ in range(2):
-            _remove_pits(ground, continuous)
-        _remove_overhanging(ground, float(np.tan(slope_max)))
-        height, seen = _planes(ground, self._low)
-        _fill(height)
-        x = self._low[0] + (np.arange(height.shape[0]) + 0.5) * CELL
-        y = self._low[1] + (np.arange(height.shape[1]) + 0.5) * CELL
-        height += x[:, None] * trend[0] + y[None, :] * trend[1] + trend[2]
+            _remove_pits(z, upright)
+        _remove_overhanging(z, float(np.tan(slope_max)))
+        seen = np.isfinite(z)
+        centre = self._low + (np.moveaxis(np.indices(z.shape), 0, -1) + 0.5) * CELL
+        height = _interpolated(ground[seen][:, :2], z[seen], centre)
+        height += centre @ trend[:2] + trend[2]
         return TerrainRaster(self._low, CELL, height, seen)
 
 
@@ -119,7 +128,7 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
         lowest: KEPT lowest returns of each cell in ascending order, infinite where there are fewer, shape
             (columns, rows, KEPT, 3) [m].
         count: Number of returns of each cell, shape (columns, rows).
-        occupied: Bits of the occupied height bins, see `_height_bit`, shape (columns, rows).
+        occupied: Bits of the occupied height bins of each cell, half of PIT high and modulo 64, same shape.
     """
     columns, rows = count.shape
     for i in range(points.shape[0]):
@@ -130,7 +139,7 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
         cell = lowest[a, b]
         count[a, b] += 1
         z = points[i, 2]
-        occupied[a, b] |= _height_bit(z, 0)
+        occupied[a, b] |= np.uint64(1) << np.uint64(int(np.floor(z / (0.5 * PIT))) & 63)
         if z >= cell[KEPT - 1, 2]:
             continue
         k = KEPT - 1
@@ -143,24 +152,12 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
 
 
 @compiled
-def _height_bit(z: float, bins_above: int) -> np.uint64:
-    """Return a mask with the bit of one height bin; bins are half of PIT high, and 64 bins in a row share no
-    bit.
-
-    Args:
-        z: Height [m].
-        bins_above: Number of bins above the bin of z.
-    """
-    return np.uint64(1) << np.uint64((int(np.floor(z / (0.5 * PIT))) + bins_above) & 63)
-
-
-@compiled
 def _supported(lowest: Float32, count: Int32) -> Float:
     """Return the lowest return of each cell that has two more returns close above it, shape (columns, rows,
     3) [m].
 
     Cells with fewer than three returns give their lowest return, and cells in which no return is supported
-    the highest of the kept ones. An empty cell has infinite z.
+    the highest of the kept ones. An empty cell has the position 0 and infinite z.
 
     Args:
         lowest: Lowest returns of each cell, shape (columns, rows, KEPT, 3) [m].
@@ -184,6 +181,21 @@ def _supported(lowest: Float32, count: Int32) -> Float:
     return ground
 
 
+def _continues_upwards(z: Float, occupied: UInt64) -> Bool:
+    """Return whether the height bins above the lowest return of each cell are occupied for the depth of a
+    pit, shape (columns, rows).
+
+    Args:
+        z: Heights of the lowest returns [m], infinite for none, shape (columns, rows).
+        occupied: Bits of the occupied height bins of each cell, see `_keep_lowest`.
+    """
+    lowest = np.floor(np.where(np.isfinite(z), z, 0.0) / (0.5 * PIT)).astype(np.int64)
+    one = np.uint64(1)
+    first, second = (occupied >> ((lowest + k) & 63).astype(np.uint64) & one for k in (1, 2))
+    upright: Bool = np.isfinite(z) & (first & second).astype(np.bool_)
+    return upright
+
+
 def _trend(ground: Float) -> Float:
     """Return a, b, c of the plane z = a x + b y + c through the lowest cells of squares of 4 m, fitted
     robustly, shape (3,). With fewer than six squares it is level at their median height, without any at 0.
@@ -191,20 +203,16 @@ def _trend(ground: Float) -> Float:
     Args:
         ground: Lowest returns, shape (columns, rows, 3) [m], infinite z for none.
     """
-    squares = 8
-    columns, rows = (-(-n // squares) * squares for n in ground.shape[:2])
-    padded = np.full((columns, rows, 3), np.inf)
-    padded[: ground.shape[0], : ground.shape[1]] = ground
-    blocks = padded.reshape(columns // squares, squares, rows // squares, squares, 3).swapaxes(1, 2)
-    blocks = blocks.reshape(-1, squares * squares, 3)
-    place = blocks[np.arange(len(blocks)), blocks[:, :, 2].argmin(axis=1)]
-    place = place[np.isfinite(place[:, 2])]
+    places = ground[np.isfinite(ground[:, :, 2])]
+    places = places[np.argsort(places[:, 2], kind="stable")]
+    _, first = np.unique(np.floor(places[:, :2] / (8.0 * CELL)), axis=0, return_index=True)
+    place = places[first]
     middle = np.median(place[:, 2]) if len(place) else 0.0
+    plane = np.array([0.0, 0.0, middle])
     if len(place) < 6:
-        return np.array([0.0, 0.0, middle])
+        return plane
     A = np.column_stack([place[:, :2], np.ones(len(place))])
     weight = np.ones(len(place))
-    plane = np.array([0.0, 0.0, middle])
     for _ in range(10):
         root = np.sqrt(weight)[:, None]
         # A weak prior for level ground: squares in a row do not determine the slope across them.
@@ -216,168 +224,66 @@ def _trend(ground: Float) -> Float:
     return np.asarray(plane)
 
 
-@compiled
-def _remove_pits(ground: Float, continuous: Bool) -> None:
-    """Remove isolated returns far below nearly all neighbouring cells: noise below the ground.
+def _remove_pits(z: Float, upright: Bool) -> None:
+    """Remove returns far below nearly all neighbouring cells, noise below the ground, in place.
 
-    Returns that continue upwards without a gap for the depth of a pit are not noise but, for example, the
-    foot of a stem. In a cloud with little ground, the neighbours of such a cell are crowns.
-
-    Args:
-        ground: Lowest returns, shape (columns, rows, 3) [m]; removed cells get infinite z.
-        continuous: Result of `_continues_upwards`, shape (columns, rows).
-    """
-    columns, rows = ground.shape[0], ground.shape[1]
-    before = ground[:, :, 2].copy()
-    around = np.empty(25)
-    for a in range(columns):
-        for b in range(rows):
-            if before[a, b] == np.inf or continuous[a, b]:
-                continue
-            n = 0
-            for i in range(max(a - 2, 0), min(a + 3, columns)):
-                for j in range(max(b - 2, 0), min(b + 3, rows)):
-                    if before[i, j] < np.inf and (i != a or j != b):
-                        around[n] = before[i, j]
-                        n += 1
-            # The lower quartile: among crowns few cells are ground, and these are no pits.
-            if n >= 4 and before[a, b] < np.sort(around[:n])[n // 4] - PIT:
-                ground[a, b, 2] = np.inf
-
-
-@compiled
-def _continues_upwards(ground: Float, occupied: UInt64) -> Bool:
-    """Return whether the height bins above the lowest return of each cell are occupied for the depth of a
-    pit, shape (columns, rows).
+    The lower quartile of at least four neighbours decides, because among crowns few cells are ground. Returns
+    that continue upwards are no noise but, for example, the foot of a stem, whose neighbours can be crowns.
 
     Args:
-        ground: Lowest returns, shape (columns, rows, 3) [m].
-        occupied: Bits of the occupied height bins of each cell, see `_height_bit`.
+        z: Lowest returns above the trend, shape (columns, rows) [m]; removed cells become infinite.
+        upright: Result of `_continues_upwards`, same shape.
     """
-    columns, rows = occupied.shape
-    continuous = np.zeros((columns, rows), np.bool_)
-    for a in range(columns):
-        for b in range(rows):
-            z = ground[a, b, 2]
-            if z < np.inf:
-                first, second = occupied[a, b] & _height_bit(z, 1), occupied[a, b] & _height_bit(z, 2)
-                continuous[a, b] = first != 0 and second != 0
-    return continuous
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(z, 2, constant_values=np.inf), (5, 5))
+    around = np.sort(np.delete(around.reshape(*z.shape, 25), 12, axis=2), axis=2)
+    known = np.isfinite(around).sum(axis=2)
+    quartile = np.take_along_axis(around, np.minimum(known // 4, 23)[:, :, None], axis=2)[:, :, 0]
+    z[(known >= 4) & ~upright & (z < quartile - PIT)] = np.inf
 
 
-@compiled
-def _remove_overhanging(ground: Float, slope: float) -> None:
+def _remove_overhanging(z: Float, slope: float) -> None:
     """Remove cells that are steeper above a lower cell than the terrain can be, in place.
 
-    The cone of the maximum slope of each cell is propagated over the raster by two passes in each direction
-    (a chamfer distance).
+    The cone of the maximum slope of each cell is propagated over the raster (a chamfer distance).
 
     Args:
-        ground: Lowest returns, shape (columns, rows, 3) [m]; removed cells get infinite z.
+        z: Lowest returns above the trend, shape (columns, rows) [m]; removed cells become infinite.
         slope: Maximum slope (rise over run).
     """
-    columns, rows = ground.shape[0], ground.shape[1]
-    cone = ground[:, :, 2].copy()
-    straight, across = slope * CELL, slope * CELL * np.sqrt(2.0)
-    for _ in range(2):
-        for turn in (1, -1):
-            for p in range(columns):
-                a = p if turn == 1 else columns - 1 - p
-                for q in range(rows):
-                    b = q if turn == 1 else rows - 1 - q
-                    best = cone[a, b]
-                    before, beside = a - turn, b - turn
-                    if 0 <= before < columns:
-                        best = min(best, cone[before, b] + straight)
-                        if b - 1 >= 0:
-                            best = min(best, cone[before, b - 1] + across)
-                        if b + 1 < rows:
-                            best = min(best, cone[before, b + 1] + across)
-                    if 0 <= beside < rows:
-                        best = min(best, cone[a, beside] + straight)
-                    cone[a, b] = best
-    for a in range(columns):
-        for b in range(rows):
-            if ground[a, b, 2] > cone[a, b] + TOLERANCE + straight:
-                ground[a, b, 2] = np.inf
+    from scipy.ndimage import minimum_filter
+
+    rise, straight = slope * CELL, np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.bool_)
+    before, cone = np.full_like(z, np.nan), z.copy()
+    while not np.array_equal(before, cone):
+        before = cone
+        cone = np.minimum(cone, minimum_filter(before, footprint=straight, mode="nearest") + rise)
+        cone = np.minimum(cone, minimum_filter(before, size=3, mode="nearest") + rise * np.sqrt(2.0))
+    z[z > cone + TOLERANCE + rise] = np.inf
 
 
-@compiled
-def _planes(ground: Float, low: Float) -> tuple[Float, Bool]:
-    """Return the height [m] at the centre of each cell with ground, NaN elsewhere, and which cells have
-    ground; shape (columns, rows) each.
-
-    The height is that of a plane fitted to the lowest returns of the cells up to WINDOW away; with fewer than
-    three of them, the cell included, it is that of the cell's own lowest return.
+def _interpolated(places: Float, z: Float, centre: Float) -> Float:
+    """Return heights at the centres of cells: linear between the ground returns, the nearest one beyond them,
+    smoothed over neighbouring cells; 0 without returns.
 
     Args:
-        ground: Lowest returns, shape (columns, rows, 3) [m], with infinite z in cells without ground.
-        low: Corner of the raster, shape (2,) [m].
+        places: Positions of the ground returns, shape (N, 2) [m].
+        z: Their heights, shape (N,) [m].
+        centre: Centres of the cells, shape (columns, rows, 2) [m].
     """
-    columns, rows = ground.shape[0], ground.shape[1]
-    height = np.full((columns, rows), np.nan)
-    seen = np.zeros((columns, rows), np.bool_)
-    H, g = np.empty((3, 3)), np.empty(3)
-    for a in range(columns):
-        for b in range(rows):
-            if ground[a, b, 2] == np.inf:
-                continue
-            seen[a, b] = True
-            x, y = low[0] + (a + 0.5) * CELL, low[1] + (b + 0.5) * CELL
-            H[:] = 0.0
-            g[:] = 0.0
-            H[0, 0] = H[1, 1] = 0.02  # prior for level ground
-            n = 0
-            for i in range(max(a - WINDOW, 0), min(a + WINDOW + 1, columns)):
-                for j in range(max(b - WINDOW, 0), min(b + WINDOW + 1, rows)):
-                    z = ground[i, j, 2]
-                    if z < np.inf:
-                        dx, dy = ground[i, j, 0] - x, ground[i, j, 1] - y
-                        w = 1.0 / (1.0 + 8.0 * (dx * dx + dy * dy))
-                        _add_row(H, g, dx, dy, z, w)
-                        n += 1
-            height[a, b] = np.linalg.solve(H, g)[2] if n >= 3 else ground[a, b, 2]
-    return height, seen
+    from scipy.interpolate import LinearNDInterpolator
+    from scipy.ndimage import gaussian_filter
+    from scipy.spatial import QhullError, cKDTree
 
-
-@compiled
-def _add_row(H: Float, g: Float, dx: float, dy: float, z: float, w: float) -> None:
-    """Add one point to normal equations of a plane, in place.
-
-    Args:
-        H: Normal matrix, shape (3, 3).
-        g: Right side, shape (3,).
-        dx, dy: Position from the middle [m].
-        z: Height [m].
-        w: Weight.
-    """
-    row = (dx, dy, 1.0)
-    for k in range(3):
-        g[k] += w * row[k] * z
-        for m in range(3):
-            H[k, m] += w * row[k] * row[m]
-
-
-def _fill(height: Float) -> None:
-    """Replace NaN in heights, shape (columns, rows), by interpolated means of coarser and coarser cells (a
-    pyramid), in place; by 0 if all are NaN."""
-    if not np.isfinite(height).any():
-        height[:] = 0.0
-        return
-    unknown = np.isnan(height)
-    if not unknown.any():
-        return
-    columns, rows = (-(-n // 2) * 2 for n in height.shape)
-    padded = np.full((columns, rows), np.nan)
-    padded[: height.shape[0], : height.shape[1]] = height
-    blocks = padded.reshape(columns // 2, 2, rows // 2, 2).swapaxes(1, 2).reshape(columns // 2, rows // 2, 4)
-    known = np.isfinite(blocks)
-    count = known.sum(axis=2)
-    coarse = np.where(count > 0, np.where(known, blocks, 0.0).sum(axis=2) / np.maximum(count, 1), np.nan)
-    _fill(coarse)
-    at = np.indices(height.shape).reshape(2, -1) + 0.5
-    ahead = _evaluate(coarse, np.zeros(2), 2.0, at[0], at[1])[:, 0].reshape(height.shape)
-    height[unknown] = ahead[unknown]
+    if not len(z):
+        return np.zeros(centre.shape[:2])
+    height: Float = z[cKDTree(places).query(centre)[1]]
+    try:
+        inside = LinearNDInterpolator(places, z)(centre)
+        height = np.where(np.isfinite(inside), inside, height)
+    except QhullError:  # fewer than three returns, or returns in a row
+        pass
+    smooth: Float = gaussian_filter(height, 1.0, mode="nearest")
+    return smooth
 
 
 @compiled

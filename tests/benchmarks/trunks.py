@@ -219,8 +219,9 @@ def tape_errors() -> tuple[list[float], int]:
         of += 1
         # Merged from several views, as a whole cloud is: no ray tells which side of the trunk was seen.
         circle = np.zeros(FIGURES)
-        best_circle(points[:, :2], TOLERANCE, RADIUS_MIN, RADIUS_MAX, circle)
-        if not fit_circle(points[:, :2], REACH_OF_A_SLICE, RADIUS_MIN, RADIUS_MAX, circle):
+        xy = points[:, :2] - points[:, :2].mean(axis=0)
+        best_circle(xy, TOLERANCE, RADIUS_MIN, RADIUS_MAX, circle)
+        if not fit_circle(xy, REACH_OF_A_SLICE, RADIUS_MIN, RADIUS_MAX, circle):
             print(f"{name}: no circle, tape {tape:.1f} cm", file=sys.stderr)
             continue
         radius = float(without_scatter(circle[2], circle[7]))

@@ -53,8 +53,9 @@ def test_lean_and_taper_are_told():
         [ground(6.0, 0.05, rng), stem(3.0, 3.0, 0.15, rng, lean=(0.1, -0.05), taper=0.01, sigma=0.003)]
     )
     m = map_plot(Made(points), FOREST)
-    assert m.lean[0] == pytest.approx((0.1, -0.05), abs=0.01)
-    assert m.taper[0] == pytest.approx(-0.01, abs=0.004)
+    (tree,) = m.stems[m.tree_candidate]
+    assert (tree["lean_x"], tree["lean_y"]) == pytest.approx((0.1, -0.05), abs=0.01)
+    assert tree["taper"] == pytest.approx(-0.01, abs=0.004)
 
 
 def test_a_short_arc_carries_a_place_but_no_diameter():
@@ -73,7 +74,7 @@ def test_bushes_stumps_and_hanging_branches_are_no_trees():
     parts = [ground(8.0, 0.05, rng), bush(2.0, 2.0, rng), stem(5.0, 5.0, 0.2, rng, height=0.9), hanging]
     m = map_plot(Made(np.concatenate(parts)), FOREST)
     assert len(m.trees.number) == 0
-    assert {Verdict.TOO_LOW, Verdict.OTHER} & set(m.candidates.verdict.tolist())
+    assert {Verdict.TOO_LOW, Verdict.OTHER} & set(m.verdict.tolist())
 
 
 def test_undergrowth_at_the_foot_does_not_hide_a_stem():
