@@ -23,6 +23,7 @@ from app.robot.address import ZenohAddress, parse_address
 from app.robot.link import Inbox
 from app.robot.zenoh import ZenohLink
 from pipeline.io.readers.container import Channel
+from pipeline.io.readers.ros_messages import standard_types
 from pipeline.io.recording import outputs
 from pipeline.types.clearance import Zone
 
@@ -103,7 +104,8 @@ class Results:
             now_s: Present time [s] from any origin.
         """
         try:
-            message = outputs.store().deserialize_cdr(payload, outputs.TYPES[topic])
+            types: Any = standard_types("cdr")
+            message = types.deserialize_cdr(payload, outputs.TYPES[topic])
             self._take(topic, message, now_s)
         except Exception:  # any error that a stranger's bytes can cause in a decoder
             self.losses[UNREADABLE] = self.losses.get(UNREADABLE, 0) + 1

@@ -204,12 +204,17 @@ def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
 class MessageSource(FileSource):
     """Parts that sources of recorded messages share: losses, pictures, and closing the recording.
 
-    A subclass sets `_picture_channels`, `_offset_ns` and `_time_of`.
+    A subclass sets `_picture_channels`, `_offset_ns` and `base`, and implements `_time_of` and
+    `_fixed_transforms`.
 
     Args:
         container: The recording; the source closes it.
+
+    Attributes:
+        base: Name of the base frame, "" when it is unknown.
     """
 
+    base: str
     _picture_channels: Mapping[int, Channel]  # by number
     _offset_ns: int  # time minus time of recording, roughly
 
@@ -218,6 +223,18 @@ class MessageSource(FileSource):
         super().__init__()
         self._container = container
         self._damage = container.damage
+        self._camera: tuple[Camera | None, str] | None = None
+
+    def camera(self) -> tuple[Camera | None, str]:
+        """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
+        if self._camera is None and self._picture_channels:  # needed for each picture
+            topic = next(channel.topic for channel in self._picture_channels.values())
+            self._camera = find_camera(self._container, self._fixed_transforms(), self.base, topic)
+        return self._camera or (None, "")
+
+    def _fixed_transforms(self) -> TransformTree:
+        """Return the fixed transforms. Subclasses implement it."""
+        raise NotImplementedError
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
         """Return the time of a picture [ns] by the stamp in its message (None without one), or None if it is

@@ -35,7 +35,7 @@ from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
 from pipeline.io.readers.ros_messages import standard_types
 from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed
-from pipeline.io.readers.transforms import Extrinsics
+from pipeline.io.readers.transforms import Extrinsics, TransformTree
 from pipeline.types.records import Notice, Record
 
 #: The source is described this long after the first scan, or after this many scans: then its topics and
@@ -248,7 +248,8 @@ class LiveCamera:
         if self._found is None or self._found[0] != base:
             known = [*self._fixed, *([] if self._info is None else [self._info])]
             messages = MessageList("", list(self._channels.values()), known)
-            self._found = (base, *find_live_camera(messages, self._pictures_of.topic, base))
+            tree = fixed_transforms(messages)
+            self._found = (base, *find_camera(messages, tree, base, self._pictures_of.topic))
         return self._found[1:]
 
     def near(self, stamp_ns: int, offset_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
@@ -279,17 +280,11 @@ class LiveCamera:
             self._found = None
 
 
-def find_live_camera(container: Container, topic: str, base: str) -> tuple[Camera | None, str]:
-    """Return the camera of a topic by the fixed transforms and the CameraInfo, or None and the reason.
-
-    Args:
-        container: The messages.
-        topic: Topic of its pictures.
-        base: Name of the base frame.
-    """
+def fixed_transforms(container: Container) -> TransformTree:
+    """Return the fixed transforms in the messages of a container."""
     mounting = Extrinsics(container)
     mounting.read(frozenset(c.number for c in container.channels if is_fixed(c.topic)), frozenset())
-    return find_camera(container, mounting.tree, base, topic)
+    return mounting.tree
 
 
 NAME, VERSION = "stemmap_live.json", 1
@@ -370,12 +365,11 @@ class LiveRecording(MessageSource):
         self._channels = _channels(container, run, uri)
         self._numbers = [channel.number for channel in self._channels]
         self._skipped = self._read_skipped()
-        self._found_camera: tuple[Camera | None, str] | None = None
-        self._camera = tuple(c for c in container.channels if c.topic in run.camera)
-        pictures = [c for c in self._camera if c.msgtype in TYPES_BY_ROLE["camera"]]
+        self._camera_channels = tuple(c for c in container.channels if c.topic in run.camera)
+        pictures = [c for c in self._camera_channels if c.msgtype in TYPES_BY_ROLE["camera"]]
         self._picture_channels = {channel.number: channel for channel in pictures}
         reader = self._opened_reader()
-        self._base, self._offset_ns = reader.base, reader.offset_ns
+        self.base, self._offset_ns = reader.base, reader.offset_ns
         if reader.description is None:
             raise SourceError("there is no scan in it", where=uri, remedy="Record the LiDAR's topic.")
         self._description = self._describe(reader.description, paths)
@@ -395,15 +389,9 @@ class LiveRecording(MessageSource):
             yield from reader.add(message)
         yield from reader.finish()
 
-    def camera(self) -> tuple[Camera | None, str]:
-        """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
-        if self._found_camera is None:  # needed for each picture
-            topic = next((c.topic for c in self._picture_channels.values()), None)
-            self._found_camera = (
-                (None, "") if topic is None
-                else find_live_camera(self._container, topic, self._base)
-            )  # fmt: skip
-        return self._found_camera
+    def _fixed_transforms(self) -> TransformTree:
+        """Return the fixed transforms."""
+        return fixed_transforms(self._container)
 
     def _reader(self) -> ArrivalReader:
         """Return a new reader of the messages of the robot."""
@@ -452,7 +440,7 @@ class LiveRecording(MessageSource):
             preset=self._run.preset,
             warnings=tuple(warnings),
             revisions=revisions,
-            topics=(*known.topics, *camera_topics(self._camera)),
+            topics=(*known.topics, *camera_topics(self._camera_channels)),
         )
 
     def _messages(self, numbers: Collection[int], losses: dict[str, int]) -> Iterator[Message]:

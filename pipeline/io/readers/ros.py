@@ -13,7 +13,7 @@ from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.ground_truth import ATTACHMENT, SIZE_LIMIT, read_truth
 from pipeline.io.readers.base import SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.camera import Camera, MessageSource, find_camera
+from pipeline.io.readers.camera import MessageSource
 from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.measured_poses import Fix, FrameAlignments
 from pipeline.io.readers.message_time import (
@@ -28,7 +28,7 @@ from pipeline.io.readers.ros_messages import LASER_SCAN
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
 from pipeline.io.readers.topics import choose_topics
-from pipeline.io.readers.transforms import Extrinsics, frame_name
+from pipeline.io.readers.transforms import Extrinsics, TransformTree, frame_name
 from pipeline.io.readers.velodyne import SENSORS
 from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
 
@@ -68,7 +68,6 @@ class RosSource(MessageSource):
         self._extrinsics.read(topics.transforms(fixed=True), topics.transforms(fixed=False))
         self._records = RecordDecoder(self._channels, self._extrinsics.tree)
         self._warnings: list[str] = []
-        self._camera: tuple[Camera | None, str] | None = None
         self._picture_channels = {number: self._channels[number] for number in topics.numbers("camera")}
         named = [topics.numbers(role) for role in ("scan", "odometry", "imu") if role in topics.chosen]
         offsets_ns = [self._clock_offset(numbers) for numbers in named]
@@ -136,19 +135,9 @@ class RosSource(MessageSource):
                     found.append(fix)
         return found
 
-    def camera(self) -> tuple[Camera | None, str]:
-        """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
-        if not self._picture_channels:
-            return None, ""
-        if self._camera is None:  # needed for each picture
-            topic = self._topics.chosen["camera"].name
-            self._camera = find_camera(self._container, self._extrinsics.tree, self._records.base, topic)
-        return self._camera
-
-    @property
-    def base(self) -> str:
-        """Name of the base frame, "" when it is unknown."""
-        return self._records.base
+    def _fixed_transforms(self) -> TransformTree:
+        """Return the fixed transforms."""
+        return self._extrinsics.tree
 
     # --- reading ---------------------------------------------------------------------------------
 
@@ -307,7 +296,7 @@ class RosSource(MessageSource):
             options: Extrinsics chosen by the user; without them, those of the transforms, else identity.
         """
         chosen = self._topics.chosen
-        self._records.base = base = self._extrinsics.base_frame(self._odometry_base())
+        self._records.base = self.base = base = self._extrinsics.base_frame(self._odometry_base())
         has_odometry = "odometry" in chosen or bool(self._moving)
         linked = options.T_base_lidar or self._extrinsics.tree.find(base, frame)
         warnings = self._warnings

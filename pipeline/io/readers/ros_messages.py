@@ -42,6 +42,16 @@ _EXTRA = {
     VELODYNE_SCAN: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets\n",
     TRANSFORMS: "geometry_msgs/TransformStamped[] transforms\n",
     ROS1_TRANSFORMS: "geometry_msgs/TransformStamped[] transforms\n",
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
+    ),
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\nstring id\n"
+    ),
+    "vision_msgs/msg/Detection3DArray": ("std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"),
 }
 _ROS1_TIME = {"velodyne_msgs/msg/VelodynePacket": "time stamp\nuint8[1206] data\n"}
 
@@ -61,8 +71,8 @@ def decode(channel: Channel, payload: bytes) -> Any:  # noqa: ANN401
 
 @cache
 def standard_types(encoding: str) -> Typestore:
-    """Return the definitions of ROS 1 for "ros1" and of ROS 2 for any other encoding, with those of Velodyne
-    and tf; the same object at each call."""
+    """Return the definitions of ROS 1 for "ros1" and of ROS 2 for any other encoding, with those of Velodyne,
+    tf and vision_msgs 4; the same object at each call."""
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_JAZZY)
     for name, text in _EXTRA.items():
         if name not in store.fielddefs:

@@ -3,45 +3,21 @@ messages."""
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
 
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.ros_messages import standard_types
 from pipeline.types.records import Imu, Odometry, Scan
 
 ODOM, BASE, LIDAR, CAMERA = "odom", "base_link", "velodyne", "camera"
 
 _SECOND = 1_000_000_000
 _FLOAT32, _UINT16, _INT32 = 7, 4, 5
-_VISION = {
-    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",
-    "vision_msgs/msg/ObjectHypothesisWithPose": (
-        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose\n"
-    ),
-    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n",
-    "vision_msgs/msg/Detection3D": (
-        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-        "vision_msgs/BoundingBox3D bbox\nstring id\n"
-    ),
-    "vision_msgs/msg/Detection3DArray": ("std_msgs/Header header\nvision_msgs/Detection3D[] detections\n"),
-}
-
 Message = Any  # rosbags makes its message classes at run time
-
-
-@cache
-def store() -> Typestore:
-    """Return the type definitions of ROS 2 with those of vision_msgs 4; the same object at each call."""
-    types = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in _VISION.items():
-        types.register({name: get_types_from_msg(text, name)[name]})
-    return types
 
 
 def make(name: str, /, **fields: Any) -> Message:  # noqa: ANN401
@@ -52,18 +28,18 @@ def make(name: str, /, **fields: Any) -> Message:  # noqa: ANN401
         TypeError: A field is missing or unknown.
     """
     package, short = name.split("/")
-    return store().types[f"{package}/msg/{short}"](**fields)
+    return standard_types("cdr").types[f"{package}/msg/{short}"](**fields)
 
 
 def encode(message: Message) -> bytes:
     """Return a message in CDR."""
-    return bytes(store().serialize_cdr(message, message.__msgtype__))
+    return bytes(standard_types("cdr").serialize_cdr(message, message.__msgtype__))
 
 
 def definition(type_name: str) -> str:
     """Return the definition of a type, e.g. "sensor_msgs/msg/Imu", with those of all types in it, as in
     `ros2msg` schemas."""
-    return str(store().generate_msgdef(type_name, ros_version=2)[0])
+    return str(standard_types("cdr").generate_msgdef(type_name, ros_version=2)[0])
 
 
 def header(stamp_ns: int, frame: str) -> Message:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.poses import Pose2
+from pipeline.io.readers.ros_messages import standard_types
 from pipeline.io.recording.messages import BASE, encode, header, make, odometry_of, pose, vector
-from pipeline.io.recording.messages import store as store
 from pipeline.types.clearance import Clearance, Zone
 from pipeline.types.records import Frame, Path, Trees
 
@@ -43,7 +43,7 @@ _GREEN, _WHITE = (0.0, 0.62, 0.45, 0.9), (1.0, 1.0, 1.0, 1.0)
 
 def type_hash(topic: str) -> str:
     """Return the hash of the type of a topic (REP 2016), by which ROS 2 nodes match topics."""
-    return str(store().hash_rihs01(TYPES[topic]))
+    return str(standard_types("cdr").hash_rihs01(TYPES[topic]))
 
 
 def scan_messages(frame: Frame) -> dict[str, bytes]:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose2
+from pipeline.io.readers.ros_messages import standard_types
 from pipeline.io.recording import messages, outputs
 from pipeline.types.clearance import Clearance, Zone
 from tests.app.fakes import START_NS, frame, path, trees
@@ -75,7 +76,7 @@ def test_a_long_path_is_thinned_and_ends_at_the_robot(length: int):
 def test_the_hash_of_a_type_is_that_of_ros():
     """The hash of std_msgs/String as ROS 2 prints it in `ros2 topic info --verbose`."""
     known = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
-    assert outputs.store().hash_rihs01("std_msgs/msg/String") == known
+    assert standard_types("cdr").hash_rihs01("std_msgs/msg/String") == known
     assert len({outputs.type_hash(topic) for topic in outputs.TYPES}) == len(outputs.TYPES)
 
 
