@@ -15,7 +15,7 @@ from app.scene.colours import ViewSettings
 from app.scene.labels import TREE_WIDTH, Label, LabelNodes, Place, apart
 from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
-from pipeline.types.records import HIDDEN, Frame, Trees, TruthTrees
+from pipeline.types.records import HIDDEN, Frame, HeightMap, Trees, TruthTrees
 
 Ring = tuple[float, float, float] | None
 
@@ -44,6 +44,7 @@ class MapNodes:
         self._mark = Circles(scene, "/world/selection", 0.06, 5.0)
         self._labels = LabelNodes(scene, "/world/numbers", 1.0)
         self._numbers: list[int] = []
+        self._drawn: tuple[TruthTrees | None, HeightMap | None] = (None, None)  # ground truth and ground
         self.labelled: list[Place] = []
 
         @self._trees.node.on_click
@@ -87,14 +88,17 @@ class MapNodes:
 
     def show_truth(self, trees: TruthTrees | None, view: ViewSettings) -> None:
         """Show rings at the objects of the ground truth, on the known ground; None removes them."""
-        if trees is None:
-            self._truth.update(False)
+        on = view.layers["truth"] and trees is not None and len(trees.x) > 0
+        drawn = (trees, self.ground.shown)
+        if trees is None or not on or (drawn[0] is self._drawn[0] and drawn[1] is self._drawn[1]):
+            self._truth.update(on)
             return
+        self._drawn = drawn
         radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh, UNKNOWN_RADIUS) + 0.12
         is_tree = np.array([kind == "tree" for kind in trees.kind], dtype=bool)
         place = np.column_stack([trees.x, trees.y])
         self._truth.show_at(
-            view.layers["truth"],
+            True,
             place,
             radius,
             colours.choose(is_tree, colours.TRUTH, colours.OTHER),

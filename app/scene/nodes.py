@@ -312,6 +312,7 @@ class GroundNode(Node[viser.MeshHandle]):
     """The mesh of the ground over the known cells of the terrain map, and its heights for the other nodes.
 
     Attributes:
+        shown: The height map that is shown; None before the first.
         faces: Number of triangles of the mesh.
     """
 
@@ -329,14 +330,14 @@ class GroundNode(Node[viser.MeshHandle]):
         )
         super().__init__(node)
         self.faces = 0
-        self._shown: HeightMap | None = None
+        self.shown: HeightMap | None = None
         self._mesh: Mesh = node.vertices, node.faces
         self._raster, self._low, self._cell = NOTHING, np.zeros(2), 1.0
 
     def show(self, on: bool, ground: HeightMap | None) -> None:
         """Show a height map; None keeps the present one."""
-        if ground is not None and ground is not self._shown:
-            self._shown = ground
+        if ground is not None and ground is not self.shown:
+            self.shown = ground
             self._raster, self._low, self._cell = raster(ground)
             self._mesh = surface(self._raster, self._low, self._cell)
             self.faces = len(self._mesh[1])
