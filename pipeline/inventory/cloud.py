@@ -12,8 +12,8 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled
-from pipeline.types.records import Float32, Int, Int32
+from pipeline.geometry.voxel_grid import add_to_voxels
+from pipeline.types.records import Float32, Int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,8 +214,6 @@ def _count(part: Float32, squares: dict[int, tuple[int, Float]]) -> None:
 
 FINEST = 0.01  # m
 COARSER = 1.5  # factor of the side when the table is full
-_AXIS_BITS, _MIDDLE = 21, 1 << 20
-_SPREAD = np.uint64(0x9E3779B97F4A7C15)
 
 
 class Thinned:
@@ -236,90 +234,34 @@ class Thinned:
 
     def _begin(self, room: int) -> None:
         """Replace the cubes by an empty table with `room` rows, a power of two."""
-        self._key = np.zeros(room, np.int64)
-        self._mean = np.zeros((room, 4), np.float32)
-        self._count = np.zeros(room, np.int32)
-        self._slot = np.full(2 * room, -1, np.int32)
+        self._keys, self._counts = np.zeros(room, np.int64), np.zeros(room, np.int64)
+        self._sums = np.zeros((room, 4))
+        self._slots = np.full(2 * room, -1, np.int32)
         self._used = 0
 
     def add(self, points: Float32) -> None:
         """Add points of shape (N, 4): x, y, z within 10 km of the origin [m], and another value, which is
         averaged too. `side` grows if the table is full."""
-        self._add(points, np.ones(len(points), np.int32))
+        self._add(points, np.ones(len(points), np.int64))
 
-    def _add(self, points: Float32, weight: Int32) -> None:
-        """Add points (see `add`), each of which represents `weight` points, int32, shape (N,)."""
+    def _add(self, points: Float32, weight: Int) -> None:
+        """Add points (see `add`), each of which represents `weight` points, shape (N,)."""
         begin = 0
         while True:
-            begin, self._used = _add(
-                points, weight, begin, self.side, self._key, self._mean, self._count, self._slot, self._used
-            )
+            tables = self._keys, self._sums, self._counts, self._slots, self._used
+            begin, self._used = add_to_voxels(points, weight, begin, self.side, *tables)
             if begin == len(points):
                 return
-            self._make_room()
-
-    def _make_room(self) -> None:
-        """Double the room for cubes or, at the limit, enlarge `side` by COARSER, and insert the means so far
-        again."""
-        mean, count, room = self._mean[: self._used], self._count[: self._used], len(self._key)
-        if 2 * room <= self._most:
-            room *= 2
-        else:
-            self.side *= COARSER
-        self._begin(room)
-        self._add(mean, count)
+            mean, count, room = self.points, self._counts[: self._used], len(self._keys)
+            if 2 * room <= self._most:
+                room *= 2
+            else:
+                self.side *= COARSER
+            self._begin(room)
+            self._add(mean, count)
 
     @property
     def points(self) -> Float32:
-        """The means in the order of the first points of their cubes, float32, shape (M, 4). It is a view that
-        a later `add` changes."""
-        return self._mean[: self._used]
-
-
-@compiled
-def _add(
-    points: Float32,
-    weight: Int32,
-    begin: int,
-    side: float,
-    keys: Int,
-    mean: Float32,
-    count: Int32,
-    slot: Int32,
-    used: int,
-) -> tuple[int, int]:
-    """Add points to the cubes until no cube is free; return the index of the first point that was not added
-    (the number of points if all were), and the number of cubes in use.
-
-    Args:
-        points: shape (N, 4).
-        weight: Number of points that each point represents, shape (N,).
-        begin: First point to add.
-        side: Side of a cube [m].
-        keys, mean, count: Key, mean and number of points of each cube, modified in place.
-        slot: Hash table of the cubes, modified in place.
-        used: Number of cubes in use.
-    """
-    mask = slot.shape[0] - 1
-    shift = np.uint64(64 - int(np.log2(slot.shape[0]) + 0.5))
-    for i in range(begin, points.shape[0]):
-        key = np.int64(0)
-        for a in range(3):
-            key = (key << _AXIS_BITS) | (
-                (np.int64(np.floor(points[i, a] / side)) + _MIDDLE) & (2 * _MIDDLE - 1)
-            )
-        at = np.int64((np.uint64(key) * _SPREAD) >> shift)
-        while slot[at] >= 0 and keys[slot[at]] != key:
-            at = (at + 1) & mask
-        row = slot[at]
-        if row < 0:
-            if used == keys.shape[0]:
-                return i, used
-            row = np.int32(used)
-            used += 1
-            slot[at], keys[row] = row, key
-        count[row] += weight[i]
-        share = np.float32(weight[i]) / np.float32(count[row])
-        for a in range(4):
-            mean[row, a] += (points[i, a] - mean[row, a]) * share
-    return points.shape[0], used
+        """The means in the order of the first points of their cubes, float32, shape (M, 4)."""
+        mean = self._sums[: self._used] / np.maximum(self._counts[: self._used, None], 1)
+        return np.asarray(mean, np.float32)

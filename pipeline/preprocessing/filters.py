@@ -5,12 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.config.stages import Filters
+from pipeline.geometry.voxel_grid import AXIS_CELLS, add_to_voxels
 from pipeline.jit import compiled
 from pipeline.types.records import Float32
-
-# Odd 64-bit constant that distributes neighbouring cells over the hash table (Fibonacci hashing).
-_SPREAD = np.uint64(0x9E3779B97F4A7C15)
-_AXIS_CELLS = 1 << 21  # three axes of 21 bits fit one 64-bit key
 
 
 def pass_through(points: Float32, parameters: Filters) -> Float32:
@@ -56,43 +53,11 @@ def voxel_grid(points: Float32, parameters: Filters) -> Float32:
         Means, float32, shape (M, 3) [m].
     """
     size = parameters.voxel_size
-    if size == 0.0 or len(points) == 0 or float(np.abs(points).max()) / size >= _AXIS_CELLS // 2 - 1:
+    if size == 0.0 or len(points) == 0 or float(np.abs(points).max()) / size >= AXIS_CELLS // 2 - 1:
         return points  # voxels this small contain one point each
-    return _voxel_means(points, size)
-
-
-@compiled
-def _voxel_means(points: Float32, size: float) -> Float32:
-    """Return the mean of the points of each cube of the edge length `size` [m], float32, shape (M, 3) [m];
-    the points, shape (N, 3) [m], are finite and within 2^20 cubes of the origin. See `voxel_grid`."""
-    n = points.shape[0]
-    slots = 2
-    while slots < 2 * n:
-        slots *= 2
-    shift = np.uint64(64 - int(np.log2(slots) + 0.5))
-    # The hash table stores row numbers; keys are stored per row. Most voxels are new and need no key
-    # comparison.
-    row_of, keys = np.full(slots, -1, np.int32), np.empty(n, np.int64)
-    sums = np.zeros((n, 3))
-    counts = np.zeros(n, np.int64)
-    rows = 0
-    for i in range(n):
-        key = np.int64(0)
-        for a in range(3):
-            key = (key << 21) | (np.int64(np.floor(points[i, a] / size)) + _AXIS_CELLS // 2)
-        slot = np.int64((np.uint64(key) * _SPREAD) >> shift)
-        while row_of[slot] >= 0 and keys[row_of[slot]] != key:
-            slot = (slot + 1) & (slots - 1)
-        row = row_of[slot]
-        if row < 0:
-            row_of[slot] = row = rows
-            keys[row] = key
-            rows += 1
-        counts[row] += 1
-        for a in range(3):
-            sums[row, a] += points[i, a]
-    means = np.empty((rows, 3), np.float32)
-    for row in range(rows):
-        for a in range(3):
-            means[row, a] = sums[row, a] / counts[row]
-    return means
+    n = len(points)
+    sums, counts = np.zeros((n, 3)), np.zeros(n, np.int64)
+    slots = np.full(2 << (n - 1).bit_length(), -1, np.int32)
+    of = np.ones(n, np.int64)
+    _, rows = add_to_voxels(points, of, 0, size, np.empty(n, np.int64), sums, counts, slots, 0)
+    return (sums[:rows] / counts[:rows, None]).astype(np.float32)

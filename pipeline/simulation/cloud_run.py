@@ -29,7 +29,7 @@ from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees
 
 # Raise it with every change that only changes the bytes of runs through clouds.
-VERSION = 3
+VERSION = 4
 SLOPE = 35.0  # degrees; of the terrain against the plane of the plot
 BAND = (-0.5, 40.0)  # m above the ground; noise below it is not scanned
 MOST = 1 << 20  # points after thinning

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import StemmapError
+from pipeline.evaluation.trajectory import fit_rigid
 from pipeline.geometry.poses import Float, Pose2
 
 # A set of control points contradicts itself if its residuals exceed this number of standard deviations.
@@ -96,20 +97,14 @@ def _without(local: Float, known: Float, k: int) -> ControlFit:
 
 
 def fit_rigid_pairs(local: Float, known: Float) -> ControlFit:
-    """Return the fit of two or more pairs of points, shape (N, 2), without any check (Horn 1987, in the
-    plane)."""
-    n, centre, to = len(local), local.mean(axis=0), known.mean(axis=0)
-    a, b = local - centre, known - to
-    yaw = math.atan2(float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()), float((a * b).sum()))
-    c, s = math.cos(yaw), math.sin(yaw)
-    R = np.array([[c, -s], [s, c]])
-    residuals = b - a @ R.T
-    shift = to - R @ centre
+    """Return the fit of two or more pairs of points, shape (N, 2), without any check."""
+    n, pose = len(local), fit_rigid(local, known)
+    residuals = known - pose.apply(local)
     squares = float(np.square(residuals).sum())
     sigma = math.sqrt(squares / max(2 * n - 3, 1))
-    spread = math.sqrt(float(np.square(a).sum()))
+    spread = math.sqrt(float(np.square(local - local.mean(axis=0)).sum()))
     return ControlFit(
-        Pose2(float(shift[0]), float(shift[1]), yaw),
+        pose,
         residuals,
         math.sqrt(squares / n),
         sigma,
