@@ -7,6 +7,7 @@ search for the lost robot is saved.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -91,8 +92,8 @@ class SavedMap:
             or not 0 <= min(self.placed, self.closed) <= max(self.placed, self.closed) <= n
         ):
             raise ValueError("the odometry is not that of the path")
-        _check_rows(self.tracks, TrackTable.empty())
-        _check_rows(self.columns, no_columns())
+        _check_columns(self.tracks, TrackTable.empty(), len(self.tracks))
+        _check_columns(self.columns, no_columns(), len(self.columns.axis))
         _check_finite(self.tracks.x, self.tracks.P, self.tracks.shared, self.columns.axis, self.motion)
         if (
             len(self.tracks)
@@ -134,11 +135,7 @@ def _check_slam(slam: SlamState) -> None:
         ValueError: Its parts contradict each other.
     """
     P = len(slam.pose)
-    template = SlamState.at_origin(max(P, 1))
-    for f in fields(SlamState):
-        wanted = getattr(template, f.name)
-        if isinstance(wanted, np.ndarray) and getattr(slam, f.name).shape != wanted.shape:
-            raise ValueError(f"{f.name} of the particles has another shape")
+    _check_columns(slam, SlamState.at_origin(max(P, 1)), P)
     if not is_sound(slam.maps, P) or not 0 <= slam.best < P:
         raise ValueError("the particles' maps do not fit")
     _check_finite(slam.pose, slam.motion, slam.motion_covariance, slam.maps.mean, slam.maps.covariance)
@@ -169,11 +166,8 @@ def _check_frame(frame: FrameUncertainty, scans: int) -> None:
     Raises:
         ValueError: They do not fit.
     """
-    marks, template = len(frame.serial), FrameUncertainty()
-    for f in fields(FrameUncertainty):
-        column, wanted = getattr(frame, f.name), getattr(template, f.name)
-        if column.shape != ((marks, *wanted.shape[1:]) if len(wanted) == 0 else wanted.shape):
-            raise ValueError(f"{f.name} of the frame has another shape")
+    marks = len(frame.serial)
+    _check_columns(frame, FrameUncertainty(), marks)
     if np.any(np.diff(frame.serial) < 0) or np.any(np.diff(frame.scan) < 0):
         raise ValueError("the marks of the frame are out of order")
     if marks and not 0 <= frame.scan[0] <= frame.scan[-1] < scans:
@@ -227,9 +221,7 @@ def _check_places(places: Places) -> None:
     Raises:
         ValueError: They do not fit.
     """
-    M = len(places.birth)
-    if not places.birth.shape == places.distance.shape == places.seen.shape == places.inactive.shape == (M,):
-        raise ValueError("the places of the path have another shape")
+    _check_columns(places, Places(), len(places.birth))
     _check_finite(places.distance, places.seen)
     if np.any(np.diff(places.birth) < 0) or np.any(np.diff(places.distance) < 0.0):
         raise ValueError("the places of the path are out of order")
@@ -250,16 +242,16 @@ def _within(rows: Int, size: int) -> bool:
     return rows.ndim == 1 and bool(np.all((rows >= 0) & (rows < size)))
 
 
-def _check_rows(table: TrackTable | Columns, empty: TrackTable | Columns) -> None:
-    """Check that all columns of a table have the length of the first one, and the shapes of those of an empty
-    table.
+def _check_columns(record: Any, template: Any, rows: int) -> None:  # noqa: ANN401 - a dataclass of arrays
+    """Check the shapes of the arrays of a record: those of a template without rows have this number of rows,
+    others the shape of the template.
 
     Raises:
-        ValueError: A column has another shape.
+        ValueError: An array has another shape.
     """
-    n = None
-    for f in fields(table):
-        column, wanted = getattr(table, f.name), getattr(empty, f.name)
-        n = len(column) if n is None and column.ndim else n
-        if column.shape != (n, *wanted.shape[1:]):
-            raise ValueError(f"{f.name} has another shape")
+    for f in fields(template):
+        column, wanted = getattr(record, f.name), getattr(template, f.name)
+        if isinstance(wanted, np.ndarray):
+            shape = wanted.shape if len(wanted) else (rows, *wanted.shape[1:])
+            if column.shape != shape:
+                raise ValueError(f"{f.name} of {type(record).__name__} has another shape")

@@ -34,8 +34,6 @@ from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth
 
 #: Number of unreadable scans at the start after which the recording is refused.
 _TRIES = 20
-#: Number of scans at the end whose stamps show whether the clock was set.
-_LAST = 3
 
 
 class RosSource(MessageSource):
@@ -248,7 +246,7 @@ class RosSource(MessageSource):
             yield from self._stamped(message, {})
 
     def _is_clock_set(self) -> bool:
-        """Return whether no stamp of the last _LAST scans fits to their times of recording
+        """Return whether no stamp of the last scans (`Container.tail_ns`) fits to their times of recording
         (`Clock.is_stepped`); False without stamps."""
         numbers = self._topics.numbers("scan")
         stamps = [
@@ -256,7 +254,7 @@ class RosSource(MessageSource):
             for message in self._container.messages(numbers, self._container.tail_ns(numbers), {})
             if (stamp_ns := header_stamp(self._channels[message.channel], message.payload)) is not None
         ]
-        return bool(stamps) and all(stamps[-_LAST:])
+        return bool(stamps) and all(stamps)
 
     def _last_stamp(self) -> int | None:
         """Return the time of the last scan [ns]; None if no message near the end has a possible time."""
