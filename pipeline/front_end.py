@@ -8,6 +8,7 @@ rules (see `pipeline.remapping`).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from pipeline.classification import depth_image, steepest_by_direction
 from pipeline.config import Parameters
 from pipeline.config.stages import Detection
-from pipeline.detection.cluster_shape import describe_stems
+from pipeline.detection.cluster_shape import describe_stems, no_lift
 from pipeline.detection.clustering import cluster
 from pipeline.detection.external_stems import external_clusters
 from pipeline.detection.free_space import clear_range
@@ -168,18 +169,19 @@ def _segment_points(
         labels = cluster(filtered, sensor, p.clustering)
 
     with timer("shape"):
-        labels, described = describe_stems(filtered, labels, sensor, p.shape)
+        # A leaning axis is compared between views at one height; without ground, at that of the points.
+        seen = terrain if terrain is not None and shows_ground(terrain) else None
+        lift_of = no_lift if seen is None else partial(_lift, seen, p.tracking.breast_height)
+        labels, described = describe_stems(filtered, labels, sensor, p.shape, lift_of)
         cut = is_truncated(filtered, labels, raw, sensor, p.filters, p.acquisition)
         described = replace(described, cut=cut)
 
     with timer("free view"):
         free = clear_range(raw, filtered, sensor_offset)
 
-    grounded = terrain is not None and shows_ground(terrain)
     with timer("obstacles"):
         near = acquire_near(step, T_base_lidar, p.acquisition)
         twist = base_velocity(step, p.acquisition)
-        seen = terrain if grounded else None
         clearance = find_clearance(raw, near, seen, sensor_offset, twist, p.obstacles)
 
     return SegmentedScan(
@@ -187,9 +189,7 @@ def _segment_points(
         filtered=filtered,
         labels=labels.label,
         clusters=described,
-        heights=heights_of_places(described.centroid, terrain.height)
-        if terrain is not None and grounded
-        else None,
+        heights=None if seen is None else heights_of_places(described.centroid, seen.height),
         free=free,
         sensor_offset=sensor_offset,
         column_input=_column_input(raw, boxed, height, terrain, sensor_offset, sensor)
@@ -198,7 +198,7 @@ def _segment_points(
         terrain=replace(terrain, height=rounded(terrain.height, GROUND))
         if terrain is not None and updates_terrain(step.index, p.classification.every)
         else None,
-        warnings=(NO_GROUND,) if terrain is not None and len(raw) and not grounded else (),
+        warnings=(NO_GROUND,) if terrain is not None and len(raw) and seen is None else (),
         counts={
             **_returns(step, raw),
             "out of the box": len(raw) - len(boxed),
@@ -209,6 +209,12 @@ def _segment_points(
         },
         clearance=clearance,
     )
+
+
+def _lift(terrain: Terrain, height: float, centroid: Float) -> Float:
+    """Return how far the height above the ground `height` [m] is above each centroid, shape (K,) [m];
+    `centroid` are the centroids of clusters, level sensor frame, shape (K, 3) [m]."""
+    return height - heights_of_places(centroid, terrain.height)
 
 
 def _column_input(

@@ -94,7 +94,7 @@ class Ground(Stage):
     height_min: float = number(0.3, "Minimum height", "m", -1.0, 10.0, 0.05)
     """Points lower above the ground are removed."""
 
-    height_max: float = number(2.0, "Maximum height", "m", 0.1, 30.0, 0.05)
+    height_max: float = number(3.0, "Maximum height", "m", 0.1, 30.0, 0.05)
     """Points higher above the ground are removed."""
 
     slope_max: float = number(35.0, "Maximum slope", "deg", 1.0, 80.0, 1.0)

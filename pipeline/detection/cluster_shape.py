@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 
 import numpy as np
@@ -88,9 +89,17 @@ def spread_about(points: Float, bounds: Int, centre: Float) -> Float:
 CENTROID_BIAS = 0.18  # m; centroid to trunk centre, measured on radii of 8 to 35 cm at 2 to 10 m
 FLAT = 1e-12  # m^2; variance caused by rounding of 32-bit coordinates
 
+# Of the centroids of clusters, shape (K, 3) [m]: returns heights above them, shape (K,) [m].
+LiftOf = Callable[[Float], Float]
+
+
+def no_lift(centroid: Float) -> Float:
+    """Return 0 for each centroid, shape (K,): the centre at the mean height of the points."""
+    return np.zeros(len(centroid))
+
 
 def describe_stems(
-    points: Float32, labels: Labels, sensor: Sensor, parameters: Shape
+    points: Float32, labels: Labels, sensor: Sensor, parameters: Shape, lift_of: LiftOf = no_lift
 ) -> tuple[Labels, Clusters]:
     """Describe each cluster, after trunks are separated from vegetation that is clustered with them.
 
@@ -99,13 +108,14 @@ def describe_stems(
         labels: Cluster of each point; no cluster is empty.
         sensor: Range sigma and azimuth step of the LiDAR.
         parameters: Choice of centre, and number of slices of `split_trunks`.
+        lift_of: See `describe`.
 
     Returns:
         Labels in which the vegetation of a separated trunk forms a cluster of its own, numbered after all
         others; and the shape of each cluster, see `describe`. The labels are those passed in if nothing is
         separated, which is always so if `split_slices` is 0 or `centre` is not "circle".
     """
-    whole = describe(points, labels, sensor, parameters)
+    whole = describe(points, labels, sensor, parameters, lift_of)
     if parameters.split_slices == 0 or parameters.centre != "circle":
         return labels, whole
     parted, changed = split_trunks(points, labels, whole, sensor, parameters.split_slices)
@@ -114,7 +124,7 @@ def describe_stems(
     number = np.full(parted.clusters + 1, -1, np.int32)  # the last entry is for noise, -1
     number[changed] = np.arange(len(changed), dtype=np.int32)
     some = Labels(number[parted.label], len(changed), parted.hidden[changed])
-    return parted, _with_rows(whole, describe(points, some, sensor, parameters), changed)
+    return parted, _with_rows(whole, describe(points, some, sensor, parameters, lift_of), changed)
 
 
 def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
@@ -134,7 +144,9 @@ def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
     return Clusters(*columns)
 
 
-def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape) -> Clusters:
+def describe(
+    points: Float32, labels: Labels, sensor: Sensor, parameters: Shape, lift_of: LiftOf = no_lift
+) -> Clusters:
     """Return the shape of each cluster; all verdicts are OTHER and `cut` is False.
 
     With the centre "centroid", radius and its sigma are NaN and the arc is 0; so are those of clusters with
@@ -145,13 +157,15 @@ def describe(points: Float32, labels: Labels, sensor: Sensor, parameters: Shape)
         labels: Cluster of each point, -1 for none; no cluster is empty.
         sensor: Range sigma and azimuth step of the LiDAR scale the fit.
         parameters: `centre`: circle fit or centroid.
+        lift_of: Returns the height above each centroid at which the centre of the circle is wanted, such as
+            breast height; the axis leans.
     """
     order, bounds = group_rows(labels.label, labels.clusters)
     members = points[order].astype(np.float64)
     centroid, eigenvalues, extent = moments(members, bounds)
     size = np.diff(bounds)
     if parameters.centre == "circle":
-        stem = fit_stems(members, bounds, sensor.range_sigma, sensor.azimuth_step)
+        stem = fit_stems(members, bounds, sensor.range_sigma, sensor.azimuth_step, lift_of(centroid))
     else:
         stem = _centroids_as_stems(members, bounds, centroid, sensor.range_sigma)
     # Contiguous, like clusters that are read from a cache: kernels are compiled for one memory layout only.

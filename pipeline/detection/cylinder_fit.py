@@ -5,8 +5,8 @@ its horizontal distance to the axis minus the radius r. The parameters are p = (
 shift of x and y per metre of height, r).
 
 The fit is Gauss-Newton with Tukey weights. It starts from the quartiles of the returns, which branches beside
-the trunk do not change. Weak priors on lean and radius, and on the width that the returns cover, prevent that
-a short arc becomes a plane and that a trunk with a branch becomes too wide.
+the trunk do not change. A weak prior on the lean, and one on the width that the returns cover, prevent that a
+short arc becomes a plane and that a trunk with a branch becomes too wide.
 
 The error of a return is along its ray, not perpendicular to the bark. At the true circle, the residuals and
 the gradient therefore do not have zero mean; their expected values are subtracted (corrected score, Nakamura
@@ -33,15 +33,14 @@ RAY = 4
 TUKEY = 3.0  # sigma; residuals beyond have no weight
 BARK = 0.01  # m; roughness of the bark
 BEAM = 0.0015  # rad; half the beam divergence
-PRIOR_RADIUS, PRIOR_RADIUS_SIGMA = 0.15, 0.15  # m; a weak prior on the stem radius
-PRIOR_LEAN_SIGMA = 0.05  # 3 degrees
+PRIOR_LEAN_SIGMA = 0.08  # 4.6 degrees; stems beyond twice that are windthrow
 
 
 @compiled_sums
 def normal_equations(
     rays: Float, n: int, p: Float, sigma: float, within: float, back: float, g: Float, H: Float
 ) -> tuple[float, float]:
-    """Compute the normal equations of the cylinder fit, with the priors on lean and radius.
+    """Compute the normal equations of the cylinder fit, with the prior on the lean.
 
     Fills the lower triangle of H = J^T W J, shape (5, 5), and the gradient g = J^T W r, shape (5,), in place.
     The Jacobian of a return is (nx, ny, nx h, ny h, -1), where n is the normal from the return to the axis;
@@ -112,7 +111,7 @@ def normal_equations(
         gy1 += ry * h
         gr += wr
     precision = 1.0 / (sigma * sigma + BARK * BARK)
-    lean, size = 1.0 / PRIOR_LEAN_SIGMA**2, 1.0 / PRIOR_RADIUS_SIGMA**2
+    lean = 1.0 / PRIOR_LEAN_SIGMA**2
     # The centre has no prior; 0.01 (a sigma of 10 m) keeps degenerate clusters solvable.
     H[0, 0] = precision * xx0 + 0.01
     H[1, 0], H[1, 1] = precision * xy0, precision * yy0 + 0.01
@@ -120,10 +119,10 @@ def normal_equations(
     H[3, 0], H[3, 1], H[3, 2] = precision * xy1, precision * yy1, precision * xy2
     H[3, 3] = precision * yy2 + lean
     H[4, 0], H[4, 1], H[4, 2], H[4, 3] = -precision * x0, -precision * y0, -precision * x1, -precision * y1
-    H[4, 4] = precision * n0 + size
+    H[4, 4] = precision * n0
     g[0], g[1] = precision * gx0, precision * gy0
     g[2], g[3] = precision * gx1 + lean * ax, precision * gy1 + lean * ay
-    g[4] = size * (radius - PRIOR_RADIUS) - precision * gr
+    g[4] = -precision * gr
     return squares, kept
 
 
@@ -286,7 +285,7 @@ COLUMNS = 11  # cx, cy, var x, cov xy, var y, radius, sigma of radius, radial de
 
 
 @compiled
-def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: float) -> Float:
+def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: float, lift: Float) -> Float:
     """Fit a leaning cylinder to each cluster.
 
     Args:
@@ -295,13 +294,15 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
         bounds: Index of the first point of each cluster, and N, shape (K + 1,); no cluster is empty.
         range_sigma: Standard deviation of a range [m]; at least SIGMA_MIN is used.
         azimuth_step: Angle between successive shots [rad].
+        lift: Height above the mean height of the points at which the centre of each cluster is wanted, shape
+            (K,) [m]. The uncertain lean widens the covariance there.
 
     Returns:
-        Shape (K, 11): centre x, y at the mean height of the points [m]; its covariance xx, xy, yy [m^2];
+        Shape (K, 11): centre x, y of the axis at that height [m]; its covariance xx, xy, yy [m^2];
         radius and its sigma [m]; root mean square of the residuals, outliers included [m]; visible arc [rad];
         shift of the axis in x and y per metre of height. For clusters with fewer than five points, radius and
-        its sigma are NaN, the last four columns are 0, and the centre is estimated from the angular width. A
-        poor fit is not reported as such: it shows in the residuals and the sigmas.
+        its sigma are NaN, the last four columns are 0, and the centre is estimated from the angular width,
+        without lift. A poor fit is not reported as such: it shows in the residuals and the sigmas.
     """
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
@@ -309,7 +310,7 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
     for k in range(clusters):
         n = _to_rays(points, bounds[k], bounds[k + 1], rays)
         if n >= 5:
-            _fit(rays, n, some, max(range_sigma, SIGMA_MIN), azimuth_step, stems[k])
+            _fit(rays, n, some, max(range_sigma, SIGMA_MIN), azimuth_step, lift[k], stems[k])
         else:
             _place_by_width(rays, n, azimuth_step, stems[k])
     return stems
@@ -372,7 +373,9 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
 
 
 @compiled
-def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, stem: Float) -> None:
+def _fit(
+    rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, lift: float, stem: Float
+) -> None:
     """Fit one cluster by a robust circle with lean and write the result to `stem`, a row of the result of
     `fit_stems`. At most ITERATIONS steps are made; whether they converged is not reported.
 
@@ -382,6 +385,7 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
         some: Buffer of the shape of `rays` for a subset; overwritten.
         sigma: Standard deviation of the ranges, at least SIGMA_MIN [m].
         azimuth_step: Azimuth step of the sensor [rad].
+        lift: Height above the mean height of the rays at which the centre is wanted [m].
         stem: Receives the result, shape (COLUMNS,).
     """
     half = middle_half(rays, n, 0.0, 0.0)
@@ -432,7 +436,7 @@ def _fit(rays: Float, n: int, some: Float, sigma: float, azimuth_step: float, st
             least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * width + 0.3 * azimuth_step * away
     # Rough bark or a poor fit inflates the covariance by the ratio of the residual variance to the expected
     # one.
-    _write(p, L, max(SMOOTH, kept / (n * (sigma * sigma + BARK * BARK))), stem)
+    _write(p, L, max(SMOOTH, kept / (n * (sigma * sigma + BARK * BARK))), lift, stem)
     stem[7], stem[8] = np.sqrt(squares / n), visible_arc(rays, n, p)
     stem[9], stem[10] = p[2], p[3]
 
@@ -456,27 +460,32 @@ def _some(rays: Float, n: int, some: Float) -> int:
 
 
 @compiled
-def _write(p: Float, L: Float, inflate: float, stem: Float) -> None:
+def _write(p: Float, L: Float, inflate: float, lift: float, stem: Float) -> None:
     """Write centre, radius and their covariance to the first seven values of `stem`, a row of the result of
-    `fit_stems`. The covariance is (L L^T)^-1 times `inflate` plus that of the model.
+    `fit_stems`. The covariance of the parameters is (L L^T)^-1 times `inflate`; that of the model is added.
 
     Args:
         p: x, y [m], lean x, lean y, radius [m], shape (5,).
         L: Cholesky factor of the normal equations, shape (5, 5).
         inflate: Factor of the covariance.
+        lift: Height above that of x and y at which the centre is wanted [m].
         stem: Row that is changed.
     """
-    unit, column = np.zeros(5), np.empty(5)
-    stem[0], stem[1], stem[5] = p[0], p[1], p[4]
-    unit[0] = 1.0
+    stem[0], stem[1], stem[5] = p[0] + lift * p[2], p[1] + lift * p[3], p[4]
+    # The centre is J p, with the rows (1, 0, lift, 0, 0) and (0, 1, 0, lift, 0) of J.
+    unit, column, model = np.zeros(5), np.empty(5), MODEL * MODEL
+    unit[0], unit[2] = 1.0, lift
     solve(L, unit, column)
-    stem[2], stem[3] = column[0] * inflate + MODEL * MODEL, column[1] * inflate
-    unit[0], unit[1] = 0.0, 1.0
+    stem[2] = (column[0] + lift * column[2]) * inflate + model
+    stem[3] = (column[1] + lift * column[3]) * inflate
+    unit[:] = 0.0
+    unit[1], unit[3] = 1.0, lift
     solve(L, unit, column)
-    stem[4] = column[1] * inflate + MODEL * MODEL
-    unit[1], unit[4] = 0.0, 1.0
+    stem[4] = (column[1] + lift * column[3]) * inflate + model
+    unit[:] = 0.0
+    unit[4] = 1.0
     solve(L, unit, column)
-    stem[6] = np.sqrt(column[4] * inflate + MODEL * MODEL)
+    stem[6] = np.sqrt(column[4] * inflate + model)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -513,7 +522,8 @@ def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
     """
     if not len(points):
         return None
-    stem = fit_stems(points, np.array([0, len(points)]), sensor.range_sigma, sensor.azimuth_step)[0]
+    one = np.array([0, len(points)])
+    stem = fit_stems(points, one, sensor.range_sigma, sensor.azimuth_step, np.zeros(1))[0]
     if not np.isfinite(stem[5]):
         return None
     lean = stem[9:11]

@@ -133,7 +133,9 @@ def test_the_sigma_of_a_diameter_is_what_it_errs():
         distance = rng.uniform(near, near + 3.0, VIEWS)
         views = [seen_from(rng, radius, lean, d) for d in distance]
         bounds = np.concatenate([[0], np.cumsum([len(view) for view in views])])
-        stems = fit_stems(np.concatenate(views), bounds, SIGMA, SENSOR.azimuth_step)
+        stems = fit_stems(
+            np.concatenate(views), bounds, SIGMA, SENSOR.azimuth_step, np.zeros(len(bounds) - 1)
+        )
         t = tracker(**ROUND_CONE)
         for k in range(VIEWS):
             show(t, k, distance[k], stems[k, 5], stems[k, 6])

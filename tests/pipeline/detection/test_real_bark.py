@@ -51,7 +51,9 @@ def fits_of_scan(run, trees, k):
         true = np.array([x, y]) - eye[:2]
         if len(seen) < LEAST or np.hypot(*true) > REACH:
             continue
-        s = fit_stems(seen, np.array([0, len(seen)]), run.lidar.range_sigma, run.lidar.sensor.azimuth_step)[0]
+        s = fit_stems(
+            seen, np.array([0, len(seen)]), run.lidar.range_sigma, run.lidar.sensor.azimuth_step, np.zeros(1)
+        )[0]
         ahead, error = true / np.hypot(*true), s[:2] - true
         across = ahead[0] * error[1] - ahead[1] * error[0]
         rows.append((2.0 * s[5] - dbh, 2.0 * s[6], ahead @ error, across))

@@ -247,5 +247,21 @@ def test_a_sensor_without_noise_does_not_break_the_fit():
 def test_fitting_leaves_the_points_alone():
     points = arc(0.15, 1.0)
     before = points.copy()
-    fit_stems(points, np.array([0, len(points)]), 0.02, 0.0035)
+    fit_stems(points, np.array([0, len(points)]), 0.02, 0.0035, np.zeros(1))
     np.testing.assert_array_equal(points, before)
+
+
+def test_the_centre_is_that_of_the_leaning_axis_at_the_height_asked_for():
+    """The axis of a stem seen from 1.5 to 3 m is extrapolated to breast height, where it is less certain."""
+    lean, radius, breast = np.array([0.03, 0.1]), 0.15, 1.3
+    angle, height = np.meshgrid(np.radians(np.linspace(100.0, 260.0, 30)), np.linspace(1.5, 3.0, 16))
+    axis = np.array([5.0, 0.0]) + lean * (height.ravel()[:, None] - breast)
+    around = radius * np.stack([np.cos(angle.ravel()), np.sin(angle.ravel())], axis=1)
+    points, bounds = np.column_stack([axis + around, height.ravel()]), np.array([0, angle.size])
+    lift = np.array([breast - height.mean()])
+    at_mean, at_breast = (fit_stems(points, bounds, 0.02, 0.0035, a)[0] for a in (np.zeros(1), lift))
+    np.testing.assert_allclose(at_breast[:2], [5.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(at_breast[:2] - at_mean[:2], lift * at_mean[9:11], atol=1e-12)
+    assert at_breast[2] > at_mean[2]
+    assert at_breast[4] > at_mean[4]
+    np.testing.assert_array_equal(at_breast[5:], at_mean[5:])

@@ -34,6 +34,8 @@ def content(frame: Frame) -> object:
 def is_later(name: str) -> bool:
     """Whether a parameter does not change the segmentation of a scan."""
     stage, _, field = name.partition(".")
+    if name == "tracking.breast_height":  # the height of the centres of clusters
+        return False
     return (
         field not in SEGMENTATION_CLASSIFICATION
         if stage == "classification"
