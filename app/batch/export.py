@@ -13,7 +13,7 @@ import sqlite3
 import threading
 import warnings
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
@@ -24,15 +24,13 @@ import shapely
 
 from app.batch.georeference import MapFrame, heights_at, read_map_frame
 from app.batch.run_folder import read_run, read_terrain
-from app.batch.stand import stand_of
+from app.batch.stand import StandResult
 from app.common.extras import needed
 from app.common.text import version
-from pipeline.config.stages import Stand
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import geojson
 from pipeline.stand.figures import FIGURES
-from pipeline.stand.plots import SamplePlot
 from pipeline.types.records import Path, Trees
 
 _DATE = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
@@ -121,25 +119,21 @@ class ExportedRun:
         return self.frame.crs or LOCAL_WKT
 
 
-def read_for_export(
-    folder: FilePath, plots: Sequence[SamplePlot] = (), parameters: Stand | None = None
-) -> ExportedRun:
+def read_for_export(folder: FilePath, of_plots: StandResult | None = None) -> ExportedRun:
     """Return a run with its values for export.
 
     Args:
         folder: Folder of the run.
-        plots: Plots in the frame of the map; without any, no figures are computed.
-        parameters: Parameters of their figures; None for the defaults.
+        of_plots: Stand figures of the run on plots, which are exported with them; None for no plots.
 
     Raises:
-        StemmapError: The run is damaged, or a plot cannot be used.
+        StemmapError: The run is damaged.
     """
     run, frame = read_run(folder), read_map_frame(folder)
     shapes: list[tuple[str, Any, dict[str, float]]] = []
-    if plots:
-        result = stand_of(folder, parameters or Stand(), plots)
-        for plot in result.plots:
-            f = result.figures[plot.name]
+    if of_plots is not None:
+        for plot in of_plots.plots:
+            f = of_plots.figures[plot.name]
             figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": float(f.trees)}
             figures.update({name: f.values[name].value for name in FIGURES})
             shapes.append((plot.name, shapely.transform(plot.shape, frame.to_crs), figures))
@@ -320,7 +314,7 @@ def _write_styles(file: FilePath) -> None:
         database.close()
 
 
-def _qml(kind: str, symbol: str, layer: str, properties: dict[str, str], extra: str = "") -> str:
+def _qml(kind: str, symbol: str, layer: str, properties: dict[str, str]) -> str:
     """Return a QGIS style with one symbol as XML.
 
     Args:
@@ -328,7 +322,6 @@ def _qml(kind: str, symbol: str, layer: str, properties: dict[str, str], extra: 
         symbol: Class of its symbol layer.
         layer: Further XML in the symbol layer.
         properties: Options of the symbol layer.
-        extra: Further XML after the renderer.
     """
     options = "".join(f'<Option name="{k}" type="QString" value="{v}"/>' for k, v in properties.items())
     return (
@@ -336,7 +329,7 @@ def _qml(kind: str, symbol: str, layer: str, properties: dict[str, str], extra: 
         f'styleCategories="Symbology"><renderer-v2 type="singleSymbol"><symbols>'
         f'<symbol type="{kind}" name="0">'
         f'<layer class="{symbol}"><Option type="Map">{options}</Option>{layer}</layer></symbol></symbols>'
-        f"</renderer-v2>{extra}</qgis>"
+        f"</renderer-v2></qgis>"
     )
 
 

@@ -27,7 +27,7 @@ from pipeline.inventory import PlotMap, map_plot
 from pipeline.inventory.cloud import WholeCloud
 from pipeline.inventory.cross_sections import slice_heights
 from pipeline.inventory.terrain_raster import TerrainRaster
-from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson
+from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson, number_text
 from pipeline.types.records import Trees, TruthTrees, Verdict
 
 SLICE_COLUMNS = (
@@ -140,16 +140,16 @@ def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
         yield [
             "0",
             "",
-            _text(x, 3),
-            _text(y, 3),
+            number_text(x, 3),
+            number_text(y, 3),
             Verdict(int(verdict)).label,
             "",
-            _text(stem["radius"], 3),
-            _text(stem["scatter"], 4),
-            _text(math.degrees(stem["coverage"]), 0),
-            _text(stem["points"], 0),
-            _text(2.0 * stem["radius"], 3),
-            _text(stem["last"] - stem["first"], 3),
+            number_text(stem["radius"], 3),
+            number_text(stem["scatter"], 4),
+            number_text(math.degrees(stem["coverage"]), 0),
+            number_text(stem["points"], 0),
+            number_text(2.0 * stem["radius"], 3),
+            number_text(stem["last"] - stem["first"], 3),
         ]
 
 
@@ -161,13 +161,13 @@ def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
             if np.isfinite(s[2]):
                 yield [
                     str(number),
-                    _text(height, 2),
-                    _text(s[0] + offset[0], 3),
-                    _text(s[1] + offset[1], 3),
-                    _text(s[2], 4),
-                    _text(math.sqrt(s[6]), 4),
-                    _text(s[7], 4),
-                    _text(math.degrees(s[8]), 0),
+                    number_text(height, 2),
+                    number_text(s[0] + offset[0], 3),
+                    number_text(s[1] + offset[1], 3),
+                    number_text(s[2], 4),
+                    number_text(math.sqrt(s[6]), 4),
+                    number_text(s[7], 4),
+                    number_text(math.degrees(s[8]), 0),
                     str(int(s[9])),
                 ]
 
@@ -179,12 +179,7 @@ def _terrain_rows(ground: TerrainRaster, offset: Float) -> Iterator[list[str]]:
     place = ground.low + (np.stack([columns, rows], axis=1) + 0.5) * ground.cell + offset[:2]
     height = ground.height[columns, rows] + offset[2]
     for (x, y), z in zip(place, height, strict=True):
-        yield [_text(x, 3), _text(y, 3), _text(z, 3), "", ""]
-
-
-def _text(value: float, digits: int) -> str:
-    """Return a number with some decimals; "" where not finite."""
-    return f"{value:.{digits}f}" if math.isfinite(value) else ""
+        yield [number_text(x, 3), number_text(y, 3), number_text(z, 3), "", ""]
 
 
 def _run_record(

@@ -87,8 +87,6 @@ def _parts_of_cloud(uri: str) -> Iterator[Float]:
     from app.sources.opening import open_cloud
 
     cloud = open_cloud(uri)
-    if cloud is None:
-        raise StemmapError("the cloud cannot be read any more", where=uri)
     for part in cloud.parts():
         yield part[:, :3].astype(np.float64) + cloud.description.offset
 

@@ -16,7 +16,7 @@ from app.batch.run_folder import FinishedRun, read_ground_area, read_run, read_s
 from app.common.text import count, version
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
-from pipeline.io.result_files import csv_text
+from pipeline.io.result_files import csv_text, number_text
 from pipeline.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
 from pipeline.stand.plots import SamplePlot, detection_function, figures_of, seen_plot, within_reach
 from pipeline.stand.seen_area import SeenArea
@@ -122,11 +122,11 @@ def stand_files(result: StandResult) -> dict[str, str]:
     rows = []
     for name, f in result.figures.items():
         about = [name, f"{f.area:.2f}", f"{f.seen:.2f}", str(f.trees), str(f.without_dbh)]
-        rows.append([*about, *map(_number, f.detection), *_cells(dict(f.values))])
+        rows.append([*about, *_numbers(f.detection), *_cells(dict(f.values))])
     if len(result.figures) > 1:
         rows.append(["mean", *[""] * (len(PLOT_COLUMNS) - 1), *_cells(result.total)])
     classes = [
-        [name, f"{c.low:g}", f"{c.high:g}", str(c.trees), *map(_number, (*c.n_ha, *c.g_ha))]
+        [name, f"{c.low:g}", f"{c.high:g}", str(c.trees), *_numbers((*c.n_ha, *c.g_ha))]
         for name, f in result.figures.items()
         for c in f.classes
     ]
@@ -182,14 +182,14 @@ def _finite(value: float) -> float | None:
     return round(float(value), 6) if math.isfinite(value) else None
 
 
-def _number(value: float) -> str:
-    """Return a number with four decimals; "" where not finite."""
-    return f"{value:.4f}" if math.isfinite(value) else ""
-
-
 def _cells(values: dict[str, Estimate]) -> list[str]:
     """Return value and standard error of each figure of FIGURES as cells."""
-    return [_number(value) for name in FIGURES for value in values[name]]
+    return _numbers([value for name in FIGURES for value in values[name]])
+
+
+def _numbers(values: Sequence[float]) -> list[str]:
+    """Return numbers with four decimals; "" where not finite."""
+    return [number_text(value, 4) for value in values]
 
 
 def stand_summary(result: StandResult) -> list[str]:

@@ -296,8 +296,8 @@ def evaluation_lines(e: MapScores, *, whole: bool = False) -> list[str]:
     """
     where = "in the whole cloud" if whole else f"within {e.reach:g} m of the path"
     return [
-        f"trees found (TA) {_rate(e.TA)}, missed (FR) {_rate(e.FR)} {where}",
-        f"other objects left out (TR) {_rate(e.TR)}, mapped as trees (FA) {_rate(e.FA)}; "
+        f"trees found (TA) {rate_text(e.TA)}, missed (FR) {rate_text(e.FR)} {where}",
+        f"other objects left out (TR) {rate_text(e.TR)}, mapped as trees (FA) {rate_text(e.FA)}; "
         f"{count(e.spurious, 'spurious tree')}",
         f"completeness {_percent(e.completeness)}   correctness {_percent(e.correctness)}   "
         f"F1 {_percent(e.f1)}",
@@ -319,7 +319,7 @@ def truth_in_doubt(e: MapScores) -> str:
     )
 
 
-def _rate(rate: Rate) -> str:
+def rate_text(rate: Rate) -> str:
     """Return a rate as text, for example "9/10 (90.0 %)"."""
     return f"{rate.count}/{rate.of} ({_percent(rate.rate)})"
 

@@ -59,13 +59,15 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.to == TREE_MANAGER:
         return _tree_manager(arguments)
     from app.batch.export import export_run, read_for_export
+    from app.batch.stand import stand_of
 
     if arguments.out is not None:
         raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
     file = Path(arguments.to)
     if file.suffix.lower() in (".las", ".laz"):
         return _cloud(arguments.run, file)
-    exported = read_for_export(arguments.run, chosen_plots(arguments), stand_parameters(arguments))
+    plots, parameters = chosen_plots(arguments), stand_parameters(arguments)
+    exported = read_for_export(arguments.run, stand_of(arguments.run, parameters, plots) if plots else None)
     written = export_run(exported, file)
     print(f"{len(exported.place)} trees in {exported.frame.name} coordinates: {', '.join(map(str, written))}")
     return 0

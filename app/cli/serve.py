@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 import textwrap
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli import flags
 from app.common.settings import DEFAULT_PORT, VARIABLES, Settings
-from pipeline.errors import SourceError
 
 if TYPE_CHECKING:
     from app.robot.address import ZenohAddress
@@ -63,6 +61,7 @@ def run(arguments: argparse.Namespace) -> int:
         StemmapError: An argument is wrong, a source does not exist, or the port cannot be used.
     """
     from app.common.settings import from_environment
+    from app.sources.opening import check_address
 
     settings = from_environment()
     if arguments.host is not None:
@@ -71,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
         settings = replace(settings, port=arguments.port)
     uris = arguments.source or [_DEFAULT_SOURCE]
     for uri in uris:
-        _check_source(uri)
+        check_address(uri)
     _report_partial_outputs(settings)
     record = flags.recording_place(arguments, *uris)
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag here and not on the page
@@ -139,35 +138,3 @@ def _report_partial_outputs(settings: Settings) -> None:
     if left := partial_outputs(settings):
         they = count(len(left), "run was", "runs were")
         print(f"{they} killed before the map was complete; the page Runs can delete the partial outputs")
-
-
-def _check_source(uri: str) -> None:
-    """Check that a file or scenario exists, and the form of an address. The worker checks the contents of a
-    file; an unknown scheme is accepted here.
-
-    Raises:
-        StemmapError: It does not exist, or the address is wrong.
-    """
-    if _exists(uri):
-        return
-    scheme, colon, _ = uri.partition(":")
-    if not colon or "/" in scheme or len(scheme) == 1:  # C:\run.mcap has a drive, not a scheme
-        raise SourceError(
-            "there is no such file or folder", where=uri, remedy="Simulated runs begin with sim:"
-        )
-    if scheme in ("zenoh", "velodyne", "dds"):
-        from app.robot.address import parse_address
-
-        parse_address(uri)
-    if scheme == "sim":
-        from pipeline.simulation.scenarios import parse_uri
-
-        parse_uri(uri)  # reports an unknown scenario; the worker builds the scene
-
-
-def _exists(path: str) -> bool:
-    """Return whether a path exists; False if it is no valid path."""
-    try:
-        return Path(path).expanduser().exists()
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: unknown home directory
-        return False

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from app.cli.flags import numbers, positive_number
 from pipeline.errors import ParameterError, StemmapError
@@ -105,16 +105,10 @@ def stand_parameters(arguments: argparse.Namespace) -> Stand:
 
     from pipeline.config.stages import Stand
 
-    given: dict[str, Any] = {}
-    for name, declared in Stand.model_fields.items():
-        text = getattr(arguments, f"stand_{name}", None)
-        if text is not None:
-            try:
-                given[name] = declared.annotation(text) if declared.annotation in (int, float) else text
-            except ValueError:
-                raise ParameterError(f"--{name.replace('_', '-')} {text!r} is not a number") from None
+    texts = {name: getattr(arguments, f"stand_{name}", None) for name in Stand.model_fields}
+    given = {name: text for name, text in texts.items() if text is not None}
     try:
-        return Stand(**given)
+        return Stand.model_validate(given, strict=False)  # the values are texts
     except ValidationError as error:
         first = error.errors()[0]
         flag = f"--{first['loc'][0]}".replace("_", "-")

@@ -77,15 +77,12 @@ class ChildProcess:
         self.pid = process.pid
 
     @classmethod
-    async def start(
-        cls, command: Sequence[str], *, line_limit: int = LINE_LIMIT, one_thread: bool = False
-    ) -> ChildProcess:
+    async def start(cls, command: Sequence[str], *, line_limit: int = LINE_LIMIT) -> ChildProcess:
         """Start a process.
 
         Args:
             command: Program and arguments, see `python_module`.
             line_limit: Longest line that is accepted [bytes].
-            one_thread: Whether its numerical libraries use one thread each.
 
         Raises:
             StemmapError: The system cannot start it.
@@ -97,7 +94,6 @@ class ChildProcess:
                 stdout=asyncio.subprocess.PIPE,
                 limit=line_limit,
                 start_new_session=True,  # Ctrl-C in the terminal is for the parent, which ends its children
-                env=_environment(one_thread),
             )
         except OSError as error:
             raise _cannot_start(error) from None
@@ -169,7 +165,7 @@ class BlockingChildProcess:
     Args:
         command: Program and arguments, see `python_module`.
         line_limit: Longest line that is accepted [bytes].
-        one_thread: Whether its numerical libraries use one thread each.
+        one_thread: Whether its numerical libraries use one thread each, unless the environment sets a number.
 
     Raises:
         StemmapError: The system cannot start it.
@@ -185,7 +181,7 @@ class BlockingChildProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 start_new_session=True,  # Ctrl-C in the terminal is for the parent, which ends its children
-                env=_environment(one_thread),
+                env={**(dict.fromkeys(_THREAD_VARIABLES, "1") if one_thread else {}), **os.environ},
             )
         except OSError as error:
             raise _cannot_start(error) from None
@@ -347,12 +343,6 @@ def _limit_memory(limit: int) -> None:
 
         _, hard = resource.getrlimit(resource.RLIMIT_DATA)
         resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
-
-
-def _environment(one_thread: bool) -> dict[str, str]:
-    """Return the environment of the child; with `one_thread`, numerical libraries get one thread unless a
-    number is set already."""
-    return {**(dict.fromkeys(_THREAD_VARIABLES, "1") if one_thread else {}), **os.environ}
 
 
 def _encoded(message: object) -> bytes:

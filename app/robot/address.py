@@ -9,6 +9,7 @@ import re
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
+from typing import ClassVar
 from urllib.parse import parse_qsl
 
 from pipeline.errors import SourceError
@@ -38,6 +39,7 @@ class Address:
     """Address of a live source.
 
     Attributes:
+        kind: Name of such sources for the user.
         uri: As the user wrote it.
         domain: ROS_DOMAIN_ID.
         robot: Namespace whose topics are read, ROOT for none; "" for all topics, or for the first robot that
@@ -45,6 +47,7 @@ class Address:
         topics: Topic by role where the user names it.
     """
 
+    kind: ClassVar[str]
     uri: str
     domain: int = 0
     robot: str = ""
@@ -61,6 +64,7 @@ class ZenohAddress(Address):
         files: Certificates: "ca" of the authority of the router, "cert" and "key" of this machine.
     """
 
+    kind: ClassVar[str] = "ROS 2 over Zenoh"
     endpoint: str
     files: dict[str, str] = field(default_factory=dict)
     mapped_there: bool = False
@@ -75,6 +79,7 @@ class DdsAddress(Address):
         peers: Hosts that are contacted where the network has no multicast.
     """
 
+    kind: ClassVar[str] = "ROS 2 over DDS"
     interface: str = ""
     peers: tuple[str, ...] = ()
 
@@ -88,6 +93,7 @@ class VelodyneAddress(Address):
         sender: Address of the sensor; "" accepts only packets of this machine.
     """
 
+    kind: ClassVar[str] = "Velodyne sensor"
     host: str
     port: int
     sender: str

@@ -140,17 +140,14 @@ class PictureStore:
         self._file.close()
 
 
-KIND, VELODYNE_KIND, DDS_KIND = "ROS 2 over Zenoh", "Velodyne sensor", "ROS 2 over DDS"
-
-
 MakeLink = Callable[[Any, Inbox], Link]
 
 
-def link_for(address: Address) -> tuple[MakeLink, str]:
-    """Return the class of the connection for an address, and a name of such sources for the user."""
+def link_for(address: Address) -> MakeLink:
+    """Return the class of the connection for an address."""
     if isinstance(address, VelodyneAddress):
-        return VelodyneLink, VELODYNE_KIND
-    return (DdsLink, DDS_KIND) if isinstance(address, DdsAddress) else (ZenohLink, KIND)
+        return VelodyneLink
+    return DdsLink if isinstance(address, DdsAddress) else ZenohLink
 
 
 #: The nodes of a robot start one after another: topics are chosen this long after the first scan topic [s].
@@ -172,22 +169,20 @@ class LiveSource:
     Args:
         address: Address of the robot.
         options: Topics and mounting that the user chose.
-        make_link: Returns the connection for the address and the inbox.
-        kind: Name of such sources for the user.
+        make_link: Returns the connection for the address and the inbox; None for that of `link_for`.
     """
 
     def __init__(
         self,
         address: Address,
         options: SourceOptions,
-        make_link: Callable[[Any, Inbox], Link] = ZenohLink,
-        kind: str = KIND,
+        make_link: MakeLink | None = None,
     ) -> None:
         self.uri = address.uri
-        self._address, self._options, self._kind = address, options, kind
+        self._address, self._options = address, options
         self._topics = {**address.topics, **options.topics}
         self._inbox = Inbox()
-        self._link = make_link(address, self._inbox)
+        self._link = (make_link or link_for(address))(address, self._inbox)
         self._choice: Choice | None = None
         self._reader: ArrivalReader | None = None
         self._seen_s: float | None = None
@@ -527,7 +522,7 @@ class LiveSource:
         named = {role: name for role, name in self._topics.items() if role == "pose" and name in there}
         topics = {"scan": choice.channels[0].topic, **named}
         options = replace(self._options, topics=topics)
-        reader = ArrivalReader(self.uri, self._kind, choice.channels, options)
+        reader = ArrivalReader(self.uri, self._address.kind, choice.channels, options)
         everything = (*choice.channels, *choice.camera)
         fixed = [channel for channel in choice.channels if channel.topic.endswith("tf_static")]
         if choice.camera:
@@ -553,23 +548,20 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
     Raises:
         SourceError: The address is invalid, or names robots that cannot be mapped here.
     """
-    address, chosen = parse_address(uri), options or SourceOptions()
-    make_link, kind = link_for(address)
-    if not isinstance(address, ZenohAddress):
-        return LiveSource(address, chosen, make_link, kind)
-    if address.mapped_there:
+    address = parse_address(uri)
+    if isinstance(address, ZenohAddress) and address.mapped_there:
         raise SourceError(
             "a robot that maps itself is shown and not mapped again",
             where=uri,
             remedy="Use `stemmap serve`, or leave out mapped=robot",
         )
-    if address.robot == ALL_ROBOTS:
+    if isinstance(address, ZenohAddress) and address.robot == ALL_ROBOTS:
         raise SourceError(
             "only one robot can be mapped at a time",
             where=uri,
             remedy="Name it, or show all of them with `stemmap serve`",
         )
-    return LiveSource(address, chosen, make_link, kind)
+    return LiveSource(address, options or SourceOptions())
 
 
 def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:

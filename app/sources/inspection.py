@@ -23,7 +23,7 @@ from app.robot.address import is_live, parse_address
 from app.robot.link import CountingInbox, Heard
 from app.robot.source import link_for
 from app.robot.topics import Publisher, countable
-from app.sources.opening import check_cloud, open_cloud, open_source
+from app.sources.opening import check_address, check_cloud, open_cloud, open_source
 from app.sources.request import LONGEST_URI, SourceRequest, with_odometry
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import check_existence
@@ -31,7 +31,6 @@ from pipeline.io.readers.base import RecordedTopic
 from pipeline.io.readers.clouds import is_cloud
 from pipeline.io.readers.topics import TYPES_BY_ROLE
 from pipeline.odometry.synchroniser import steps
-from pipeline.simulation.scenarios import SCHEME, parse_uri
 
 COMMAND = python_module("app.sources.inspection")
 PATIENCE_S = 120.0
@@ -104,11 +103,9 @@ async def check_source(request: SourceRequest) -> None:
     Raises:
         StemmapError: It cannot be opened; the error gives the reason.
     """
-    if is_live(request.uri):
-        parse_address(request.uri)
-    elif request.uri.startswith(SCHEME) and not Path(request.uri).exists():
-        parse_uri(request.uri)
-    elif await asyncio.to_thread(is_cloud, request.uri):
+    if not check_address(request.uri):
+        return
+    if await asyncio.to_thread(is_cloud, request.uri):
         await asyncio.to_thread(check_cloud, request.uri)  # a copy of this process, which starts at once
     else:
         question = {"ask": "first_scan", "path": request.uri, "request": msgspec.to_builtins(request)}
@@ -311,7 +308,7 @@ def heard(uri: str) -> dict[str, Any]:
         SourceError: The address is invalid.
     """
     address, inbox = parse_address(uri), CountingInbox()
-    make_link, _ = link_for(address)
+    make_link = link_for(address)
     with closing(make_link(address, inbox)) as link:
         begun = changed = time.monotonic()
         known = link.publishers()

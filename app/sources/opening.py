@@ -11,9 +11,31 @@ from collections.abc import Callable
 from pathlib import Path
 
 from app.common.limited_process import ProcessLimits, run_limited
+from app.robot.address import is_live, parse_address
 from pipeline.inventory.cloud import WholeCloud
-from pipeline.io.readers import Source, SourceOptions, clouds
+from pipeline.io.readers import Source, SourceOptions, check_existence, clouds
 from pipeline.io.readers import open_source as _open_source
+from pipeline.simulation.scenarios import SCHEME, parse_uri
+
+
+def check_address(uri: str) -> bool:
+    """Check that a file or folder exists, and the form of the address of a live robot or a simulated run.
+    Nothing is opened.
+
+    Returns:
+        Whether it is a file or folder, or has an unknown scheme.
+
+    Raises:
+        StemmapError: It does not exist, or the address is wrong.
+    """
+    if is_live(uri):
+        parse_address(uri)
+    elif uri.startswith(SCHEME) and not Path(uri).exists():
+        parse_uri(uri)
+    else:
+        check_existence(uri)
+        return True
+    return False
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:

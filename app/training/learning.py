@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from app.batch.summary import rate_text
 from app.common.child_process import ParentConnection, run_child
 from app.common.text import count, version
 from app.store.forests import Forests
@@ -34,7 +35,6 @@ from pipeline.classification.forest import (
 )
 from pipeline.config.stages import Classification
 from pipeline.errors import SourceError, StemmapError
-from pipeline.evaluation import Rate
 
 LEAST_TREES, LEAST_OTHERS = 10, 5
 
@@ -216,13 +216,7 @@ def table_lines(learned: LearningResult) -> list[str]:
 
 def _cells(rates: Rates) -> list[str]:
     """Return TA, FR, TR and FA as text."""
-    return [_cell(rate) for rate in (rates.TA, rates.FR, rates.TR, rates.FA)]
-
-
-def _cell(rate: Rate) -> str:
-    """Return a rate as text, for example "9/10 (90.0 %)"; "-" for the percentage if its total is 0."""
-    part = "-" if rate.rate is None else f"{100.0 * rate.rate:.1f} %"
-    return f"{rate.count}/{rate.of} ({part})"
+    return [rate_text(rate) for rate in (rates.TA, rates.FR, rates.TR, rates.FA)]
 
 
 def _row(*cells: str) -> str:

@@ -22,6 +22,7 @@ from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import csv_text
 
 Figures = dict[str, float | int | None]
+Criterion = Callable[[Figures], tuple[float, ...] | None]
 
 # Figure, heading, unit and factor from the stored value to the shown one.
 SHOWN: tuple[tuple[str, str, str, float], ...] = (
@@ -66,19 +67,6 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Criterion:
-    """A criterion for the best set.
-
-    Attributes:
-        words: Its name.
-        value: Value of a row's figures, larger is better; None where it is unknown.
-    """
-
-    words: str
-    value: Callable[[Figures], tuple[float, ...] | None]
-
-
-@dataclass(frozen=True, slots=True)
 class Comparison:
     """All rows.
 
@@ -99,13 +87,13 @@ class Comparison:
         return [row for row in self.rows if row.error]
 
 
-def _most(name: str) -> Callable[[Figures], tuple[float, ...] | None]:
+def _most(name: str) -> Criterion:
     """Return a criterion function whose value is a figure, where larger is better; None where the figure is
     unknown."""
     return lambda f: None if f[name] is None else (float(f[name] or 0.0),)
 
 
-def _least(name: str) -> Callable[[Figures], tuple[float, ...] | None]:
+def _least(name: str) -> Criterion:
     """Return a criterion function that prefers a small figure, then a large F1; None where the figure is
     unknown."""
     return lambda f: None if f[name] is None else (-float(f[name] or 0.0), float(f["f1"] or 0.0))
@@ -117,13 +105,14 @@ def _careful(f: Figures) -> tuple[float, ...] | None:
     return (-wrong, float(f["TA"] or 0))
 
 
-CRITERIA = (
-    Criterion("F1", _most("f1")),
-    Criterion("completeness", _most("completeness")),
-    Criterion("fewest false trees, then most true ones", _careful),
-    Criterion("position RMSE", _least("position_rmse_m")),
-    Criterion("pair error", _least("mean_pair_error_percent")),
-)
+#: Criteria for the best set by name: the value of a row's figures, larger is better, None for an unknown one.
+CRITERIA: dict[str, Criterion] = {
+    "F1": _most("f1"),
+    "completeness": _most("completeness"),
+    "fewest false trees, then most true ones": _careful,
+    "position RMSE": _least("position_rmse_m"),
+    "pair error": _least("mean_pair_error_percent"),
+}
 
 
 def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) -> Comparison:
@@ -139,7 +128,7 @@ def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) 
         rows += of_set
         means.append(_mean(s + 1, of_set))
     return Comparison(
-        plan, tuple(rows), tuple(means), {goal.words: best_of(means, goal) for goal in CRITERIA}
+        plan, tuple(rows), tuple(means), {words: best_of(means, value) for words, value in CRITERIA.items()}
     )
 
 
@@ -193,16 +182,16 @@ def _mean(set_number: int, rows: Sequence[Row]) -> Row:
     return Row(set_number, 0, mean, seconds, any(row.looked for row in rows))
 
 
-def best_of(means: Sequence[Row], goal: Criterion) -> int:
+def best_of(means: Sequence[Row], criterion: Criterion) -> int:
     """Return the number of the best set, the first of equals; 0 if no value is known, or if several are known
     and all are equal. A single set with a known value is the best.
 
     Args:
         means: One row per set.
-        goal: Criterion of the best set.
+        criterion: One of CRITERIA.
     """
     values = [
-        (value, -m.set_number) for m in means if m.figures and (value := goal.value(m.figures)) is not None
+        (value, -m.set_number) for m in means if m.figures and (value := criterion(m.figures)) is not None
     ]
     equal = len(values) > 1 and max(values)[0] == min(values)[0]
     return -max(values)[1] if values and not equal else 0

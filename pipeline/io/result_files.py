@@ -27,7 +27,7 @@ TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
 SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
 
 
-def _number(value: float, digits: int) -> str:
+def number_text(value: float, digits: int) -> str:
     """Return a decimal text with `digits` decimals, without exponent and without minus zero; empty for values
     that are not finite."""
     if not math.isfinite(value):
@@ -37,8 +37,8 @@ def _number(value: float, digits: int) -> str:
 
 
 def _numbers(values: Iterable[float] | None, digits: int) -> Iterable[str]:
-    """Yield the texts of numbers, see `_number`; empty ones without end for None."""
-    return itertools.repeat("") if values is None else (_number(value, digits) for value in values)
+    """Yield the texts of numbers, see `number_text`; empty ones without end for None."""
+    return itertools.repeat("") if values is None else (number_text(value, digits) for value in values)
 
 
 def _seconds(stamp_ns: Int, start_ns: int) -> Iterable[str]:
@@ -114,7 +114,7 @@ def detection_rows(frame: Frame, start_ns: int) -> list[tuple[str, ...]]:
         frame: Results of the scan.
         start_ns: Time from which the seconds count [ns].
     """
-    time = _number((frame.stamp_ns - start_ns) * 1e-9, 3) if frame.stamp_ns >= 0 else ""
+    time = number_text((frame.stamp_ns - start_ns) * 1e-9, 3) if frame.stamp_ns >= 0 else ""
     return list(zip(*(column(frame, time) for column in _DETECTIONS.values()), strict=False))
 
 
@@ -140,7 +140,7 @@ def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
     middle = (ground.place[order] + 0.5) * ground.cell
     columns = (middle, ground.height[order], ground.sigma[order], ground.views[order])
     for (x, y), z, sigma, views in zip(*columns, strict=True):
-        yield [_number(x, 3), _number(y, 3), _number(z, 3), _number(sigma, 3), str(views)]
+        yield [number_text(x, 3), number_text(y, 3), number_text(z, 3), number_text(sigma, 3), str(views)]
 
 
 def seen_text(area: SeenArea) -> str:
@@ -149,7 +149,7 @@ def seen_text(area: SeenArea) -> str:
     return csv_text(
         SEEN_COLUMNS,
         (
-            [_number(x, 3), _number(y, 3), _number(nearest, 2), str(views) if views else ""]
+            [number_text(x, 3), number_text(y, 3), number_text(nearest, 2), str(views) if views else ""]
             for (x, y), nearest, views in zip(area.centres, area.nearest, area.views, strict=True)
         ),
     )

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 
 from app.batch.export import ExportedRun, read_for_export
-from app.batch.run_folder import read_run_record
 from app.batch.stand import StandResult, stand_of
 from app.common.text import version
 from pipeline.config.stages import Stand
@@ -86,7 +85,7 @@ def report_page(
     parameters = parameters or Stand()
     whole = stand_of(folder, parameters)
     of_plots = stand_of(folder, parameters, plots) if plots else None
-    run, record = read_for_export(folder, plots, parameters), read_run_record(folder)
+    run, record = read_for_export(folder, of_plots), whole.run.record
     number = Numbers(texts["point"], texts["group"])
     environment = Environment(
         loader=PackageLoader("app.batch.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True

@@ -101,7 +101,7 @@ class Announced:
 def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.MonkeyPatch):
     names = [("points", POINT_CLOUD), ("fix", NAV_SAT_FIX), ("image", IMAGE), ("depth", "a/msg/Large")]
     topics = [Publisher("red", f"/red/{name}", kind) for name, kind in names]
-    link = (lambda _, inbox: Announced(inbox, *topics), "")
+    link = lambda _, inbox: Announced(inbox, *topics)  # noqa: E731
     monkeypatch.setattr(inspection, "link_for", lambda _address: link)
     monkeypatch.setattr(inspection, "SETTLE_S", 0.3)
     monkeypatch.setattr(inspection, "COUNT_S", 0.01)
@@ -115,7 +115,7 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
     }
     assert "silent" in by_name(told)["/red/fix"]["why_not"]
     assert (told["mount"], told["warnings"]) == (None, [])
-    monkeypatch.setattr(inspection, "link_for", lambda _address: (lambda _, inbox: Announced(inbox), ""))
+    monkeypatch.setattr(inspection, "link_for", lambda _address: lambda _, inbox: Announced(inbox))
     monkeypatch.setattr(inspection, "LISTEN_S", 0.1)
     assert "no topic was announced" in inspection.heard("velodyne:127.0.0.1:2368")["warnings"][0]
 

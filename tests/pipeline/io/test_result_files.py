@@ -18,10 +18,10 @@ from pipeline.io.result_files import (
     PATH_COLUMNS,
     TREE_COLUMNS,
     RunFiles,
-    _number,
     csv_text,
     detection_rows,
     geojson,
+    number_text,
     path_rows,
     terrain_text,
     tree_rows,
@@ -54,7 +54,7 @@ def a_frame():
 
 @given(st.floats(-1e9, 1e9), st.integers(0, 6))
 def test_a_number_is_plain_and_as_near_as_its_digits(value, digits):
-    text = _number(value, digits)
+    text = number_text(value, digits)
     assert "e" not in text
     assert abs(float(text) - value) <= 0.5 * 10**-digits * (1 + 1e-9) + abs(value) * 1e-15
     assert not (float(text) == 0.0 and text.startswith("-"))
@@ -62,13 +62,13 @@ def test_a_number_is_plain_and_as_near_as_its_digits(value, digits):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_what_is_no_number_is_empty(value):
-    assert _number(value, 3) == ""
+    assert number_text(value, 3) == ""
 
 
 def test_there_is_no_minus_zero():
-    assert _number(-0.0, 3) == "0.000"
-    assert _number(-0.0004, 3) == "0.000"
-    assert _number(-0.4, 0) == "0"
+    assert number_text(-0.0, 3) == "0.000"
+    assert number_text(-0.0004, 3) == "0.000"
+    assert number_text(-0.4, 0) == "0"
 
 
 # --- rows -----------------------------------------------------------------------------------------
