@@ -278,11 +278,16 @@ class Mapper:
 
     def _predict_motion(self, step: Step) -> tuple[Motion, tuple[str, ...]]:
         """Return the motion since the last scan with its uncertainty, by odometry and gyroscope, and
-        warnings. A scan without odometry, and the first one with it, has no motion. Stores the odometry pose
-        of the scan."""
+        warnings. A scan without odometry, and the first one with it, has no motion. When a missing odometry
+        returns, the motion since it was missing is left out if trees have determined it meanwhile. Stores the
+        odometry pose of the scan."""
         before, now = self._odometry, step.T_odom_base
         self._odometry = before if now is None else now
         driven = Pose2() if before is None or now is None else before.inverse() @ now
+        if step.unreported is not None:
+            if not self._slam.is_led_by_trees:
+                return self._gated(Motion(driven, step.slack, step.doubt, step.measured))
+            driven = step.unreported.inverse() @ driven
         return self._gated(self._with_gyro(step, driven))
 
     def _with_gyro(self, step: Step, driven: Pose2) -> Motion:

@@ -83,6 +83,7 @@ class Synchroniser:
         self._imu: deque[Imu] = deque()
         self._gyro = Gyro()
         self._stepped: Pose2 | None = None  # odometry of the last step
+        self._was_bridged = False  # whether the odometry was missing at the last step
         self._turned_ns: int | None = None
         self._gyro_tilt = (0, 0.0, 0.0)  # time [ns], roll and pitch [rad]
         self._measured = PoseBuffer()
@@ -235,7 +236,8 @@ class Synchroniser:
         self._report_pause(scan.stamp_ns)
         pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
-        turn = self._turn_to(scan.stamp_ns, pose)
+        unreported = self._unreported(scan.stamp_ns)
+        turn = self._turn_to(scan.stamp_ns, pose, unreported)
         odometry_at = None if self._odometry.newest is None else self._odometry.pose_at
         step = Step(
             index=self._index,
@@ -248,28 +250,46 @@ class Synchroniser:
             warnings=tuple(self._warnings),
             doubt=self._doubt,
             slack=self._slack,
+            unreported=unreported,
             measured=self._measured.at(scan.stamp_ns, pose, odometry_at),
             turn=turn if self._gyro.proven else None,
             turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
         )
+        newest = self._odometry.newest
+        self._was_bridged = newest is not None and scan.stamp_ns > newest.stamp_ns + STALE_NS
         self._stepped_ns, self._slack, self._doubt = scan.stamp_ns, (0.0, 0.0), ""
         self._stepped = pose
         self._index += 1
         self._warnings.clear()
         return step
 
-    def _turn_to(self, stamp_ns: int, pose: Pose2 | None) -> Turn | None:
+    def _unreported(self, stamp_ns: int) -> Pose2 | None:
+        """Return the motion by the odometry up to the last step that the pose of that step does not contain,
+        because the odometry was missing then and has returned before a time [ns]; None otherwise.
+
+        The pose at the last step is interpolated between the readings before and after the gap.
+        """
+        newest = self._odometry.newest
+        if newest is None or self._stepped is None or self._stepped_ns is None:
+            return None
+        if stamp_ns > newest.stamp_ns + STALE_NS or not self._was_bridged:
+            return None
+        return self._stepped.inverse() @ self._odometry.pose_at(self._stepped_ns)
+
+    def _turn_to(self, stamp_ns: int, pose: Pose2 | None, unreported: Pose2 | None) -> Turn | None:
         """Return the turn since the last step by the gyroscope, None if unknown; it is compared with the
         odometry (`Gyro.compare`) if neither is missing and the odometry is not doubted.
 
         Args:
             stamp_ns: Time of the scan [ns].
             pose: Pose by the odometry at that time, or None.
+            unreported: See Step.
         """
         turn = None if self._stepped_ns is None else self._gyro.turn(self._stepped_ns, stamp_ns)
         if turn is None or pose is None or self._stepped is None or self._doubt:
             return turn
-        self._gyro.compare(float(wrap_angle(pose.yaw - self._stepped.yaw)), turn)
+        earlier = 0.0 if unreported is None else unreported.yaw
+        self._gyro.compare(float(wrap_angle(pose.yaw - self._stepped.yaw - earlier)), turn)
         return turn
 
     def _motion_at(self, stamp_ns: int) -> tuple[Pose2 | None, tuple[float, float, float], Tilt | None]:

@@ -287,6 +287,11 @@ class FastSlam:
         """Whether too few known trees are found where they should be visible; see `pose_quality.is_lost`."""
         return is_lost(self.state.recent)
 
+    @property
+    def is_led_by_trees(self) -> bool:
+        """Whether trees determined the motion in the last scan with a doubted odometry."""
+        return self.state.recent.led > 0
+
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
         """Return the pose of the present state, for example after `place`, with the health and the
         associations of an earlier estimate. The state is unchanged and `resampled` is False."""

@@ -68,29 +68,39 @@ def estimate_rigid_shift(
         (SEVERAL); the pose x, y [m], yaw [rad] by the trees, shape (3,); and its covariance, shape (3, 3). If
         both are False, pose and covariance have no meaning.
     """
-    lever, off, variance, landmark = _pairs(pose, centre, R, known, spread)
-    place, motion, N_inv = pose.copy(), np.zeros(3), np.zeros((3, 3))
-    familiar = trust.known_share >= FAMILIAR and well[landmark].sum() >= FEWEST
-    fewest, votes = (FEWEST, well) if familiar else (MANY, np.ones(well.shape[0], np.bool_))
-    may = votes[landmark]
-    kept, agree, misfit = may.copy(), may.sum(), 0.0
-    if agree < fewest:
-        return False, False, place, N_inv
-    for _ in range(ROUNDS):
-        N, b = _normal_equations(lever, off, variance, kept)
-        N_inv, det = inverted(N)
-        if not det > 0.0:
-            return False, False, place, N_inv
-        for i in range(3):
-            motion[i] = N_inv[i, 0] * b[0] + N_inv[i, 1] * b[1] + N_inv[i, 2] * b[2]
-        agree, misfit = _agreeing(lever, off, variance, motion, may, kept)
+    place, N_inv = pose.copy(), np.zeros((3, 3))
+    familiar, agree, misfit = trust.known_share >= FAMILIAR, 0, 0.0
+    # Pairs at the odometry, then pairs at the pose that these determine (iterative closest point; Besl, McKay
+    # 1992), since a turn moves distant trees beyond NEAR.
+    for _ in range(2):
+        owner = _pairs(place, centre, known)
+        lever, off, variance, landmark = _pair_arrays(place, centre, R, known, spread, owner)
+        familiar = familiar and well[landmark].sum() >= FEWEST
+        fewest, votes = (FEWEST, well) if familiar else (MANY, np.ones(well.shape[0], np.bool_))
+        may = votes[landmark]
+        kept, agree = may.copy(), may.sum()
         if agree < fewest:
             return False, False, place, N_inv
-    away = motion[0] * motion[0] + motion[1] * motion[1] + (LEVER * motion[2]) ** 2
+        motion = np.zeros(3)
+        for _ in range(ROUNDS):
+            N, b = _normal_equations(lever, off, variance, kept)
+            N_inv, det = inverted(N)
+            if not det > 0.0:
+                return False, False, place, N_inv
+            for i in range(3):
+                motion[i] = N_inv[i, 0] * b[0] + N_inv[i, 1] * b[1] + N_inv[i, 2] * b[2]
+            agree, misfit = _agreeing(lever, off, variance, motion, may, kept)
+            if agree < fewest:
+                return False, False, place, N_inv
+        place += motion
+    shift = place - pose
+    away = shift[0] * shift[0] + shift[1] * shift[1] + (LEVER * shift[2]) ** 2
     least, expected = LEAST + trust.distrust * (STILL_LEAST - LEAST), _expected(pose, centre, known, votes)
     if agree < CONVINCING * expected or misfit > MISFIT or away < least * least:
         return False, False, place, N_inv
-    if _standing(lever, off, variance, position, heading, motion, kept) > agree // STANDING:
+    square = _deviations(lever, off, motion)
+    lever, off, variance, _ = _pair_arrays(pose, centre, R, known, spread, owner)
+    if _standing(lever, off, variance, position, heading, square, kept) > agree // STANDING:
         return False, False, place, N_inv
     N_inv *= max(1.0, misfit)
     S = N_inv.copy()
@@ -98,12 +108,11 @@ def estimate_rigid_shift(
     S[1, 1] += position
     S[2, 2] += heading
     S_inv, _ = inverted(S)
-    square, beyond = 0.0, BEYOND + trust.distrust * (STILL_BEYOND - BEYOND)
+    total, beyond = 0.0, BEYOND + trust.distrust * (STILL_BEYOND - BEYOND)
     for i in range(3):
         for j in range(3):
-            square += motion[i] * S_inv[i, j] * motion[j]
-        place[i] += motion[i]
-    significant, enough = square > beyond * beyond, agree >= SEVERAL or trust.distrust > 0.0
+            total += shift[i] * S_inv[i, j] * shift[j]
+    significant, enough = total > beyond * beyond, agree >= SEVERAL or trust.distrust > 0.0
     return significant and enough, significant and not enough, place, N_inv
 
 
@@ -129,74 +138,64 @@ def _expected(pose: Float, centre: Float, known: Float, votes: Bool) -> int:
 
 @compiled
 def _standing(
-    lever: Float, off: Float, variance: Float, position: float, heading: float, motion: Float, kept: Bool
+    lever: Float, off: Float, variance: Float, position: float, heading: float, shifted: Float, kept: Bool
 ) -> int:
-    """Count the pairs that agree with the odometry and fit it better than the motion.
+    """Count the pairs that agree with the odometry and fit it better than the shifted pose.
 
-    A pair that also agrees with the motion counts only if it prefers the odometry by CLEARLY: near people who
-    walk slowly, a tree is within the gate of their motion as well.
+    A pair that also agrees with the shifted pose counts only if it prefers the odometry by CLEARLY: near
+    people who walk slowly, a tree is within the gate of their motion as well.
 
     Args:
-        lever, off, variance: Results of `_pairs`.
-        position, heading: Variances of the pose by odometry [m^2, rad^2].
-        motion: Rigid motion x, y [m], yaw [rad], shape (3,).
-        kept: Which pairs agree with the motion, shape (K,).
+        lever, off, variance: Results of `_pair_arrays` at the pose by odometry.
+        position, heading: Variances of this pose [m^2, rad^2].
+        shifted: Squared deviations at the shifted pose, shape (K,) [m^2].
+        kept: Which pairs agree with the shifted pose, shape (K,).
     """
     standing = 0
     for k in range(lever.shape[0]):
         square, far2 = off[k, 0] ** 2 + off[k, 1] ** 2, lever[k, 0] ** 2 + lever[k, 1] ** 2
         if square > AGREE * AGREE * (variance[k] + position + far2 * heading):
             continue
-        ex = off[k, 0] - motion[0] + motion[2] * lever[k, 1]
-        ey = off[k, 1] - motion[1] - motion[2] * lever[k, 0]
-        standing += ex * ex + ey * ey > square + (CLEARLY * variance[k] if kept[k] else 0.0)
+        standing += shifted[k] > square + (CLEARLY * variance[k] if kept[k] else 0.0)
     return standing
 
 
 @compiled
-def _pairs(
-    pose: Float, centre: Float, R: Float, known: Float, spread: Float
+def _pairs(pose: Float, centre: Float, known: Float) -> Int:
+    """Return the detection of each landmark, -1 for none, int64, shape (L,): the nearest one of the
+    detections whose nearest landmark it is, up to NEAR. See `estimate_rigid_shift` for the arguments."""
+    found, c, s = centre.shape[0], np.cos(pose[2]), np.sin(pose[2])
+    owner = np.full(known.shape[0], -1, np.int64)
+    least = np.full(known.shape[0], np.inf)
+    for d in range(found):
+        x = pose[0] + c * centre[d, 0] - s * centre[d, 1]
+        y = pose[1] + s * centre[d, 0] + c * centre[d, 1]
+        best, nearest = NEAR * NEAR, -1
+        for j in range(known.shape[0]):
+            square = (known[j, 0] - x) ** 2 + (known[j, 1] - y) ** 2
+            if square < best:
+                best, nearest = square, j
+        if nearest >= 0 and best < least[nearest]:
+            least[nearest], owner[nearest] = best, d
+    return owner
+
+
+@compiled
+def _pair_arrays(
+    pose: Float, centre: Float, R: Float, known: Float, spread: Float, owner: Int
 ) -> tuple[Float, Float, Float, Int]:
-    """Pair each landmark with the nearest detection, of the detections whose nearest landmark it is, up to
-    NEAR.
+    """Return the pairs at a pose, in the order of the landmarks.
 
     Args:
         pose, centre, R, known, spread: See `estimate_rigid_shift`.
+        owner: Detection of each landmark, -1 for none, int64, shape (L,).
 
     Returns:
         For each of K pairs: vector from the robot to the detection, shape (K, 2) [m]; vector from the
         detection to the landmark, shape (K, 2) [m], both in the frame of the map; variance of the latter per
         axis, shape (K,) [m^2]; and row of the landmark, shape (K,).
     """
-    found, c, s = centre.shape[0], np.cos(pose[2]), np.sin(pose[2])
-    nearest, owner = np.full(found, -1, np.int64), np.full(known.shape[0], -1, np.int64)
-    least = np.full(known.shape[0], np.inf)
-    for d in range(found):
-        x = pose[0] + c * centre[d, 0] - s * centre[d, 1]
-        y = pose[1] + s * centre[d, 0] + c * centre[d, 1]
-        best = NEAR * NEAR
-        for j in range(known.shape[0]):
-            square = (known[j, 0] - x) ** 2 + (known[j, 1] - y) ** 2
-            if square < best:
-                best, nearest[d] = square, j
-        j = nearest[d]
-        if j >= 0 and best < least[j]:
-            least[j], owner[j] = best, d
-    return _pair_arrays(pose, c, s, centre, R, known, spread, owner)
-
-
-@compiled
-def _pair_arrays(
-    pose: Float, c: float, s: float, centre: Float, R: Float, known: Float, spread: Float, owner: Int
-) -> tuple[Float, Float, Float, Int]:
-    """Return the results of `_pairs` for known pairs, in the order of the landmarks.
-
-    Args:
-        pose, centre, R, known, spread: See `estimate_rigid_shift`.
-        c, s: Cosine and sine of the yaw of `pose`.
-        owner: Detection of each landmark, -1 for none, int64, shape (L,).
-    """
-    n = (owner >= 0).sum()
+    n, c, s = (owner >= 0).sum(), np.cos(pose[2]), np.sin(pose[2])
     lever, off, variance = np.empty((n, 2)), np.empty((n, 2)), np.empty(n)
     landmark, k = np.empty(n, np.int64), 0
     for j in range(owner.shape[0]):
@@ -214,10 +213,22 @@ def _pair_arrays(
 
 
 @compiled
+def _deviations(lever: Float, off: Float, motion: Float) -> Float:
+    """Return the squared deviations of pairs after a small rigid motion x, y [m], yaw [rad], shape (3,), as
+    shape (K,) [m^2]; see `_pair_arrays` for `lever` and `off`."""
+    square = np.empty(lever.shape[0])
+    for k in range(lever.shape[0]):
+        ex = off[k, 0] - motion[0] + motion[2] * lever[k, 1]
+        ey = off[k, 1] - motion[1] - motion[2] * lever[k, 0]
+        square[k] = ex * ex + ey * ey
+    return square
+
+
+@compiled
 def _normal_equations(lever: Float, off: Float, variance: Float, kept: Bool) -> tuple[Float, Float]:
     """Return the normal equations N, b, shapes (3, 3) and (3,), of off = t + theta (-lever_y, lever_x) for
     the unknowns t [m] and theta [rad], over the pairs in `kept`, weighted by 1 / variance; zeros without
-    pairs. See `_pairs` for the arguments; `kept` is bool, shape (K,)."""
+    pairs. See `_pair_arrays` for the arguments; `kept` is bool, shape (K,)."""
     N, b = np.zeros((3, 3)), np.zeros(3)
     for k in range(lever.shape[0]):
         if not kept[k]:
@@ -244,7 +255,7 @@ def _agreeing(
     larger.
 
     Args:
-        lever, off, variance: Results of `_pairs`.
+        lever, off, variance: Results of `_pair_arrays`.
         motion: x, y [m], yaw [rad], shape (3,).
         may: Pairs that are considered, shape (K,).
         kept: Pairs by which the motion was estimated, shape (K,), at least one true; overwritten.
@@ -252,11 +263,8 @@ def _agreeing(
     Returns:
         Number of agreeing pairs, and their sum of squared normalised deviations per degree of freedom.
     """
-    square, total, n = np.empty(lever.shape[0]), 0.0, 0
+    square, total, n = _deviations(lever, off, motion) / variance, 0.0, 0
     for k in range(lever.shape[0]):
-        ex = off[k, 0] - motion[0] + motion[2] * lever[k, 1]
-        ey = off[k, 1] - motion[1] - motion[2] * lever[k, 0]
-        square[k] = (ex * ex + ey * ey) / variance[k]
         if kept[k]:
             total += square[k]
             n += 1

@@ -51,6 +51,8 @@ class Step:
         warnings: Messages of the synchroniser since the previous scan.
         doubt: Message why the motion to this scan may be wrong; empty if there is no doubt.
         slack: Standard deviations that the doubt adds to the motion: position [m] and heading [rad].
+        unreported: Motion by the odometry up to the previous scan that no earlier step contains, because the
+            odometry was missing; it came with this step. None without such a motion.
         measured: Pose measurement of another source at this scan, or None.
         turn: Rotation by the gyroscope since the previous scan, or None.
         turn_rate: Rate of turn by the gyroscope at the scan [rad/s], or None.
@@ -67,6 +69,7 @@ class Step:
     warnings: tuple[str, ...] = ()
     doubt: str = ""
     slack: tuple[float, float] = (0.0, 0.0)
+    unreported: Pose2 | None = None
     measured: PoseMeasurement | None = None
     turn: Turn | None = None
     turn_rate: float | None = None

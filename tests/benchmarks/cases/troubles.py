@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 NAME = "troubles"
 LINE = "Bad odometry and bad scans, twenty drives each: error, false trees, what is said"
 SEEDS = range(4)
+DRIVE_SEEDS = range(10)
 DRIFT, WRONG = 0.3, 0.5  # m; more than the first the map may not lie off, and at the second it is another one
 
 
@@ -64,8 +65,41 @@ def run() -> list[Table]:
                 "straight and on a circle), 40 scans before the trouble and 55 since it began; error of the "
                 "pose at the end, false: where no tree stands, or one has another already.",
             ),
-        )
+        ),
+        _drives(),
     ]
+
+
+def _drives() -> Table:
+    """Faults of the odometry in drives with whole scans."""
+    from tests.benchmarks.faulty_odometry import FAULTS, MATCH, SECONDS, WRONG, SimulatedDrive
+
+    drives = [SimulatedDrive(seed) for seed in chosen_seeds(DRIVE_SEEDS)]
+    rows: list[tuple[Cell, ...]] = []
+    for name, fault in FAULTS.items():
+        done = [drive.mapped(fault) for drive in drives]
+        rows.append(
+            (name, len(done), max(one.error for one in done), max(one.false for one in done),
+             max(one.missing for one in done), sum(one.silent > 0 for one in done))
+        )  # fmt: skip
+        print(f"{name}: worst {rows[-1][2]:.2f} m, {rows[-1][3]} false", file=sys.stderr, flush=True)
+    return Table(
+        f"Faults of the odometry in sim:stand, {SECONDS:g} s, whole scans",
+        (
+            "odometry",
+            "drives",
+            "largest error [m]",
+            "most false trees",
+            "most missing trees",
+            "wrong without a word",
+        ),
+        tuple(rows),
+        (
+            f"Largest error of the reported position in any scan; a false tree has no true tree within "
+            f"{MATCH} m. Wrong without a word: drives with a scan whose position is off by more than {WRONG} "
+            "m while the pose quality is good.",
+        ),
+    )
 
 
 WORDS = ("good", "weak", "lost")

@@ -200,3 +200,21 @@ def test_memory_does_not_grow_with_the_run():
     joiner = stream.gi_frame.f_locals["joiner"]
     assert len(joiner._odometry._readings) < 300
     assert len(joiner._imu) < 300
+
+
+def test_the_motion_of_a_gap_is_reported_apart_when_the_odometry_returns():
+    readings = [odometry(t, t * 1e-3) for t in range(0, 4000, 20) if t not in range(1000, 3000)]
+    records = sorted([*readings, *(at(t) for t in range(0, 3500, 100))], key=lambda r: r.stamp_ns)
+    made = list(steps(records))
+    (back,) = [step for step in made if step.unreported is not None]
+    seconds = (back.scan.stamp_ns - START) * 1e-9
+    assert 1.5 < seconds <= 3.0, "some scans wait for the odometry"
+    assert back.unreported is not None
+    assert back.unreported.x == pytest.approx(seconds - 0.1 - 0.98, abs=1e-6), "after 0.98 m before the gap"
+    assert pose_of(back).x == pytest.approx(seconds, abs=1e-6)
+
+
+def test_a_gap_without_scans_has_no_unreported_motion():
+    readings = [odometry(t, t * 1e-3) for t in (0, 20, 3000, 3020)]
+    records = sorted([*readings, at(10), at(3010)], key=lambda r: r.stamp_ns)
+    assert [step.unreported for step in steps(records)] == [None, None]

@@ -227,3 +227,16 @@ def test_a_large_motion_of_some_detections_is_rejected():
     assert tree_motion([0.0, 0.0, 0.0], known, seen).slipped
     seen[:3] = known[:3]
     assert not tree_motion([0.0, 0.0, 0.0], known, seen).slipped
+
+
+@pytest.mark.parametrize("turn", [1.2, 3.0, 5.0])
+def test_a_turn_is_recovered_from_distant_trees(turn):
+    """Trees beyond 0.8 m / turn are farther from their detections than a pair may be."""
+    rng = np.random.default_rng(3)
+    angle, distance = rng.uniform(-np.pi, np.pi, 40), rng.uniform(4.0, 30.0, 40)
+    known = np.column_stack([distance * np.cos(angle), distance * np.sin(angle)])
+    true = Pose2(0.1, 0.0, np.radians(turn))
+    seen = true.inverse().apply(known) + rng.normal(0.0, 0.01, known.shape)
+    result = tree_motion([0.0, 0.0, 0.0], known, seen, distrust=0.9)
+    assert result.slipped
+    np.testing.assert_allclose(result.motion, true.as_array(), atol=0.02)
