@@ -29,7 +29,6 @@ const hint = (name) => HINTS[name] ?? HINTS[Object.keys(HINTS).find((key) => nam
 const RULES = {
   tree: (g) => `Accepted as tree: single scans fitted a round trunk on more than half of its circumference, so votes against a round stem count a tenth. A tree needs ${percent(g.tree_share)} of the votes.`,
   moving: (g) => `Rejected as moving: empty in ${g.absent} of ${g.absent + g.present} clear views.`,
-  wall: () => "Rejected as wall: it is wide but not thick and continues sideways.",
   "too low": () => "Rejected as too low: less than 30 % of the rays at breast height (1.2 to 2.2 m above the ground), or above a person's height (2.2 to 3.2 m), ended at it.",
   "too few points": () => "Rejected as too few points: so few voxels can be occupied by chance.",
 };
