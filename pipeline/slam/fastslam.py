@@ -89,7 +89,7 @@ class FastSlam:
         ancestors, doubt = None, motion.doubt
         R, rules = rows_of(detections.covariance), rules_of(p)
         places = self._places_in_reach(state, detections.centre)
-        trees = self._by_trees(state, detections.centre, R, places, rules)
+        trees = self._by_trees(state, detections.centre, R, clear_range, places, rules)
         used = index == 0 or state.since_update >= p.update_distance or trees.slipped
         slipped = trees.slipped or state.recent.slipped
         doubted = OdometryDoubt(bool(doubt), slipped)
@@ -504,7 +504,13 @@ class FastSlam:
         )  # fmt: skip
 
     def _by_trees(
-        self, state: SlamState, centre: Float, R: Float, places: PlaceStates, rules: Rules
+        self,
+        state: SlamState,
+        centre: Float,
+        R: Float,
+        clear_range: Float,
+        places: PlaceStates,
+        rules: Rules,
     ) -> TreeMotion:
         """Return the motion since the last used scan by `against_slip`: that of the odometry, or that of the
         trees where they contradict it.
@@ -513,12 +519,13 @@ class FastSlam:
             state: State after the motion.
             centre: Detections in the base frame, shape (D, 2) [m].
             R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+            clear_range: Free distance by azimuth, shape (bins,) [m].
             places: States of the places in reach.
             rules: Parameters.
         """
         return against_slip(
             state.pose, state.maps, state.best, state.motion, state.motion_covariance, state.since_update,
-            state.recent.odometry_trust(noise_of(self.parameters)), centre, R, places, rules,
+            state.recent.odometry_trust(noise_of(self.parameters)), centre, R, clear_range, places, rules,
         )  # fmt: skip
 
     def _shared(

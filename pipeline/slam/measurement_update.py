@@ -30,6 +30,7 @@ def against_slip(
     wheels: OdometryTrust,
     centre: Float,
     R: Float,
+    clear_range: Float,
     places: PlaceStates,
     rules: Rules,
 ) -> TreeMotion:
@@ -41,7 +42,7 @@ def against_slip(
         pose: Poses before the motion, shape (P, 3).
         maps: Maps of the particles.
         best: Row of the best particle.
-        motion, motion_covariance, centre, R, places, rules: See `particle_update.observe`.
+        motion, motion_covariance, centre, R, clear_range, places, rules: See `particle_update.observe`.
         driven: Path length since the last used scan [m], see `drift_variances`.
         wheels: Trust in the odometry.
     """
@@ -54,7 +55,7 @@ def against_slip(
         known, spread, hits = known[active], spread[active], hits[active]
     return motion_by_trees(
         pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,
-        rules.hits_to_weigh, rules.gate,
+        rules.hits_to_weigh, rules.gate, clear_range,
     )  # fmt: skip
 
 

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.detection.free_space import BEHIND
+from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import OdometryTrust, inverted
@@ -26,7 +28,7 @@ NEAR = 0.8  # m; maximum distance of a pair; beyond it the nearest tree may be a
 # not well known, more than people walk side by side.
 FEWEST, SEVERAL, MANY = 5, 8, 10
 FAMILIAR = 0.6  # share of well-known trees among recent detections, from which new objects are an exception
-CONVINCING = 0.7  # share of the expected pairs that must agree
+CONVINCING = 0.7  # share of the pairs, and of the landmarks missed in free view, that must agree
 CLEARLY = 6.0  # excess in squared sigma (twice the log likelihood) by which a pair must prefer the odometry
 STANDING = 16  # agreeing pairs per permitted pair that prefers the odometry, by chance or on the robot itself
 AGREE = 3.5  # sigma; maximum distance of a pair after the motion
@@ -49,6 +51,7 @@ def estimate_rigid_shift(
     known: Float,
     spread: Float,
     well: Bool,
+    clear_range: Float,
 ) -> tuple[bool, bool, Float, Float]:
     """Return whether the trees contradict the odometry by a rigid shift, and the pose that they determine.
 
@@ -62,6 +65,7 @@ def estimate_rigid_shift(
         known: Landmarks in the frame of the map, shape (L, 2) [m].
         spread: Their covariances xx, xy, yy, shape (L, 3) [m^2].
         well: Which landmarks are well known, shape (L,).
+        clear_range: Free distance by azimuth in the base frame, shape (bins,) [m].
 
     Returns:
         Whether the shift is significant and enough pairs agree; whether it is significant with too few pairs
@@ -95,7 +99,9 @@ def estimate_rigid_shift(
         place += motion
     shift = place - pose
     away = shift[0] * shift[0] + shift[1] * shift[1] + (LEVER * shift[2]) ** 2
-    least, expected = LEAST + trust.distrust * (STILL_LEAST - LEAST), _expected(pose, centre, known, votes)
+    least = LEAST + trust.distrust * (STILL_LEAST - LEAST)
+    # Landmarks that other trees hide are not expected.
+    expected = may.sum() + _missed(place, centre, known, votes, owner, clear_range)
     if agree < CONVINCING * expected or misfit > MISFIT or away < least * least:
         return False, False, place, N_inv
     square = _deviations(lever, off, motion)
@@ -117,23 +123,28 @@ def estimate_rigid_shift(
 
 
 @compiled
-def _expected(pose: Float, centre: Float, known: Float, votes: Bool) -> int:
-    """Return the number of expected pairs: the smaller of the number of detections and the number of
-    landmarks in `votes` that are no farther from the pose than the farthest detection.
+def _missed(place: Float, centre: Float, known: Float, votes: Bool, owner: Int, clear_range: Float) -> int:
+    """Return the number of landmarks in `votes` that are in free view at a pose and no farther than the
+    farthest detection, but have no detection.
 
     Args:
-        pose: x, y [m], yaw [rad], shape (3,).
+        place: x, y [m], yaw [rad], shape (3,).
         centre: Detections in the base frame, shape (D, 2) [m].
         known: Landmarks in the frame of the map, shape (L, 2) [m].
         votes: Landmarks that count, shape (L,).
+        owner: Detection of each landmark, -1 for none, int64, shape (L,).
+        clear_range: Free distance by azimuth in the base frame, shape (bins,) [m].
     """
-    farthest, expected = 0.0, 0
+    missed, farthest, c, s = 0, 0.0, np.cos(place[2]), np.sin(place[2])
     for d in range(centre.shape[0]):
         farthest = max(farthest, centre[d, 0] ** 2 + centre[d, 1] ** 2)
     for j in range(known.shape[0]):
-        if votes[j] and (known[j, 0] - pose[0]) ** 2 + (known[j, 1] - pose[1]) ** 2 <= farthest:
-            expected += 1
-    return int(min(centre.shape[0], expected))
+        if owner[j] >= 0 or not votes[j]:
+            continue
+        dx, dy = known[j, 0] - place[0], known[j, 1] - place[1]
+        free = clear_range[direction_bin(c * dx + s * dy, c * dy - s * dx, clear_range.shape[0])] - BEHIND
+        missed += free > 0.0 and min(free * free, farthest) > dx * dx + dy * dy
+    return missed
 
 
 @compiled

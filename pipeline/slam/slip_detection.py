@@ -79,6 +79,7 @@ def motion_by_trees(
     hits_of: Int32,
     hits_to_weigh: int,
     gate: float,
+    clear_range: Float,
 ) -> TreeMotion:
     """Return the motion since the last used scan, from trees where they contradict the odometry.
 
@@ -100,12 +101,13 @@ def motion_by_trees(
         hits_of: Their hits, shape (L,).
         hits_to_weigh: Minimum hits of a well-known landmark.
         gate: Association gate [sigma].
+        clear_range: Free distance by azimuth in the base frame, shape (bins,) [m].
     """
     pose = moved_pose(before, motion)
     position, heading = drift_variances(motion, driven, trust)
     well_known = hits_of >= hits_to_weigh
     sure, unsure, place, fitted = estimate_rigid_shift(
-        pose, position, heading, trust, centre, R, known, spread, well_known
+        pose, position, heading, trust, centre, R, known, spread, well_known, clear_range
     )
     if sure:
         reduced = np.zeros((3, 3))

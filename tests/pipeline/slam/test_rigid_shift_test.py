@@ -7,6 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.detection.free_space import BINS
+from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam.motion import Noise, OdometryTrust
 from pipeline.slam.rigid_shift_test import AGREE, FEWEST, MANY, SEVERAL, estimate_rigid_shift
@@ -28,6 +30,16 @@ def scene(seed, trees=14):
     return np.array(places), rng
 
 
+def clear_of(seen):
+    """Return the free distance by azimuth of a scan that shows only points, shape (N, 2) [m]."""
+    free = np.full(BINS, np.inf)
+    for x, y in seen:
+        k = direction_bin(x, y, BINS)
+        for bin_ in (k - 1, k, k + 1):
+            free[bin_ % BINS] = min(free[bin_ % BINS], np.hypot(x, y))
+    return free
+
+
 def shift_test(
     known, seen, *, pose=(0.0, 0.0, 0.0), position=0.0, heading=0.0, distrust=0.0, familiar=1.0, well=None
 ):
@@ -38,7 +50,7 @@ def shift_test(
     well = np.ones(len(known), np.bool_) if well is None else well
     wheels = OdometryTrust(SURE, distrust, 0.0, familiar)
     moved, unsure, place, C = estimate_rigid_shift(
-        np.array(pose), position, heading, wheels, seen, R, known, spread, well
+        np.array(pose), position, heading, wheels, seen, R, known, spread, well, clear_of(seen)
     )
     assert not (moved and unsure)
     return moved, place, C
@@ -182,7 +194,7 @@ def tree_motion(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0, 
         np.zeros(3), np.array(motion), covariance * np.eye(3), driven,
         OdometryTrust(SURE, distrust, alone, 1.0), seen,
         np.tile(rows, (len(seen), 1)), known, np.tile(rows, (len(known), 1)),
-        np.full(len(known), 10, np.int32), 3, 3.5,
+        np.full(len(known), 10, np.int32), 3, 3.5, clear_of(seen),
     )  # fmt: skip
 
 
@@ -240,3 +252,10 @@ def test_a_turn_is_recovered_from_distant_trees(turn):
     result = tree_motion([0.0, 0.0, 0.0], known, seen, distrust=0.9)
     assert result.slipped
     np.testing.assert_allclose(result.motion, true.as_array(), atol=0.02)
+
+
+def test_hidden_landmarks_are_not_expected():
+    known, _ = scene(14, trees=SEVERAL + 8)
+    seen = (known - [0.3, 0.0])[:SEVERAL]
+    behind = 2.0 * known[:SEVERAL]
+    assert shift_test(np.concatenate([known[:SEVERAL], behind]), seen)[0]
