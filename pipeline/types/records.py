@@ -28,7 +28,6 @@ from pipeline.types.sensor_data import Record as Record
 from pipeline.types.sensor_data import Scan as Scan
 from pipeline.types.sensor_data import Sensor as Sensor
 from pipeline.types.sensor_data import Stems as Stems
-from pipeline.types.sensor_data import SynchroniserState as SynchroniserState
 from pipeline.types.sensor_data import Truth as Truth
 from pipeline.types.sensor_data import TruthPath as TruthPath
 from pipeline.types.sensor_data import TruthTrees as TruthTrees
@@ -56,7 +55,6 @@ class Step:
         measured: Pose measurement of another source at this scan, or None.
         turn: Rotation by the gyroscope since the previous scan, or None.
         turn_rate: Rate of turn by the gyroscope at the scan [rad/s], or None.
-        synchroniser_state: State from which the reading of the source can continue after this step.
     """
 
     index: int
@@ -73,7 +71,6 @@ class Step:
     measured: PoseMeasurement | None = None
     turn: Turn | None = None
     turn_rate: float | None = None
-    synchroniser_state: SynchroniserState = field(default_factory=SynchroniserState)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

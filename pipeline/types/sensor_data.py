@@ -145,38 +145,6 @@ class Turn:
 
 
 @dataclass(frozen=True, slots=True)
-class SynchroniserState:
-    """State of the synchroniser at a step, from which reading can continue: calibration of the gyroscope,
-    standstill and tilt.
-
-    Attributes:
-        stamp_ns: Time of the step.
-        bias: Bias of the turn rate [rad/s].
-        scatter: Standard deviation of the readings around the bias [rad/s].
-        blocks: Number of blocks of readings in the bias.
-        block: Readings of the unfinished block [rad/s].
-        equal_readings: Number of equal readings in a row.
-        turn_sums: Sums over the steps of the turns by wheels [rad], of their squares, and of their products
-            with the turns by gyroscope [rad^2].
-        proven: Whether the gyroscope was observed to turn with the wheels.
-        standing_since: Time and odometry pose since which the robot is at rest; None before the first
-            odometry.
-        tilt: Time of the last tilt [ns], roll and pitch [rad].
-    """
-
-    stamp_ns: int = 0
-    bias: float = 0.0
-    scatter: float = 0.0
-    blocks: int = 0
-    block: tuple[float, ...] = ()
-    equal_readings: int = 0
-    turn_sums: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    proven: bool = False
-    standing_since: tuple[int, Pose2] | None = None
-    tilt: tuple[int, float, float] = (0, 0.0, 0.0)
-
-
-@dataclass(frozen=True, slots=True)
 class Notice:
     """A message of a source for the user, which becomes a warning of the next step.
 
