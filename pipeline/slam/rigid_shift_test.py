@@ -13,6 +13,8 @@ pair that agrees with the odometry and not with the motion refutes it.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.detection.free_space import BEHIND
@@ -72,43 +74,25 @@ def estimate_rigid_shift(
         (SEVERAL); the pose x, y [m], yaw [rad] by the trees, shape (3,); and its covariance, shape (3, 3). If
         both are False, pose and covariance have no meaning.
     """
-    place, N_inv = pose.copy(), np.zeros((3, 3))
-    familiar, agree, misfit = trust.known_share >= FAMILIAR, 0, 0.0
     # Pairs at the odometry, then pairs at the pose that these determine (iterative closest point; Besl, McKay
     # 1992), since a turn moves distant trees beyond NEAR.
-    for _ in range(2):
-        owner = _pairs(place, centre, known)
-        lever, off, variance, landmark = _pair_arrays(place, centre, R, known, spread, owner)
-        familiar = familiar and well[landmark].sum() >= FEWEST
-        fewest, votes = (FEWEST, well) if familiar else (MANY, np.ones(well.shape[0], np.bool_))
-        may = votes[landmark]
-        kept, agree = may.copy(), may.sum()
-        if agree < fewest:
-            return False, False, place, N_inv
-        motion = np.zeros(3)
-        for _ in range(ROUNDS):
-            N, b = _normal_equations(lever, off, variance, kept)
-            N_inv, det = inverted(N)
-            if not det > 0.0:
-                return False, False, place, N_inv
-            for i in range(3):
-                motion[i] = N_inv[i, 0] * b[0] + N_inv[i, 1] * b[1] + N_inv[i, 2] * b[2]
-            agree, misfit = _agreeing(lever, off, variance, motion, may, kept)
-            if agree < fewest:
-                return False, False, place, N_inv
-        place += motion
+    fit = _fitted(pose, centre, R, known, spread, well, trust)
+    if fit.agree > 0:
+        fit = _fitted(fit.place, centre, R, known, spread, well, trust)
+    place, agree, N_inv = fit.place, fit.agree, fit.covariance
+    if agree == 0:
+        return False, False, place, N_inv
     shift = place - pose
     away = shift[0] * shift[0] + shift[1] * shift[1] + (LEVER * shift[2]) ** 2
     least = LEAST + trust.distrust * (STILL_LEAST - LEAST)
     # Landmarks that other trees hide are not expected.
-    expected = may.sum() + _missed(place, centre, known, votes, owner, clear_range)
-    if agree < CONVINCING * expected or misfit > MISFIT or away < least * least:
+    expected = fit.voting + _missed(place, centre, known, fit.votes, fit.owner, clear_range)
+    if agree < CONVINCING * expected or fit.misfit > MISFIT or away < least * least:
         return False, False, place, N_inv
-    square = _deviations(lever, off, motion)
-    lever, off, variance, _ = _pair_arrays(pose, centre, R, known, spread, owner)
-    if _standing(lever, off, variance, position, heading, square, kept) > agree // STANDING:
+    lever, off, variance, _ = _pair_arrays(pose, centre, R, known, spread, fit.owner)
+    if _standing(lever, off, variance, position, heading, fit.square, fit.kept) > agree // STANDING:
         return False, False, place, N_inv
-    N_inv *= max(1.0, misfit)
+    N_inv *= max(1.0, fit.misfit)
     S = N_inv.copy()
     S[0, 0] += position
     S[1, 1] += position
@@ -120,6 +104,63 @@ def estimate_rigid_shift(
             total += shift[i] * S_inv[i, j] * shift[j]
     significant, enough = total > beyond * beyond, agree >= SEVERAL or trust.distrust > 0.0
     return significant and enough, significant and not enough, place, N_inv
+
+
+class Fit(NamedTuple):
+    """Rigid motion that fits detections to landmarks.
+
+    Attributes:
+        agree: Number of agreeing pairs; 0 if they are too few or determine no motion, and then the other
+            attributes have no meaning.
+        place: Pose x, y [m], yaw [rad] after the motion, shape (3,).
+        covariance: Its covariance relative to the landmarks, shape (3, 3).
+        misfit: Sum of squared normalised deviations per degree of freedom.
+        votes: Landmarks that vote, shape (L,).
+        voting: Number of pairs with these landmarks.
+        owner: Detection of each landmark, -1 for none, int64, shape (L,).
+        square: Squared deviation of each pair after the motion, shape (K,) [m^2].
+        kept: Which pairs agree, shape (K,).
+    """
+
+    agree: int
+    place: Float
+    covariance: Float
+    misfit: float
+    votes: Bool
+    voting: int
+    owner: Int
+    square: Float
+    kept: Bool
+
+
+@compiled
+def _fitted(
+    pose: Float, centre: Float, R: Float, known: Float, spread: Float, well: Bool, trust: OdometryTrust
+) -> Fit:
+    """Return the least-squares motion of the pairs at a pose, without the pairs that do not agree with it.
+    See `estimate_rigid_shift` for the arguments."""
+    owner = _pairs(pose, centre, known)
+    lever, off, variance, landmark = _pair_arrays(pose, centre, R, known, spread, owner)
+    familiar = trust.known_share >= FAMILIAR and well[landmark].sum() >= FEWEST
+    fewest, votes = (FEWEST, well) if familiar else (MANY, np.ones(well.shape[0], np.bool_))
+    may = votes[landmark]
+    kept, voting, agree, misfit = may.copy(), may.sum(), may.sum(), 0.0
+    motion, N_inv = np.zeros(3), np.zeros((3, 3))
+    for _ in range(ROUNDS):
+        if agree < fewest:
+            agree = 0
+            break
+        N, b = _normal_equations(lever, off, variance, kept)
+        N_inv, det = inverted(N)
+        if not det > 0.0:
+            agree = 0
+            break
+        for i in range(3):
+            motion[i] = N_inv[i, 0] * b[0] + N_inv[i, 1] * b[1] + N_inv[i, 2] * b[2]
+        agree, misfit = _agreeing(lever, off, variance, motion, may, kept)
+    agree = agree if agree >= fewest else 0
+    square = _deviations(lever, off, motion)
+    return Fit(agree, pose + motion, N_inv, misfit, votes, voting, owner, square, kept)
 
 
 @compiled

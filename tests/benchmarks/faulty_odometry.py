@@ -75,13 +75,13 @@ class SimulatedDrive:
 
     def mapped(self, fault: Fault) -> DriveResult:
         """Map the drive with a fault of the odometry."""
-        mapper, errors, silent = self._mapper(), [], 0
+        mapper, errors, silent, found = self._mapper(), list[float](), 0, np.zeros((0, 2))
         for step in steps(with_fault(self._records, fault)):
             frame = mapper.process(step, self._scans[step.index])
             pose = frame.estimate.T_map_base
-            errors.append(np.hypot(*(self._true_position(frame.stamp_ns) - [pose.x, pose.y])))
+            errors.append(float(np.hypot(*(self._true_position(frame.stamp_ns) - [pose.x, pose.y]))))
             silent += bool(errors[-1] > WRONG and frame.health.state == "good")
-        found = frame.trees.position[frame.trees.confirmed]
+            found = frame.trees.position[frame.trees.confirmed]
         false, missing = self._compared(found)
         return DriveResult(max(errors), false, missing, silent)
 
