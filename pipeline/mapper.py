@@ -284,7 +284,7 @@ class Mapper:
         before, now = self._odometry, step.T_odom_base
         self._odometry = before if now is None else now
         driven = Pose2() if before is None or now is None else before.inverse() @ now
-        if step.unreported is not None:
+        if before is not None and step.unreported is not None:
             if not self._slam.is_led_by_trees:
                 return self._gated(Motion(driven, step.slack, step.doubt, step.measured))
             driven = step.unreported.inverse() @ driven

@@ -8,7 +8,7 @@ import re
 import secrets
 import shutil
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -53,7 +53,7 @@ class Uploads:
     def __init__(self, folder: Path | None, limit: int, store: AsyncStore) -> None:
         self._folder, self.limit, self._store = folder, limit, store
         self._under_way = 0
-        self._reserved = 0  # bytes of the uploads that are in progress
+        self._awaited = 0  # bytes that active uploads have not written yet
 
     def room(self) -> int:
         """Return the maximum size of an upload at present [bytes]: the limit or the free disk space without a
@@ -62,7 +62,7 @@ class Uploads:
         Raises:
             UploadError: There is no folder for uploads, or it cannot be created.
         """
-        return max(0, min(self.limit, self._free() - self._reserved))
+        return self._room(self._free())
 
     async def take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
         """Receive a file, check it in a child process, and return its path (`uri`), name, format (`kind`) and
@@ -87,7 +87,8 @@ class Uploads:
 
     async def _take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
         """Receive a file; as `take`, without the limit of simultaneous uploads."""
-        room = await asyncio.to_thread(self.room)
+        free = await asyncio.to_thread(self._free)
+        room = self._room(free)  # without an await in between, other uploads cannot take the same space
         if size > room:
             why = "the limit" if size > self.limit else "what the disk has free"
             raise UploadError(
@@ -99,9 +100,8 @@ class Uploads:
         suffix = Path(name).suffix.lower()
         suffix = suffix if _SUFFIX.match(suffix) else ""
         part = self._place() / f"{_PART}{secrets.token_hex(8)}{suffix}"
-        self._reserved += size
         try:
-            await _write(part, size, stream)
+            await self._write(part, size, stream)
             kind = await _look_at(part, name)
             made_up = f"upload-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}{suffix}"
             place = part.with_name(made_up)
@@ -109,7 +109,6 @@ class Uploads:
         except OSError as error:
             raise UploadError(507, f"the file cannot be kept: {error.strerror}", where=name) from None
         finally:
-            self._reserved -= size
             part.unlink(missing_ok=True)
         with contextlib.suppress(StemmapError):  # it is then listed under its generated name
             await self._store.ask(lambda store: store.book.add_upload(made_up, _shown(name), kind, size))
@@ -118,6 +117,26 @@ class Uploads:
     def _free(self) -> int:
         """Return the free disk space without SPARE_BYTES [bytes]; may be negative."""
         return shutil.disk_usage(self._place()).free - SPARE_BYTES
+
+    def _room(self, free: int) -> int:
+        """Return the maximum size of an upload with a free disk space, see `_free` [bytes]."""
+        return max(0, min(self.limit, free - self._awaited))
+
+    async def _write(self, part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
+        """Write the file, and reserve the space that is not written yet against other uploads. Arguments and
+        errors as in `take`."""
+        awaited = size
+
+        def wrote(length: int) -> None:
+            nonlocal awaited
+            awaited -= length
+            self._awaited -= length
+
+        self._awaited += size
+        try:
+            await _write(part, size, stream, wrote)
+        finally:
+            self._awaited -= awaited
 
     def clear(self) -> None:
         """Remove incomplete uploads that were not written for an hour: those of servers that were
@@ -143,13 +162,14 @@ class Uploads:
         return self._folder
 
 
-async def _write(part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
+async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]) -> None:
     """Write the file in large blocks, each in a thread.
 
     Args:
         part: File to write; it must not exist.
         size: Announced length [bytes].
         stream: The contents.
+        wrote: Called with the length of each block but the last.
 
     Raises:
         UploadError: The browser disconnected, stalled, or sent another length than announced. What has been
@@ -164,6 +184,7 @@ async def _write(part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
             if len(waiting) >= _CHUNK:
                 written += len(waiting)
                 await asyncio.to_thread(file.write, bytes(waiting))
+                wrote(len(waiting))
                 waiting.clear()
         written += len(waiting)
         await asyncio.to_thread(file.write, bytes(waiting))

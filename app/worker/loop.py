@@ -1,7 +1,7 @@
 """Main loop of the mapping process: executes commands between two scans, keeps the time of the replay, and
 sends results to the web process.
 
-The way of a scan from the source to the browsers, from `WorkerLoop.run` on:
+Path of a scan from the source to the browsers, from `WorkerLoop.run` on:
 
 1. `WorkerLoop._map_next` calls `Session.work`, which calls `Run.map_next` (`run.py`).
 2. `Cursor.take` (`cursor.py`) returns the next step: scan, odometry and tilt, joined by the synchroniser.

@@ -245,7 +245,7 @@ class Run:
 
     def remap(self, parameters: Parameters) -> None:
         """Begin to map the run again from its first scan, in place of a rerun that is not complete, and
-        compute the preview. Nothing begins if the map would not change. The map changes in `remap_on`."""
+        compute the preview. Nothing begins if the map would not change. The map changes in `remap_next`."""
         self.cancel_remapping()
         if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
             return

@@ -265,7 +265,7 @@ class WorkerProcess:
                 if limit_s is None:
                     silent_s = 0.0
                     continue
-                silent_s += limit_s / _NOTICE_SHARE
+                silent_s += pause_s or 0.0
                 if silent_s >= limit_s:
                     return None
                 if limit_s == self._silence_limit_s:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from fastapi import APIRouter, Depends, Path, Query
@@ -29,7 +29,8 @@ from app.web.routes.access import Bounds, Dash, ViewerTurn
 from app.worker.protocol import CloudFrame, Shown
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
-from pipeline.types.records import Trees
+from pipeline.types.records import Frame, Trees
+from pipeline.types.records import Path as RobotPath
 
 router = APIRouter(prefix="/api")
 
@@ -98,8 +99,14 @@ async def export(
     """Return the map as a file for GIS, CAD or spreadsheets, in local coordinates or those of a whole cloud;
     a Shapefile as zip archive. For a run of scans, the bytes are those of `stemmap export` for a run with the
     same map. 409 before the first map; 422 if a package is missing or the map lacks what the format shows."""
+    if dashboard.path is None:
+        raise NothingMappedError
+    # All parts are of one run: another source may be opened while the file is written.
+    run = _MappedRun(
+        dashboard.source.uri, shown.frame, dashboard.path, dashboard.start_ns, dashboard.status.cloud
+    )
     try:
-        content, name = await asyncio.to_thread(_exported, dashboard, shown, f".{suffix}")
+        content, name = await asyncio.to_thread(_exported, run, f".{suffix}")
     except StemmapError as error:
         return failure_reply(422, error)
     headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
@@ -112,24 +119,40 @@ def _in_file(trees: Trees, cloud: CloudFrame | None) -> Trees:
     return trees if cloud is None else replace(trees, position=trees.position + cloud.offset[:2])
 
 
-def _exported(dashboard: Dashboard, shown: Shown, suffix: str) -> tuple[bytes, str]:
-    """Return the bytes and the name of the exported file, see `export`; NothingMappedError without a path."""
+class _MappedRun(NamedTuple):
+    """Parts of the newest map that an export contains.
+
+    Attributes:
+        uri: URI of the source.
+        frame: Newest results.
+        path: The estimated path.
+        start_ns: Time of the first scan [ns].
+        cloud: Frame of a whole cloud; None for a run of scans.
+    """
+
+    uri: str
+    frame: Frame
+    path: RobotPath
+    start_ns: int
+    cloud: CloudFrame | None
+
+
+def _exported(run: _MappedRun, suffix: str) -> tuple[bytes, str]:
+    """Return the bytes and the name of the exported file, see `export`."""
     from app.batch.export import export_bytes, for_export
     from app.batch.georeference import MapFrame
     from app.batch.run_folder import as_written
     from pipeline.io.result_files import terrain_rows
 
-    path, ground, cloud = dashboard.path, shown.frame.ground, dashboard.status.cloud
-    if path is None:
-        raise NothingMappedError
+    ground, cloud = run.frame.ground, run.cloud
     cells = [] if ground is None else [[float(cell) for cell in row[:3]] for row in terrain_rows(ground)]
     terrain = np.array(cells, np.float64).reshape(-1, 3)
     frame = MapFrame()
     if cloud is not None:
         terrain += cloud.offset
         frame = MapFrame(cloud.crs, how="the cloud's own" if cloud.crs else "")
-    written = as_written(_in_file(shown.frame.trees, cloud), path, dashboard.start_ns)
-    return export_bytes(for_export(dashboard.source.uri, *written, terrain, frame), suffix)
+    written = as_written(_in_file(run.frame.trees, cloud), run.path, run.start_ns)
+    return export_bytes(for_export(run.uri, *written, terrain, frame), suffix)
 
 
 @router.get("/evaluation")

@@ -133,6 +133,23 @@ async def test_two_uploads_at_once_share_the_room(recordings: Path, monkeypatch:
     assert room_of_uploads.room() == 100
 
 
+async def test_uploads_that_start_together_do_not_take_the_same_space(
+    recordings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(recordings.parent)._replace(free=uploads.SPARE_BYTES + 100)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _place: usage)
+
+    async def content() -> AsyncIterator[bytes]:
+        await asyncio.sleep(0.05)
+        yield b"good" + bytes(66)
+
+    together = Uploads(recordings, 1000, AsyncStore(None))
+    done = await asyncio.gather(
+        *(together.take(f"{name}.mcap", 70, content()) for name in "ab"), return_exceptions=True
+    )
+    assert sum(isinstance(one, UploadError) for one in done) == 1
+
+
 async def quick_short() -> AsyncIterator[bytes]:
     yield b"goo"
 
