@@ -151,12 +151,13 @@ class Inventory:
         p = self._kept[1]
         share = vote(p.features, self._forests(parameters.classification.forest, True))
         parts = [np.zeros((0, len(slice_heights()), FIGURES))]
+        described = [describe_stems(parts[0])]
         for k in range(0, len(p.axes), TRACED):
             yield 0.5 + 0.4 * k / len(p.axes)
             parts.append(trace(p.slices, p.axes[k : k + TRACED], r_min, r_max))
-        circles = np.concatenate(parts)
+            described.append(describe_stems(parts[-1]))
+        circles, stems = np.concatenate(parts), np.concatenate(described)
         yield 0.9
-        stems = describe_stems(circles)
         verdict = classify_stems(stems, share, parameters.detection.radius_min, r_max)
         kept = np.flatnonzero(~is_repeated(stems, p.axes, verdict))
         circles, stems, share, verdict = circles[kept], stems[kept], share[kept], verdict[kept]

@@ -11,7 +11,7 @@ from pipeline.classification.forest import CLASSES
 from pipeline.detection.verdicts import Check
 from pipeline.geometry.poses import Float
 from pipeline.inventory.cross_sections import STEP, TUKEY, slice_heights, without_scatter
-from pipeline.inventory.stem_tracing import ALIKE, BREAST
+from pipeline.inventory.stem_tracing import BREAST
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Int32, Verdict
 
@@ -20,6 +20,7 @@ _MAX: Final = "at most"
 
 LOCAL = 1.0  # m above and below breast height in which the taper is nearly constant
 MODEL = 0.003  # m; deviation of a trunk from a circle
+BESIDE = 0.3  # m outside of a stem; bark, root flares and branches form columns here that are no trees
 LEAST_HIGH = 1.2  # m; least height of a stem
 FILLED = 2.0 / 3.0  # least share of the slices between the lowest and the highest with a circle
 STRAIGHT = 0.1  # largest offset from a straight axis and an even taper, as a share of the radius
@@ -203,6 +204,7 @@ def is_repeated(stems: Stems, axes: Float, verdict: Int32) -> Bool:
 
     Two stems are at the same place if the axis of one is inside of the other at the middle of the heights
     that both have, or half-way between them. A column without a circle is at its own axis.
+    A stem that is not a tree is also repeated up to BESIDE outside of another one.
 
     Args:
         stems: Result of `describe_stems`, shape (K,).
@@ -222,7 +224,7 @@ def is_repeated(stems: Stems, axes: Float, verdict: Int32) -> Bool:
         at = 0.5 * (np.maximum(first[i], first[kept]) + np.minimum(last[i], last[kept])) - BREAST
         dx = x[i] - x[kept] + at * (lean_x[i] - lean_x[kept])
         dy = y[i] - y[kept] + at * (lean_y[i] - lean_y[kept])
-        reach = np.maximum(radius[i], radius[kept]) + (0.0 if verdict[i] == Verdict.TREE else ALIKE)
+        reach = np.maximum(radius[i], radius[kept]) + (0.0 if verdict[i] == Verdict.TREE else BESIDE)
         again[i] = (dx * dx + dy * dy < reach * reach).any()
         if not again[i]:
             kept = np.append(kept, i)

@@ -23,6 +23,7 @@ CELL = 0.5  # m
 KEPT = 8  # lowest returns of a cell
 TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
 PIT = 0.5  # m; a cell this far below its neighbours is noise
+BLOCK = 32  # columns of the raster whose neighbours are sorted at once, to bound the memory
 TOLERANCE = 0.15  # m; grass and noise above the steepest slope
 
 
@@ -234,31 +235,56 @@ def _remove_pits(z: Float, upright: Bool) -> None:
         z: Lowest returns above the trend, shape (columns, rows) [m]; removed cells become infinite.
         upright: Result of `_continues_upwards`, same shape.
     """
-    around = np.lib.stride_tricks.sliding_window_view(np.pad(z, 2, constant_values=np.inf), (5, 5))
-    around = np.sort(np.delete(around.reshape(*z.shape, 25), 12, axis=2), axis=2)
-    known = np.isfinite(around).sum(axis=2)
-    quartile = np.take_along_axis(around, np.minimum(known // 4, 23)[:, :, None], axis=2)[:, :, 0]
-    z[(known >= 4) & ~upright & (z < quartile - PIT)] = np.inf
+    before = np.pad(z, 2, constant_values=np.inf)
+    for first in range(0, len(z), BLOCK):
+        part, rows = z[first : first + BLOCK], slice(first, first + BLOCK + 4)
+        around = np.lib.stride_tricks.sliding_window_view(before[rows], (5, 5))
+        around = np.sort(np.delete(around.reshape(*part.shape, 25), 12, axis=2), axis=2)
+        known = np.isfinite(around).sum(axis=2)
+        quartile = np.take_along_axis(around, np.minimum(known // 4, 23)[:, :, None], axis=2)[:, :, 0]
+        part[(known >= 4) & ~upright[first : first + BLOCK] & (part < quartile - PIT)] = np.inf
 
 
 def _remove_overhanging(z: Float, slope: float) -> None:
     """Remove cells that are steeper above a lower cell than the terrain can be, in place.
 
-    The cone of the maximum slope of each cell is propagated over the raster (a chamfer distance).
-
     Args:
         z: Lowest returns above the trend, shape (columns, rows) [m]; removed cells become infinite.
         slope: Maximum slope (rise over run).
     """
-    from scipy.ndimage import minimum_filter
+    rise = slope * CELL
+    z[z > _lowest_cone(z, rise) + TOLERANCE + rise] = np.inf
 
-    rise, straight = slope * CELL, np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.bool_)
-    before, cone = np.full_like(z, np.nan), z.copy()
-    while not np.array_equal(before, cone):
-        before = cone
-        cone = np.minimum(cone, minimum_filter(before, footprint=straight, mode="nearest") + rise)
-        cone = np.minimum(cone, minimum_filter(before, size=3, mode="nearest") + rise * np.sqrt(2.0))
-    z[z > cone + TOLERANCE + rise] = np.inf
+
+@compiled
+def _lowest_cone(z: Float, rise: float) -> Float:
+    """Return the height of the lowest of the cones that rise from all cells, shape (columns, rows) [m].
+
+    The cones are propagated by one pass over the raster in each direction (a chamfer distance).
+
+    Args:
+        z: Heights of the cells, shape (columns, rows) [m], infinite for none.
+        rise: Rise of a cone from a cell to the next one [m].
+    """
+    columns, rows = z.shape
+    cone, across = z.copy(), rise * np.sqrt(2.0)
+    for turn in (1, -1):
+        for p in range(columns):
+            a = p if turn == 1 else columns - 1 - p
+            before = a - turn
+            for q in range(rows):
+                b = q if turn == 1 else rows - 1 - q
+                best = cone[a, b]
+                if 0 <= before < columns:
+                    best = min(best, cone[before, b] + rise)
+                    if b > 0:
+                        best = min(best, cone[before, b - 1] + across)
+                    if b + 1 < rows:
+                        best = min(best, cone[before, b + 1] + across)
+                if 0 <= b - turn < rows:
+                    best = min(best, cone[a, b - turn] + rise)
+                cone[a, b] = best
+    return cone
 
 
 def _interpolated(places: Float, z: Float, centre: Float) -> Float:
