@@ -24,6 +24,9 @@ from pipeline.types.records import (
 
 OdometryChoice = Literal["auto", "wheels", "static"]
 WAIT_NS = 500_000_000  # time for which a scan waits for later odometry
+#: Scans that wait at most. It bounds the memory where damaged stamps are nearly equal: a scan of 100,000
+#: points takes about 3 MB. Sensors of up to 100 Hz send fewer within WAIT_NS.
+MOST_WAITING = 64
 STALE_NS = 250_000_000  # readings farther in time from a scan are not used
 JUMP_SLACK = (0.2, 0.05)  # m, rad; one sigma of the motion during a jump of the odometry
 PAUSE_NS = 10_000_000_000  # a longer time without a scan is reported
@@ -47,9 +50,10 @@ def steps(
     """Yield a step for each scan: the scan with odometry and tilt interpolated to its time, the measured
     pose, and the turn by the gyroscope.
 
-    A scan waits for the first odometry at or after its stamp, until a scan is WAIT_NS later; then the last
-    pose is used. A scan that is not later than the last one is left out, counted in `losses`, and reported in
-    the warnings of the next step. Without any odometry the step has no pose.
+    A scan waits for the first odometry at or after its stamp, until a scan is WAIT_NS later or more than
+    MOST_WAITING scans wait; then the last pose is used. A scan that is not later than the last one is left
+    out, counted in `losses`, and reported in the warnings of the next step. Without any odometry the step has
+    no pose.
 
     Args:
         records: Records in the order of arrival.
@@ -225,8 +229,8 @@ class Synchroniser:
 
     def _is_ready(self, scan: Scan) -> bool:
         """Return whether a waiting scan can be joined: its odometry has arrived, a waiting scan is WAIT_NS
-        later, or odometry is not used."""
-        if self._scans[-1].stamp_ns - scan.stamp_ns >= WAIT_NS:
+        later, more than MOST_WAITING scans wait, or odometry is not used."""
+        if self._scans[-1].stamp_ns - scan.stamp_ns >= WAIT_NS or len(self._scans) > MOST_WAITING:
             return True
         newest = self._odometry.newest
         return not self._use_odometry if newest is None else newest.stamp_ns >= scan.stamp_ns

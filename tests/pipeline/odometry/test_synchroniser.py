@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
-from pipeline.odometry.synchroniser import steps
+from pipeline.odometry.synchroniser import MOST_WAITING, steps
 from pipeline.types.records import Imu, Odometry, Step
 from tests.pipeline.strategies import scan
 
@@ -200,6 +200,21 @@ def test_memory_does_not_grow_with_the_run():
     joiner = stream.gi_frame.f_locals["joiner"]
     assert len(joiner._odometry._readings) < 300
     assert len(joiner._imu) < 300
+
+
+def test_few_scans_wait_when_their_stamps_are_nearly_equal():
+    given_out = []
+
+    def records():
+        yield odometry(0)
+        for k in range(1000):
+            given_out.append(k)
+            yield at(10 + 1e-3 * k)
+
+    stream = steps(records())
+    next(stream)
+    assert len(given_out) == MOST_WAITING + 1
+    assert len(list(stream)) == 999
 
 
 def test_the_motion_of_a_gap_is_reported_apart_when_the_odometry_returns():
