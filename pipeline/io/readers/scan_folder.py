@@ -48,7 +48,7 @@ class ScanFolder(FileSource):
         options: Extrinsics.
 
     Raises:
-        SourceError: None of the first files holds a scan.
+        SourceError: There are no files, or none of the first ones holds a scan.
         OSError: The folder cannot be read.
     """
 
@@ -58,6 +58,8 @@ class ScanFolder(FileSource):
         super().__init__()
         self._suffix, self._files = _scan_files(path)
         self._kind, self._load, sensor_of_first = FORMATS[self._suffix]
+        if not self._files:
+            raise SourceError(f"the folder has no {self._suffix} files", where=uri)
         self._warnings: list[str] = []
         self._texts: list[Path] = []
         numbers = np.array([_number(file) for file in self._files], dtype=np.int64)

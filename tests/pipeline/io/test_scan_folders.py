@@ -9,6 +9,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
+from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
@@ -122,3 +123,10 @@ def test_a_damaged_scan_is_counted_and_the_others_are_read(tmp_path: Path, opene
     source = opened(tmp_path)
     assert sum(isinstance(record, Scan) for record in source.records()) == 2
     assert source.losses == {"scan files that cannot be read": 1}
+
+
+def test_a_folder_of_broken_links_is_refused(tmp_path: Path, opened: Opened):
+    (tmp_path / "velodyne").mkdir()
+    (tmp_path / "velodyne" / "000000.bin").symlink_to(tmp_path / "missing.bin")
+    with pytest.raises(SourceError, match=r"the folder has no \.bin files"):
+        opened(tmp_path)
