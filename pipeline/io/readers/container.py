@@ -119,7 +119,7 @@ class Container:
 
 class IndexedContainer(Container):
     """A recording with an index of all its messages. A format calls `_set_index` and implements
-    `_payload`."""
+    `_message`."""
 
     #: What is counted for a message whose bytes cannot be read.
     unreadable: str
@@ -136,11 +136,11 @@ class IndexedContainer(Container):
         first = 0 if start_ns is None else int(np.searchsorted(self.index[:, 1], start_ns))
         for row in first + np.flatnonzero(np.isin(self.index[first:, 0], list(numbers))):
             number, log_ns, place = self.index[row].tolist()
-            payload = self._payload(number, place)
-            if payload is None:
+            message = self._message(number, log_ns, place)
+            if message is None:
                 count_loss(losses, self.unreadable)
             else:
-                yield Message(number, log_ns, plain(payload))
+                yield replace(message, payload=plain(message.payload))
 
     def _set_index(self, channels: Iterable[Channel], index: Int) -> None:
         """Store the channels, with their numbers of messages, and the index.
@@ -156,9 +156,15 @@ class IndexedContainer(Container):
         )
         self.channels = [replace(channel, count=counts.get(channel.number, 0)) for channel in channels]
 
-    def _payload(self, number: int, place: int) -> bytes | None:
-        """Return the bytes of a message of a channel by its place in the index; None if they cannot be read.
-        Subclasses implement it."""
+    def _message(self, number: int, log_ns: int, place: int) -> Message | None:
+        """Return the message of a row of the index, as it is stored; None if it cannot be read. Subclasses
+        implement it.
+
+        Args:
+            number: Number of its channel.
+            log_ns: Time of recording by the index [ns].
+            place: Place of the message.
+        """
         raise NotImplementedError
 
 
@@ -278,6 +284,7 @@ class Chunk:
         crc: CRC-32 of the unpacked bytes, 0 when the file has none.
         index: Channel, time of recording [ns] and offset in the unpacked bytes of its messages, int64, shape
             (N, 3) each; empty if the file has no index of the chunk.
+        index_is_whole: False if a part of the index may be missing.
     """
 
     offset: int
@@ -286,6 +293,7 @@ class Chunk:
     size: int
     crc: int = 0
     index: list[Int] = field(default_factory=list)
+    index_is_whole: bool = True
 
 
 class ChunkedFile(IndexedContainer):
@@ -307,7 +315,8 @@ class ChunkedFile(IndexedContainer):
         self._path = path
         self._known: dict[int, Channel] = {}
         self._chunks: list[Chunk] = []
-        self._unpacked: dict[int, bytes] = {}  # by offset, the chunk that was read last is the last one
+        # By offset, None for damaged chunks; the chunk that was read last is the last one.
+        self._unpacked: dict[int, bytes | None] = {}
         try:
             self._file = path.open("rb", buffering=0)
         except OSError as error:
@@ -322,7 +331,9 @@ class ChunkedFile(IndexedContainer):
             if not self._known:
                 raise damaged("the recording holds no messages that can be read", path)
             table = np.concatenate(index)
+            recorded_ns = table[:, 1].copy()
             self.clock_steps = shift_after_steps(table)
+            self._places, self._shifts_ns = table[:, 2], table[:, 1] - recorded_ns
             self._set_index((self._known[number] for number in sorted(self._known)), table)
         except BaseException:
             self.close()
@@ -376,40 +387,49 @@ class ChunkedFile(IndexedContainer):
         because chunks may overlap in time.
 
         Raises:
-            BrokenChunkError: It is damaged or empty.
+            BrokenChunkError: It is damaged.
         """
-        raw = self._unpacked.pop(chunk.offset, None)
-        if raw is None:
+        if chunk.offset in self._unpacked:
+            raw = self._unpacked.pop(chunk.offset)
+        else:
             raw = self._unpack(chunk)
-            while self._unpacked and sum(map(len, self._unpacked.values())) + len(raw) > BLOCK_LIMIT:
+            while self._unpacked and self._unpacked_size() + len(raw or b"") > BLOCK_LIMIT:
                 del self._unpacked[next(iter(self._unpacked))]
         self._unpacked[chunk.offset] = raw
-        if not raw:
+        if raw is None:
             raise BrokenChunkError
         return raw
 
-    def _unpack(self, chunk: Chunk) -> bytes:
-        """Return the unpacked bytes of a chunk, b"" if it is damaged."""
+    def _unpacked_size(self) -> int:
+        """Return the size of the chunks in memory [bytes]."""
+        return sum(len(raw or b"") for raw in self._unpacked.values())
+
+    def _unpack(self, chunk: Chunk) -> bytes | None:
+        """Return the unpacked bytes of a chunk, None if it is damaged."""
         try:
             packed = self._read(chunk.offset, chunk.length) if chunk.length <= BLOCK_LIMIT else b""
             raw = unpack(packed, chunk.compression, chunk.size)
         except BrokenChunkError:
-            return b""
-        return raw if not chunk.crc or zlib.crc32(raw) == chunk.crc else b""
+            return None
+        return raw if not chunk.crc or zlib.crc32(raw) == chunk.crc else None
 
-    def _payload(self, number: int, place: int) -> bytes | None:
-        """Return the bytes of a message, see `IndexedContainer._payload`; None also if there is no message of
-        this channel."""
+    def _message(self, number: int, log_ns: int, place: int) -> Message | None:
+        """Return a message, see `IndexedContainer._message`; None also if there is no message of this
+        channel. Its time is that of its own record, because the time in the index may be damaged."""
+        del log_ns
         try:
             message, _ = self._record(self._bytes_of(self._chunks[place >> 32]), place & 0xFFFFFFFF)
         except (BrokenChunkError, *DAMAGE):
             return None
-        return None if message is None or message.channel != number else message.payload
+        if message is None or message.channel != number:
+            return None
+        shift_ns = int(self._shifts_ns[np.searchsorted(self._places, place)])
+        return replace(message, log_ns=message.log_ns + shift_ns)
 
     def _rows_of(self, chunk: Chunk) -> Int:
         """Return the index of a chunk in the order of the file, int64, shape (N, 3); it is made anew if the
-        file has none, or an impossible one."""
-        if chunk.index:
+        file has no whole one, or an impossible one."""
+        if chunk.index and chunk.index_is_whole:
             rows = np.concatenate(chunk.index)
             rows = rows[np.argsort(rows[:, 2], kind="stable")]
             known = np.isin(rows[:, 0], list(self._known)).all()

@@ -90,6 +90,8 @@ class McapFile(ChunkedFile):
         for chunk in self._chunks:
             try:
                 raw = self._bytes_of(chunk)
+                if not raw:
+                    continue
                 stream = io.BytesIO(raw)
                 for record in StreamReader(stream, skip_magic=True, emit_chunks=True).records:
                     yield record
@@ -124,13 +126,13 @@ class McapFile(ChunkedFile):
             if opcode == Opcode.FOOTER:
                 break
         if not whole:
+            if self._chunks:
+                self._chunks[-1].index_is_whole = False
             read = self._read_summary(at)
             if read:
                 count_loss(self.damage, "bytes between damaged records", read - at)
             elif end > at:
                 count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
-                if self._chunks:  # a part of its index may be missing
-                    self._chunks[-1].index.clear()
             else:
                 count_loss(self.damage, NOT_FINISHED)
 
@@ -157,7 +159,7 @@ class McapFile(ChunkedFile):
 
     def _take_or_count(self, opcode: int, body: int, length: int) -> bool:
         """Store the contents of a record, see `_take`. Return whether it could be read; a damaged record is
-        counted.
+        counted, and may be a part of the index of the last chunk.
 
         Args:
             opcode: Type of the record.
@@ -168,6 +170,8 @@ class McapFile(ChunkedFile):
             self._take(opcode, body, length)
         except DAMAGE:
             count_loss(self.damage, "damaged records of the recording")
+            if self._chunks:
+                self._chunks[-1].index_is_whole = False
             return False
         return True
 
@@ -200,6 +204,8 @@ class McapFile(ChunkedFile):
             case Opcode.MESSAGE:
                 self._add_loose(body - RECORD.size, body + length)
             case Opcode.MESSAGE_INDEX if self._chunks:
+                if length > BLOCK_LIMIT:
+                    raise ValueError("the index of a chunk is too large")
                 content = self._read(body, length)
                 (number,) = struct.unpack_from("<H", content)
                 times = np.frombuffer(content, "<i8", offset=6).reshape(-1, 2)

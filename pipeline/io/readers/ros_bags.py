@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import (
+    BLOCK_LIMIT,
     DAMAGE,
     STRANGE_LIMIT,
     BrokenChunkError,
@@ -30,6 +31,9 @@ from pipeline.io.readers.mcap_file import McapFile
 from pipeline.types.records import Int
 
 MESSAGE_LIMIT = 256 << 20
+#: The channels of the n-th file of a folder are numbered from n times this value; those of one file have
+#: smaller numbers.
+_STRIDE = 1 << 40
 
 
 class Db3File(IndexedContainer):
@@ -69,14 +73,15 @@ class Db3File(IndexedContainer):
         """Close the database."""
         self._database.close()
 
-    def _payload(self, number: int, place: int) -> bytes | None:
-        """Return the bytes of the message in a row of the table; None if they cannot be read."""
-        del number
+    def _message(self, number: int, log_ns: int, place: int) -> Message | None:
+        """Return the message in a row of the table, see `IndexedContainer._message`."""
         try:
             found = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (place,)).fetchone()
         except (sqlite3.Error, MemoryError):
             return None
-        return found[0] if found is not None and isinstance(found[0], bytes) else None
+        if found is None or not isinstance(found[0], bytes):
+            return None
+        return Message(number, log_ns, found[0])
 
     def _check_tables(self) -> None:
         """Check that the tables are plain.
@@ -94,27 +99,29 @@ class Db3File(IndexedContainer):
             raise damaged("the database holds no tables of messages and topics", self._path)
 
     def _read_index(self) -> Int:
-        """Return topic, time [ns] and row of all messages, int64, shape (N, 3). Damaged ones are left out;
-        damaged pages end the list and are counted."""
+        """Return topic, time [ns] and row of all messages, int64, shape (N, 3). Damaged ones are left out
+        and counted; damaged pages end the list and are counted."""
         rows: list[tuple[int, int, int]] = []
         cursor = self._database.execute("SELECT topic_id, timestamp, rowid FROM messages")
         try:
-            rows.extend(row for row in cursor if all(isinstance(cell, int) for cell in row))
+            for row in cursor:
+                if all(isinstance(cell, int) for cell in row) and 0 <= row[0] < _STRIDE:
+                    rows.append(row)
+                else:
+                    count_loss(self.damage, "damaged rows of the database")
         except sqlite3.Error:
             count_loss(self.damage, "pages of the database that cannot be read")
         return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
     def _read_channels(self) -> list[Channel]:
-        """Return the channels by number."""
+        """Return the channels by number; those with an impossible number are left out, as their messages
+        are."""
         rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id")
         return [
             Channel(int(number), str(topic), ros2_type_name(str(msgtype)), str(encoding or ""))
             for number, topic, msgtype, encoding in rows
+            if 0 <= int(number) < _STRIDE
         ]
-
-
-#: The channels of the n-th file are numbered from n times this value.
-_STRIDE = 1 << 40
 
 
 def bag_files(folder: Path) -> list[Path]:
@@ -195,10 +202,11 @@ class BagFolder(IndexedContainer):
         for part in self._parts:
             part.close()
 
-    def _payload(self, number: int, place: int) -> bytes | None:
-        """Return the bytes of a message of the file to which its channel belongs."""
+    def _message(self, number: int, log_ns: int, place: int) -> Message | None:
+        """Return a message of the file to which its channel belongs, see `IndexedContainer._message`."""
         part, own = divmod(number, _STRIDE)
-        return self._parts[part]._payload(own, place)
+        message = self._parts[part]._message(own, log_ns, place)
+        return None if message is None else replace(message, channel=number)
 
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -240,11 +248,13 @@ class BagFile(ChunkedFile):
             except DAMAGE:
                 count_loss(self.damage, "damaged records of the recording")
                 strange += 1
+                if self._chunks:  # the record may be a part of its index
+                    self._chunks[-1].index_is_whole = False
             at = body + length
         if at < end:
             count_loss(self.damage, "bytes at the end of a recording that was cut", end - at)
             if self._chunks:  # a part of its index may be missing
-                self._chunks[-1].index.clear()
+                self._chunks[-1].index_is_whole = False
 
     def _take(self, header: Header, body: int, length: int) -> None:
         """Store the contents of a record: a connection, a chunk, or the counts of a chunk; other kinds are
@@ -269,6 +279,8 @@ class BagFile(ChunkedFile):
             method = header[b"compression"].decode()
             self._chunks.append(Chunk(body, length, method, size))
         elif opcode == INDEX and self._chunks:
+            if length > BLOCK_LIMIT:
+                raise ValueError("the index of a chunk is too large")
             table = np.frombuffer(self._read(body, length), "<u4").reshape(-1, 3).astype(np.int64)
             channel = np.full(len(table), LENGTH.unpack(header[b"conn"])[0])
             times = table[:, 0] * 1_000_000_000 + table[:, 1]
