@@ -61,8 +61,11 @@ def test_a_cluster_of_a_tree_names_the_tree(session: Session):
 
 
 def test_a_tree_tells_its_votes_its_sides_and_how_it_became_sure(session: Session):
-    trees = frame_of(session).trees
-    rows = np.flatnonzero(trees.confirmed & (trees.observations >= 12))
+    frame = frame_of(session)
+    trees, pose = frame.trees, frame.estimate.T_map_base
+    # Columns reach as far as `classification.range_max`, and detections farther.
+    near = np.hypot(*(trees.position - [pose.x, pose.y]).T) < 20.0
+    rows = np.flatnonzero(trees.confirmed & (trees.observations >= 12) & near)
     assert len(rows) > 5
     for row in rows:
         story = tree_story(session.run, session.frame, int(trees.number[row]))
