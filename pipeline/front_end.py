@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.classification import depth_image, steepest_by_direction
+from pipeline.classification.voxel_map import FIRST_SCANS
 from pipeline.config import Parameters
 from pipeline.config.stages import Detection
 from pipeline.detection.cluster_shape import describe_stems, no_lift
@@ -30,10 +31,17 @@ from pipeline.ground.terrain import NO_GROUND, Terrain, height_above, heights_of
 from pipeline.preprocessing import filters
 from pipeline.preprocessing.acquisition import acquire, acquire_near, base_velocity
 from pipeline.stage_timer import StageTimer, no_timer
-from pipeline.types.clearance import Clearance
-from pipeline.types.records import Clusters, Detections, Float32, Int32, Sensor, Stems, Step, UInt16
-
-FIRST_SCANS = 10  # scans that all update columns and terrain, so that a short recording uses all its data
+from pipeline.types.records import (
+    Clearance,
+    Clusters,
+    Detections,
+    Float32,
+    Int32,
+    Sensor,
+    Stems,
+    Step,
+    UInt16,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +124,10 @@ def segment(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, timer: StageTimer = no_timer
 ) -> SegmentedScan:
     """Return a scan filtered and segmented into ground and clusters. It may have no points; without ground in
-    view, heights are None and a warning is added.
+    view, heights are None and a warning is added. The step is unchanged.
+
+    Its counts are "returns", "without a value", "out of range", "out of the box", "ground or too high",
+    "averaged in voxels", "clustered" and "noise"; of detected stems, the first three and "clustered".
 
     Args:
         step: The scan: points of a LiDAR, or stems that another program has detected, each of which becomes a
@@ -138,7 +149,7 @@ def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_ti
     Args:
         scan: The segmented scan.
         parameters: Rules of the verdicts and sigmas of the detections.
-        timer: See `segment`.
+        timer: Called with the name of the stage, "detection"; its context encloses the stage.
     """
     with timer("detection"):
         clusters = classify_clusters(scan.clusters, parameters)
@@ -150,7 +161,8 @@ def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_ti
 def _segment_points(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
-    """Return the segmented scan of a LiDAR; see `segment`."""
+    """Return the segmented scan of a LiDAR; arguments as in `segment`. Only scans that update columns or
+    terrain (`updates_columns`, `updates_terrain`) have their input."""
     with timer("acquisition"):
         raw, sensor_offset = acquire(step, T_base_lidar, p.acquisition)
 
@@ -248,8 +260,8 @@ def _column_input(
 
 
 def _returns(step: Step, raw: Float32) -> dict[str, int]:
-    """Return the numbers of returns: all with a value, those without a value, and those outside of the range
-    limits, which are missing in `raw`."""
+    """Return the numbers of returns by name: "returns", all with a value; "without a value"; and "out of
+    range", those outside of the range limits, which are missing in `raw`."""
     returns = len(step.scan.points)
     return {
         "returns": returns,
@@ -261,8 +273,8 @@ def _returns(step: Step, raw: Float32) -> dict[str, int]:
 def _segment_stems(
     step: Step, stems: Stems, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
-    """Return the segmented scan of stems that another program detected: each stem is a cluster of one point,
-    without ground, column input and clearance; see `segment`."""
+    """Return the segmented scan of stems that another program detected: each stem within the range limits is
+    a cluster of one point, without ground, column input and clearance. `timer` as in `segment`."""
     with timer("acquisition"):
         places, sensor_offset, clusters = external_clusters(step, stems, T_base_lidar, p.acquisition)
 

@@ -13,7 +13,8 @@ from functools import partial
 import numpy as np
 
 from pipeline.classification import ColumnClassifier, ColumnClassifierState, ForestOf, ScanView, package_alone
-from pipeline.classification.voxel_map import VoxelMap
+from pipeline.classification.forest import is_seen_all_around
+from pipeline.classification.voxel_map import FIRST_SCANS, VoxelMap
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
 from pipeline.front_end import DetectionResult, SegmentedScan, detect, segment
@@ -31,8 +32,8 @@ from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
 from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.odometry.gyro import fused
 from pipeline.slam import FastSlam, Motion, SlamState
+from pipeline.slam.measured_pose import REJECTED, within_gate
 from pipeline.slam.motion import noise_of, step_variances
-from pipeline.slam.pose_gate import REJECTED, within_gate
 from pipeline.slam.trajectory_buffer import TrajectoryBuffer
 from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.tracking import Tracker
@@ -114,7 +115,11 @@ class Mapper:
         timer: StageTimer = no_timer,
         forests: ForestOf = package_alone,
     ) -> None:
-        """Create a mapper with an empty map."""
+        """Create a mapper with an empty map.
+
+        Raises:
+            StemmapError: The forest that the parameters name does not exist.
+        """
         self._parameters = parameters
         self._sensor = sensor
         self._T_base_lidar = T_base_lidar
@@ -201,9 +206,9 @@ class Mapper:
 
     @property
     def path(self) -> Path:
-        """The estimated path so far, one row per scan. A correction changes earlier rows. The arrays are
-        copies."""
-        return self._path.columns(self._slam.path())
+        """The estimated path so far, one row per scan. Later paths may have other earlier rows, because of
+        corrections; a path that was returned never changes."""
+        return self._path.path(self._slam.state.path)
 
     @property
     def height_map(self) -> HeightMap:
@@ -240,12 +245,12 @@ class Mapper:
         )
 
     def restore(self, state: MapperState) -> None:
-        """Return to an earlier snapshot of this mapper: its path is the beginning of the present one.
-        Parameters stay; the snapshot is unchanged."""
+        """Return to an earlier snapshot of this mapper, or forward to a later one that it reached before with
+        the same scans and parameters. Parameters stay; the snapshot is unchanged."""
         self._restore_map(state)
         self._tracker.next_number = state.next_number
         self._odometry = state.odometry
-        self._path.cut(state.path_length)
+        self._path.return_to(state.path_length)
         self._placed, self._closed, self._last = state.placed, state.closed, state.last
         self._relocaliser.state = state.recovery.copy()
 
@@ -262,8 +267,8 @@ class Mapper:
         self.restore(state)
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
-        """Set the pose of the base before scan `index`, see `FastSlam.place`. The next scan has no motion by
-        odometry, and loops do not begin before it.
+        """Set the pose of the base before scan `index`: all particles are drawn from it, with the map and the
+        path of the best one. The next scan has no motion by odometry, and loops do not begin before it.
 
         Args:
             index: Number of the next scan.
@@ -284,16 +289,29 @@ class Mapper:
         before, now = self._odometry, step.T_odom_base
         self._odometry = before if now is None else now
         driven = Pose2() if before is None or now is None else before.inverse() @ now
+        motion = Motion(driven, step.slack, step.doubt, step.measured, due=self._is_due(step))
         if before is not None and step.unreported is not None:
             if not self._slam.is_led_by_trees:
-                return self._gated(Motion(driven, step.slack, step.doubt, step.measured))
-            driven = step.unreported.inverse() @ driven
-        return self._gated(self._with_gyro(step, driven))
+                return self._gated(motion)
+            motion = motion._replace(step=step.unreported.inverse() @ driven)
+        return self._gated(self._with_gyro(step, motion))
 
-    def _with_gyro(self, step: Step, driven: Pose2) -> Motion:
-        """Return the motion of a step with the odometry `driven`, fused with the turn by the gyroscope;
-        unchanged if the turn or the odometry is unknown or the parameter `acquisition.gyro` is off."""
-        motion = Motion(driven, step.slack, step.doubt, step.measured)
+    def _is_due(self, step: Step) -> bool:
+        """Return whether the scan updates SLAM however little the robot has moved: one of the first
+        FIRST_SCANS, so that a short recording uses all its data, or the first one of an interval of
+        `slam.update_interval`, because the wheels may be stuck. False if this parameter is 0. Call it before
+        the scan is appended to the path."""
+        interval_ns = round(self._parameters.slam.update_interval * 1e9)
+        if interval_ns == 0:
+            return False
+        if step.index < FIRST_SCANS or not len(self._path):
+            return True
+        return step.scan.stamp_ns // interval_ns > int(self._path.stamp_ns[-1]) // interval_ns
+
+    def _with_gyro(self, step: Step, motion: Motion) -> Motion:
+        """Return the motion of a step fused with the turn by the gyroscope; unchanged if the turn or the
+        odometry is unknown or the parameter `acquisition.gyro` is off."""
+        driven = motion.step
         if step.turn is None or step.T_odom_base is None or not self._parameters.acquisition.gyro:
             return motion
         _, variance = step_variances(driven.x, driven.y, driven.yaw, noise_of(self._parameters.slam))
@@ -357,6 +375,7 @@ class Mapper:
         with self._timer("gathering"):
             pose, offset = estimate.T_map_base, scan.sensor_offset
             view = ScanView(pose, offset, scan.free, given.steepest, given.depth, given.terrain)
+            self._columns.all_around = is_seen_all_around(self._sensor.rings, self._slam.path()[:, :2])
             self._columns.add(given.points, given.height, step.index, view)
             self._columns.columns = self._tracker.classify(
                 step.scan.stamp_ns, self._columns.columns, self._parameters.classification
@@ -399,7 +418,7 @@ class Mapper:
         estimate: PoseEstimate,
     ) -> Correction | None:
         """Begin a search if the robot is lost (`FastSlam.is_lost`), or continue the search. The map is
-        unchanged; see `_apply`.
+        unchanged: `_apply` changes it by the result.
 
         Returns:
             The restart with which a search begins; the pose, the loop or the failure with which it ends; None

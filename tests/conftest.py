@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Callable
@@ -95,6 +96,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return order.get("browser" if name.startswith("browser/") else name, len(order))
 
     items.sort(key=rank)
+
+
+def pytest_collection_finish() -> None:
+    """Leave what is imported and collected out of the searches for garbage, an eighth of the time."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_sessionfinish() -> None:
+    """Let libraries free at the end what they have."""
+    gc.unfreeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

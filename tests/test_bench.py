@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from datetime import date
 from itertools import islice
 from pathlib import Path
@@ -17,6 +18,8 @@ from app.cli import FAILED, WRONG_USAGE, bench, main
 from pipeline.config import preset
 from pipeline.errors import StemmapError
 from tests.benchmarks import process, recorded, runner
+from tests.benchmarks.campaign import Result
+from tests.benchmarks.cases import campaign
 from tests.benchmarks.cases.peer import Comparison, compare
 from tests.benchmarks.peer.fastslam import FastSlam, Landmark, Particle, resample
 from tests.benchmarks.peer.stages import Detection, detect
@@ -120,6 +123,26 @@ def test_a_run_writes_both_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     written = json.loads(json_file.read_text(encoding="utf-8"))
     assert list(written["benchmarks"]) == ["scan"]
     assert written["benchmarks"]["scan"][0]["rows"][1] == ["peer", 1234.5]
+
+
+def test_a_campaign_goes_on_after_its_finished_steps_and_reports_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "campaign"
+    folder.mkdir()
+    before = {"kind": "a", "seconds": 0.0, "result": asdict(Result(done=3, peak_mib=5.0))}
+    (folder / "steps.jsonl").write_text(json.dumps(before) + "\n")
+    kinds = {
+        "a": lambda _turn, _folder: Result(),
+        "b": lambda _turn, _folder: Result(done=1, faults=["it hangs"]),
+    }
+    monkeypatch.setattr(campaign, "FOLDER", folder)
+    monkeypatch.setattr(campaign, "KINDS", kinds)
+    monkeypatch.setattr(campaign, "HOURS", 1e-12)
+    (table,) = campaign.run()
+    assert [row[:5] for row in table.rows] == [("a", 1, 3, 0, 0), ("b", 1, 1, 0, 1)]
+    assert "b: it hangs" in table.notes
+    assert not folder.exists()
 
 
 def test_the_list_runs_nothing(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,3 +269,19 @@ def test_a_recording_gives_back_what_was_written(tmp_path: Path) -> None:
         assert scan.stamp_ns == step.scan.stamp_ns
         assert np.array_equal(scan.points, step.scan.points)
         assert scan.twist == step.twist
+
+
+def test_the_table_of_a_campaign_counts_steps_and_lists_faults() -> None:
+    results = [
+        ("requests", Result(3, ["GET /: 500"], 1.5, 200.0)),
+        ("requests", Result(4)),
+        ("link", Result(1)),
+    ]
+    steps = [{"kind": kind, "seconds": 1800.0, "result": asdict(result)} for kind, result in results]
+    table = campaign._table(steps)
+    rows = {row[0]: row[1:] for row in table.rows}
+    assert table.title.startswith("1.50 h")
+    assert rows["requests"] == (2, 7, 0, 1, 1.5, 200.0)
+    assert rows["link"][:2] == (1, 1)
+    assert "requests: GET /: 500" in table.notes
+    assert "NOT reached" in table.notes[1]

@@ -40,14 +40,12 @@ STAND = "sim:stand?duration=4"
 RUN_CHANGES = {
     "shape.split_slices": 6,
     "slam.particles": 20,
-    "slam.independent_views_max": 50.0,
     "classification.range_max": 12.0,
     "classification.voxels_log2": 12,
     "classification.tree_share": 0.45,
 }
 PAGE_CHANGES = {
     "shape.split_slices": 6,
-    "slam.independent_views_max": 50.0,
     "classification.every": 2,
     "classification.range_max": 12.0,
     "classification.voxels_log2": 14,
@@ -56,17 +54,13 @@ PAGE_CHANGES = {
 CLI_CHANGES = {
     "detection.whole": False,
     "shape.split_slices": 6,
-    "slam.independent_views_max": 50.0,
     "classification.every": 2,
     "classification.range_max": 12.5,
     "classification.tree_share": 0.45,
 }
 # Parameters of 0.1.0 that no longer exist.
-REMOVED = {"shape.plane", "tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"}
-NAMES_OF_0_1_0 = {
-    "shape.split_slices": "shape.slices",
-    "slam.independent_views_max": "slam.looks",
-}
+REMOVED = {"shape.plane", "slam.looks", "tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"}
+NAMES_OF_0_1_0 = {"shape.split_slices": "shape.slices"}
 
 
 def as_saved(changes: dict[str, Any]) -> dict[str, Any]:
@@ -207,7 +201,7 @@ def test_a_learned_forest_is_used(tmp_path: Path):
     forest = f"gathering.forest={FOREST}"
     words = ("map", "sim:stand?duration=1", "--config", CLI_FILE, "--set", forest, "--out", out)
     stemmap(*words, folder=DATA_FOLDER)
-    former = {"ground.height_max": 2.0}  # a default of that version, which the file states
+    former = {"ground.height_max": 2.0, "slam.update_distance": 0.0}  # defaults of that version in the file
     assert record_of(out)["changed"] == {**CLI_CHANGES, **former, "classification.forest": FOREST}
 
 

@@ -298,8 +298,9 @@ def _in_another_run(
 def localise(
     source: Source, parameters: Parameters, reference: MapStems, odometry: OdometryChoice, seed: int
 ) -> Match:
-    """Return the match of the first scans of a source with a map; its pose is that of the first scan. The
-    scans are mapped separately until their stems match, at first after 10 scans.
+    """Return the match of the first scans of a source with a map; its pose is that of the first scan and
+    never None. The scans are mapped separately; the match is tried after 10 scans, then whenever their number
+    has grown by 30 %, and after the last.
 
     Args:
         source: The source.

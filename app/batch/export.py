@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.batch.georeference import MapFrame, heights_at, read_map_frame
+from app.batch.georeference import LOCAL_NAME, WGS84, MapFrame, heights_at, read_map_frame, reproject
 from app.batch.run_folder import read_run, read_terrain
 from app.batch.stand import StandResult
 from app.common.extras import needed
@@ -31,7 +31,7 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.result_files import geojson
 from pipeline.stand.figures import FIGURES
-from pipeline.types.records import Path, Trees
+from pipeline.types.records import Trees
 
 _DATE = datetime.datetime(2000, 1, 1, tzinfo=datetime.UTC)
 # The libraries have settings of the process, which must not change while another thread writes.
@@ -40,7 +40,7 @@ _CELLS_MAX = 25_000_000
 TERRAIN_CELL = 0.5  # m
 CONTOUR_STEP = 0.5  # m
 LOCAL_WKT = (
-    'ENGCRS["local frame of the map",EDATUM["origin of the map"],CS[Cartesian,2],'
+    f'ENGCRS["{LOCAL_NAME}",EDATUM["origin of the map"],CS[Cartesian,2],'
     'AXIS["x",unspecified,ORDER[1]],AXIS["y",unspecified,ORDER[2]],LENGTHUNIT["metre",1]]'
 )
 
@@ -71,6 +71,7 @@ TREE_FIELDS = (
     Field("height_m", "height_m", "m", "height of the tree; empty where its top is not seen"),
     Field("sigma_height_m", "sh_m", "m", "standard deviation of the height"),
     Field("lean_deg", "lean_deg", "deg", "angle of the stem from the vertical"),
+    Field("review", "review", "", "state of the review: open, or confirmed by a person"),
 )
 #: Names of the figures of a plot in a Shapefile.
 PLOT_SHORT = {
@@ -80,6 +81,8 @@ PLOT_SHORT = {
     "g_ha": "g_ha",
     "g_ha_plain": "g_ha_plain",
     "g_ha_corrected": "g_ha_corr",
+    "v_ha": "v_ha",
+    "v_ha_corrected": "v_ha_corr",
     "dg_cm": "dg_cm",
     "mean_dbh_cm": "dm_cm",
     "dominant_dbh_cm": "ddom_cm",
@@ -98,7 +101,7 @@ class ExportedRun:
         trees: Its confirmed trees.
         frame: Its reference system.
         place: East, north of the trees, or x, y of a local map, shape (T, 2) [m].
-        columns: Values of TREE_FIELDS by name; NaN for unknown values.
+        columns: Arrays of the values of TREE_FIELDS by name, shape (T,), rounded; NaN for unknown values.
         path: The path, shape (N, 2) [m].
         plots: Plots in these coordinates, with their figures by name.
         terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
@@ -119,8 +122,8 @@ class ExportedRun:
         return self.frame.crs or LOCAL_WKT
 
 
-def read_for_export(folder: FilePath, of_plots: StandResult | None = None) -> ExportedRun:
-    """Return a run with its values for export.
+def read_for_export(folder: FilePath, of_plots: StandResult | None) -> ExportedRun:
+    """Return a run with its values for export; rejected trees are left out.
 
     Args:
         folder: Folder of the run.
@@ -137,26 +140,7 @@ def read_for_export(folder: FilePath, of_plots: StandResult | None = None) -> Ex
             figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": float(f.trees)}
             figures.update({name: f.values[name].value for name in FIGURES})
             shapes.append((plot.name, shapely.transform(plot.shape, frame.to_crs), figures))
-    return for_export(run.uri, run.trees, run.path, read_terrain(folder), frame, tuple(shapes))
-
-
-def for_export(
-    uri: str,
-    trees: Trees,
-    path: Path,
-    terrain: Float,
-    frame: MapFrame,
-    plots: tuple[tuple[str, Any, dict[str, float]], ...] = (),
-) -> ExportedRun:
-    """Return a map with its values for export.
-
-    Args:
-        uri: Source of the run.
-        trees, path: The map, see `as_written`.
-        terrain: x, y, z of its cells, shape (K, 3) [m].
-        frame: Its reference system.
-        plots: Plots in that system, with their figures by name.
-    """
+    trees, path, terrain = run.trees, run.path, read_terrain(folder)
     ground = heights_at(terrain, trees.position) + frame.z
     unknown = np.full(len(trees.number), np.nan)
     values = (
@@ -175,14 +159,16 @@ def for_export(
         unknown if trees.height is None else trees.height,
         unknown if trees.height_sigma is None else trees.height_sigma,
         unknown if trees.lean is None else np.degrees(trees.lean),
+        np.array(list(run.reviews.values()), np.str_),
     )
-    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 1)
+    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 1, 0)
     columns = {
-        field.name: v if v.dtype.kind == "i" else np.round(v, d)
+        field.name: np.round(v, d) if v.dtype.kind == "f" else v
         for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)
     }
     path_xy = frame.to_crs(np.stack([path.x, path.y], axis=1))
-    return ExportedRun(uri, trees, frame, frame.to_crs(trees.position), columns, path_xy, plots, terrain)
+    place = frame.to_crs(trees.position)
+    return ExportedRun(run.uri, trees, frame, place, columns, path_xy, tuple(shapes), terrain)
 
 
 def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
@@ -197,13 +183,15 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
             folder.
 
     Raises:
-        StemmapError: The suffix is unknown, a package is missing, or the run lacks what the format shows.
+        StemmapError: The suffix is unknown, a package is missing, or the run lacks what the format shows: a
+            GeoTIFF needs terrain and an EPSG code.
         OSError: The file cannot be written.
     """
     writer = WRITERS.get(file.suffix.lower())
     if writer is None:
         raise StemmapError(
-            f"{file.name!r} has an unknown format", remedy=f"Formats: {', '.join(WRITERS)}, or tree-manager"
+            f"{file.name!r} has an unknown format",
+            remedy=f"Formats: {', '.join([*WRITERS, '.laz'])}, or tree-manager",
         )
     with _WRITING, TemporaryDirectory(prefix=".export-", dir=file.parent) as folder:
         writer(run, FilePath(folder) / file.name)
@@ -237,8 +225,9 @@ def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
 
 
 def _layers(run: ExportedRun) -> dict[str, Any]:
-    """Return the layers as GeoDataFrames by name: trees, and path, plots and contours where there are any.
-    Raises StemmapError if a package is not installed."""
+    """Return the layers as GeoDataFrames by name, in the coordinates of the files: `trees` (TREE_FIELDS), and
+    where there are any `path` (scans, length_m), `plots` (plot and figures) and `contours` (z_m). Raises
+    StemmapError if a package is not installed."""
     geopandas = needed("geopandas", "gis", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -286,7 +275,8 @@ def _write_layers(run: ExportedRun, file: FilePath) -> None:
 
 
 def _write_styles(file: FilePath) -> None:
-    """Add the styles that QGIS reads from a GeoPackage by default (table layer_styles)."""
+    """Add the styles that QGIS reads from a GeoPackage by default, as a table layer_styles with a row per
+    layer."""
     database = sqlite3.connect(file)
     try:
         tables = [row[0] for row in database.execute("SELECT table_name FROM gpkg_contents")]
@@ -380,16 +370,16 @@ def _write_geojson(run: ExportedRun, file: FilePath) -> None:
     """Write the trees as GeoJSON: in longitude and latitude (WGS84), or in the frame of a local map."""
     lon_lat = None
     if run.frame.crs:
-        import pyproj
-
-        transformer = pyproj.Transformer.from_crs(run.frame.crs, 4326, always_xy=True)
-        lon_lat = np.stack(transformer.transform(*run.place.T), axis=1).reshape(-1, 2)
-    file.write_text(geojson(run.trees, 0, lon_lat=lon_lat), encoding="utf-8", newline="")
+        lon_lat = reproject(run.place, run.frame.crs, WGS84)
+    reviews = dict(zip(run.columns["tree"].tolist(), run.columns["review"].tolist(), strict=True))
+    text = geojson(run.trees, 0, lon_lat=lon_lat, reviews=reviews)
+    file.write_text(text, encoding="utf-8", newline="")
 
 
 def _write_dxf(run: ExportedRun, file: FilePath) -> None:
     """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS and CONTOURS. A tree without a
-    diameter is a point without a circle, one without a height has z 0."""
+    diameter is a point without a circle, one without a height has z 0. StemmapError if ezdxf is not
+    installed."""
     ezdxf = needed("ezdxf", "gis", "DXF files")
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
@@ -426,7 +416,8 @@ def _write_dxf(run: ExportedRun, file: FilePath) -> None:
 
 
 def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
-    """Write a workbook with the sheets trees, plots (if there are any), fields and about."""
+    """Write a workbook with the sheets trees, plots (if there are any), fields and about. StemmapError if
+    xlsxwriter is not installed."""
     xlsxwriter = needed("xlsxwriter", "gis", "XLSX files")
     book = xlsxwriter.Workbook(str(file), {"nan_inf_to_errors": False, "strings_to_formulas": False})
     book.set_properties({"created": _DATE.replace(tzinfo=None), "comments": f"stemmap {version()}"})
@@ -488,10 +479,10 @@ def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # n
 
 
 def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
-    """Return the terrain as a north-up raster in the coordinates of the files, rows from north to south, NaN
-    where unknown, with west and north of its corner [m]; None without terrain. Cells have TERRAIN_CELL
-    metres. A turned map is resampled linearly from the centres of its cells, within 0.75 cells of a known
-    one.
+    """Return the heights of the terrain as a north-up raster in the coordinates of the files, shape (rows
+    from north to south, columns from west to east) [m], NaN where unknown, with west and north of its corner
+    [m]; None without terrain. Cells have TERRAIN_CELL metres. A turned map is resampled linearly from the
+    centres of its cells, within 0.75 cells of a known one.
 
     Raises:
         SourceError: The raster would have more than 25 million cells.
@@ -572,7 +563,7 @@ def _write_geotiff(run: ExportedRun, file: FilePath) -> None:
         (42113, "s", 0, "nan", True),  # GDAL_NODATA
     ]
     authority, _, code = run.frame.crs.partition(":")
-    if run.frame.crs and (authority != "EPSG" or not code.isdigit() or int(code) > 32766):
+    if run.frame.crs and (authority != "EPSG" or not code.isdecimal() or int(code) > 32766):
         raise StemmapError(
             f"a GeoTIFF needs a reference system with an EPSG code, not {run.frame.crs[:60]}",
             remedy="Run stemmap georeference with --crs EPSG:CODE",

@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
-from app.batch.run_folder import is_of_cloud, read_run, read_run_record, read_terrain
+from app.batch.run_folder import is_of_cloud, read_run, read_run_record, read_terrain, read_tree_places
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_beside
+from pipeline.io.csv_table import CsvTable
+from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.stand.control_points import fit_control_points, fit_rigid_pairs
 
 FILE = "georeference.json"
 LOCAL = "local"
+#: Name of the reference system of local files.
+LOCAL_NAME = "local frame of the map"
+#: Longitude and latitude [deg].
+WGS84 = "EPSG:4326"
 _LARGEST_FILE = 1 << 20
-_FARTHEST = 1e8  # m
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +41,7 @@ class MapFrame:
         sigma: Standard deviation of a position by this georeference, at the centre of its points [m]; NaN if
             unknown.
         residuals: Name and residual east, north [m] of each control point.
+        place: The reference system and the place of the map in it, see `place_words`; "" if unknown.
     """
 
     crs: str = ""
@@ -43,11 +50,17 @@ class MapFrame:
     how: str = ""
     sigma: float = math.nan
     residuals: tuple[tuple[str, float, float], ...] = ()
+    place: str = ""
 
     @property
     def name(self) -> str:
-        """The reference system for people."""
+        """The reference system; LOCAL for the local frame."""
         return self.crs or LOCAL
+
+    @property
+    def title(self) -> str:
+        """The reference system for people: the name of one in WKT, else as `name`."""
+        return self.crs.split('"')[1] if '["' in self.crs else self.name
 
     def to_crs(self, points: Float) -> Float:
         """Return positions of the map, shape (N, 2), in the reference system: east, north [m]."""
@@ -56,6 +69,42 @@ class MapFrame:
     def to_map(self, points: Float) -> Float:
         """Return positions in the reference system, shape (N, 2), in the frame of the map [m]."""
         return self.pose.inverse().apply(np.reshape(points, (-1, 2)))
+
+    def record(self) -> dict[str, Any]:
+        """Return the frame as JSON values, the contents of georeference.json: `crs`, `east_m`, `north_m`,
+        `turn_rad`, `z_m`, `sigma_m` (None if unknown), `how`, `residuals_m` and `place`."""
+        return {
+            "crs": self.crs,
+            "east_m": self.pose.x,
+            "north_m": self.pose.y,
+            "turn_rad": self.pose.yaw,
+            "z_m": self.z,
+            "sigma_m": None if math.isnan(self.sigma) else self.sigma,
+            "how": self.how,
+            "residuals_m": [list(row) for row in self.residuals],
+            "place": self.place,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class ControlPoint:
+    """A point that is known in the map and in a reference system.
+
+    Attributes:
+        name: For messages.
+        east, north: Its position in the reference system [m].
+        tree: Number of the tree that it is; None for another mark.
+        x, y: Its position in the map [m]; None for a tree.
+        z: Its height in the reference system [m]; None if unknown.
+    """
+
+    name: str
+    east: float
+    north: float
+    tree: int | None = None
+    x: float | None = None
+    y: float | None = None
+    z: float | None = None
 
 
 def projected(crs: str) -> str:
@@ -71,7 +120,7 @@ def projected(crs: str) -> str:
     import pyproj
 
     try:
-        system = pyproj.CRS.from_user_input(int(crs) if crs.isdigit() else crs)
+        system = pyproj.CRS.from_user_input(f"EPSG:{crs}" if crs.isdigit() else crs)
     except pyproj.exceptions.CRSError:
         raise StemmapError(
             f"{crs!r} is not a coordinate reference system", remedy="Give a code such as EPSG:25832"
@@ -88,6 +137,23 @@ def projected(crs: str) -> str:
     return ":".join(authority) if authority else system.to_wkt()
 
 
+def reproject(points: Float, source: str, target: str) -> Float:
+    """Return positions of one reference system in another as a new array, shape (N, 2): east, north [m] or
+    longitude, latitude [deg], in this order in both systems; inf where the transformation has no value.
+
+    Args:
+        points: Positions in `source`, shape (N, 2).
+        source, target: Reference systems as text for pyproj, such as WGS84.
+
+    Raises:
+        pyproj.exceptions.ProjError: A reference system is unknown.
+    """
+    import pyproj
+
+    transformer = pyproj.Transformer.from_crs(source, target, always_xy=True)
+    return np.stack(transformer.transform(*np.reshape(points, (-1, 2)).T), axis=1)
+
+
 def check_area(crs: str, points: Float) -> None:
     """Check that positions are in the area for which a reference system is defined, with a margin of 3
     degrees; for a system without an area only that they have a longitude and latitude.
@@ -102,9 +168,7 @@ def check_area(crs: str, points: Float) -> None:
     import pyproj
 
     system = pyproj.CRS.from_user_input(crs)
-    lon, lat = pyproj.Transformer.from_crs(system, 4326, always_xy=True).transform(
-        *np.reshape(points, (-1, 2)).T
-    )
+    lon, lat = reproject(points, crs, WGS84).T
     area = system.area_of_use
     margin = 3.0  # degrees; systems are used somewhat beyond their area
     fits = np.isfinite(lon) & np.isfinite(lat)
@@ -123,6 +187,36 @@ def check_area(crs: str, points: Float) -> None:
             f"the coordinates do not fit {system.name}: {east:.1f}, {north:.1f} is {where}",
             remedy="Check the EPSG code, the order of the axes (east, north) and the unit",
         )
+
+
+def map_centre(folder: FilePath) -> Float:
+    """Return the middle of the trees of a run in the map, shape (1, 2) [m]; the origin without trees.
+
+    Raises:
+        StemmapError: The folder is not that of a run, or a file is damaged.
+    """
+    places = read_tree_places(folder)
+    centre: Float = np.array(list(places.values()) or [(0.0, 0.0)]).mean(axis=0, keepdims=True)
+    return centre
+
+
+def place_words(crs: str, point: Float) -> str:
+    """Return a reference system and a position in it for people, so that a wrong code is noticed: code, name,
+    longitude and latitude, and the area for which the system is defined.
+
+    Args:
+        crs: The reference system.
+        point: East, north, shape (1, 2) [m].
+    """
+    import pyproj
+
+    system = pyproj.CRS.from_user_input(crs)
+    authority = system.to_authority()
+    code = f"{':'.join(authority)}, " if authority else ""
+    lon, lat = reproject(point, crs, WGS84)[0]
+    where = f"{abs(lon):.2f}° {'W' if lon < 0 else 'E'}, {abs(lat):.2f}° {'S' if lat < 0 else 'N'}"
+    area = f" (area of use: {system.area_of_use.name.rstrip('.')})" if system.area_of_use else ""
+    return f"{code}{system.name}: {where}{area}"
 
 
 def read_map_frame(folder: FilePath) -> MapFrame:
@@ -144,31 +238,26 @@ def read_map_frame(folder: FilePath) -> MapFrame:
         x, y, yaw, z = (float(given[key]) for key in ("east_m", "north_m", "turn_rad", "z_m"))
         sigma = math.nan if given["sigma_m"] is None else float(given["sigma_m"])
         residuals = tuple((str(n), float(e), float(m)) for n, e, m in given["residuals_m"])
-        if not all(abs(v) < _FARTHEST for v in (x, y, yaw, z)):
+        if not all(abs(v) < COORDINATE_LIMIT for v in (x, y, yaw, z)):
             raise ValueError("out of range")
-        return MapFrame(str(given["crs"]), Pose2(x, y, yaw), z, str(given["how"]), sigma, residuals)
+        how, place = str(given["how"]), str(given.get("place", ""))
+        return MapFrame(str(given["crs"]), Pose2(x, y, yaw), z, how, sigma, residuals, place)
     except (ValueError, KeyError, TypeError, RecursionError, OSError):
         raise SourceError(
             f"{FILE} is damaged", where=str(folder), remedy="Run stemmap georeference again"
         ) from None
 
 
-def write_map_frame(folder: FilePath, frame: MapFrame) -> None:
+def write_map_frame(folder: FilePath, record: dict[str, Any]) -> None:
     """Write georeference.json, in place of an earlier one.
+
+    Args:
+        folder: Folder of the run.
+        record: The frame, see `MapFrame.record`.
 
     Raises:
         StemmapError: The file cannot be written.
     """
-    record = {
-        "crs": frame.crs,
-        "east_m": frame.pose.x,
-        "north_m": frame.pose.y,
-        "turn_rad": frame.pose.yaw,
-        "z_m": frame.z,
-        "sigma_m": None if math.isnan(frame.sigma) else frame.sigma,
-        "how": frame.how,
-        "residuals_m": [list(row) for row in frame.residuals],
-    }
     with write_beside(folder / FILE) as partial:
         partial.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -177,132 +266,113 @@ _EAST = ("easting", "easting_m", "east", "east_m", "utm_x")
 _NORTH = ("northing", "northing_m", "north", "north_m", "utm_y")
 _LON, _LAT = ("lon", "longitude", "lon_deg"), ("lat", "latitude", "lat_deg")
 _HEIGHT = ("elevation_m", "elevation", "z_m", "z", "height_m")
-_POINTS_MAX = 1000
+POINTS_MAX = 1000
+NAME_MAX = 60  # characters of the name of a control point
 
 
-def by_control_points(folder: FilePath, file: FilePath, crs: str, point_sigma: float | None) -> MapFrame:
-    """Return the frame of a map by control points: trees by their numbers, or positions in the map. It is not
-    written.
+def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
+    """Return the control points of a table, in its order. A point with a tree has no x and y; one without a
+    name is called by its tree or its place in the table.
 
-    Heights, if the file has them, give the height of the map's zero with the terrain of the run; it is 0
+    Args:
+        file: CSV with a header: easting and northing (or lon and lat), tree or x_m and y_m, optionally name
+            and elevation_m.
+        crs: Reference system, see `projected`, to which longitudes and latitudes are converted.
+
+    Raises:
+        SourceError: It cannot be read, is larger than 1 MB, has an incomplete header or row, a name of more
+            than NAME_MAX characters, no rows or more than POINTS_MAX.
+    """
+    table = CsvTable.read(file, "table of control points", _LARGEST_FILE)
+    if len(table.rows) > POINTS_MAX:
+        raise SourceError(f"there are more than {POINTS_MAX} control points", where=str(file))
+    names = (_LON, _LAT) if table.find(_LON) else (_EAST, _NORTH)
+    east, north = (table.find(each) for each in names)
+    if not (east and north) or not ("tree" in table.column or {"x_m", "y_m"} <= table.column.keys()):
+        raise SourceError(
+            "the header of the control points is not complete",
+            where=str(file),
+            remedy="It needs easting and northing (or lon and lat), and tree or x_m and y_m",
+        )
+    if not table.rows:
+        raise SourceError("the file has no control points", where=str(file))
+    known = np.stack([table.numbers(east), table.numbers(north)], axis=1)
+    if names[0] is _LON:
+        known = reproject(known, WGS84, crs)
+    x, y, tree = (table.numbers(name, required=False) for name in ("x_m", "y_m", "tree"))
+    z = table.numbers(table.find(_HEIGHT) or "", required=False)
+    points = []
+    for k, name in enumerate(table.text("name")):
+        number = None if math.isnan(tree[k]) else int(tree[k])
+        if number is not None and number != tree[k]:
+            raise SourceError(f"line {table.lines[k]}: the map has no tree {tree[k]}", where=str(file))
+        if number is None and not (math.isfinite(x[k]) and math.isfinite(y[k])):
+            raise SourceError(f"line {table.lines[k]}: it has no tree and no x_m and y_m", where=str(file))
+        if len(name) > NAME_MAX:
+            raise SourceError(
+                f"line {table.lines[k]}: the name has more than {NAME_MAX} characters", where=str(file)
+            )
+        points.append(
+            ControlPoint(
+                name=name or str(k + 1 if number is None else number),
+                east=float(known[k, 0]),
+                north=float(known[k, 1]),
+                tree=number,
+                x=float(x[k]) if number is None else None,
+                y=float(y[k]) if number is None else None,
+                z=float(z[k]) if math.isfinite(z[k]) else None,
+            )
+        )
+    return points
+
+
+def by_control_points(
+    folder: FilePath, points: Sequence[ControlPoint], crs: str, point_sigma: float
+) -> MapFrame:
+    """Return the frame of a map by control points. It is not written.
+
+    The height of the map's zero is the mean by the points with a height and the terrain of the run; it is 0
     without heights.
 
     Args:
         folder: Folder of the run.
-        file: CSV with a header: easting and northing (or lon and lat), tree or x_m and y_m, optionally name
-            and elevation_m.
+        points: Trees by their numbers, also rejected ones, or positions in the map.
         crs: Reference system, see `projected`.
-        point_sigma: See `fit_control_points`; None for 0.125 m.
+        point_sigma: See `fit_control_points`.
 
     Raises:
-        StemmapError: The table is damaged or names unknown trees, the points are not in the area of the
-            reference system or contradict one another, or the run has no terrain at a point with a height.
+        StemmapError: A tree is unknown, the points are not in the area of the reference system or contradict
+            one another, or the run has no terrain at a point with a height.
     """
-    import pyproj
-
-    rows = _control_rows(file)
-    run = read_run(folder)
-    place = {int(n): p for n, p in zip(run.trees.number, run.trees.position, strict=True)}
-    local: list[Float] = []
-    names: list[str] = []
-    for line, row in rows:
-        name = row.get("name") or row.get("tree") or str(len(names) + 1)
-        if row.get("tree"):
-            number = _cell(row, ("tree",), line, file)
-            if number not in place:
-                raise StemmapError(f"line {line}: the map has no tree {row['tree']}", where=str(file))
-            local.append(place[int(number)])
-        else:
-            local.append(np.array([_cell(row, (axis,), line, file) for axis in ("x_m", "y_m")]))
-        names.append(name)
-    columns = rows[0][1]
-    geographic = any(name in columns for name in _LON)
-    axes = (_LON, _LAT) if geographic else (_EAST, _NORTH)
-    known = np.array([[_cell(row, axis, line, file) for axis in axes] for line, row in rows])
-    if geographic:
-        transformer = pyproj.Transformer.from_crs(4326, crs, always_xy=True)
-        known = np.stack(transformer.transform(known[:, 0], known[:, 1]), axis=1)
+    read_run_record(folder)
+    trees = read_tree_places(folder)
+    for point in points:
+        if point.tree is not None and point.tree not in trees:
+            raise StemmapError(f"point {point.name}: the map has no tree {point.tree}")
+    local = np.array([(p.x, p.y) if p.tree is None else trees[p.tree] for p in points]).reshape(-1, 2)
+    known = np.array([(p.east, p.north) for p in points]).reshape(-1, 2)
+    names = [point.name for point in points]
     check_area(crs, known)
-    fit = fit_control_points(np.array(local), known, names=names, point_sigma=point_sigma or 0.125)
-    z = 0.0
-    if any(name in columns for name in _HEIGHT):
-        heights = np.array([_cell(row, _HEIGHT, line, file) for line, row in rows])
-        z = float(np.mean(heights - ground_heights(folder, np.array(local))))
+    fit = fit_control_points(local, known, names=names, point_sigma=point_sigma)
+    z, heights = 0.0, np.array([math.nan if point.z is None else point.z for point in points])
+    if (high := np.isfinite(heights)).any():
+        z = float(np.mean(heights[high] - heights_at(read_terrain(folder), local[high])))
         if not math.isfinite(z):
             raise StemmapError(
-                "the run has no terrain at a control point with a height",
-                where=str(file),
-                remedy="Leave the heights out",
+                "the run has no terrain at a control point with a height", remedy="Leave the heights out"
             )
     residuals = [(n, float(e), float(m)) for n, (e, m) in zip(names, fit.residuals, strict=True)]
     how = (
         f"{len(names)} control points, {fit.rms:.3f} m (RMS), one coordinate of a point "
         f"+- {fit.sigma_point:.3f} m, turn +- {math.degrees(fit.sigma_turn):.3f} degrees"
     )
-    return MapFrame(crs, fit.pose, z, how, fit.sigma, tuple(residuals))
-
-
-def _control_rows(file: FilePath) -> list[tuple[int, dict[str, str]]]:
-    """Return line number and cells by lower-case header of each row that is not empty, at least one and at
-    most _POINTS_MAX.
-
-    Raises:
-        SourceError: The file cannot be read, is larger than 1 MB, or has an incomplete header or no rows.
-    """
-    try:
-        if file.stat().st_size > _LARGEST_FILE:
-            raise SourceError("the table of control points is larger than 1 MB", where=str(file))
-        text = file.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise SourceError(f"cannot read the control points: {error.strerror}", where=str(file)) from None
-    except UnicodeDecodeError:
-        raise SourceError("the table of control points is not text", where=str(file)) from None
-    head = text.partition("\n")[0]
-    reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=head.count))
-    try:
-        table = [(reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except csv.Error as error:
-        raise SourceError(f"the control points are damaged: {error}", where=str(file)) from None
-    table = [(line, row) for line, row in table if any(row)]
-    header = [name.lower() for name in table[0][1]] if table else []
-    if len(table) > _POINTS_MAX:
-        raise SourceError(f"there are more than {_POINTS_MAX} control points", where=str(file))
-    known = any(n in header for n in (*_EAST, *_LON)) and any(n in header for n in (*_NORTH, *_LAT))
-    if not known or not ("tree" in header or {"x_m", "y_m"} <= set(header)):
-        raise SourceError(
-            "the header of the control points is not complete",
-            where=str(file),
-            remedy="It needs easting and northing (or lon and lat), and tree or x_m and y_m",
-        )
-    rows = [(line, dict(zip(header, row, strict=False))) for line, row in table[1:]]
-    if not rows:
-        raise SourceError("the file has no control points", where=str(file))
-    return rows
-
-
-def _cell(row: dict[str, str], names: tuple[str, ...], line: int, file: FilePath) -> float:
-    """Return the number in the first column of some names that a row has.
-
-    Args:
-        row: Cells by header.
-        names: Names of the column; of several that exist the first.
-        line, file: Line and file, for errors.
-
-    Raises:
-        SourceError: The cell is missing, not a number, or its magnitude is 1e8 or more.
-    """
-    name = next((name for name in names if name in row), names[0])
-    try:
-        value = float(row[name])
-    except (KeyError, ValueError):
-        value = math.nan
-    if not abs(value) < _FARTHEST:
-        raise SourceError(f"line {line}: {name} = {row.get(name, '')!r} is not a number", where=str(file))
-    return value
+    place = place_words(crs, fit.pose.apply(map_centre(folder)))
+    return MapFrame(crs, fit.pose, z, how, fit.sigma, tuple(residuals), place)
 
 
 def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, z: float) -> MapFrame:
-    """Return the frame of a map by the position of its origin. It is not written.
+    """Return the frame of a map by the position of its origin, without an uncertainty. It is not written.
+    Zeros are the frame of a map whose coordinates are already in the reference system.
 
     Args:
         folder: Folder of the run.
@@ -312,51 +382,50 @@ def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, 
         z: Height of the map's zero [m].
 
     Raises:
-        StemmapError: The folder is not that of a run, or the position is not in the area of the reference
-            system.
+        StemmapError: The folder is not that of a run, or the centre of the map is not in the area of the
+            reference system.
     """
     read_run_record(folder)
-    check_area(crs, np.array([[east, north]]))
-    return MapFrame(crs, Pose2(east, north, turn), z, "by hand")
+    pose = Pose2(east, north, turn)
+    centre = pose.apply(map_centre(folder))
+    check_area(crs, centre)
+    how = "hand" if any((east, north, turn, z)) else "the coordinates of the file"
+    return MapFrame(crs, pose, z, how, place=place_words(crs, centre))
 
 
-def by_gnss(folder: FilePath, crs: str) -> MapFrame:
-    """Return the frame of a map by the GNSS fixes of its recording, fitted to the whole path. Fixes that are
-    far from the path, compared with the others, do not count. The height of the map's zero is 0. It is not
-    written.
+def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame:
+    """Return the frame of a map by the GNSS fixes of its recording, fitted to the whole path. Fixes before or
+    after the path, and those far from it compared with the others, do not count. The height of the map's
+    zero is 0. It is not written.
 
     Args:
         folder: Folder of the run, whose recording must still exist.
         crs: Reference system, see `projected`.
+        start_ns: Time of the first scan [ns]; None for that of the saved state of the run.
 
     Raises:
         StemmapError: The recording or the saved state cannot be read, the recording has no fixes, or they do
             not fit the path.
     """
-    import pyproj
-
     from app.batch.continue_map import read_saved_run
+    from app.robot.address import is_live
     from app.sources.opening import open_source
     from pipeline.io.readers.measured_poses import fit_rigid
     from pipeline.io.readers.ros import RosSource
 
     run = read_run(folder)
-    source = open_source(run.uri)
-    try:
-        fixes = source.fixes() if isinstance(source, RosSource) else []
-    finally:
-        source.close()
+    fixes = []
+    if not (run.of_cloud or is_live(run.uri)):
+        with closing(open_source(run.uri)) as source:
+            fixes = source.fixes() if isinstance(source, RosSource) else []
     if not fixes:
         raise StemmapError(
-            "the recording has no GNSS fixes", where=run.uri, remedy="Use --control or --by-hand"
+            "the recording has no GNSS fixes", where=run.uri, remedy="Use control points, or place it by hand"
         )
-    transformer = pyproj.Transformer.from_crs(4326, crs, always_xy=True)
-    positions = np.stack(
-        transformer.transform([f.longitude for f in fixes], [f.latitude for f in fixes]), axis=1
-    )
+    positions = reproject(np.array([(f.longitude, f.latitude) for f in fixes]), WGS84, crs)
     check_area(crs, positions)
     origin = positions[0].copy()
-    stamps = read_saved_run(folder).map.stamp_ns
+    stamps = run.path.stamp_ns + (read_saved_run(folder).start_ns if start_ns is None else start_ns)
     path = np.stack([run.path.x, run.path.y], axis=1)
     at_ns = np.array([fix.stamp_ns for fix in fixes], np.int64)
     sigma = np.array([fix.sigma for fix in fixes])
@@ -377,23 +446,17 @@ def by_gnss(folder: FilePath, crs: str) -> MapFrame:
         shortest=5.0, what="fixes", unknown="the direction of north",
     )  # fmt: skip
     if fit is None:
-        raise StemmapError(f"the GNSS fixes cannot be used: {why}", where=run.uri, remedy="Use --control")
+        raise StemmapError(
+            f"the GNSS fixes cannot be used: {why}", where=run.uri, remedy="Use control points"
+        )
     pose = fit.T_map_other.inverse()
     how = (
         f"{len(keep)} of {len(fixes)} GNSS fixes, {fit.residual:.2f} m (RMS) from the path, "
         f"turn +- {math.degrees(fit.yaw_sigma):.2f} degrees"
     )
-    return MapFrame(crs, Pose2(pose.x + origin[0], pose.y + origin[1], pose.yaw), 0.0, how, fit.sigma)
-
-
-def ground_heights(folder: FilePath, points: Float) -> Float:
-    """Return the height of the terrain of a run at positions in the map, shape (N, 2), as shape (N,) [m]:
-    that of the nearest cell within 2 m; NaN without one.
-
-    Raises:
-        SourceError: terrain.csv is missing or damaged.
-    """
-    return heights_at(read_terrain(folder), points)
+    pose = Pose2(pose.x + origin[0], pose.y + origin[1], pose.yaw)
+    place = place_words(crs, pose.apply(map_centre(folder)))
+    return MapFrame(crs, pose, 0.0, how, fit.sigma, place=place)
 
 
 def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
@@ -414,14 +477,16 @@ def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
 
 
 def frame_lines(frame: MapFrame) -> list[str]:
-    """Return a frame as lines for people: position, and where known its standard deviation and the residuals
-    of the control points."""
+    """Return a frame as lines for people: where known the place of the map; position, and where known its
+    standard deviation and the residuals of the control points."""
     if not frame.crs:
         return ["local coordinates: the map has no reference system"]
-    lines = [
-        f"{frame.name}: origin at {frame.pose.x:.3f}, {frame.pose.y:.3f} m, x axis "
-        f"{math.degrees(frame.pose.yaw):.3f} degrees from east to north, by {frame.how or 'the source'}"
-    ]
+    lines = [f"the map is at {frame.place}"] if frame.place else []
+    how = frame.how.removeprefix("by ") or "the source"  # files of earlier versions have "by hand"
+    lines.append(
+        f"{frame.title}: origin at {frame.pose.x:.3f}, {frame.pose.y:.3f} m, x axis "
+        f"{math.degrees(frame.pose.yaw):.3f} degrees from east to north, by {how}"
+    )
     if math.isfinite(frame.sigma):
         lines.append(f"a coordinate in the middle of the points +- {frame.sigma:.3f} m")
     lines += [f"point {name}: residual {e:+.3f} m east, {n:+.3f} m north" for name, e, n in frame.residuals]

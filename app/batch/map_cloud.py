@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from app.batch.georeference import WGS84, reproject
 from app.batch.map_run import MappingResult
 from app.batch.run_folder import NO_PATH, as_written, score_map
 from app.batch.summary import evaluation_lines
@@ -24,10 +25,10 @@ from pipeline.config import Parameters
 from pipeline.evaluation import MapScores
 from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap, map_plot
-from pipeline.inventory.cloud import WholeCloud
 from pipeline.inventory.cross_sections import slice_heights
 from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson, number_text
+from pipeline.types.clouds import WholeCloud
 from pipeline.types.records import Trees, TruthTrees, Verdict
 
 SLICE_COLUMNS = (
@@ -117,9 +118,7 @@ def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
     import pyproj
 
     try:
-        system = pyproj.CRS.from_user_input(crs)
-        to_wgs84 = pyproj.Transformer.from_crs(system, 4326, always_xy=True)
-        lon_lat = np.stack(to_wgs84.transform(position[:, 0], position[:, 1]), axis=1)
+        lon_lat = reproject(position, crs, WGS84)
     except pyproj.exceptions.ProjError:
         lon_lat = np.full((1, 2), np.inf)
     if not np.isfinite(lon_lat).all():
@@ -129,7 +128,8 @@ def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
 
 
 def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
-    """Yield a row of DETECTION_COLUMNS for each candidate; scan 0, without times.
+    """Yield a row of DETECTION_COLUMNS for each candidate: scan 0, without time and eccentricity; the width
+    is that of the circle, the height the extent of the stem.
 
     Args:
         plot: The map in local coordinates.
@@ -154,8 +154,8 @@ def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
 
 
 def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
-    """Yield a row of SLICE_COLUMNS for each cross-section with a known radius; arguments as in
-    `_detection_rows`."""
+    """Yield a row of SLICE_COLUMNS for each cross-section of a tree with a known radius; heights are above
+    the ground at the tree. Arguments as in `_detection_rows`."""
     for number, circles in zip(plot.trees.number, plot.circles[plot.tree_candidate], strict=True):
         for height, s in zip(slice_heights(), circles, strict=True):
             if np.isfinite(s[2]):
@@ -173,8 +173,9 @@ def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
 
 
 def _terrain_rows(ground: TerrainRaster, offset: Float) -> Iterator[list[str]]:
-    """Yield the centres of the cells with ground returns, from west to east, without interpolated cells. The
-    number of views and the uncertainty of the heights are unknown for a cloud."""
+    """Yield a row of TERRAIN_COLUMNS for each cell with ground returns, from west to east, without
+    interpolated cells: its centre and height in the coordinates of the cloud; uncertainty and number of views
+    are empty. `offset` as in `_detection_rows`."""
     columns, rows = np.nonzero(ground.seen)
     place = ground.low + (np.stack([columns, rows], axis=1) + 0.5) * ground.cell + offset[:2]
     height = ground.height[columns, rows] + offset[2]
@@ -191,7 +192,9 @@ def _run_record(
     warnings: list[str],
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """Return the contents of run.json, without times of day and computing times.
+    """Return the contents of run.json, as far as a cloud has the same as a drive, with `offset_m` and `crs`
+    in `source`, and without times of day and computing times. `ground_m` is the least and the greatest height
+    of the terrain in the coordinates of the cloud.
 
     Args:
         cloud, plot: The cloud and its map.
@@ -200,7 +203,7 @@ def _run_record(
         warnings: Messages for people.
         losses: Number of left-out points by reason.
     """
-    about = cloud.description
+    about, heights = cloud.description, plot.ground.height
     verdicts = Counter(Verdict(int(v)).label for v in plot.verdict)
     return {
         "stemmap": version(),
@@ -219,17 +222,12 @@ def _run_record(
         "trees": len(plot.trees.number),
         "points": plot.counts,
         "voxel_size_m": round(plot.voxel_size, 6),
-        "ground_m": [round(float(v) + about.offset[2], 3) for v in _range(plot.ground.height)],
+        "ground_m": [round(float(v) + about.offset[2], 3) for v in (heights.min(), heights.max())],
         "verdicts": dict(sorted(verdicts.items())),
         "evaluation": None if evaluation is None else asdict(evaluation),
         "warnings": warnings,
         "losses": losses,
     }
-
-
-def _range(values: Float) -> tuple[float, float]:
-    """Return the least and the greatest of some values, at least one."""
-    return float(values.min()), float(values.max())
 
 
 def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None) -> list[str]:

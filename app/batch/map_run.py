@@ -37,7 +37,7 @@ from pipeline.io.readers.base import Source
 from pipeline.io.result_files import RunFiles, seen_text, terrain_text
 from pipeline.jit import on_compiling
 from pipeline.mapper import Mapper
-from pipeline.stand.seen_area import SeenArea, SeenRecorder
+from pipeline.stand.seen_area import SeenArea, SeenRecorder, ViewSelection
 from pipeline.types.records import Frame, Path, Step, Trees, Truth, TruthTrees
 
 MEASURED_SCANS = 100_000  # whose times enter the medians
@@ -104,8 +104,8 @@ class MappingResult:
 def map_run(
     plan: OfflineRun, folder: FilePath, progress: Progress, earlier: FilePath | None = None
 ) -> MappingResult:
-    """Map a run, write its files, and return the result for people. Pictures of trees are written at the end,
-    if the source has a camera and no map is continued; their errors are warnings.
+    """Map a run, write its files, and return the result for people. The source stays open. Pictures of trees
+    are written at the end, if the source has a camera and no map is continued; their errors are warnings.
 
     Args:
         plan: The run.
@@ -141,7 +141,8 @@ def _map(
     stopwatch: Stopwatch,
     earlier: FilePath | None,
 ) -> tuple[MappingResult, _Mapped]:
-    """Map the run and finish its files; return the result and the input of the pictures.
+    """Map the run and finish its files; return the result and the input of the pictures. Errors as in
+    `map_run`.
 
     Args:
         plan, progress, earlier: As in `map_run`.
@@ -222,6 +223,7 @@ def _map_scans(
         SourceError: There is no scan that is not in the map yet.
     """
     start_ns, frame = begun.start_ns, None
+    views = ViewSelection()
     for step in to_map:
         _use_revisions(plan, mapper, step.index)
         # The first scan loads the kernels, which takes much longer than mapping.
@@ -229,9 +231,8 @@ def _map_scans(
             frame = mapper.process(step)
         if plan.on_frame is not None:
             plan.on_frame(frame, mapper)
-        pose = frame.estimate.T_map_base
-        if seen.is_due(pose):
-            seen.add(frame.stamp_ns, pose, clear_range(frame.raw, frame.filtered, frame.sensor_offset))
+        if views.take(frame.estimate.T_map_base):
+            seen.add(frame.stamp_ns, clear_range(frame.raw, frame.filtered, frame.sensor_offset))
         start_ns = frame.stamp_ns if start_ns is None else start_ns
         files.add(frame, start_ns)
         begun.tally.add(frame)
@@ -243,7 +244,8 @@ def _map_scans(
 
 
 def _observed(area: SeenArea, earlier: FilePath | None) -> SeenArea:
-    """Return the observed area with that of the run in `earlier`, if its files contain it."""
+    """Return the observed area with that of the run in `earlier`, if its files contain it; raises SourceError
+    if they are damaged."""
     before = None if earlier is None else read_seen_area(earlier)
     return area if before is None else before.joined(area)
 
@@ -284,8 +286,9 @@ def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
 
 
 def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
-    """Return the parameter changes of each revision for run.json, first an empty one from scan 0 on.
-    Revisions without a change are omitted."""
+    """Return the revisions of the parameters for run.json as dicts with `revision`, `from_scan` and `changes`
+    (new value by dotted name, against the revision before); first an empty one from scan 0 on. Revisions
+    without a change are omitted."""
     revisions: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
     before = plan.parameters.flat()
     for first, parameters in plan.revisions:
@@ -298,12 +301,15 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
 
 
 def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunStart:
-    """Return how the run begins. The warnings of source and odometry are counted.
+    """Return how the run begins. The warnings of source and odometry are counted in its tally.
 
     Args:
         plan: The run.
         mapper: A mapper before its first scan; a continued map is loaded into it.
         chosen: Selected source of the motion.
+
+    Raises:
+        StemmapError: The start in the continued map was not found.
     """
     warned = (chosen.warning,) if chosen.warning else ()
     warnings = [*warned, *plan.source.description.warnings]
@@ -338,8 +344,8 @@ def _saved(
 
 
 def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
-    """Return the ground truth: trees of the plan, else those of the source in the frame of the map; and its
-    path."""
+    """Return the ground truth in the frame of the map: trees of the plan, else those of the source or, in a
+    continued map, of its first source; and the path of the same source. Both are None where unknown."""
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 
@@ -354,8 +360,10 @@ def _run_record(
     error: PathError | None,
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """Return the contents of run.json, without times of day and computing times, so that the same run gives
-    the same bytes.
+    """Return the contents of run.json: `source` (that of the first drive), `continued` (further drives) and
+    `chosen` where there are any, preset and parameters with their revisions, counts, pose quality (`health`),
+    scores (`evaluation`, `path_error`; None without), warnings and losses. Without times of day and computing
+    times, so that the same run gives the same bytes.
 
     Args:
         plan: The run with its parameters.

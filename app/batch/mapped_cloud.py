@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path as FilePath
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +15,10 @@ from app.batch.georeference import heights_at, read_map_frame
 from app.batch.run_folder import read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
+from pipeline.io.readers.clouds import SYSTEM_OF_DRIVE
+
+if TYPE_CHECKING:
+    from pipeline.types.clouds import WholeCloud
 
 EVERY = 5  # scans of a drive between two that are used
 MARGIN = 0.10  # m around the trunk at breast height, for lean and roughness of the stem
@@ -36,11 +41,13 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
         file: File .las or .laz.
 
     Raises:
-        StemmapError: The source cannot be read any more, or the run continues another one.
+        StemmapError: The source cannot be read any more, is live, or the run continues another one.
         OSError: The file cannot be written.
     """
     import laspy
     from scipy.spatial import cKDTree
+
+    from app.sources.opening import open_cloud
 
     run, frame, terrain = read_run(folder), read_map_frame(folder), read_terrain(folder)
     trees = run.trees
@@ -48,7 +55,10 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
     radius = np.where(np.isfinite(trees.dbh), 0.5 * trees.dbh + MARGIN, UNKNOWN_RADIUS)
     header = laspy.LasHeader(point_format=6, version="1.4")
     header.add_extra_dim(laspy.ExtraBytesParams("tree", np.uint32, "number of the tree"))
-    header.generating_software, header.system_identifier = "stemmap", "stemmap"
+    header.generating_software = "stemmap"
+    cloud = open_cloud(run.uri) if run.of_cloud else None
+    is_of_drive = cloud is None or cloud.description.cut_above
+    header.system_identifier = SYSTEM_OF_DRIVE if is_of_drive else "stemmap"
     header.creation_date = datetime.date(2000, 1, 1)  # the same run gives the same bytes
     header.scales = np.full(3, 0.001)
     header.offsets = np.floor(np.append(frame.to_crs(np.zeros((1, 2))), frame.z))
@@ -58,7 +68,7 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
         import pyproj
 
         header.add_crs(pyproj.CRS.from_user_input(frame.crs))
-    parts = _parts_of_cloud(run.uri) if run.of_cloud else _parts_of_drive(folder)
+    parts = _parts_of_drive(folder) if cloud is None else _parts_of_cloud(cloud)
     written = 0
     with laspy.open(file, "w", header=header) as writer:
         for points in parts:
@@ -82,19 +92,22 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
     return written
 
 
-def _parts_of_cloud(uri: str) -> Iterator[Float]:
+def _parts_of_cloud(cloud: WholeCloud) -> Iterator[Float]:
     """Yield the points of a whole cloud in its own coordinates, shape (N, 3) [m]."""
-    from app.sources.opening import open_cloud
-
-    cloud = open_cloud(uri)
     for part in cloud.parts():
         yield part[:, :3].astype(np.float64) + cloud.description.offset
 
 
 def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
-    """Yield the thinned points of a drive in the frame of the map, shape (N, 3) [m]; z by the terrain of each
-    scan and the nearest known terrain of the run."""
+    """Yield the thinned points of a drive in the frame of the map, shape (N, 3) [m], in parts of at most
+    _CHUNK; z by the terrain of each scan and the nearest known terrain of the run.
+
+    Raises:
+        StemmapError: The run is live or continues another one, its source cannot be read, or no point is near
+            known ground.
+    """
     from app.batch.continue_map import at_origin
+    from app.robot.address import is_live
     from app.sources.opening import open_source
     from app.sources.request import request_of_kept, with_odometry
     from pipeline.ground.scan_ground import find_terrain
@@ -103,6 +116,8 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     from pipeline.preprocessing.acquisition import acquire
 
     run, terrain = read_run(folder), read_terrain(folder)
+    if is_live(run.uri):
+        raise StemmapError("a live run has no recording to be read again", where=run.uri)
     if run.record.get("continued"):
         raise StemmapError("a run that continues another one has no single cloud", where=str(folder))
     odometry = str(run.record.get("odometry") or "auto")

@@ -45,7 +45,7 @@ def merge_runs(
     out: FilePath,
     parameters: Parameters | None,
     *,
-    force: bool = False,
+    force: bool,
 ) -> MergeResult:
     """Merge run b into run a, and write the files of a run and correspondence.csv. Scores of run a are not
     part of the result.
@@ -141,7 +141,7 @@ def _joined(
 
 
 def _path(merged: MergedMap) -> Path:
-    """Return the path of a merged map, that of a first."""
+    """Return the path of a merged map: that of run a, then that of run b."""
     m = merged.map
     poses = m.slam.path.poses()
     return Path(m.stamp_ns, poses[:, 0], poses[:, 1], poses[:, 2], m.sigma_xy)
@@ -193,9 +193,10 @@ def _shown(trees: Trees) -> set[int]:
 def _correspondence(
     merged: MergedMap, b: SavedMap, shown: set[int], of_a: set[int], of_b: set[int]
 ) -> list[list[str]]:
-    """Return rows of CORRESPONDENCE_COLUMNS for the confirmed trees of the merged map, by number. The cell of
-    a run in which the tree was not confirmed is empty; of several trees of b that became one tree, the last
-    is written.
+    """Return rows of CORRESPONDENCE_COLUMNS for the confirmed trees of the merged map, ordered by number,
+    which for a tree of a is that of a. The cell of a run in which the tree was not confirmed is empty, and
+    the distance unless it was confirmed in both; of several trees of b that became one tree, the last is
+    written.
 
     Args:
         merged: The merged map.

@@ -3,30 +3,38 @@
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path as FilePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import shapely
 
-from app.batch.georeference import LOCAL, MapFrame, read_map_frame
+from app.batch.georeference import LOCAL, LOCAL_NAME, MapFrame, read_map_frame
 from app.common.extras import needed
+from app.store.records import FRAME, PLOT
 from pipeline.errors import SourceError, StemmapError
-from pipeline.stand.plots import PLOTS_MAX, SamplePlot, checked
+from pipeline.stand.plots import PLOTS_MAX, SamplePlot, checked, circle, plot_of
+
+if TYPE_CHECKING:
+    from app.store.records import Content
+    from app.store.store import Store
 
 LARGEST_FILE = 64 << 20
-SUFFIXES = (".gpkg", ".shp", ".geojson", ".json")
+SUFFIXES = (".gpkg", ".shp", ".zip", ".geojson", ".json")
 _NAMES = ("name", "plot", "plot_id", "plotid", "id", "nr", "number")
 _RADII = ("radius_m", "radius", "r_m")
 
 
-def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list[SamplePlot]:
+def read_plots(file: FilePath, run: FilePath, *, crs: str | None) -> list[SamplePlot]:
     """Return the plots of a file in the frame of the map of a run.
 
     Polygons are plots; points are circles if a column `radius_m` (or `radius`, `r_m`) gives their radius.
     Names are those of a column `name`, `plot`, `id` or similar, else the numbers of the rows.
 
     Args:
-        file: A GeoPackage, Shapefile or GeoJSON of at most 64 MB and PLOTS_MAX rows.
+        file: A GeoPackage, Shapefile (also in a zip archive) or GeoJSON of at most 64 MB and PLOTS_MAX rows.
         run: Folder of the run.
         crs: Reference system of a file without one: an EPSG code, or "local" for the frame of the map. It
             also states that a GeoJSON, which is WGS84 by its standard, is in that system. It is ignored for
@@ -38,11 +46,12 @@ def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list
     """
     geopandas = needed("geopandas", "gis", "plots from files")
     if file.suffix.lower() not in SUFFIXES:
-        raise SourceError("plots are .gpkg, .shp or .geojson files", where=str(file))
+        raise SourceError("plots are .gpkg, .shp (also in a .zip) or .geojson files", where=str(file))
     try:
         if file.stat().st_size > LARGEST_FILE:
             raise SourceError("the file of plots is larger than 64 MB", where=str(file))
-        table = geopandas.read_file(file, engine="pyogrio", rows=PLOTS_MAX + 1)
+        layer = _layer_of(file)
+        table = geopandas.read_file(file, engine="pyogrio", rows=PLOTS_MAX + 1, layer=layer)
     except OSError as error:
         raise SourceError(f"cannot read the plots: {error.strerror}", where=str(file)) from None
     except (RuntimeError, ValueError) as error:
@@ -57,13 +66,69 @@ def read_plots(file: FilePath, run: FilePath, *, crs: str | None = None) -> list
     plots = []
     for k, shape in enumerate(shapes):
         name = str(k + 1) if named is None else str(table[named].iloc[k])
-        if shape is not None and shape.geom_type == "Point" and radius is not None:
-            from pipeline.stand.plots import circle
-
-            plots.append(circle(name, shape.x, shape.y, float(table[radius].iloc[k])))
+        is_centre = shape is not None and shape.geom_type == "Point" and not shape.is_empty
+        if is_centre and radius is not None:
+            plots.append(circle(name, shape.x, shape.y, _radius(table[radius].iloc[k], name, file)))
         else:
             plots.append(checked(SamplePlot(name, shape)))
     return plots
+
+
+def placed(contents: Sequence[Content], offset: Sequence[float]) -> list[SamplePlot]:
+    """Return plots of the store in the coordinates of the files of a run.
+
+    Args:
+        contents: Annotations; those that are no plots are left out.
+        offset: Offset x, y of the frame of the map in these coordinates [m].
+    """
+    plots = [plot_of(**content.plot) for content in contents if content.plot]
+    by = np.array(offset[:2], np.float64)
+    return [SamplePlot(p.name, shapely.transform(p.shape, lambda xy: xy + by)) for p in plots]
+
+
+def stored_plots(store: Store, source: Mapping[str, Any]) -> list[SamplePlot]:
+    """Return the plots of a recording, in the coordinates of the files of its runs.
+
+    Args:
+        store: The store.
+        source: Member `source` of run.json.
+    """
+    contents = store.contents(str(source.get("sha256") or source.get("uri")), PLOT)
+    return placed(contents, source.get("offset_m", (0.0, 0.0)))
+
+
+def stored_frame(store: Store, source: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return the reference system that a recording got on the page, in the form of `MapFrame.record`; None
+    without one. Arguments as in `stored_plots`."""
+    contents = store.contents(str(source.get("sha256") or source.get("uri")), FRAME)
+    return contents[0].plot["frame"] if contents and contents[0].plot else None
+
+
+def _radius(value: object, name: str, file: FilePath) -> float:
+    """Return the radius in a cell [m]; raises SourceError for anything but a finite number.
+
+    Args:
+        value: The cell.
+        name, file: Name of the plot and its file, for errors.
+    """
+    try:
+        radius = float(str(value))
+    except ValueError:
+        radius = math.nan
+    if not math.isfinite(radius):
+        raise SourceError(f"plot {name}: the radius {str(value)!r} is not a number", where=str(file))
+    return radius
+
+
+def _layer_of(file: FilePath) -> str:
+    """Return the name of the layer with the plots: `plots`, or one that ends in `_plots`, as in the files of
+    `stemmap export`; else the first. ValueError without a layer."""
+    import pyogrio
+
+    names = [str(name) for name in pyogrio.list_layers(file)[:, 0]]
+    if not names:
+        raise ValueError("it has no layer")
+    return next((name for name in names if name == "plots" or name.endswith("_plots")), names[0])
 
 
 def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN401 - a pyproj.CRS
@@ -81,7 +146,10 @@ def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN4
 
     declared = table.crs
     if file.suffix.lower() in (".geojson", ".json"):
-        record = json.loads(file.read_text(encoding="utf-8-sig"))
+        try:
+            record = json.loads(file.read_text(encoding="utf-8-sig"))
+        except ValueError:
+            raise SourceError("the file of plots is not JSON in UTF-8", where=str(file)) from None
         if "coordinateFrame" in record:  # a file of this program without georeference
             declared = None
             given = given or LOCAL
@@ -91,16 +159,16 @@ def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN4
         raise StemmapError(
             "the file of plots has no coordinate reference system",
             where=str(file),
-            remedy="Give it with --plots-crs EPSG:CODE, or --plots-crs local for the coordinates of the map",
+            remedy="Name it (--plots-crs): EPSG:CODE, or local for the coordinates of the map",
         )
     if declared is not None:
-        return declared
+        return None if declared.name == LOCAL_NAME else declared
     if given == LOCAL:
         return None
     try:
         return pyproj.CRS.from_user_input(given)
     except pyproj.exceptions.CRSError:
-        raise StemmapError(f"--plots-crs {given!r} is not a coordinate reference system") from None
+        raise StemmapError(f"{given!r} (--plots-crs) is not a coordinate reference system") from None
 
 
 def _in_map(table: Any, crs: Any, frame: MapFrame, file: FilePath) -> list[Any]:  # noqa: ANN401
@@ -121,7 +189,7 @@ def _in_map(table: Any, crs: Any, frame: MapFrame, file: FilePath) -> list[Any]:
         raise StemmapError(
             f"the plots are in {crs.name}, but the map is local",
             where=str(file),
-            remedy="Run stemmap georeference for the map, or give --plots-crs local if they are in its frame",
+            remedy="Run stemmap georeference for the map, or name local (--plots-crs) if they are in it",
         )
     moved = table.set_crs(crs, allow_override=True).to_crs(frame.crs)
     return [None if shape is None else shapely.transform(shape, frame.to_map) for shape in moved.geometry]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.batch.georeference import MapFrame, read_map_frame
+from app.batch.georeference import WGS84, MapFrame, read_map_frame, reproject
 from app.batch.run_folder import read_ground_area, read_run, read_seen_area
 from app.common.text import count, version
 from pipeline.config import Parameters
@@ -19,7 +19,8 @@ from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.atomic_files import write_texts
-from pipeline.io.ground_truth import read_truth_trees
+from pipeline.io.csv_table import CsvTable
+from pipeline.io.ground_truth import LARGEST_FILE, read_truth_trees
 from pipeline.io.result_files import csv_text
 from pipeline.stand.plots import within_reach
 from pipeline.stand.revisit import VisitComparison, VisitTrees, align_visits, compare_visits, with_known_sigma
@@ -52,7 +53,6 @@ class Visit:
         trees: Its trees.
         seen: Observed area of a run; None for a table.
         frame: Reference system of its coordinates.
-        numbered: Whether its trees have numbers of their own.
     """
 
     name: str
@@ -69,15 +69,17 @@ class Visit:
         return inside
 
 
-def read_visit(path: FilePath, *, dbh_unit: str | None = None) -> Visit:
-    """Return the visit of a run folder or of a table of trees (CSV).
+def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: bool = False) -> Visit:
+    """Return the visit of a run folder or of a table of trees (CSV). Rejected trees of a run, and objects in
+    a table that are not trees, are left out; those of a table have the sigma TABLE_SIGMA.
 
     Args:
         path: The folder or the table.
         dbh_unit: Unit of a diameter column without a unit.
+        may_be_empty: Whether it may have no trees.
 
     Raises:
-        StemmapError: It cannot be read or has no trees.
+        StemmapError: It cannot be read, has no trees, or its median diameter is below 5 mm or above 3 m.
     """
     if path.is_dir():
         trees = read_run(path).trees
@@ -95,21 +97,19 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None) -> Visit:
         unknown = np.full(n, np.nan)
         found = VisitTrees(numbers, position, np.full(n, TABLE_SIGMA), np.asarray(table.dbh)[keep], unknown)
         visit = Visit(str(path), found, None, MapFrame())
-    if not len(visit.trees.number):
+    if not len(visit.trees.number) and not may_be_empty:
         raise StemmapError("there are no trees", where=str(path))
     _check_unit(visit)
     return visit
 
 
 def _numbers(path: FilePath, keep: Bool) -> np.ndarray:
-    """Return the column `tree` of a table if all are different whole numbers, else 1, 2, ..."""
-    import csv
-
-    with path.open(encoding="utf-8-sig", newline="") as text:
-        rows = [row for row in csv.DictReader(text) if any(row.values())]
+    """Return the numbers of the rows of a table that the mask `keep`, shape (N,), selects, int64: its column
+    `tree` if all rows have different whole numbers, else their places in the table, from 1 on."""
+    cells = CsvTable.read(path, "table of trees", LARGEST_FILE).text("tree")
     try:
-        numbers = np.array([int(row["tree"]) for row in rows], np.int64)
-    except (KeyError, ValueError, TypeError):
+        numbers = np.array([int(cell) for cell in cells], np.int64)
+    except (ValueError, OverflowError):
         numbers = np.zeros(0, np.int64)
     if len(numbers) != len(keep) or len(np.unique(numbers)) < len(numbers):
         numbers = np.arange(1, len(keep) + 1)
@@ -117,6 +117,8 @@ def _numbers(path: FilePath, keep: Bool) -> np.ndarray:
 
 
 def _check_unit(visit: Visit) -> None:
+    """Check that the median diameter is 5 mm to 3 m; raises StemmapError if not. Nothing without
+    diameters."""
     known = visit.trees.dbh[np.isfinite(visit.trees.dbh)]
     if len(known) and float(np.median(known)) > 3.0:
         raise StemmapError(
@@ -202,6 +204,9 @@ def _row(
     sigma: float = math.nan,
     significant: bool | None = None,
 ) -> dict[str, Any]:
+    """Return a row of COLUMNS by name; lengths [m] as in the parameters, diameters and growth in centimetres,
+    None for NaN."""
+
     def number(value: float, digits: int) -> float | None:
         return round(float(value), digits) if math.isfinite(value) else None
 
@@ -219,11 +224,14 @@ def _row(
 
 
 def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, Any]:
-    """Return the figures of a comparison as JSON values."""
+    """Return the figures of a comparison as JSON values, with None where there is none: `alignment`, the
+    `counts` of COLUMNS' status, the number of `pairs`, RMS of their shifts, and mean, weighted mean, standard
+    error and RMS of the growth of those `with_dbh` in both."""
     rows = rows_of(a, b, found)
     growth = found.growth[np.isfinite(found.growth)]
     weight = 1.0 / np.square(found.growth_sigma[np.isfinite(found.growth)])
-    known, centre = len(growth) > 0, b.trees.position.mean(axis=0, keepdims=True)
+    known, position = len(growth) > 0, b.trees.position
+    centre = position.mean(axis=0, keepdims=True) if len(position) else np.zeros((1, 2))
     return {
         "stemmap": version(),
         "a": a.name,
@@ -277,6 +285,15 @@ def comparison_lines(record: dict[str, Any]) -> list[str]:
     return lines
 
 
+def comparison_csv(rows: list[dict[str, Any]]) -> str:
+    """Return the rows of `rows_of` as a CSV table; unknown values are empty."""
+    cells = [
+        ["" if v is None else str(v).lower() if isinstance(v, bool) else str(v) for v in row.values()]
+        for row in rows
+    ]
+    return csv_text(COLUMNS, cells)
+
+
 def write_comparison(a: Visit, b: Visit, found: VisitComparison, folder: FilePath) -> None:
     """Write comparison.csv, comparison.json, comparison.svg (a map) and comparison.geojson to a folder, which
     is created if necessary.
@@ -285,12 +302,8 @@ def write_comparison(a: Visit, b: Visit, found: VisitComparison, folder: FilePat
         OSError: The folder cannot be written.
     """
     rows = rows_of(a, b, found)
-    cells = [
-        ["" if v is None else str(v).lower() if isinstance(v, bool) else str(v) for v in r.values()]
-        for r in rows
-    ]
     texts = {
-        "comparison.csv": csv_text(COLUMNS, cells),
+        "comparison.csv": comparison_csv(rows),
         "comparison.json": json.dumps(comparison_record(a, b, found), indent=1, allow_nan=False) + "\n",
         "comparison.geojson": _geojson(a, rows),
         "comparison.svg": comparison_map(rows),
@@ -299,13 +312,12 @@ def write_comparison(a: Visit, b: Visit, found: VisitComparison, folder: FilePat
 
 
 def _geojson(a: Visit, rows: list[dict[str, Any]]) -> str:
+    """Return the rows of `rows_of` as GeoJSON text: points in WGS84 if the first visit has a reference
+    system, else in its local frame, which is declared."""
     place = np.array([[row["x_m"], row["y_m"]] for row in rows], np.float64).reshape(-1, 2)
     collection: dict[str, Any] = {"type": "FeatureCollection"}
     if a.frame.crs:
-        import pyproj
-
-        transformer = pyproj.Transformer.from_crs(a.frame.crs, 4326, always_xy=True)
-        place = np.round(np.stack(transformer.transform(*a.frame.to_crs(place).T), axis=1), 8)
+        place = np.round(reproject(a.frame.to_crs(place), a.frame.crs, WGS84), 8)
     else:
         collection["coordinateFrame"] = {"type": "local", "unit": "m", "origin": "that of the first visit"}
     collection["features"] = [
@@ -327,8 +339,8 @@ _SYMBOLS = {
 
 
 def comparison_map(rows: list[dict[str, Any]]) -> str:
-    """Return a map of the trees by their status as SVG, with a scale bar and a legend; significant growth is
-    a filled circle with a ring."""
+    """Return a map of the trees of `rows_of`, at least one, by their status as SVG, with a scale bar and a
+    legend; significant growth is a filled circle with a ring."""
     place = np.array([[row["x_m"], row["y_m"]] for row in rows], np.float64).reshape(-1, 2)
     low, high = place.min(axis=0) - 2.0, place.max(axis=0) + 2.0
     scale = 180.0 / max(float((high - low).max()), 1.0)

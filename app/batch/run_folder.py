@@ -1,18 +1,14 @@
-"""The folder of a mapped run: reading it back, checking it before it is overwritten, and finding the finished
-runs and partial outputs in the data folders.
+"""The folder of a mapped run: reading it back, and checking it before it is overwritten.
 
 `stemmap map` and `export` write to a folder whose name begins with a dot, and rename it at the end. When they
-are killed, this partial output remains. It cannot be continued; it can be deleted here.
+are killed, this partial output remains. It cannot be continued.
 """
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import json
 import math
-import shutil
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -20,19 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from app.common.settings import Settings
-from app.sources import inspection
-from app.store.records import UnknownError
+from app.common.arrays import rows_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.evaluation import MapScores, evaluate
 from pipeline.geometry.poses import Float
-from pipeline.io.atomic_files import UNFINISHED, is_held
+from pipeline.io.atomic_files import UNFINISHED
 from pipeline.io.result_files import (
     NEW_TREE_COLUMNS,
     PATH_COLUMNS,
-    ROWS,
+    REJECTED,
+    REVIEWS,
     SEEN_COLUMNS,
     TERRAIN_COLUMNS,
     TREE_COLUMNS,
@@ -64,6 +59,9 @@ class FinishedRun:
     Attributes:
         record: run.json; only "source", "seed" and "parameters" are checked.
         uri: URI of the source.
+        trees: The trees that no person rejected.
+        reviews: Whether a tree is open or confirmed in the review, see `REVIEWS`, by its number.
+        rejected: Number of rejected trees.
         of_cloud: Whether a whole cloud was mapped, which has an empty path.
     """
 
@@ -73,12 +71,15 @@ class FinishedRun:
     parameters: Parameters
     path: Path
     trees: Trees
+    reviews: dict[int, str]
+    rejected: int
     of_cloud: bool
 
 
 def read_run(folder: FilePath) -> FinishedRun:
-    """Return the run in a folder that `stemmap map` wrote: its run.json, path.csv and trees.csv. The trees
-    have no velocity, diagonal covariances, and are all confirmed.
+    """Return the run in a folder that `stemmap map` wrote: its run.json, path.csv and trees.csv, without the
+    trees that a person rejected. The trees have the velocity 0, diagonal covariances, and are all confirmed;
+    times count from the first scan, unknown ones of trees are -1; other unknown values are NaN.
 
     Raises:
         SourceError: A file is missing, damaged or larger than 256 MB.
@@ -89,20 +90,37 @@ def read_run(folder: FilePath) -> FinishedRun:
         uri, seed = str(record["source"]["uri"]), int(record["seed"])
     except (ValueError, KeyError, TypeError, ParameterError):
         raise _damaged(folder) from None
+    columns = _columns(folder / "trees.csv", TREE_COLUMNS)
+    states = [REVIEWS[k] for k in np.nan_to_num(columns["review"]).astype(np.int64)]
+    trees = rows_of(_trees(columns), kept := np.array([state != REJECTED for state in states], np.bool_))
     return FinishedRun(
         record,
         uri,
         seed,
         parameters,
         _path(_columns(folder / "path.csv", PATH_COLUMNS)),
-        _trees(_columns(folder / "trees.csv", TREE_COLUMNS)),
+        trees,
+        dict(zip(trees.number.tolist(), (state for state in states if state != REJECTED), strict=True)),
+        int(np.count_nonzero(~kept)),
         is_of_cloud(record),
     )
 
 
+def read_tree_places(folder: FilePath) -> dict[int, tuple[float, float]]:
+    """Return x, y [m] of each tree in trees.csv by its number, also of those that a person rejected. run.json
+    is not read.
+
+    Raises:
+        SourceError: The file is missing or damaged.
+    """
+    c = _columns(folder / "trees.csv", TREE_COLUMNS)
+    numbers = c["tree"].astype(np.int64).tolist()
+    return dict(zip(numbers, zip(c["x_m"].tolist(), c["y_m"].tolist(), strict=True), strict=True))
+
+
 def read_seen_area(folder: FilePath) -> SeenArea | None:
-    """Return the area that a run observed, from seen.csv; None without this file. An unknown number of views
-    is 0.
+    """Return the area that a run observed, from seen.csv, with cells of CELL; None without this file. An
+    unknown distance is NaN, an unknown number of views 0.
 
     Raises:
         SourceError: The file is damaged.
@@ -110,7 +128,9 @@ def read_seen_area(folder: FilePath) -> SeenArea | None:
     file = folder / "seen.csv"
     if not file.is_file():
         return None
-    return _seen_area(_columns(file, SEEN_COLUMNS), CELL)
+    c = _columns(file, SEEN_COLUMNS)
+    place = np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / CELL).astype(np.int64)
+    return SeenArea(CELL, place, c["nearest_m"], np.nan_to_num(c["views"]).astype(np.int64))
 
 
 def read_ground_area(folder: FilePath) -> SeenArea | None:
@@ -147,12 +167,6 @@ def read_terrain(folder: FilePath) -> Float:
     return np.stack([c["x_m"], c["y_m"], c["z_m"]], axis=1)
 
 
-def _seen_area(c: dict[str, Float], cell: float) -> SeenArea:
-    """Return the area from the columns of seen.csv; `cell` is the size of its cells [m]."""
-    place = np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / cell).astype(np.int64)
-    return SeenArea(cell, place, c["nearest_m"], np.nan_to_num(c["views"]).astype(np.int64))
-
-
 def is_of_cloud(record: dict[str, Any]) -> bool:
     """Return whether a record (run.json) is that of the map of a whole cloud."""
     return isinstance(record.get("source"), dict) and "offset_m" in record["source"]
@@ -179,9 +193,9 @@ def _damaged(folder: FilePath) -> SourceError:
 
 
 def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
-    """Return the confirmed trees and the path with the precision of their files, so that scores after mapping
-    equal scores of the files. As from `read_run`, the trees have no velocity and diagonal covariances, and
-    times count from `start_ns`.
+    """Return copies of the confirmed trees and of the path with the precision of their files, so that scores
+    after mapping equal scores of the files. As from `read_run`, the trees have the velocity 0 and diagonal
+    covariances, times count from `start_ns`, and unknown times of trees are -1.
 
     Args:
         trees, path: The map.
@@ -232,8 +246,8 @@ def _text(file: FilePath) -> str:
 
 
 def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
-    """Return the columns of a CSV file by name; an empty cell is NaN, also in NEW_TREE_COLUMNS that the file
-    does not have.
+    """Return the columns of a CSV file by name, shape (rows,) each, in the units of the file; an empty cell
+    is NaN, also in NEW_TREE_COLUMNS that the file does not have, and a review its place in REVIEWS.
 
     Args:
         file: The file.
@@ -260,7 +274,8 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
 
 
 def _table(rows: Sequence[Sequence[str]], names: tuple[str, ...]) -> dict[str, Float]:
-    """Return the columns of a CSV table by name, shape (rows,) each; an empty cell is NaN.
+    """Return the columns of a CSV table by name, shape (rows,) each; an empty cell is NaN, a review its place
+    in REVIEWS.
 
     Args:
         rows: Cells of the rows, without the header.
@@ -269,8 +284,17 @@ def _table(rows: Sequence[Sequence[str]], names: tuple[str, ...]) -> dict[str, F
     Raises:
         ValueError: A row does not fit the columns, or a cell is not a number.
     """
-    table = np.array([[float(cell) if cell else math.nan for cell in row] for row in rows], np.float64)
+    table = np.array(
+        [[_number(name, cell) for name, cell in zip(names, row, strict=True)] for row in rows], np.float64
+    )
     return dict(zip(names, table.reshape(len(rows), len(names)).T, strict=True))
+
+
+def _number(name: str, cell: str) -> float:
+    """Return a cell of a column as a number, see `_table`; raises ValueError if it is none."""
+    if not cell:
+        return math.nan
+    return float(REVIEWS.index(cell)) if name == "review" else float(cell)
 
 
 def _path(c: dict[str, Float]) -> Path:
@@ -304,7 +328,7 @@ def _trees(c: dict[str, Float]) -> Trees:
 
 
 def _stamps(seconds: Float) -> Int:
-    """Convert seconds to nanoseconds; NaN, as in the map of a whole cloud, becomes -1."""
+    """Return seconds, shape (N,), as nanoseconds, int64; NaN, as in the map of a whole cloud, becomes -1."""
     stamps: Int = np.where(np.isfinite(seconds), np.round(np.nan_to_num(seconds) * 1e9), -1.0).astype(
         np.int64
     )
@@ -350,163 +374,11 @@ def check_folder(folder: FilePath, digest: str, *, force: bool) -> bool:
     return True
 
 
-_FINISHED_LIMIT = 500
-_PARTIAL_LIMIT = 100
-QUIET_S = 600.0  # a folder that was written to more recently may belong to a running process
-
-
-def finished_folders(settings: Settings) -> dict[str, FilePath]:
-    """Return the folders of finished runs in the data folders by name, at most 500; of two with the same name
-    the first. Links that point outside of the data folders, and data folders that cannot be read, are left
-    out."""
-    found: dict[str, FilePath] = {}
-    for folder in settings.data_folders:
-        try:
-            paths = sorted(path for path in folder.iterdir() if _is_finished(path, folder))
-        except OSError:
-            continue
-        for path in paths:
-            found.setdefault(path.name, path)
-    return dict(list(found.items())[:_FINISHED_LIMIT])
-
-
-async def read_folder(name: str, settings: Settings) -> dict[str, Any]:
-    """Return a finished run, read in a child process.
-
-    Args:
-        name: Name in `finished_folders`.
-        settings: Settings of the deployment.
-
-    Raises:
-        UnknownError: There is no such folder.
-        StemmapError: It cannot be read.
-    """
-    path = finished_folders(settings).get(name)
-    if path is None:
-        raise UnknownError("there is no such run in the data folders", where=name[:200])
-    return {**await inspection.ask({"ask": "finished", "path": str(path)}), "name": name}
-
-
-def _is_finished(path: FilePath, folder: FilePath) -> bool:
-    """Return whether a path is the folder of a finished run inside of a data folder.
-
-    Args:
-        path: The path.
-        folder: The data folder.
-    """
-    try:
-        if path.name.startswith(".") or not path.resolve().is_relative_to(folder.resolve()):
-            return False
-        return (path / "run.json").is_file() and (path / "trees.csv").is_file()
-    except OSError:
-        return False
-
-
-@dataclass(frozen=True, slots=True)
-class PartialOutput:
-    """A folder that a killed process left.
-
-    Attributes:
-        name: Path relative to the data folder.
-        size: Size of its files [bytes].
-        changed_s: Time of the last change [s since 1970].
-        quiet: Whether it can be deleted: no process holds it, and it was not changed for QUIET_S.
-    """
-
-    name: str
-    size: int
-    changed_s: int
-    quiet: bool
-
-
-def partial_outputs(settings: Settings, now_s: float | None = None) -> list[PartialOutput]:
-    """Return at most 100 partial outputs in the data folders, the newest first.
-
-    Args:
-        settings: Settings of the deployment.
-        now_s: Present time [s since 1970]; None for the system time.
-    """
-    now_s = time.time() if now_s is None else now_s
-    found = [_described(path, name, now_s) for name, path in _partial_folders(settings).items()]
-    return sorted((each for each in found if each is not None), key=lambda each: -each.changed_s)
-
-
-def delete_partial_output(name: str, settings: Settings, now_s: float | None = None) -> None:
-    """Delete a partial output with all its files.
-
-    Args:
-        name: Its path relative to the data folder.
-        settings: Settings of the deployment.
-        now_s: Present time [s since 1970]; None for the system time.
-
-    Raises:
-        UnknownError: There is none of this name.
-        StemmapError: A process may still write to it, or it cannot be deleted.
-    """
-    path = _partial_folders(settings).get(name)
-    output = None if path is None else _described(path, name, time.time() if now_s is None else now_s)
-    if path is None or output is None:
-        raise UnknownError("there is no such partial output in the data folders", where=name[:200])
-    if is_held(path / ROWS):
-        raise StemmapError(
-            "a stemmap process writes to it", where=name, remedy="Wait until it has ended, or end it"
-        )
-    if not output.quiet:
-        raise StemmapError(
-            "it was written to within the last ten minutes",
-            where=name,
-            remedy="If no stemmap process writes to it any more, delete it later",
-        )
-    try:
-        shutil.rmtree(path)
-    except OSError as error:
-        raise StemmapError(f"it cannot be deleted: {error.strerror}", where=name) from None
-
-
 def partial_output_warnings(folder: FilePath) -> list[str]:
     """Return a warning for each partial output directly in a folder; [] if the folder does not exist."""
     return [
         f"{path} is the partial output of a run that was killed: delete it, unless another stemmap process "
         "writes to it"
-        for path in _inside(folder)
+        for path in sorted(folder.glob(f"{UNFINISHED}*"))
+        if path.is_dir()
     ]
-
-
-def _partial_folders(settings: Settings) -> dict[str, FilePath]:
-    """Return at most 100 partial outputs by their path relative to the data folder, in the data folders and
-    in the folders in these, without links."""
-    found: dict[str, FilePath] = {}
-    for folder in settings.data_folders:
-        for path in [*_inside(folder), *(each for run in _folders(folder) for each in _inside(run))]:
-            found.setdefault(path.relative_to(folder).as_posix(), path)
-    return dict(list(found.items())[:_PARTIAL_LIMIT])
-
-
-def _inside(folder: FilePath) -> list[FilePath]:
-    """Return the partial outputs directly in a folder."""
-    return [path for path in _folders(folder) if path.name.startswith(UNFINISHED)]
-
-
-def _folders(folder: FilePath) -> list[FilePath]:
-    """Return the folders in a folder without links, sorted; [] if it cannot be read."""
-    try:
-        return sorted(path for path in folder.iterdir() if path.is_dir() and not path.is_symlink())
-    except OSError:
-        return []
-
-
-def _described(path: FilePath, name: str, now_s: float) -> PartialOutput | None:
-    """Return the description of a partial output; None if it has just been deleted or cannot be read.
-
-    Args:
-        path: The folder.
-        name: Name in the description.
-        now_s: Time now [s]; output is "quiet" if nothing changed for QUIET_S and no process holds it.
-    """
-    with contextlib.suppress(OSError):
-        stats = [path.stat(), *(file.lstat() for file in path.iterdir())]
-        changed = max(stat.st_mtime for stat in stats)
-        size = sum(stat.st_size for stat in stats[1:])
-        quiet = now_s - changed > QUIET_S and not is_held(path / ROWS)
-        return PartialOutput(name, size, int(changed), quiet)
-    return None

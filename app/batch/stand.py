@@ -20,6 +20,8 @@ from pipeline.io.result_files import csv_text, number_text
 from pipeline.stand.figures import FEW_TREES, FIGURES, Estimate, PlotTrees, StandFigures, combined
 from pipeline.stand.plots import SamplePlot, detection_function, figures_of, seen_plot, within_reach
 from pipeline.stand.seen_area import SeenArea
+from pipeline.stand.volume import VolumeFormula
+from pipeline.types.records import Trees
 
 ALL = "all"
 NO_RECORD = "the run has no record of what was observed; cells with ground returns are used. Map it again"
@@ -34,6 +36,7 @@ class StandResult:
         trees: Its trees.
         parameters: Parameters of the figures.
         plots: The plots; the whole observed area without plots.
+        whole: Whether there are no plots, and the only one is the whole observed area.
         seen: Observed area within reach.
         figures: Figures of each plot by name.
         total: Mean over the plots, or the figures of the one plot.
@@ -46,6 +49,7 @@ class StandResult:
     trees: PlotTrees
     parameters: Stand
     plots: Sequence[SamplePlot]
+    whole: bool
     seen: SeenArea
     figures: dict[str, StandFigures]
     total: dict[str, Estimate]
@@ -54,7 +58,9 @@ class StandResult:
 
 
 def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = ()) -> StandResult:
-    """Return the stand figures of a finished run. Nothing is written.
+    """Return the stand figures of a finished run; rejected trees do not count. Nothing is written. A run
+    without seen.csv was observed where it has ground returns, which is a warning for a drive. Diameters that
+    look like those of another unit, and few trees, are warnings, too.
 
     Args:
         folder: Its folder.
@@ -83,17 +89,17 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise StemmapError(f"two plots are called {twice!r}", remedy="Give each plot its own name")
-    trees = PlotTrees(run.trees.position, run.trees.dbh, run.trees.dbh_sigma)
+    trees = _plot_trees(run.trees, parameters.volume)
     chosen = list(plots) or [seen_plot(ALL, seen)]
     figures = figures_of(chosen, trees, seen, parameters)
     if not any(f.seen > 0.0 for f in figures.values()):
         raise StemmapError(
             f"{'the plot is' if len(chosen) == 1 else 'all plots are'} outside of what the run observed",
             where=str(folder),
-            remedy=f"Check the coordinates; the map is in {frame.name} coordinates, {_extent(seen.centres)}",
+            remedy=f"Check the coordinates; the map is in {frame.title} coordinates, {_extent(seen.centres)}",
         )
     for name, f in figures.items():
-        warnings += [text if name == ALL else f"plot {name}: {text}" for text in f.warnings]
+        warnings += [f"plot {name}: {text}" if plots else text for text in f.warnings]
     if len(chosen) > 1 and 0 < sum(f.trees for f in figures.values()) < FEW_TREES:
         warnings.append("fewer than ten trees in all plots: the figures are uncertain")
     if np.nanmax(trees.dbh, initial=0.0) > 3.0:
@@ -102,7 +108,20 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         warnings.append("all diameters are below 2 cm: is the column dbh_cm of trees.csv in metres?")
     total = combined(figures) if len(chosen) > 1 else dict(figures[chosen[0].name].values)
     sigma = detection_function(trees, seen, parameters).sigma
-    return StandResult(run, frame, trees, parameters, chosen, seen, figures, total, sigma, tuple(warnings))
+    return StandResult(
+        run, frame, trees, parameters, chosen, not plots, seen, figures, total, sigma, tuple(warnings)
+    )
+
+
+def _plot_trees(trees: Trees, formula: str) -> PlotTrees:
+    """Return trees for stand figures, with volumes by a formula if it is not empty."""
+    if not formula:
+        return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma)
+    unknown = np.full(len(trees.number), np.nan)
+    height = unknown if trees.height is None else trees.height
+    sigma = unknown if trees.height_sigma is None else trees.height_sigma
+    volume = VolumeFormula.parse(formula).with_sigma(trees.dbh, trees.dbh_sigma, height, sigma)
+    return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma, *volume)
 
 
 def _extent(points: np.ndarray) -> str:
@@ -111,7 +130,16 @@ def _extent(points: np.ndarray) -> str:
     return f"x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} to {high[1]:.0f} m"
 
 
-PLOT_COLUMNS = ("plot", "area_m2", "seen_m2", "trees", "trees_without_dbh", "detection", "detection_se")
+PLOT_COLUMNS = (
+    "plot",
+    "area_m2",
+    "seen_m2",
+    "trees",
+    "trees_without_dbh",
+    "trees_with_volume",
+    "detection",
+    "detection_se",
+)
 CLASS_COLUMNS = ("plot", "from_cm", "to_cm", "trees", "n_ha", "n_ha_se", "g_ha", "g_ha_se")
 
 
@@ -122,6 +150,7 @@ def stand_files(result: StandResult) -> dict[str, str]:
     rows = []
     for name, f in result.figures.items():
         about = [name, f"{f.area:.2f}", f"{f.seen:.2f}", str(f.trees), str(f.without_dbh)]
+        about.append("" if f.with_volume is None else str(f.with_volume))
         rows.append([*about, *_numbers(f.detection), *_cells(dict(f.values))])
     if len(result.figures) > 1:
         rows.append(["mean", *[""] * (len(PLOT_COLUMNS) - 1), *_cells(result.total)])
@@ -138,12 +167,16 @@ def stand_files(result: StandResult) -> dict[str, str]:
 
 
 def stand_record(result: StandResult) -> dict[str, Any]:
-    """Return the figures as JSON values; unknown values are null."""
+    """Return the figures as JSON values, the contents of stand.json: each figure is [value, standard error],
+    None for unknown values. `plots` has by name `area_m2`, `seen_m2`, `trees`, `trees_without_dbh`,
+    `trees_with_volume`, `detection`, the figures, and `classes` (from_cm, to_cm, trees, n_ha, g_ha); `mean`
+    has the figures over all plots, `units` the unit of each figure."""
     return {
         "stemmap": version(),
         "source": result.run.uri,
         "crs": result.frame.name,
         "parameters": result.parameters.model_dump(),
+        "trees_rejected": result.run.rejected,
         "detection_sigma_m": _finite(result.detection_sigma),
         "units": {name: unit for name, (_, unit) in FIGURES.items()},
         "plots": {
@@ -152,6 +185,7 @@ def stand_record(result: StandResult) -> dict[str, Any]:
                 "seen_m2": round(f.seen, 3),
                 "trees": f.trees,
                 "trees_without_dbh": f.without_dbh,
+                "trees_with_volume": f.with_volume,
                 "detection": _pair(f.detection),
                 **{key: _pair(value) for key, value in f.values.items()},
                 "classes": [
@@ -193,16 +227,16 @@ def _numbers(values: Sequence[float]) -> list[str]:
 
 
 def stand_summary(result: StandResult) -> list[str]:
-    """Return the figures as lines for people; figures without a value are omitted."""
+    """Return the figures over all plots as lines for people; figures without a value are omitted."""
     seen = sum(f.seen for f in result.figures.values())
     area = sum(f.area for f in result.figures.values())
     trees = sum(f.trees for f in result.figures.values())
-    of = count(len(result.figures), "plot") if result.figures.keys() != {ALL} else "whole observed area"
+    of = "whole observed area" if result.whole else count(len(result.figures), "plot")
     least = f"{100.0 * result.parameters.dbh_min:g} cm"
     part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
     lines = [
         f"{of}: {count(trees, 'tree')} from {least} on {seen:,.0f} m2 observed{part}, "
-        f"coordinates {result.frame.name}"
+        f"coordinates {result.frame.title}"
     ]
     for name, (title, unit) in FIGURES.items():
         value, se = result.total[name]
@@ -210,11 +244,14 @@ def stand_summary(result: StandResult) -> list[str]:
             error = f" +- {_digits(se)}" if math.isfinite(se) else ""
             lines.append(f"{title}: {_digits(value)}{error} {unit}".rstrip())
     sigma = result.detection_sigma
-    lines.append(
-        f"detection: half-normal over distance, sigma {sigma:.1f} m"
-        if math.isfinite(sigma)
-        else "detection: does not decrease with distance within reach"
-    )
+    if math.isfinite(sigma):
+        lines.append(f"detection: half-normal over distance, sigma {sigma:.1f} m")
+        lines.append(
+            "which to use: the figures without correction; corrected ones only where trees far from the path "
+            "were missed, because they are too large where the stand is thinner there"
+        )
+    else:
+        lines.append("detection: does not decrease with distance within reach")
     errors = "between plots" if len(result.figures) > 1 else "of this area: diameters, occlusion, detection"
     lines.append(f"+- standard error {errors}")
     return lines

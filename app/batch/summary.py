@@ -12,8 +12,7 @@ import numpy as np
 
 from app.common.text import count
 from pipeline.evaluation import MapScores, PathError, Rate
-from pipeline.types.pose_health import Health, HealthState
-from pipeline.types.records import Frame, Path, Verdict
+from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
 
 if TYPE_CHECKING:
     from app.batch.continue_map import RunSource
@@ -46,7 +45,8 @@ class RunHealth:
 
     @classmethod
     def of_both(cls, first: RunHealth, second: RunHealth, scans: int, shift_ns: int) -> RunHealth:
-        """Return the pose quality of two consecutive runs.
+        """Return the pose quality of two consecutive runs as another object; at most MOST_SPANS spans are
+        kept, the others counted.
 
         Args:
             first, second: Pose quality of the runs.
@@ -112,8 +112,9 @@ class RunHealth:
             self._worst[name] = min(value, self._worst.get(name, math.inf))
 
     def record(self, start_ns: int) -> dict[str, Any]:
-        """Return the record for run.json: scans by state, worst values, and at most MOST_SPANS spans; times
-        are seconds after `start_ns`."""
+        """Return the record for run.json: `scans`, the number by state; `worst`, the worst value by name;
+        `spans`, at most MOST_SPANS, each with `state`, `reason`, `scans` [first, last] and `time_s` [first,
+        last], seconds after `start_ns`; and `spans_left_out`, the number of further ones."""
         return {
             "scans": {state: self._scans[state] for state in ("good", "weak", "lost")},
             "worst": {name: round(value, 4) for name, value in sorted(self._worst.items())},
@@ -194,7 +195,7 @@ class RunTotals:
         self.warned.update(frame.warnings)
 
     def warn_of_unconfirmed(self, frame: Frame, hits: int) -> None:
-        """Add a warning if trees are not confirmed at the end.
+        """Add a warning with the number of trees that are not confirmed at the end, if there are any.
 
         Args:
             frame: Results of the last scan.
@@ -214,7 +215,7 @@ class RunTotals:
 
 
 def far_truth(reach: float) -> str:
-    """Return the message for ground truth that is not near the path."""
+    """Return the message for ground truth that is not within `reach` metres of the path."""
     return (
         f"no ground truth is within {reach:g} m of the path: it must be in the frame of the map, "
         "with the first pose as the origin and x along its heading "
@@ -340,8 +341,8 @@ def _pair(value: float | None) -> str:
 
 
 def start_lines(last: RunSource) -> list[str]:
-    """Return where a run was found to start in an earlier map, as one line; [] if it was not found by its
-    stems."""
+    """Return where a run was found to start in an earlier map, as one line for people; [] if its start was
+    not found by stems."""
     if last.start != "constellation":
         return []
     x, y, yaw = last.pose

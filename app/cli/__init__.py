@@ -11,6 +11,7 @@ import contextlib
 import difflib
 import importlib
 import os
+import re
 import signal
 import sys
 import threading
@@ -41,13 +42,15 @@ COMMANDS = (
     "licences",
 )
 
-DONE, FAILED, WRONG_USAGE, DONE_WITH_LOSSES = 0, 1, 2, 3
+FAILED, WRONG_USAGE = 1, 2
 
 CODES = (
     "Exit codes: 0 done; 1 failed, with a message; 2 wrong usage, such as a mistyped flag, parameter or\n"
     "scenario; 3 done, but something was left out (see stderr)."
 )
 
+
+_NEGATIVE = re.compile(r"-[\d.][^,]*,")
 
 STOPPED = "stopped; no result was written"
 
@@ -100,6 +103,10 @@ def main(arguments: list[str] | None = None) -> int:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or (words[0] not in COMMANDS and words[0] not in ("-h", "--help", "--version")):
         words.insert(0, "serve")  # `stemmap run.mcap` is short for `stemmap serve run.mcap`
+    # argparse takes a word such as -5,3,10 for a flag.
+    for k in range(len(words) - 1, 0, -1):
+        if _NEGATIVE.match(words[k]) and words[k - 1].startswith("--") and words[k - 1] != "--":
+            words[k - 1 : k + 1] = [f"{words[k - 1]}={words[k]}"]
     parser, known = _build_parser(words[0])
     parsed = argparse.Namespace()
     try:

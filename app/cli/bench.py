@@ -10,6 +10,7 @@ import sys
 from datetime import date
 from pathlib import Path
 
+from app.cli import flags
 from pipeline.errors import StemmapError
 
 HELP = "measure speed and memory, and write docs/benchmarks.md (needs the source tree)"
@@ -27,6 +28,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=_seeds,
         help="seeds of benchmarks that map a recording several times, such as 1-20 (default: their own)",
     )
+    parser.add_argument(
+        "--hours", metavar="N", type=flags.positive_number(1000.0, "hours"), help="duration of `campaign`"
+    )
+    parser.add_argument("--scans", metavar="N", type=flags.whole_number(1000, 10**8), help="length of `soak`")
     parser.add_argument("--json", metavar="FILE", type=Path, help="also write the figures as JSON")
     parser.add_argument(
         "--out", metavar="FILE", type=Path, help="Markdown file (default: docs/benchmarks.md of the tree)"
@@ -48,7 +53,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the benchmarks and write docs/benchmarks.md or --out; with --list or --pictures only list them or
-    draw pictures. --seeds is passed on by an environment variable.
+    draw pictures. --seeds, --hours and --scans are passed on by environment variables.
 
     Returns:
         Exit code: 1 if a benchmark failed, else 0.
@@ -76,6 +81,9 @@ def run(arguments: argparse.Namespace) -> int:
     day = arguments.date or date.today()
     if arguments.seeds is not None:
         os.environ[VARIABLE] = arguments.seeds
+    for name in ("hours", "scans"):
+        if (value := getattr(arguments, name)) is not None:
+            os.environ[f"STEMMAP_BENCH_{name.upper()}"] = str(value)
     failed = run_benchmarks(arguments.names, out=out, json_file=arguments.json, day=day)
     return 1 if failed else 0
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from app.cli.flags import add_dbh_unit_flag, positive_number
+from app.cli.stand import reviewed
 
 HELP = "compare two runs or surveys of one stand: growth, new, missing and moved trees"
 
@@ -43,10 +45,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the comparison and write its files."""
+    """Print the comparison and write its files to --out; return 0.
+
+    Raises:
+        StemmapError: A visit cannot be read or has no trees, the stems do not agree with certainty, or the
+            files cannot be written.
+    """
     from app.batch.revisit import compare, comparison_lines, comparison_record, read_visit, write_comparison
 
-    a, b = (read_visit(path, dbh_unit=arguments.dbh_unit) for path in (arguments.a, arguments.b))
+    visits = []
+    for path in (arguments.a, arguments.b):
+        with reviewed(path) as folder:
+            visits.append(replace(read_visit(folder, dbh_unit=arguments.dbh_unit), name=str(path)))
+    a, b = visits
     found = compare(
         a, b, same_frame=arguments.same_frame, reach=arguments.match, dbh_sigma=0.01 * arguments.dbh_sigma
     )

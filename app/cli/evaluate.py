@@ -51,7 +51,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Score the runs and print the scores, with one set of parameters or, with --param-grid, with many. A run
-    that cannot be scored is reported on standard error if there are several.
+    that cannot be scored is reported on standard error if there are several. With --json several runs become
+    one object by their names.
 
     Returns:
         Exit code: 0; 3 if some runs could not be scored; 1 if none could.
@@ -195,12 +196,7 @@ def add_grid_flags(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="folder for report.html, results.csv, means.csv, results.json and times.csv",
     )
-    group.add_argument(
-        "--keep",
-        metavar="DIR",
-        type=Path,
-        help="folder that stores results, so that they are computed once (default: in STEMMAP_FOLDER)",
-    )
+    flags.add_keep_flag(group)
     flags.add_parameter_flags(parser)
     flags.add_run_flags(parser)
     flags.add_source_flags(parser)
@@ -302,29 +298,29 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
 def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
     """Compute all jobs of a plan with a progress bar, in --jobs processes (default: one per usable core, at
     most one per job). Return their results, and print warnings to standard error."""
-    from app.common.settings import from_environment
     from app.common.text import count
-    from app.tuning.sweep import ResultStore, sweep
-    from app.tuning.workers import ScoringProcesses
+    from app.tuning.sweep import sweep
+    from app.tuning.workers import ResultStore, ScoringProcesses
 
-    folder = from_environment().folder
-    kept = ResultStore(arguments.keep or (folder and folder / "results"))
+    kept = ResultStore(flags.kept_results(arguments))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    processes: ScoringProcesses[int] = ScoringProcesses(min(arguments.jobs or cores, len(plan.jobs)))
+    processes: ScoringProcesses[int] = ScoringProcesses(
+        min(arguments.jobs or cores, len(plan.jobs)), kept=kept
+    )
     with (
         contextlib.closing(processes),
         flags.progress_bar(len(plan.jobs), "set") as bar,
     ):
-        outcome = sweep(list(plan.jobs.values()), processes, kept, bar.update)
-    if outcome.known:
-        print(f"{count(outcome.known, 'stored result')} used", file=sys.stderr)
+        answers = sweep(list(plan.jobs.values()), processes, bar.update)
+    if kept.used:
+        print(f"{count(kept.used, 'stored result')} used", file=sys.stderr)
     lost = [
         f"{count(times, 'process', 'processes')} lost during a job: {reason}"
         for reason, times in sorted(processes.lost.items())
     ]
-    for warning in (*outcome.warnings, *lost):
+    for warning in (*kept.warnings(), *lost):
         print(f"warning: {flags.plain(warning)}", file=sys.stderr)
-    return outcome.answers
+    return answers
 
 
 def _print_comparison(arguments: argparse.Namespace, comparison: Comparison, *, refused: int) -> int:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from app.cli.flags import positive_number
-from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, stand_parameters
+from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, reviewed, stand_parameters
 from pipeline.errors import StemmapError, UsageError
 
 HELP = "write a finished run as GIS, CAD or spreadsheet files, or for other tools"
@@ -56,8 +56,16 @@ def run(arguments: argparse.Namespace) -> int:
         StemmapError: A flag is wrong, the run cannot be read or lacks what the format shows, a package is not
             installed, or a file cannot be written.
     """
+    with reviewed(arguments.run) as folder:
+        return _export(arguments, folder)
+
+
+def _export(arguments: argparse.Namespace, folder: Path) -> int:
+    """Write what --to names for the run in `folder`: the files of the tree manager, its cloud (.las, .laz),
+    or its trees with the figures of the chosen plots. --out is only for the tree manager. Returns and raises
+    as `run`."""
     if arguments.to == TREE_MANAGER:
-        return _tree_manager(arguments)
+        return _tree_manager(arguments, folder)
     from app.batch.export import export_run, read_for_export
     from app.batch.stand import stand_of
 
@@ -65,16 +73,18 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
     file = Path(arguments.to)
     if file.suffix.lower() in (".las", ".laz"):
-        return _cloud(arguments.run, file)
+        return _cloud(folder, file)
     plots, parameters = chosen_plots(arguments), stand_parameters(arguments)
-    exported = read_for_export(arguments.run, stand_of(arguments.run, parameters, plots) if plots else None)
+    exported = read_for_export(folder, stand_of(folder, parameters, plots) if plots else None)
     written = export_run(exported, file)
-    print(f"{len(exported.place)} trees in {exported.frame.name} coordinates: {', '.join(map(str, written))}")
+    frame = exported.frame.title
+    print(f"{len(exported.place)} trees in {frame} coordinates: {', '.join(map(str, written))}")
     return 0
 
 
 def _cloud(run: Path, file: Path) -> int:
-    """Write the cloud with the number of the tree of each point."""
+    """Write the cloud with the number of the tree of each point and print the number of points; return 0.
+    Errors as in `run`."""
     from app.batch.mapped_cloud import write_cloud
     from pipeline.io.atomic_files import write_beside
 
@@ -90,7 +100,7 @@ def _cloud(run: Path, file: Path) -> int:
     return 0
 
 
-def _tree_manager(arguments: argparse.Namespace) -> int:
+def _tree_manager(arguments: argparse.Namespace, folder: Path) -> int:
     """Write poses and trees of a mapped run as files of Tree Manager to the new or empty folder --out.
 
     Returns:
@@ -106,7 +116,7 @@ def _tree_manager(arguments: argparse.Namespace) -> int:
 
     if arguments.out is None:
         raise UsageError("--out is missing", remedy="Name a folder, or a file with --to trees.gpkg")
-    finished = read_run(arguments.run)
+    finished = read_run(folder)
     if finished.of_cloud:
         raise StemmapError(
             "this is the map of a whole cloud, which has no poses",

@@ -64,7 +64,7 @@ def add_set_flag(parser: argparse.ArgumentParser, help_text: str) -> None:
 
 
 def add_truth_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --truth, for several runs, and --dbh-unit; see `truths_of`."""
+    """Add --truth, for several runs, and --dbh-unit; see `files_of`."""
     parser.add_argument(
         "--truth",
         metavar="[RUN=]FILE",
@@ -72,7 +72,7 @@ def add_truth_flags(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         help="true trees (CSV) of a run, in the frame of its map; repeated for each run, in their order or "
-        "with RUN= in front (default: those of the source)",
+        "with RUN= in front; one FILE serves all runs of `evaluate` (default: that of the source)",
     )
     add_dbh_unit_flag(parser)
 
@@ -137,6 +137,25 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_keep_flag(parser: argparse._ActionsContainer) -> None:
+    """Add --keep."""
+    parser.add_argument(
+        "--keep",
+        metavar="DIR",
+        type=Path,
+        help="folder that stores results, so that they are computed once (default: in STEMMAP_FOLDER)",
+    )
+
+
+def kept_results(arguments: argparse.Namespace) -> Path | None:
+    """Return the folder of stored results: --keep, else that in the data folder; None without both."""
+    from app.common.settings import RESULTS, from_environment
+
+    folder = from_environment().folder
+    kept: Path | None = arguments.keep
+    return kept or (folder and folder / RESULTS)
+
+
 def add_source_flags(parser: argparse.ArgumentParser) -> None:
     """Add --topic and --mount."""
     parser.add_argument(
@@ -182,21 +201,16 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
         sources: URIs of the sources.
 
     Raises:
-        ParameterError: With --record or --publish a source is not live or maps by itself, or with --publish
-            is not reached over Zenoh.
+        ParameterError: With --record or --publish a source is not live, or with --publish is not reached over
+            Zenoh.
     """
     import time
 
-    from app.robot.address import is_live, parse_address
+    from app.robot.address import is_live
 
     is_requested = arguments.record is not None or arguments.publish
     if is_requested and not all(is_live(uri) for uri in sources):
         raise ParameterError("--record and --publish need a live robot", remedy="Remove them")
-    if is_requested and any(getattr(parse_address(uri), "mapped_there", False) for uri in sources):
-        raise ParameterError(
-            "a robot that maps itself also records and publishes itself",
-            remedy="Remove --record and --publish here, or give them to `stemmap map` on the robot",
-        )
     if arguments.publish and not all(uri.lower().startswith("zenoh:") for uri in sources):
         raise ParameterError(
             "results can be published only over Zenoh",

@@ -7,7 +7,9 @@ import math
 from pathlib import Path
 
 from app.cli.flags import numbers, positive_number
-from pipeline.errors import UsageError
+from app.cli.stand import stored_on_page
+from pipeline.errors import StemmapError, UsageError
+from pipeline.stand import POINT_SIGMA
 
 BY_HAND = "EAST,NORTH,TURN[,Z]"
 HELP = "give a mapped run coordinates of the country, by control points, GNSS or by hand"
@@ -33,12 +35,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=numbers(BY_HAND),
         help="position of the map's origin, angle of its x axis from east to north in degrees, and height",
     )
+    how.add_argument(
+        "--in-file",
+        action="store_true",
+        help="the coordinates of the file are already in the system of --crs",
+    )
+    how.add_argument(
+        "--from-page", action="store_true", help="those that the recording got on the page, on the tab Plots"
+    )
     how.add_argument("--remove", action="store_true", help="make the map local again")
     parser.add_argument(
         "--point-sigma",
         metavar="M",
         type=positive_number(100.0, "standard deviation in metres"),
-        help="expected error of a control point; contradicting points are refused (default: 0.125)",
+        default=POINT_SIGMA,
+        help="expected error of a point; contradicting points are refused (default: %(default)s)",
     )
     parser.epilog = (
         "Writes georeference.json to DIR, which `stemmap stand`, `export` and `report` use. Without\n"
@@ -47,8 +58,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Find the frame of the map, write it and print its residuals. --remove deletes georeference.json;
-    without a method the present frame is printed and nothing is written.
+    """Find the frame of the map, write it and print its residuals, by the first method given of --from-page,
+    --control, --gnss, --in-file and --by-hand (turn in degrees). --remove deletes
+    georeference.json; without a method the present frame is printed and nothing is written. All but
+    --from-page need --crs.
 
     Returns:
         0.
@@ -58,6 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
             cannot be written.
     """
     from app.batch import georeference
+    from app.batch.plot_files import stored_frame
     from app.batch.run_folder import read_run_record
 
     folder = arguments.run
@@ -66,20 +80,27 @@ def run(arguments: argparse.Namespace) -> int:
         (folder / georeference.FILE).unlink(missing_ok=True)
         print("the map is local")
         return 0
-    if arguments.control is None and not arguments.gnss and arguments.by_hand is None:
+    if arguments.from_page:
+        record = stored_on_page(folder, stored_frame)
+        if record is None:
+            raise StemmapError("the recording got no reference system on the page", where=str(folder))
+        georeference.write_map_frame(folder, record)
+        frame = georeference.read_map_frame(folder)
+    elif not (arguments.control or arguments.gnss or arguments.in_file or arguments.by_hand):
         frame = georeference.read_map_frame(folder)
     else:
         if not arguments.crs:
             raise UsageError("--crs is missing", remedy="Name the reference system, such as EPSG:25832")
         crs = georeference.projected(arguments.crs)
         if arguments.control is not None:
-            frame = georeference.by_control_points(folder, arguments.control, crs, arguments.point_sigma)
+            points = georeference.read_control_points(arguments.control, crs)
+            frame = georeference.by_control_points(folder, points, crs, arguments.point_sigma)
         elif arguments.gnss:
             frame = georeference.by_gnss(folder, crs)
         else:
-            east, north, turn, z = arguments.by_hand
+            east, north, turn, z = arguments.by_hand or (0.0, 0.0, 0.0, 0.0)
             frame = georeference.by_hand(folder, crs, east, north, math.radians(turn), z)
-        georeference.write_map_frame(folder, frame)
+        georeference.write_map_frame(folder, frame.record())
     for line in georeference.frame_lines(frame):
         print(line)
     return 0

@@ -13,9 +13,9 @@ from app.cli.flags import SOURCE_HELP, add_source_flags, plain, program, seed, s
 if TYPE_CHECKING:
     import numpy as np
 
-    from pipeline.inventory.cloud import CloudDescription
     from pipeline.io.readers import Source, SourceDescription
     from pipeline.io.readers.base import RecordedTopic
+    from pipeline.types.clouds import CloudDescription
     from pipeline.types.records import Sensor, Truth
 
 HELP = "describe a source and show the commands for it"
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         StemmapError: The source cannot be read.
     """
     from app.sources.opening import open_cloud, open_source
-    from pipeline.io.readers.clouds import is_cloud
+    from pipeline.io.readers import is_cloud
 
     if is_cloud(arguments.source):
         cloud = open_cloud(arguments.source).description
@@ -56,7 +56,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _record(opened: Source) -> dict[str, Any]:
-    """Return the description of a source as JSON values; times are ns, lengths m."""
+    """Return the description of a source, its `topics`, number of true `trees` and `others` (in `truth`) and
+    `losses` as JSON values; times are nanoseconds, lengths metres, unknown values None."""
     from dataclasses import asdict
 
     d, truth = opened.description, opened.truth()
@@ -170,7 +171,8 @@ SQUARE_M = 1.0  # smallest area for the point density [m^2]
 
 
 def _cloud_record(d: CloudDescription) -> dict[str, Any]:
-    """Return the description of a cloud as JSON values; null where unknown."""
+    """Return the description of a cloud as JSON values: its corners `low_m` and `high_m` (None without a
+    valid extent), `offset_m`, `crs` (None without) and its other fields."""
     extent = _extent(d)
     return {
         "uri": d.uri,
@@ -187,7 +189,8 @@ def _cloud_record(d: CloudDescription) -> dict[str, Any]:
 
 
 def _cloud_lines(d: CloudDescription) -> list[str]:
-    """Return the description of a cloud as lines."""
+    """Return the description of a cloud as lines: a figure a line, warnings, and the commands to map it and
+    to drive through it."""
     rows = [
         ("kind", f"whole cloud, {d.kind}"),
         ("points", f"{d.points:,}"),

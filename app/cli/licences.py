@@ -42,6 +42,8 @@ def _used(name: str) -> dict[str, Distribution]:
 
 
 def _licence(found: Distribution) -> str:
+    """Return the licences that a package declares by its classifiers, else its expression; "unknown" without
+    both."""
     about = found.metadata.json
     expression = about.get("license_expression") or about.get("license") or ""
     named = [c.rpartition(" :: ")[2] for c in about.get("classifier", ()) if c.startswith("License ::")]

@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag before heavy modules are loaded
 
     from app.batch.run_folder import partial_output_warnings
-    from pipeline.io.readers.clouds import is_cloud
+    from pipeline.io.readers import is_cloud
 
     for line in partial_output_warnings(arguments.out):
         print(f"warning: {line}", file=sys.stderr)
@@ -151,7 +151,6 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             opened,
             flags.recording_place(arguments, arguments.source),
             publish=arguments.publish,
-            pictures=arguments.out,
         ),
     ):
         revisions = (
@@ -191,8 +190,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
 
 
 def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the topics and the mounting that the flags give, for run.json, and that --as-live was given;
-    None if there are none of these."""
+    """Return the topics and the mounting that the flags give, see `SourceRequest.kept_choices`, for run.json,
+    with `as_live` if that was given; None if there are none of these."""
     from app.sources.request import request_of_options
 
     kept = request_of_options(arguments.source, flags.source_options(arguments)).kept_choices()
@@ -248,9 +247,7 @@ _NOTICE_S = 5.0
 
 
 @contextmanager
-def _listening(
-    source: Source | LiveSource, recording: str, *, publish: bool, pictures: Path
-) -> Iterator[None]:
+def _listening(source: Source | LiveSource, recording: str, *, publish: bool) -> Iterator[None]:
     """Wait until a live source sends scans. Inside, Ctrl-C and SIGTERM end its records and not the command.
     Other sources are ready at once and keep both signals.
 
@@ -258,8 +255,6 @@ def _listening(
         source: Live or not.
         recording: File to which the messages are recorded; "" for none.
         publish: Whether results are published on the network of the robot.
-        pictures: Folder on whose disk pictures for the trees are stored; if that fails, it is reported and
-            there are none.
 
     Raises:
         SourceError: It was stopped before a scan arrived, a message cannot be read, or no recording can be
@@ -272,10 +267,7 @@ def _listening(
     if not isinstance(source, LiveSource):
         yield
         return
-    try:
-        source.keep_pictures(pictures)
-    except OSError as error:
-        print(f"stemmap: there will be no pictures of trees: {error.strerror}", file=sys.stderr)
+    source.keep_pictures()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, lambda *_: source.stop()) for number in numbers}
     try:

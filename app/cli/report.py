@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, stand_parameters
+from app.cli.stand import add_plot_flags, add_stand_flags, chosen_plots, reviewed, stand_parameters
 
 HELP = "write a report of a mapped run as one HTML page or PDF"
 
@@ -32,12 +32,9 @@ def run(arguments: argparse.Namespace) -> int:
     """
     from app.batch.report import report_page, write_report
 
-    page = report_page(
-        arguments.run,
-        language=arguments.language,
-        plots=chosen_plots(arguments),
-        parameters=stand_parameters(arguments),
-    )
+    plots, parameters = chosen_plots(arguments), stand_parameters(arguments)
+    with reviewed(arguments.run) as folder:
+        page = report_page(folder, language=arguments.language, plots=plots, parameters=parameters)
     write_report(page, arguments.out)
     print(f"report in {arguments.out}")
     return 0

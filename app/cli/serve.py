@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from app.cli import flags
-from app.common.settings import DEFAULT_PORT, VARIABLES, Settings
+from app.common.settings import DEFAULT_PORT, VARIABLES
 
 if TYPE_CHECKING:
     from app.robot.address import ZenohAddress
@@ -71,7 +71,6 @@ def run(arguments: argparse.Namespace) -> int:
     uris = arguments.source or [_DEFAULT_SOURCE]
     for uri in uris:
         check_address(uri)
-    _report_partial_outputs(settings)
     record = flags.recording_place(arguments, *uris)
     flags.chosen_parameters(arguments, "forest")  # reports a mistyped flag here and not on the page
 
@@ -109,9 +108,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
-    """Return the router whose robots are all shown and how they are opened, if an address has robot=*, asks
-    for maps that robots compute, or names no robot and several are found; else None. In the last case it asks
-    the router, which takes up to 3 s."""
+    """Return the router whose robots are all shown and how they are opened, if an address has robot=*,
+    or names no robot and several are found; else None. In the last case it asks the router, which takes up to
+    3 s."""
     from app.robot.address import ALL_ROBOTS, ZenohAddress, is_live, parse_address
 
     if len(sources) != 1 or not is_live(sources[0].uri):
@@ -119,8 +118,6 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
     address = parse_address(sources[0].uri)
     if not isinstance(address, ZenohAddress) or address.robot not in ("", ALL_ROBOTS):
         return None
-    if address.mapped_there:
-        return address, sources[0]
     if address.robot == ALL_ROBOTS:
         return replace(address, robot=""), sources[0]
     if address.topics:  # a topic belongs to one robot
@@ -128,13 +125,3 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
     from app.fleet.server import robots_at
 
     return (address, sources[0]) if len(robots_at(address)) > 1 else None
-
-
-def _report_partial_outputs(settings: Settings) -> None:
-    """Print how many partial outputs are in the data folders; nothing without any."""
-    from app.batch.run_folder import partial_outputs
-    from app.common.text import count
-
-    if left := partial_outputs(settings):
-        they = count(len(left), "run was", "runs were")
-        print(f"{they} killed before the map was complete; the page Runs can delete the partial outputs")

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from app.cli.flags import numbers, positive_number
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
+    from app.store.store import Store
     from pipeline.config.stages import Stand
     from pipeline.stand.plots import SamplePlot
 
+T = TypeVar("T")
+
+NO_PLOTS = "none"
 CIRCLE, RECTANGLE = "X,Y,R", "X,Y,LENGTH,WIDTH[,TURN]"
 HELP = "stems and basal area per hectare, diameters and density of a mapped run"
 
@@ -39,7 +45,8 @@ def add_plot_flags(parser: argparse.ArgumentParser) -> None:
         "--plots",
         metavar="FILE",
         type=Path,
-        help="polygons: .gpkg, .shp or .geojson",
+        help="polygons: .gpkg, .shp or .geojson; by default those drawn on the page, if no plot is given; "
+        "none: without them",
     )
     group.add_argument(
         "--plots-crs",
@@ -78,7 +85,8 @@ def add_plot_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_stand_flags(parser: argparse.ArgumentParser, without: tuple[str, ...] = ()) -> None:
-    """Add a flag for each parameter of the stand figures but those in `without`."""
+    """Add a flag for each parameter of the stand figures but those in `without`; values stay texts, see
+    `stand_parameters`."""
     from pipeline.config.stages import Stand
 
     group = parser.add_argument_group("figures")
@@ -91,7 +99,7 @@ def add_stand_flags(parser: argparse.ArgumentParser, without: tuple[str, ...] = 
             f"--{name.replace('_', '-')}",
             dest=f"stand_{name}",
             metavar=unit or name.upper(),
-            help=f"{declared.description} (default: {declared.default})".replace("%", "%%"),
+            help=f"{declared.description} (default: {declared.default or 'none'})".replace("%", "%%"),
         )
 
 
@@ -112,17 +120,17 @@ def stand_parameters(arguments: argparse.Namespace) -> Stand:
     except ValidationError as error:
         first = error.errors()[0]
         flag = f"--{first['loc'][0]}".replace("_", "-")
-        raise ParameterError(
-            f"{flag} {first['input']}: {first['msg'][0].lower()}{first['msg'][1:]}"
-        ) from None
+        reason = first["msg"].removeprefix("Value error, ")
+        raise ParameterError(f"{flag} {first['input']}: {reason[0].lower()}{reason[1:]}") from None
 
 
 def chosen_plots(arguments: argparse.Namespace) -> list[SamplePlot]:
     """Return the plots that the flags define, in the frame of the map: those of --plots, then circles and
-    rectangles, then those along the path. [] without such flags.
+    rectangles, then those along the path. Without such flags, those that were drawn on the page for the
+    recording, which is reported; [] with --plots none.
 
     Raises:
-        StemmapError: A plot or a file is not valid.
+        StemmapError: A plot, a file or the database is not valid.
     """
     import numpy as np
 
@@ -130,7 +138,10 @@ def chosen_plots(arguments: argparse.Namespace) -> list[SamplePlot]:
     from pipeline.stand.plots import along, circle, rectangle
 
     plots: list[SamplePlot] = []
-    if arguments.plots is not None:
+    given = (arguments.plots, arguments.along, *arguments.circle, *arguments.rectangle)
+    if all(each is None for each in given):
+        return _drawn_plots(arguments.run)
+    if arguments.plots is not None and str(arguments.plots) != NO_PLOTS:
         from app.batch.plot_files import read_plots
 
         plots += read_plots(arguments.plots, arguments.run, crs=arguments.plots_crs)
@@ -144,6 +155,74 @@ def chosen_plots(arguments: argparse.Namespace) -> list[SamplePlot]:
     if arguments.along is not None:
         path = read_run(arguments.run).path
         plots += along(np.stack([path.x, path.y], axis=1), arguments.along, arguments.radius)
+    return plots
+
+
+def stored_on_page(run: Path, read: Callable[[Store, dict[str, Any]], T]) -> T | None:
+    """Return what a function reads of the database for the recording of a run; None without a database.
+
+    Args:
+        run: Folder of the run.
+        read: The function; its arguments are the store and the member `source` of run.json.
+
+    Raises:
+        StemmapError: The run or the database cannot be read.
+    """
+    import os
+
+    from app.batch.run_folder import read_run_record
+    from app.common.settings import data_folder
+    from app.store.database import FILE_NAME
+
+    folder = data_folder(os.environ)
+    if folder is None or not (folder / FILE_NAME).is_file():
+        return None
+    from app.store.store import Store
+
+    store = Store(folder)
+    try:
+        return read(store, read_run_record(run)["source"])
+    finally:
+        store.close()
+
+
+@contextmanager
+def reviewed(run: Path) -> Iterator[Path]:
+    """Yield the folder of a run, or a temporary one in which trees.csv has the reviews that people made on
+    the page (see `reviewed_run`); the number of rejected trees is then printed to standard error.
+
+    Raises:
+        StemmapError: The run or the database cannot be read.
+    """
+    import sys
+
+    from app.batch.reviews import reviewed_run, stored_reviews
+    from app.batch.run_folder import read_run
+    from app.common.text import count
+
+    contents = stored_on_page(run, stored_reviews) if run.is_dir() else None
+    with nullcontext(run) if contents is None else reviewed_run(run, contents) as folder:
+        if folder != run and (rejected := read_run(folder).rejected):
+            print(f"review: {count(rejected, 'tree')} rejected on the page left out", file=sys.stderr)
+        yield folder
+
+
+def _drawn_plots(run: Path) -> list[SamplePlot]:
+    """Return the plots that were drawn on the page for the recording of a run, in the coordinates of the map,
+    and print their number to standard error; [] without a database.
+
+    Raises:
+        StemmapError: The run or the database cannot be read.
+    """
+    import sys
+
+    from app.batch.plot_files import stored_plots
+    from app.common.text import count
+
+    plots = stored_on_page(run, stored_plots) or []
+    if plots:
+        words = f"{count(len(plots), 'plot')} of the page (--plots {NO_PLOTS}: without)"
+        print(f"plots: {words}", file=sys.stderr)
     return plots
 
 
@@ -161,7 +240,9 @@ def run(arguments: argparse.Namespace) -> int:
     from app.batch.stand import stand_files, stand_of, stand_summary
     from pipeline.io.atomic_files import write_texts
 
-    result = stand_of(arguments.run, stand_parameters(arguments), chosen_plots(arguments))
+    plots, parameters = chosen_plots(arguments), stand_parameters(arguments)
+    with reviewed(arguments.run) as folder:
+        result = stand_of(folder, parameters, plots)
     print("\n".join(stand_summary(result)))
     for warning in result.warnings:
         print(f"warning: {warning}", file=sys.stderr)

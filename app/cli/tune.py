@@ -55,7 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         type=flags.whole_number(1, 1 << 20),
         default=200,
-        help="number of trials in all (default: 200)",
+        help="number of trials (default: 200)",
     )
     parser.add_argument(
         "--minutes",
@@ -66,13 +66,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--workers", metavar="N", type=flags.whole_number(1, 1 << 20), default=1,
-        help="number of processes; with one, the same input gives the same result (default: 1)",
+        help="number of processes; another number gives other trials (default: 1)",
     )  # fmt: skip
     parser.add_argument("--out", metavar="FILE", type=Path, required=True, help="TOML file for the best set")
-    parser.add_argument(
-        "--journal", metavar="FILE", type=Path,
-        help="file with the trials; the same command continues with it (default: next to --out)",
-    )  # fmt: skip
+    flags.add_keep_flag(parser)
     flags.add_parameter_flags(parser)
     flags.add_run_flags(parser)
     flags.add_source_flags(parser)
@@ -95,11 +92,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     plan = _plan(arguments)
     compile_ahead()
-    with (
-        closing(search_processes(plan, arguments.workers)) as workers,
-        closing(Search(plan, workers)) as search,
-    ):
+    with closing(search_processes(plan, arguments.workers)) as workers:
+        search = Search(plan, workers)
         stopped = _search(search)
+        for warning in workers.kept.warnings():
+            print(f"warning: {flags.plain(warning)}", file=sys.stderr)
         return _finish(search, arguments, stopped=stopped)
 
 
@@ -130,7 +127,7 @@ def _plan(arguments: argparse.Namespace) -> Plan:
         runs=runs,
         axes=axes_of(arguments.over or SENSIBLE),
         start=parameters.model_dump(),
-        journal=str((arguments.journal or arguments.out.with_suffix(".journal")).absolute()),
+        kept=str(flags.kept_results(arguments) or ""),
         preset=preset_name,
         goal=arguments.goal,
         false_max=arguments.false_max,
@@ -164,17 +161,17 @@ def _search(search: Search) -> bool:
 
     Raises:
         KeyboardInterrupt: Ctrl-C before the first trial.
-        StemmapError: A run cannot be mapped or scored, or the trials cannot be stored.
+        StemmapError: A run cannot be mapped or scored.
     """
     import time
 
     plan, bar = search.plan, _SearchProgress(search.plan)
-    since_s, before = time.monotonic(), 0
+    since_s = time.monotonic()
     try:
         while search.start is None:
             search.advance()
-        bar.begin(search.start, search)
-        since_s, before = time.monotonic(), len(search.trials())
+        bar.begin(search.start)
+        since_s = time.monotonic()
         while not search.is_complete and not 0.0 < plan.seconds < time.monotonic() - since_s:
             search.advance()
             bar.show(search)
@@ -184,7 +181,7 @@ def _search(search: Search) -> bool:
             raise
         return True
     finally:
-        bar.close(len(search.trials()) - before, time.monotonic() - since_s)
+        bar.close(len(search.trials()), time.monotonic() - since_s)
 
 
 def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool) -> int:
@@ -229,14 +226,10 @@ class _SearchProgress:
         self._best: float | None = None
         self._bar = flags.progress_bar(plan.trials, "trial", "first mapping")
 
-    def begin(self, start: Trial, search: Search) -> None:
-        """Print the score of the start and the number of earlier trials."""
-        made = len(search.trials())
+    def begin(self, start: Trial) -> None:
+        """Print the score of the start."""
         self._line(f"start: {self._goal.shown(start.loss or 0.0)}")
-        if made:
-            self._line(f"continuing after {made} trials")
         self._bar.set_description("searching", refresh=False)
-        self._bar.update(made)
 
     def show(self, search: Search) -> None:
         """Update the bar, and print a line for a new best set."""

@@ -12,7 +12,8 @@ T = TypeVar("T")
 
 
 def rows_of(table: T, rows: Any) -> T:  # noqa: ANN401 - what indexes an array
-    """Return some rows of a record of columns, for example of `Trees`; columns that are None stay None.
+    """Return some rows of a record of columns, for example of `Trees`; columns that are None stay None. The
+    columns are copies; for a slice they are views.
 
     Args:
         table: A dataclass whose fields are arrays of equal length, or None.
@@ -24,7 +25,7 @@ def rows_of(table: T, rows: Any) -> T:  # noqa: ANN401 - what indexes an array
 
 def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:
     """Return the number of leading rows that are equal in two arrays, at most the number of rows of the
-    shorter one. NaN differs from NaN.
+    shorter one. NaN differs from NaN, except in arrays that share their memory, see `GrowingColumns`.
 
     Args:
         old: Shape (M, ...); None has no rows.
@@ -33,8 +34,16 @@ def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:
     if old is None:
         return 0
     n = min(len(old), len(new))
+    if _has_same_memory(old, new):
+        return n
     differs = (old[:n] != new[:n]).reshape(n, -1).any(axis=1) if n else np.zeros(0, np.bool_)
     return int(np.argmax(differs)) if differs.any() else n
+
+
+def _has_same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    """Return whether two arrays have their rows at the same addresses."""
+    layouts = [(x.__array_interface__["data"], x.strides, x.dtype) for x in (a, b)]
+    return layouts[0] == layouts[1]
 
 
 def evenly_spaced(n: int, most: int) -> NDArray[np.int64]:

@@ -21,6 +21,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import BinaryIO, NoReturn, SupportsFloat, TypeVar
 
 import msgspec
@@ -60,6 +61,15 @@ def exit_reason(returncode: int) -> str:
     with contextlib.suppress(ValueError):
         return f"signal {-returncode}, {signal.Signals(-returncode).name}"
     return f"signal {-returncode}"
+
+
+def starved_s(pid: int) -> float:
+    """Return how long the main thread of a process has waited for a processor since its start [s], because
+    other programs had all of them; 0 where the system does not report it."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[1]) / 1e9
+    except (OSError, ValueError, IndexError):
+        return 0.0
 
 
 class ChildProcess:
@@ -247,11 +257,10 @@ class ParentConnection:
 
     Args:
         incoming, outgoing: Streams of lines from and to the parent.
-        on_close: Called in a thread of its own when the parent closes the connection or ends.
     """
 
-    def __init__(self, incoming: BinaryIO, outgoing: BinaryIO, on_close: Callable[[], None]) -> None:
-        self._incoming, self._outgoing, self._on_close = incoming, outgoing, on_close
+    def __init__(self, incoming: BinaryIO, outgoing: BinaryIO) -> None:
+        self._incoming, self._outgoing = incoming, outgoing
         self._lines: queue.Queue[bytes] = queue.Queue()
         threading.Thread(target=self._read, name="parent", daemon=True).start()
 
@@ -261,8 +270,8 @@ class ParentConnection:
         return not self._lines.empty()
 
     def receive(self, kind: type[T]) -> T:
-        """Wait for the next message, without a time limit. If the parent ends, `on_close` is called in
-        another thread.
+        """Wait for the next message, without a time limit. If the parent closes the connection or ends, this
+        process ends.
 
         Raises:
             ProtocolError: It is not of this type.
@@ -277,12 +286,12 @@ class ParentConnection:
         self._outgoing.flush()
 
     def _read(self) -> None:
-        """Queue the lines of the parent until it closes the connection; then call `on_close`. Runs in a
-        thread."""
+        """Queue the lines of the parent until it closes the connection; then end this process with code 1.
+        Runs in a thread."""
         for line in self._incoming:
             if line.endswith(b"\n"):
                 self._lines.put(line)
-        self._on_close()
+        os._exit(1)
 
 
 def run_child(
@@ -290,10 +299,9 @@ def run_child(
     *,
     memory_limit: int | None = None,
     low_priority: bool = False,
-    on_close: Callable[[], None] | None = None,
 ) -> NoReturn:
     """Run the program of a child process, then end the process with code 0, or 1 after an exception, which is
-    printed. It never returns.
+    printed, or at once when the parent closes the connection or ends. It never returns.
 
     What libraries print goes to standard error. Ctrl-C is ignored: the parent ends its children.
 
@@ -302,7 +310,6 @@ def run_child(
         memory_limit: Memory that the process may allocate [bytes]; more raises MemoryError. File mappings do
             not count. Not available on Windows.
         low_priority: Whether all other processes come first.
-        on_close: Called when the parent closes the connection or ends; ends this process by default.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if low_priority and hasattr(os, "nice"):
@@ -312,7 +319,7 @@ def run_child(
     incoming, outgoing = private_streams()
     code = 0
     try:
-        main(ParentConnection(incoming, outgoing, on_close or (lambda: os._exit(1))))
+        main(ParentConnection(incoming, outgoing))
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
     except BaseException:

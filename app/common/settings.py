@@ -31,6 +31,8 @@ VARIABLES: dict[str, str] = {
     "STEMMAP_UPLOAD_GB": "largest recording that a browser may upload, in GB (default: 20)",
 }
 
+#: Folder in the data folder with the results of comparisons, searches and sensitivity curves.
+RESULTS = "results"
 Files = Literal["", "any", "folders"]
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000

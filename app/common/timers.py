@@ -13,23 +13,22 @@ from statistics import median
 from typing import Any, Generic, ParamSpec
 
 P = ParamSpec("P")
+_MOST_SHARE = 0.3  # of the time, spent in the calls of a Throttle
 _log = logging.getLogger(__name__)
 
 
 class Throttle(Generic[P]):
-    """Limits the rate of calls of a function. A call that is too early is made later, with the newest
-    arguments.
+    """Limits the rate of calls of a function, and the time spent in them to 30 %. A call that is too early is
+    made later, with the newest arguments.
 
     Args:
         function: Function that is called on the event loop.
         pause_s: Minimum time between two calls [s].
-        share: Maximum fraction of time that is spent in the calls.
     """
 
-    def __init__(self, function: Callable[P, None], *, pause_s: float, share: float = 0.3) -> None:
+    def __init__(self, function: Callable[P, None], *, pause_s: float) -> None:
         self._function = function
         self._pause_s = pause_s
-        self._share = share
         self._free_at = 0.0
         self._timer: asyncio.TimerHandle | None = None
         self._call: Callable[[], None] | None = None
@@ -63,7 +62,7 @@ class Throttle(Generic[P]):
             call()
         finally:
             end = loop.time()
-            self._free_at = max(start + self._pause_s, end + (end - start) * (1 / self._share - 1))
+            self._free_at = max(start + self._pause_s, end + (end - start) * (1 / _MOST_SHARE - 1))
 
 
 async def cancel(task: asyncio.Task[Any] | None) -> None:
@@ -103,7 +102,8 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Measure one stage inside the context, unless measurements are disabled by `aside`."""
+        """Measure one stage inside the context, unless measurements are disabled by `aside` or it is
+        disturbed."""
         start, disturbances = self._clock(), self._disturbances
         try:
             yield

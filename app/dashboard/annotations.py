@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from app.batch.reviews import SAME_THING
 from app.store.async_store import AsyncStore
-from app.store.records import SKIPPED, Annotation, Content, StaleError, as_truth
+from app.store.records import FRAME, KINDS, PLOT, SKIPPED, Annotation, Content, StaleError, as_truth
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
 
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
 
 Against = Literal["both", "own", "annotations"]
 Counted = Literal["none", "source", "annotations", "both"]
-
-# Largest distance between an annotation and the same object in the ground truth of the source [m].
-SAME_THING = 0.5
 
 
 def truth_of(own: TruthTrees | None, rows: Sequence[Annotation], against: Against) -> TruthTrees | None:
@@ -140,8 +138,10 @@ class AnnotationEditor:
 
     Attributes:
         run: Number of the run in the store, None while none is open.
-        rows: The annotations of the run that state something, which are all that are not in `skipped`.
+        rows: The annotations of the run that state something about a tree or another thing.
         skipped: The annotations of trees about which a person did not decide.
+        plots: The annotations that are plots.
+        frame: The annotation that is the reference system of the map; None for a local map.
         truth: Ground truth against which the map is scored.
         against: Choice of the ground truth, see `truth_of`.
         problem: Reason why nothing can be annotated; empty otherwise.
@@ -152,15 +152,13 @@ class AnnotationEditor:
 
     def __init__(self, store: AsyncStore) -> None:
         self.run: int | None = None
-        self.rows: list[Annotation] = []
-        self.skipped: list[Annotation] = []
-        self.truth: TruthTrees | None = None
+        self._own: TruthTrees | None = None
         self.against: Against = "both"
+        self._show([])
         self.problem = ""
         self.serial = 0
         self.changed: Callable[[], None] = lambda: None
         self.edited: Callable[[str, int], None] = lambda _who, _number: None
-        self._own: TruthTrees | None = None
         self._store = store
         self._generation = 0  # grows whenever another run is opened or the run is left
 
@@ -175,18 +173,18 @@ class AnnotationEditor:
         """
         self.leave()
 
-        def work(store: Store) -> tuple[int, _Rows]:
+        def work(store: Store) -> tuple[int, list[Annotation]]:
             run = store.open_run(source, uri, Path(uri).name[:200] or uri[:200])
-            return run, _rows_of(store, run)
+            return run, store.annotations(run)
 
         self._own = self.truth = own
         generation = self._generation
         try:
-            run, (rows, skipped) = await self._store.ask(work)
+            run, stored = await self._store.ask(work)
             if generation != self._generation:  # another run was opened meanwhile
                 return
-            self.run, self.rows, self.skipped, self.problem = run, rows, skipped, ""
-            self.truth = truth_of(own, rows, self.against)
+            self.run, self.problem = run, ""
+            self._show(stored)
         except StemmapError as error:
             if generation != self._generation:
                 return
@@ -198,8 +196,20 @@ class AnnotationEditor:
         """Forget the annotations and the choice of the ground truth, because the run was closed; the store
         does not change."""
         self._generation += 1
-        self.run, self.truth, self._own, self.against = None, None, None, "both"
-        self.rows, self.skipped = [], []
+        self.run, self._own, self.against = None, None, "both"
+        self._show([])
+
+    def _show(self, stored: Sequence[Annotation]) -> None:
+        """Set the annotations, sorted by kind, and the ground truth that results from them.
+
+        Args:
+            stored: All annotations of the run.
+        """
+        self.rows = [row for row in stored if row.content.kind in KINDS]
+        self.skipped = [row for row in stored if row.content.kind == SKIPPED]
+        self.plots = [row for row in stored if row.content.kind == PLOT]
+        self.frame = next((row for row in stored if row.content.kind == FRAME), None)
+        self.truth = truth_of(self._own, self.rows, self.against)
 
     def score_against(self, against: Against) -> None:
         """Choose the ground truth for the scores, see `truth_of`, and call `changed`. No annotation
@@ -230,19 +240,19 @@ class AnnotationEditor:
             )
         generation = self._generation
 
-        def work(store: Store) -> tuple[T | StaleError, _Rows]:
+        def work(store: Store) -> tuple[T | StaleError, list[Annotation]]:
             done: T | StaleError
             try:
                 done = function(store)
             except StaleError as error:  # the current state is shown to the person
                 done = error
-            return done, _rows_of(store, run)
+            return done, store.annotations(run)
 
-        done, (rows, skipped) = await self._store.ask(work)
+        done, stored = await self._store.ask(work)
         if generation == self._generation:  # else another run was opened meanwhile
-            who, number = _edits(self.rows, rows)
-            self.rows, self.skipped = rows, skipped
-            self.truth = truth_of(self._own, rows, self.against)
+            before = self.rows
+            self._show(stored)
+            who, number = _edits(before, self.rows)
             self.serial += 1
             self.changed()
             if number:
@@ -252,16 +262,19 @@ class AnnotationEditor:
         return done
 
     async def read(self, function: Callable[[Store, int], T]) -> T | None:
-        """Return the result of a function of the store and the number of the run; None if no run is open or
-        nothing can be annotated. Raises StemmapError if the store cannot be used."""
+        """Return what a function returns for the store and the number of the run, called in the thread of the
+        store; None if no run is open or nothing can be annotated. Raises StemmapError if the store cannot be
+        used."""
         run = self.run
         if run is None or self.problem:
             return None
         return await self._store.ask(lambda store: function(store, run))
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the annotations, the choice of the ground truth and the state of the editor as JSON
-        values."""
+        """Return the state for the page: `run`, `serial`, `problem`; the ground truth `used` and the choice
+        `against`, the number of objects of the source (`own`, None without) and of annotations that
+        contradict it (`contradicting`), and `same_thing_m`; `trees` and `skipped`, see `row_payload`; `plots`
+        and `georeference` (None without), see `plot_payload`."""
         return {
             "run": self.run,
             "serial": self.serial,
@@ -273,19 +286,9 @@ class AnnotationEditor:
             "same_thing_m": SAME_THING,
             "trees": [row_payload(row) for row in self.rows],
             "skipped": [row_payload(row) for row in self.skipped],
+            "plots": [plot_payload(row) for row in self.plots],
+            "georeference": None if self.frame is None else plot_payload(self.frame),
         }
-
-
-_Rows = tuple[list[Annotation], list[Annotation]]
-
-
-def _rows_of(store: Store, run: int) -> _Rows:
-    """Return the annotations of a run that state something, and those of skipped trees."""
-    rows = store.annotations(run)
-    return (
-        [row for row in rows if row.content.kind != SKIPPED],
-        [row for row in rows if row.content.kind == SKIPPED],
-    )
 
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
@@ -299,8 +302,8 @@ def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[s
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:
-    """Return an annotation as JSON values for the page, with units in the names. Unknown diameters are
-    None."""
+    """Return an annotation of an object as JSON values for the page: `id`, `x` and `y` in the map [m],
+    `kind`, `dbh_cm` (None if unknown), `who`, `at_s` (of the last edit, since 1970) and `version`."""
     content = row.content
     return {
         "id": row.id,
@@ -308,6 +311,18 @@ def row_payload(row: Annotation) -> dict[str, Any]:
         "y": round(content.y, 4),
         "kind": content.kind,
         "dbh_cm": None if content.dbh is None else round(100.0 * content.dbh, 2),
+        "who": row.who,
+        "at_s": row.at_ns // 1_000_000_000,
+        "version": row.version,
+    }
+
+
+def plot_payload(row: Annotation) -> dict[str, Any]:
+    """Return a plot or the reference system of the map as JSON values for the page: its values (see
+    `Content.plot`), `id`, `who`, `at_s` (of the last edit, since 1970) and `version`."""
+    return {
+        "id": row.id,
+        **(row.content.plot or {}),
         "who": row.who,
         "at_s": row.at_ns // 1_000_000_000,
         "version": row.version,

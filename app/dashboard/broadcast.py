@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.common.arrays import first_difference
-from app.dashboard.payload import path_points
 
 _encode = msgspec.json.encode
 
@@ -32,11 +31,6 @@ class Broadcast:
         self._path_json: tuple[int, int, bytes] = (-1, 0, b"")
         self._count = 0
         self._listeners: set[Listener] = set()
-
-    @property
-    def listeners(self) -> int:
-        """Number of connected browsers."""
-        return len(self._listeners)
 
     def publish(self, kind: str, content: object) -> None:
         """Replace the message of a kind and wake the listeners; nothing happens if it equals the one before.
@@ -66,8 +60,8 @@ class Broadcast:
         self._wake()
 
     def forget_map(self) -> None:
-        """Replace the map with an empty one (index -1), because another run begins; nothing if no map was
-        shown."""
+        """Replace the map with an empty one (index -1, no trees, no path), because another run begins;
+        nothing if no map was ever shown."""
         if self._map is not None:
             self.show(_EMPTY_MAP, np.zeros((0, 2)))
 
@@ -87,11 +81,13 @@ class Broadcast:
         return sorted(m for m in self._messages.values() if m[0] > count)
 
     def map_after(self, count: int) -> tuple[int, bytes, NDArray[np.float64]] | None:
-        """Return number, JSON and path of the map if its number is larger than `count`, else None."""
+        """Return number, JSON and path, shape (N, 2) [m], of the map if its number is larger than `count`,
+        else None. The path is not a copy."""
         return self._map if self._map is not None and self._map[0] > count else None
 
     def path_json(self, count: int, path_xy: NDArray[np.float64], start: int) -> bytes:
-        """Return the path of a map as JSON. Listeners that need the same rows share the result.
+        """Return the rows of a path from `start` on, for a page that has those before, as JSON: `start` and
+        `points`, [x, y] to the millimetre. Listeners that need the same rows share the result.
 
         Args:
             count: Number of the message with the map.
@@ -99,7 +95,8 @@ class Broadcast:
             start: First row.
         """
         if self._path_json[:2] != (count, start):
-            self._path_json = (count, start, _encode(path_points(path_xy, start)))
+            rows = {"start": start, "points": np.round(path_xy[start:], 3).tolist()}
+            self._path_json = (count, start, _encode(rows))
         return self._path_json[2]
 
     def _next(self) -> int:

@@ -51,9 +51,11 @@ class CameraView:
         return self._kept.get(stamp_ns)
 
     async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
-        """Return the camera picture at the time of a scan as JSON values: its stamp, the boxes of trees and
-        clusters in it, the reason if there are no boxes, and `of`, a number of the run. Calls wait for one
-        another, so that there are at most about three pictures per second.
+        """Return the camera picture at the time of a scan as JSON values: `index` of the scan, `of`, a number
+        of the run, `stamp_ns` as text, for `jpeg`, `later_ms`, by how much the picture is later, `marks`, see
+        `marks_of`, `why`, the reason if the camera is unknown and there are no marks, and `received`, see
+        `CameraPicture`. Calls wait for one another, so that there are at most about three pictures per
+        second.
 
         Args:
             frame: Results of the scan.
@@ -94,6 +96,7 @@ class CameraView:
 
     async def tree(self, number: int, trees: Trees, path: Path | None) -> bytes:
         """Return the part of a camera picture that shows a tree best, as JPEG, with a frame around its stem.
+        Calls wait for one another and for those of `look`.
 
         Args:
             number: Number of the tree.
@@ -103,6 +106,7 @@ class CameraView:
         Raises:
             NoStoryError: No picture shows the tree, or it cannot be decoded.
             WorkerBusyError: The worker did not answer in time.
+            TooManyRequestsError: Too many calls wait.
         """
         async with self._queue.turn():
             found = await self._client.tree_picture(number)
@@ -126,8 +130,8 @@ _MARGIN = 0.6
 
 
 def drawn_tree(found: CameraPicture, number: int, trees: Trees, path: Path | None) -> bytes | None:
-    """Return the part of a picture around a tree as JPEG; None if the tree is not in it, or it cannot be
-    decoded. Arguments as in `CameraView.tree`.
+    """Return the part of a picture around a tree as JPEG; None if the tree is not in it, camera or path are
+    unknown, or it cannot be decoded. Raises StemmapError if no process can be started.
 
     Args:
         found: The picture with its camera.
@@ -161,9 +165,10 @@ MOST = 150
 
 
 def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return boxes around the clusters and trees in a picture as JSON values. Only the MOST nearest objects
-    have a box; clusters come before trees, and distant objects before near ones, so that near trees are drawn
-    last.
+    """Return boxes around the clusters and trees in a picture as dicts: `kind` ("tree" or "cluster"),
+    `number` of the tree or row of the cluster, `verdict`, `distance_m`, and the box, see `_box`. Only the
+    MOST nearest objects have a box; clusters come before trees, and distant objects before near ones, so that
+    near trees are drawn last.
 
     The tilt of the robot is not known here, so the boxes of trees are slightly too high or too low on a
     slope.
@@ -198,7 +203,8 @@ def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
 
 
 def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each cluster with points in view; arguments as in `marks_of`."""
+    """Return a box for each cluster of which all points are in view, at any distance; arguments as in
+    `marks_of`."""
     verdicts = clusters_payload(frame)["verdict"]
     points = frame.filtered.astype(np.float64) + frame.sensor_offset
     points[:, :2] = moved.inverse().apply(points[:, :2])
@@ -271,7 +277,8 @@ def _pose_at(path: Path, stamp_ns: int) -> Pose2:
 
 
 def _held(begin: Pose2, end: Pose2, part: float) -> Pose2:
-    """Extrapolate the motion between two poses: before `begin` (part < 0) or beyond `end` (part > 1).
+    """Return the pose that continues the motion between two poses with constant velocities: before `begin`
+    (part < 0) or beyond `end` (part > 1).
 
     Args:
         begin, end: The poses.

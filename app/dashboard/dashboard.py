@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from app.common.settings import RESULTS
 from app.common.timers import Throttle
 from app.common.user import SOMEBODY, current_user
 from app.dashboard.annotations import AnnotationEditor
@@ -25,15 +26,18 @@ from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_pay
 from app.dashboard.run_recorder import RunRecorder, RunState
 from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
+from app.dashboard.shown_run import ShownRun
 from app.sources.inspection import check_source
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
 from app.tuning.sensitivity import Sensitivity, question_of
 from app.worker import protocol
-from app.worker.outbox import joined
+from app.worker.outbox import path_columns
 from pipeline.config import preset
 from pipeline.config.model import Value
+from pipeline.geometry.growing_columns import GrowingColumns
+from pipeline.stand.seen_area import SeenRecorder
 from pipeline.types.records import Path, TruthTrees
 
 if TYPE_CHECKING:
@@ -47,7 +51,7 @@ _SCENE_PAUSE_S = 0.09
 class Dashboard:
     """State of the open run for the page, and the actions of users.
 
-    `worker` and `scene` are set before `start`.
+    `worker` is set before `start`, which sets `scene`.
 
     Args:
         parameters: Parameters at the beginning.
@@ -58,6 +62,8 @@ class Dashboard:
         status: Newest status of the worker.
         shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
         truth: Ground truth with annotations; None where none is known.
+        seen: Views of the observed area.
+        results: Folder of stored results of sensitivity curves and searches; None without a data folder.
         source, digest: Requested source, and digest (or URI) of the open run, "" before it is open.
     """
 
@@ -67,17 +73,20 @@ class Dashboard:
     def __init__(self, parameters: ParameterState, live: Broadcast, store: AsyncStore | None = None) -> None:
         self.parameters = parameters
         self.store = store or AsyncStore(None)
+        self.results = self.store.folder and self.store.folder / RESULTS
         self.run_recorder = RunRecorder(self.store)
         self.annotation_editor = AnnotationEditor(self.store)
         self.annotation_editor.changed, self.annotation_editor.edited = self._use_truth, self._mark_edits
         self.live = live
         self.scores = Scores(self._broadcast_score)
-        self.sensitivity = Sensitivity(lambda state: live.publish("sensitivity", state))
+        self.sensitivity = Sensitivity(lambda state: live.publish("sensitivity", state), kept=self.results)
         self.status = protocol.Status(state="starting", detail="Starting")
         self.shown: protocol.Shown | None = None
         self.path: Path | None = None
         self.path_xy = np.zeros((0, 2))
+        self._path_rows = _no_path()
         self.truth: TruthTrees | None = None
+        self.seen = SeenRecorder()
         self.sets = ParameterSets(self.store, self._show_parameters)
         self._before_after = BeforeAfter()
         self.worker_client = WorkerClient(lambda question: self.worker.send(question), lambda: self._run)
@@ -122,23 +131,33 @@ class Dashboard:
         (x, y), truth = self.offset, self.truth
         return None if truth is None else replace(truth, x=truth.x + x, y=truth.y + y)
 
-    async def start(self, source: SourceRequest) -> None:
-        """Start the worker and open a source, which plays as soon as it is open."""
+    async def start(self, source: protocol.Open, make_scene: Callable[[], Scene]) -> None:
+        """Start the worker, which opens a source while the scene is made, and load the saved parameter sets.
+        The source plays as soon as both are there.
+
+        Args:
+            source: The source, without parameters of its own.
+            make_scene: Returns the scene; called in a thread.
+        """
+        scene = asyncio.create_task(asyncio.to_thread(make_scene))
+        await self._send_parameters()
+        await self.worker.send(source)
+        self.scene = await scene
         await self.sets.load()
         self.live.publish("view", self.scene.view)
-        await self.worker.start()
-        await self._send_parameters()
-        await self.open(source)
+        self._opens += 1
+        await self._leave_for(source.request())
+        await self.worker.start(self.receive)
 
     async def close(self) -> None:
         """Write pending records, and end searches, the worker, the store and the scene."""
         self.scores.close()
         await self.sensitivity.leave()
         self.selector.leave()
-        self._show_scene.cancel()
         await self.search.leave()
         await self.run_recorder.close()
         await self.worker.close()
+        self._show_scene.cancel()  # the worker sends no scan any more
         await self.store.close()
         await asyncio.to_thread(self.scene.close)
 
@@ -171,7 +190,7 @@ class Dashboard:
 
     @property
     def request(self) -> SourceRequest:
-        """Request that maps the open run in the same way: its source and the parameters in force."""
+        """Request that maps the open run in the same way: its source, with preset and parameters in force."""
         state = self.parameters
         changed = state.parameters.changes_from(preset(state.preset))
         return msgspec.structs.replace(self.source, preset=state.preset, parameters=changed)
@@ -267,7 +286,7 @@ class Dashboard:
 
     async def reach(self, *, whole: bool) -> None:
         """Choose whether changes of parameters apply to the whole run, which is then mapped again at once, or
-        from the current scan onwards."""
+        from the current scan onwards; for all browsers. It is no change that can be undone."""
         self.parameters.whole = whole
         self._show_parameters()
         await self._send_parameters()
@@ -337,6 +356,8 @@ class Dashboard:
                 await self._begin(message)
             case protocol.Shown():
                 await self._show(message)
+            case protocol.View(run=run, stamp_ns=stamp_ns, free=free) if run == self._run:
+                self.seen.add(stamp_ns, free)
             case protocol.Answer():
                 self.worker_client.take(message)
             case protocol.Remapped(run=run, changes=changes) if run == self._run:
@@ -382,7 +403,9 @@ class Dashboard:
         """Remove map, path, selection, scores and events from the page, and show the ground truth of the run
         that begins."""
         self.shown = self.path = None
+        self.seen = SeenRecorder()
         self.path_xy = np.zeros((0, 2))
+        self._path_rows = _no_path()
         self.live.forget_map()
         self.scores.forget()
         self._before_after = BeforeAfter()
@@ -397,7 +420,8 @@ class Dashboard:
         self.selector.tree(None)
 
     def _use_truth(self) -> None:
-        """Show the ground truth and the annotations, and score the map against them."""
+        """Show the ground truth with the annotations in scene and browsers, and request the score of the map
+        against it; without ground truth the score is removed."""
         self.truth = self.annotation_editor.truth
         self.scene.show_truth(self.truth)
         self.live.publish("truth", truth_payload(self.truth))
@@ -426,13 +450,15 @@ class Dashboard:
         if self.shown is None:
             self.scene.suit(cloud=shown.frame.of_cloud)
             self.live.publish("view", self.scene.view)
-        self.path = joined(self.path, shown.path_start, shown.path)
+        new_xy = np.column_stack([shown.path.x, shown.path.y])
+        self._path_rows.write(shown.path_start, *path_columns(shown.path), new_xy)
+        *columns, self.path_xy = self._path_rows.shared()
+        self.path = Path(*columns)
         if shown.frame.ground is None and self.shown is not None:
             # The ground is sent only when it changes; the scene may not have drawn the earlier frame.
             frame = replace(shown.frame, ground=self.shown.frame.ground)
             shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
-        self.path_xy = np.column_stack([self.path.x, self.path.y])
         path_xy = self.path_xy
         distance = self.parameters.parameters.evaluation.match_distance
         payload = await asyncio.to_thread(map_payload, shown)
@@ -453,7 +479,13 @@ class Dashboard:
         """Return the state of the run for its record."""
         state = self.parameters
         return RunState(
-            shown, self.path_xy, state.preset, state.parameters.flat(), self.truth, self.scores.latest
+            shown,
+            self.path_xy,
+            state.preset,
+            state.parameters.flat(),
+            self.truth,
+            self.scores.latest,
+            ShownRun.of(self).texts,
         )
 
     def _broadcast_score(self, score: dict[str, Any] | None) -> None:
@@ -463,9 +495,8 @@ class Dashboard:
 
     def _score(self) -> None:
         """Request the score of the shown map; nothing without a map or ground truth."""
-        if self.shown is not None and self.truth is not None:
-            evaluation = self.parameters.parameters.evaluation
-            self.scores.ask(self.shown.frame.trees, self.truth, evaluation, self.path_xy)
+        if self.shown is not None and self.path is not None and self.truth is not None:
+            self.scores.ask(self.shown.frame.trees, self.path, self.truth, self.parameters.parameters)
 
     def _set_status(self, status: protocol.Status) -> None:
         """Broadcast a status of the worker, and add events for new warnings. While paused, a notice replaces
@@ -476,6 +507,12 @@ class Dashboard:
         self.live.publish("status", status)
         if status.scan_index >= 0 and self.events.warned(status.warnings, status.time_s):
             self._broadcast_events()
+
+
+def _no_path() -> GrowingColumns:
+    """Return the columns of a path without scans, with the positions, shape (0, 2), as the last column."""
+    none = np.zeros(0)
+    return GrowingColumns(np.zeros(0, np.int64), none, none, none, none, np.zeros((0, 2)))
 
 
 def _open_command(request: SourceRequest) -> protocol.Open:

@@ -13,16 +13,13 @@ from typing import Any
 from app.common.child_process import ChildProcess, python_module
 from app.common.timers import cancel
 from app.store.async_store import AsyncStore
-from app.store.forests import Forests
+from app.store.forests import LEAST_OTHERS, LEAST_TREES, PACKAGE, Forests
 from app.store.store import AnnotatedSource
-from pipeline.classification.forest import PACKAGE
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 
 LEARN = python_module("app.training.learning")
 LONGEST_LINE = 1 << 20
-# As in app.training.learning, which the web process does not load.
-LEAST_TREES, LEAST_OTHERS = 10, 5
 _UNDER_WAY = "decision trees are being grown already"
 
 
@@ -56,9 +53,9 @@ class Learning:
         self.learned: dict[str, Any] | None = None
 
     async def known(self, in_force: str = PACKAGE) -> dict[str, Any]:
-        """Return what a training can use, as JSON values: numbers of runs and of annotations by class, the
-        numbers that are needed, the provenance of the forest in force (None for that of the package and for
-        an unknown one), and the state.
+        """Return what a training can use, as JSON values: the number of `runs`, of `annotations` by class,
+        and the `needed` numbers of `trees` and `others`; `in_use`, the provenance of the forest in force
+        (None for that of the package and for an unknown one); and the state, see `as_plain`.
 
         Args:
             in_force: Name of the forest in force.
@@ -108,7 +105,7 @@ class Learning:
         await cancel(task)
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state for the browsers."""
+        """Return the state for the browsers: `state`, its text (`words`) and the result (`learned`)."""
         return {"state": self.state, "words": self.words, "learned": self.learned}
 
     def _become(self, state: str, words: str, learned: dict[str, Any] | None = None) -> None:

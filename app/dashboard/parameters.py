@@ -175,8 +175,8 @@ class ParameterState:
         return True
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state for the page: reach of a change, preset, revision, values, names that differ from
-        the preset, and numbers of steps that can be undone and redone."""
+        """Return the state for the page: `whole`, `preset`, `revision`, `undo` and `redo` (numbers of steps),
+        `values` by dotted name, and `changed`, the names that differ from the preset."""
         return {
             "whole": self.whole,
             "preset": self.preset,
@@ -188,18 +188,19 @@ class ParameterState:
         }
 
     def as_plain_with_specs(self) -> dict[str, Any]:
-        """Return `as_plain` with the declarations of the parameters and the presets, which do not change."""
+        """Return `as_plain` with `specs`, the declarations of the parameters, and `presets`, each with `name`
+        and `doc`; these do not change."""
         presets = [{"name": name, "doc": doc} for name, (doc, _) in PRESETS.items()]
         return {**self.as_plain(), "specs": _SPECS, "presets": presets}
 
     def _become(self, preset_name: str, parameters: Parameters, goes_on: bool = False) -> None:
-        """Put parameters in force as a step, and clear the redo steps. Equal parameters only increase the
-        revision. At most 200 steps are kept.
+        """Put parameters in force as an undo step, and clear the redo steps. Equal parameters only increase
+        the revision. At most 200 steps are kept. From now on `suit` changes nothing.
 
         Args:
-            preset_name: Name of their preset.
+            preset_name: Name of their preset, which is not checked.
             parameters: The values.
-            goes_on: Whether the change belongs to the step before.
+            goes_on: Whether the change belongs to the step before; then no step is added.
 
         Raises:
             StemmapError: `check` refuses them; nothing changes.
@@ -285,8 +286,8 @@ class ParameterSets:
         self._values: dict[str, tuple[str, Parameters]] = {}
 
     async def load(self) -> None:
-        """Read the saved sets and call `changed`. Without access to the store there are none; `save` then
-        raises the error."""
+        """Read the saved sets and call `changed`. If the store cannot be used there are none; `save` then
+        raises the error. Sets of another version are listed; `named` raises their error."""
         try:
             rows = await self._store.ask(lambda store: store.sets.all())
         except StemmapError:
@@ -365,7 +366,8 @@ class ParameterSets:
         return next((name for name, values in self._values.items() if values == wanted), "")
 
     def as_plain(self) -> dict[str, Any]:
-        """Return name, author and time of the saved sets for the page."""
+        """Return {"sets": [...]} for the page, each set with `name`, `who` and `at_s`, the time of its last
+        change [s since 1970]."""
         rows = [
             {"name": row.name, "who": row.who, "at_s": row.at_ns // 1_000_000_000}
             for row in self._sets.values()

@@ -13,10 +13,7 @@ from numpy.typing import NDArray
 
 from app.explain.history import half_axes
 from app.worker.protocol import Shown
-from pipeline.classification.forest import CLASSES
-from pipeline.types.clearance import Clearance
-from pipeline.types.pose_health import Health
-from pipeline.types.records import Frame, Trees, TruthTrees, Verdict
+from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict
 
 Float = NDArray[np.float64]
 
@@ -26,8 +23,10 @@ _DIGITS = 4
 
 
 def map_payload(shown: Shown) -> dict[str, Any]:
-    """Return the message "map" without its path. Times are seconds since the first scan, `sigma_xy` is the
-    root mean square of the standard deviations of x and y [m]; points are not included."""
+    """Return the message "map" without its path: `index` and `time_s` of the scan [s since the first], `pose`
+    and `odom` as [x, y, yaw], `sigma_xy`, the root mean square of the standard deviations of x and y [m],
+    `n_eff`, and `health`, `trees`, `verdicts`, `clusters`, `counts`, `layers` and `clearance` as the
+    functions of this module return them. Points are not included."""
     frame = shown.frame
     estimate = frame.estimate
     return {
@@ -49,7 +48,8 @@ def map_payload(shown: Shown) -> dict[str, Any]:
 
 
 def layer_counts(frame: Frame) -> dict[str, int]:
-    """Return the number of objects of each layer of the scene, except path and ground truth."""
+    """Return the number of objects of a frame by layer of the scene: raw, filtered, clusters, fits,
+    particles and (confirmed) trees."""
     return {
         "raw": len(frame.raw),
         "filtered": len(frame.filtered),
@@ -61,7 +61,8 @@ def layer_counts(frame: Frame) -> dict[str, int]:
 
 
 def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
-    """Return the clearance of the path; unknown or infinite values are None."""
+    """Return `zone` as text, `ahead_m`, `beside_m` and `within_m`, see `Clearance`; unknown or infinite
+    distances are None, and so is the result without a clearance."""
     if clearance is None:
         return None
     ahead, beside = _known(clearance.ahead), _known(clearance.beside)
@@ -69,7 +70,8 @@ def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
 
 
 def health_payload(health: Health) -> dict[str, Any]:
-    """Return the pose quality: word, reason and figures; unknown figures are None."""
+    """Return the pose quality: `state`, `reason` and the figures of `Health`, with units in the names and
+    angles in degrees; unknown figures are None."""
     return {
         "state": health.state,
         "reason": health.reason,
@@ -104,8 +106,10 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 
 def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
-    """Return the confirmed trees of a table as dicts for the page. Unknown diameters, eccentricities,
-    coverages, heights and leans are None.
+    """Return the confirmed trees of a table as dicts for the page: `number`, `x`, `y` [m], `ellipse` (see
+    `ellipses`), `dbh_cm`, `sigma_dbh_cm`, `eccentricity`, `observations`, `coverage_deg`, `first_seen_s`,
+    `last_seen_s`, `height_m`, `sigma_height_m` and `lean_deg`. Unknown diameters, eccentricities, coverages,
+    heights and leans are None.
 
     Args:
         trees: The table.
@@ -134,7 +138,8 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
 
 
 def ellipses(covariance: Float) -> list[list[float]]:
-    """Return half axes [m] and direction of the major axis [rad] of the 1-sigma ellipses of (T, 2, 2)."""
+    """Return [major half axis, minor half axis [m], direction of the major axis [rad]] of the 1-sigma ellipse
+    of each covariance, shape (T, 2, 2)."""
     rows: list[list[float]] = np.round(half_axes(covariance), _DIGITS).tolist()
     return rows
 
@@ -147,17 +152,12 @@ def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:
 
 
 def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
-    """Return the objects of the ground truth (all classes), or None for None; unknown diameters are None."""
+    """Return {"trees": [...]}, the objects of the ground truth of all classes with `x`, `y` [m], `dbh_cm`
+    (None if unknown) and `kind`; None for None."""
     if truth is None:
         return None
     rows = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
     return {"trees": [{"x": x, "y": y, "dbh_cm": dbh, "kind": kind} for x, y, dbh, kind in rows]}
-
-
-def path_points(path_xy: Float, start: int) -> dict[str, Any]:
-    """Return rows of a path, shape (N, 2) [m], from row `start` onwards, for a page that has the rows
-    before."""
-    return {"start": start, "points": np.round(path_xy[start:], 3).tolist()}
 
 
 def _rounded(values: Float) -> list[float]:
@@ -221,10 +221,12 @@ REACH = 0.45  # m; maximum distance between a tree and its column
 
 
 def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
-    """Return number and votes of each confirmed tree, and the class with most votes besides "tree", the most
-    uncertain first. [] without confirmed trees.
+    """Return a dict for each confirmed tree, the most uncertain first: its number (`tree`), the share of
+    `votes` for a tree, and the class with most votes besides "tree" (`next`, `next_votes`). [] without
+    confirmed trees.
 
-    Trees without a voxel column within REACH have no votes (None) and come last.
+    Trees without a voxel column within REACH have no votes (None) and come last. Without any columns, `next`
+    is "" and `next_votes` 0.
 
     Args:
         frame: Results of the newest scan, with its voxel columns; None for these gives no votes.
@@ -319,8 +321,9 @@ def comparison_payload(
 
 
 def _clustered(frame: Frame) -> dict[str, NDArray[Any]]:
-    """Return filtered points [cm], the cluster of each, and x, y, radius, height [m] of each cluster, as
-    arrays for `packed`."""
+    """Return arrays for `packed`: `points`, filtered points, int16, shape (M, 3) [cm]; `labels`, the cluster
+    of each, int32, shape (M,), -1 for none; and `circles`, x, y, radius and height of each cluster, float32,
+    shape (K, 4) [m]. All are in the level frame of the sensor."""
     circles = np.column_stack([frame.clusters.centre, frame.clusters.radius, frame.clusters.centroid[:, 2]])
     return {
         "points": in_centimetres(frame.filtered),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import io
 import logging
-from collections.abc import Callable
+import zipfile
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path as FilePath
 from typing import Any
@@ -42,6 +44,7 @@ class RunState:
         path_xy: Path, shape (N, 2) [m].
         preset, parameters: Current preset and parameters.
         truth, scores: Ground truth and scores at that moment.
+        files: Returns the texts of its result files by name, see `ShownRun.texts`; takes up to seconds.
     """
 
     shown: Shown
@@ -50,6 +53,7 @@ class RunState:
     parameters: dict[str, Value]
     truth: TruthTrees | None
     scores: dict[str, Any] | None
+    files: Callable[[], dict[str, str]]
 
 
 @dataclass(slots=True, eq=False)
@@ -116,7 +120,8 @@ class RunRecorder:
         self._page = _Page(beginning, opened.scans)
 
     def leave(self) -> None:
-        """Write pending changes in the background and end the record, because the run is closed."""
+        """Write pending changes and the result files in the background and end the record, because the run is
+        closed."""
         page, self._page = self._page, None
         if page is not None:
             page.ended.set()
@@ -161,6 +166,13 @@ class RunRecorder:
         page.changes.append(Change(revision, page.newest.shown.time_s, who, preset, changes))
         self._soon(page)
 
+    async def write_now(self) -> None:
+        """Write what is pending of the open run, without its result files; an error of the store is only
+        logged. Nothing without a run."""
+        if self._page is not None:
+            with contextlib.suppress(StemmapError):
+                await self._write(self._page)
+
     async def close(self) -> None:
         """Write pending changes and wait until they are stored."""
         self.leave()
@@ -175,24 +187,28 @@ class RunRecorder:
             page.writer.add_done_callback(self._tasks.discard)
 
     async def _write_on(self, page: _Page) -> None:
-        """Write the record every 5 s as long as it changes, and once more when the run is left. What the
-        store refuses is written with the next attempt."""
-        while page.dirty or page.changes:
+        """Write the record every 5 s as long as it changes, and once more, with the result files, when the
+        run is left. What the store refuses is written with the next attempt; after the last one it is
+        lost."""
+        while page.dirty or page.changes or page.ended.is_set():
             is_last = page.ended.is_set()
             with contextlib.suppress(StemmapError):  # the error was logged
                 await self._write(page)
+                if is_last:
+                    await self._write_files(page)
             if is_last:
                 return
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(page.ended.wait(), _PAUSE_S)
 
     async def _write(self, page: _Page) -> None:
-        """Write the best state of a record and the changes of parameters, creating the record if necessary;
-        raises StemmapError if the store refuses, then they stay pending."""
+        """Write the best state of a record and the changes of parameters if they are not written, creating
+        the record if necessary; raises StemmapError if the store refuses, then they stay pending."""
         state, changes = page.best, page.changes
-        page.dirty, page.changes = False, []
-        if state is None:
+        if state is None or not (page.dirty or changes):
+            page.dirty, page.changes = False, []
             return
+        page.dirty, page.changes = False, []
 
         def work(store: Store) -> None:
             figures = _figures_of(state, page.all_scans)
@@ -209,6 +225,14 @@ class RunRecorder:
             page.dirty, page.changes = True, changes + page.changes
             raise
 
+    async def _write_files(self, page: _Page) -> None:
+        """Write the result files of the best state; nothing without a record. Raises StemmapError if the
+        store refuses."""
+        state, record = page.best, page.record
+        if state is not None and record is not None:
+            files = packed(await asyncio.to_thread(state.files))
+            await self._ask(lambda store: store.book.put_files(record, files))
+
     async def _ask(self, work: Callable[[Store], None]) -> None:
         """Run a function of the store; an error is logged, unless it equals the one before, and raised."""
         try:
@@ -221,14 +245,24 @@ class RunRecorder:
         self._problem = ""
 
 
+def packed(texts: Mapping[str, str]) -> bytes:
+    """Return files as a zip archive; the same texts give the same bytes."""
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, text in texts.items():
+            archive.writestr(zipfile.ZipInfo(name), text, zipfile.ZIP_DEFLATED)
+    return content.getvalue()
+
+
 def _named(beginning: NewRun, store: Store) -> NewRun:
-    """Return the start of a run; that of an uploaded file has the name that the file had before."""
+    """Return the start of a run; of an uploaded file a copy with the name that the file had before."""
     uploaded = store.book.uploads().get(beginning.name)
     return beginning if uploaded is None else replace(beginning, name=uploaded["name"])
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
-    """Return the figures of a state for the store.
+    """Return the figures of a state for the store, with the map as `trees` (see `trees_payload`), thinned
+    `path` and `truth` (see `truth_payload`; None without).
 
     Args:
         state: The state.

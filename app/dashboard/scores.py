@@ -12,14 +12,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from app.batch.run_folder import score_map
 from app.batch.summary import truth_in_doubt
-from pipeline.config.stages import Evaluation
-from pipeline.evaluation import MapScores, evaluate, match, pair_distances, pair_errors
-from pipeline.types.records import Trees, TruthTrees
-
-Float = NDArray[np.float64]
+from pipeline.config import Parameters
+from pipeline.evaluation import MapScores, match, pair_distances, pair_errors
+from pipeline.types.records import Path, Trees, TruthTrees
 
 _log = logging.getLogger(__name__)
 
@@ -41,21 +39,15 @@ class Scores:
     def __init__(self, tell: Callable[[dict[str, Any] | None], None]) -> None:
         self.latest: dict[str, Any] | None = None
         self._tell = tell
-        self._requested: tuple[Trees, TruthTrees, Evaluation, Float] | None = None
+        self._requested: tuple[Trees, Path, TruthTrees, Parameters] | None = None
         self._task: asyncio.Task[None] | None = None
         self._runs = 0
 
-    def ask(self, trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> None:
-        """Request the score of a map; it replaces a request that has not begun. `tell` receives it, at most
-        about three times a second. A score that fails is only logged.
-
-        Args:
-            trees: The map.
-            truth: Ground truth.
-            parameters: Distances of a match and of the ground truth from the path.
-            path_xy: Path, shape (N, 2) [m].
-        """
-        self._requested = (trees, truth, parameters, path_xy)
+    def ask(self, trees: Trees, path: Path, truth: TruthTrees, parameters: Parameters) -> None:
+        """Request the score of a map, see `score_payload`; it replaces a request that has not begun. `tell`
+        receives it, at most about three times a second. A score that fails is only logged. Arguments as in
+        `score_map`."""
+        self._requested = (trees, path, truth, parameters)
         if self._task is None or self._task.done():
             self._task = asyncio.create_task(self._work(), name="scores")
 
@@ -72,7 +64,8 @@ class Scores:
             self._task.cancel()
 
     async def _work(self) -> None:
-        """Compute the requested scores, with a pause after each, until none is requested."""
+        """Compute the requested scores, with a pause after each, until none is requested. Errors are logged;
+        a score of a map that is gone is dropped."""
         while self._requested is not None:
             requested, self._requested = self._requested, None
             run = self._runs
@@ -82,25 +75,14 @@ class Scores:
                 _log.exception("the map could not be scored")
             else:
                 if run == self._runs:  # else the map has gone meanwhile
-                    self.latest = score
-                    self._tell(score)
+                    self.latest = score_payload(score)
+                    self._tell(self.latest)
             await asyncio.sleep(_PAUSE_S)
 
 
-def score_map(trees: Trees, truth: TruthTrees, parameters: Evaluation, path_xy: Float) -> dict[str, Any]:
-    """Return the scores of a map for the page, see `score_payload`.
-
-    Args:
-        trees: The map.
-        truth: Ground truth.
-        parameters: Distances of a match and of the ground truth from the path.
-        path_xy: Path, shape (N, 2) [m]; empty for a whole cloud, of which all true trees count.
-    """
-    return score_payload(evaluate(trees, truth, parameters, path_xy if len(path_xy) else None))
-
-
 def score_payload(score: MapScores) -> dict[str, Any]:
-    """Return scores for the page, with units in the names. An undefined score is None."""
+    """Return scores for the page, with units in the names: the fields of `MapScores`, each rate as `count`,
+    `of` and `rate`, and `warning`, see `truth_in_doubt`. An undefined score is None."""
     rates = {"TA": score.TA, "TR": score.TR, "FA": score.FA, "FR": score.FR}
     return {
         **{name: {"count": r.count, "of": r.of, "rate": r.rate} for name, r in rates.items()},
@@ -121,8 +103,9 @@ def score_payload(score: MapScores) -> dict[str, Any]:
 
 
 def pairs_payload(trees: Trees, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the distances between the confirmed trees [m], and their errors [%] if both trees are matched
-    with true trees (NaN otherwise; None for all without ground truth), as JSON values.
+    """Return the distances between the confirmed trees as lists: `numbers` of the T trees, `distance_m`,
+    shape (T, T), and `error_percent`, shape (T, T): the error if both trees are matched with true trees, NaN
+    otherwise; None without ground truth.
 
     Only the first MOST_PAIRED trees are included, because a larger matrix cannot be drawn; `left_out` is the
     number of the others.

@@ -71,10 +71,11 @@ class WorkerClient:
             waiting.set_result(answer)
 
     async def cluster(self, scan: int | None, cluster: int) -> ClusterStory:
-        """Return the explanation of a cluster of a recently shown scan.
+        """Return the explanation of a cluster of a recently shown scan; raises NoStoryError without such a
+        cluster, WorkerBusyError without an answer.
 
         Args:
-            scan: Index of the scan; None if no scan is shown.
+            scan: Index of the scan; None if no scan is shown, which raises NothingMappedError.
             cluster: Row of the cluster.
         """
         run = self._shown_run()
@@ -84,33 +85,38 @@ class WorkerClient:
         return _known(answer.cluster)
 
     async def tree(self, number: int) -> TreeStory:
-        """Return the explanation of a tree, by its number, after the current scan."""
+        """Return the explanation of a tree, by its number, after the current scan; raises NoStoryError
+        without such a tree, WorkerBusyError without an answer."""
         answer = await self._ask(AskTree(next(self._tickets), self._shown_run(), number))
         return _known(answer.tree)
 
     async def compare(self, sets: list[Parameters]) -> list[Frame]:
-        """Return the results of the current scan under each of several parameter sets, in their order."""
+        """Return the results of the current scan under each of several parameter sets, in their order; raises
+        NoStoryError without a scan, WorkerBusyError without an answer."""
         plain = [each.model_dump() for each in sets]
         answer = await self._ask(AskCompare(next(self._tickets), self._shown_run(), plain))
         return _known(answer.frames)
 
     async def camera(self, stamp_ns: int) -> CameraPicture:
-        """Return the camera picture of the run nearest to a time [ns]."""
+        """Return the camera picture of the run nearest to a time [ns]; raises NoStoryError without one,
+        WorkerBusyError without an answer."""
         answer = await self._ask(AskCamera(next(self._tickets), self._shown_run(), stamp_ns))
         return _known(answer.camera)
 
     async def tree_picture(self, number: int) -> CameraPicture:
-        """Return the camera picture of the run that shows a tree best, by its number."""
+        """Return the camera picture of the run that shows a tree best, by its number; raises NoStoryError
+        without one, WorkerBusyError without an answer."""
         answer = await self._ask(AskTreePicture(next(self._tickets), self._shown_run(), number))
         return _known(answer.camera)
 
     async def section(self) -> MapSection:
-        """Return the accumulated points at breast height after the current scan."""
+        """Return the accumulated points at breast height after the current scan; raises NoStoryError without
+        a run, WorkerBusyError without an answer."""
         answer = await self._ask(AskSection(next(self._tickets), self._shown_run()))
         return _known(answer.section)
 
     def _shown_run(self) -> int:
-        """Return the number of the shown run; raises NoStoryError if there is none."""
+        """Return the number of the shown run; raises NothingMappedError if there is none."""
         run = self._run()
         if run is None:
             raise NothingMappedError
@@ -168,7 +174,8 @@ class Selection:
         return (*story.position, reach)
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the selection for the page; the explanation is requested separately."""
+        """Return the selection for the page: `tree`, a number or None, and `cluster`, None or its scan, row,
+        verdict and place [m]. The explanation is requested separately."""
         story = self.cluster
         if story is None:
             return {"tree": self.tree, "cluster": None}
@@ -207,8 +214,8 @@ class Selector:
         self._task: asyncio.Task[None] | None = None
 
     def tree(self, number: int | None) -> None:
-        """Select a tree in place of the selection, and cancel a pending request; None selects nothing.
-        Whether the tree exists is not checked."""
+        """Select a tree, without a cluster, in place of the selection, and cancel a pending request; None
+        selects nothing. Whether the tree exists is not checked."""
         self.leave()
         self._select(Selection(number))
 
@@ -226,8 +233,8 @@ class Selector:
             self._select(Selection(story.tree, story))
 
     def cluster_soon(self, scan: int, cluster: int) -> None:
-        """Select a cluster in the background; of several calls the last one counts. If it does not exist, the
-        browsers receive the message "missing".
+        """Select a cluster in the background; of several calls the last one counts. If it does not exist, or
+        the worker does not answer in time, the browsers receive the message "missing" with the reason.
 
         Args:
             scan: Index of the scan.
@@ -268,11 +275,11 @@ class Selector:
             self._task.cancel()
 
     async def _if_known(self, scan: int, cluster: int) -> None:
-        """Select a cluster; if it does not exist, broadcast the message "missing". WorkerBusyError is raised
-        if the worker does not answer in time."""
+        """Select a cluster; if it does not exist, or the worker does not answer in time, broadcast the
+        message "missing"."""
         try:
             await self.cluster(scan, cluster)
-        except NoStoryError as error:
+        except StemmapError as error:
             self._live.publish("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
 
     def _select(self, selection: Selection) -> None:

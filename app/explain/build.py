@@ -19,6 +19,7 @@ from pipeline.classification.forest import (
     CLASSES,
     TREE_IN_FREE_AIR,
     feature_effects,
+    is_seen_all_around,
     standard_forest,
     tree_in_free_air,
 )
@@ -29,6 +30,7 @@ from pipeline.errors import StemmapError
 from pipeline.types.records import Clusters, Frame, Sensor, Verdict
 
 if TYPE_CHECKING:
+    from app.worker.run import Run
     from app.worker.session import AnyRun
 
 Float = NDArray[np.float64]
@@ -94,7 +96,7 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
         axes=_axes(points[:, :2], to_picture),
         tree=tree,
         tree_distance=tree_distance,
-        column=column_story(frame, place, parameters, sensor),
+        column=column_story(frame, place, parameters, _is_seen_all_around(run)),
     )
 
 
@@ -103,7 +105,7 @@ def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStor
 
     Args:
         run: The open run, or None.
-        frame: Results of the scan, or None.
+        frame: Results of the scan, or None; a whole cloud has its own.
         number: Number of the tree.
 
     Raises:
@@ -116,7 +118,7 @@ def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStor
         raise StemmapError(
             f"tree {number} is not known at this time of the run", remedy="Play on, or select another"
         )
-    parameters, sensor = run.parameters_at(frame.index), run.source.description.sensor
+    parameters = run.parameters_at(frame.index)
     row = int(rows[0])
     trees = frame.trees
     major, minor, angle = half_axes(trees.covariance[row : row + 1])[0].tolist()
@@ -138,7 +140,7 @@ def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStor
         first_seen_s=(int(trees.first_seen_ns[row]) - run.start_ns) / _NS,
         last_seen_s=(int(trees.last_seen_ns[row]) - run.start_ns) / _NS,
         cluster=_cluster_of(frame, trees.position[row], parameters.slam.distance_max),
-        column=column_story(frame, trees.position[row], parameters, sensor),
+        column=column_story(frame, trees.position[row], parameters, _is_seen_all_around(run)),
         points=points_around(run.voxels, trees.position[row]),
         history=run.history(int(trees.number[row]), frame.index),
     )
@@ -157,15 +159,21 @@ def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[Chec
     return check_results(checks(clusters, parameters.detection), row)
 
 
-def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sensor) -> ColumnStory | None:
-    """Return the classification of the accumulated scans at a place; None if no voxel column is within 0.45
-    m.
+def _is_seen_all_around(run: Run) -> bool:
+    """Return which forest classifies the columns of a run up to its current scan."""
+    path = run.path
+    return is_seen_all_around(run.source.description.sensor.rings, np.column_stack([path.x, path.y]))
+
+
+def column_story(frame: Frame, place: Float, parameters: Parameters, all_around: bool) -> ColumnStory | None:
+    """Return the classification of the voxel column that is nearest to a place, a tree before all others;
+    None if none is within 0.45 m.
 
     Args:
         frame: Results of the newest scan, with its voxel columns.
         place: x, y in the map [m].
         parameters: Parameters with which the scan was mapped.
-        sensor: The LiDAR.
+        all_around: Which forest classified them, see `is_seen_all_around`.
     """
     columns = frame.columns
     if columns is None or not len(columns.verdict):
@@ -177,7 +185,7 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, sensor: Sen
     if distance[row] > _COLUMN_REACH:
         return None
     share, verdict = columns.share[row], Verdict(int(columns.verdict[row]))
-    forest = kept_forests()(parameters.classification.forest, sensor.rings > 0)
+    forest = kept_forests()(parameters.classification.forest, all_around)
     figures = columns.figures[row]
     in_free_air = float(tree_in_free_air(figures[None], forest)[0])
     refused = forest.free_end if in_free_air < TREE_IN_FREE_AIR else None

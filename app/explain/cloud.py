@@ -10,6 +10,7 @@ from app.common.arrays import evenly_spaced
 from app.explain.history import half_axes
 from app.explain.records import CheckResult, ClusterStory, CrossSection, TreeStory
 from app.worker.inventory_run import InventoryRun
+from pipeline.classification.column_extraction import BREAST
 from pipeline.config import field_specs
 from pipeline.detection.verdicts import Check
 from pipeline.errors import StemmapError
@@ -17,7 +18,6 @@ from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap
 from pipeline.inventory.cross_sections import STEP, THICK, slice_heights
 from pipeline.inventory.stem_model import stem_checks
-from pipeline.inventory.stem_tracing import BREAST
 from pipeline.types.records import Verdict
 
 _PICTURES = 9  # cross-sections with points
@@ -37,7 +37,7 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
         number: Number of the tree.
 
     Raises:
-        StemmapError: There is no such tree.
+        StemmapError: There is no such tree, or the cloud is not mapped yet.
     """
     row, plot, frame = run.row_of(number), run.plot, run.frame
     if plot is None or frame is None:
@@ -66,14 +66,14 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
 
 
 def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
-    """Return the explanation of a candidate of a whole cloud.
+    """Return the explanation of a candidate of a whole cloud; without checks if no stem was fitted.
 
     Args:
         run: The cloud.
         row: Row of the candidate.
 
     Raises:
-        StemmapError: There is no such candidate.
+        StemmapError: There is no such candidate, or the cloud is not mapped yet.
     """
     plot, frame = run.plot, run.frame
     if plot is None or frame is None or not 0 <= row < len(plot.verdict):

@@ -33,10 +33,6 @@ class TreeHistory:
         self._count = 0
         self._spacing = 1
 
-    def __len__(self) -> int:
-        """Return the number of stored estimates of all trees."""
-        return self._count
-
     def record(self, frame: Frame, start_ns: int) -> None:
         """Add a row for each tree that the scan detected. Rows of this scan and of later ones are removed
         first, because the run went back.
@@ -94,7 +90,8 @@ class TreeHistory:
 
 
 def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return half axes [m] and direction of the major axis [rad] of 1-sigma ellipses, shape (T, 3).
+    """Return major and minor half axis [m] and direction of the major axis [rad] of 1-sigma ellipses, shape
+    (T, 3).
 
     Args:
         covariance: shape (T, 2, 2) [m^2].
@@ -105,7 +102,8 @@ def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:
-    """Return a row for each tree that the scan detected, shape (R, _WIDTH)."""
+    """Return a row for each tree that the scan detected, shape (R, _WIDTH): scan, number, observations, time
+    [s], x, y [m], covariance xx, xy, yy [m^2], DBH and its sigma [m]."""
     trees = frame.trees
     # A tree that began as a voxel column has a position before any scan detects it.
     rows = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))

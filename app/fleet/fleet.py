@@ -15,17 +15,18 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI
 
-from app.batch.compare import align
 from app.common.settings import Settings
 from app.common.timers import cancel
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.dashboard.payload import clearance_payload, trees_payload
+from app.sources import inspection
 from app.web.app import FleetLink, MakeScene, MakeWorker, build
 from app.web.routes.access import ConnectionLimit
 from app.web.serving import first_free, uvicorn_config
 from app.worker.protocol import Open
+from app.worker.supervisor import WorkerProcess
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 
@@ -36,6 +37,7 @@ _log = logging.getLogger(__name__)
 MORE_TREES = 4
 #: Fewer stems fix no pose.
 LEAST_TREES = 6
+_LEAST_SIGMA = 0.02  # of the position of a stem [m]
 
 Map = dict[str, Any]
 
@@ -109,11 +111,35 @@ class Frames:
                 how = f"the same recording as {self._first}"
                 self._found[name] = _MapFrame(digest, count, Pose2(), how)
             elif count >= (LEAST_TREES if known is None else known.trees + MORE_TREES):
-                pose, how = await align({"map": maps[self._first][1]}, {"map": shown})
+                pose, how = await _aligned(maps[self._first][1], shown)
                 how = how if pose is None else f"{how} of {self._first}"
                 self._found[name] = _MapFrame(digest, count, pose, how)
                 return True
         return False
+
+
+async def _aligned(reference: Map, local: Map) -> tuple[Pose2 | None, str]:
+    """Return the pose of a map in a reference map and how it was found as text; where it is unknown, None and
+    the reason. It is computed in a child process; its errors are returned as the reason."""
+    question = {"ask": "alignment", "local": _stems(local), "reference": _stems(reference)}
+    try:
+        found = await inspection.ask(question)
+    except StemmapError as error:
+        return None, error.what
+    if found["pose"] is None:
+        return None, f"their stems do not agree with certainty ({found['reason']})"
+    return Pose2(*found["pose"]), f"aligned by {found['stems']} stems"
+
+
+def _stems(shown: Map) -> list[list[float | None]]:
+    """Return x, y, sigma, DBH and its sigma [m] of each tree of a map; the last two are None unless both are
+    known. Sigma is the longer semi-axis of the ellipse, at least 0.02 m."""
+    rows = []
+    for tree in shown["trees"]:
+        known = tree["dbh_cm"] is not None and tree["sigma_dbh_cm"] is not None
+        dbh = [tree["dbh_cm"] / 100.0, tree["sigma_dbh_cm"] / 100.0] if known else [None, None]
+        rows.append([tree["x"], tree["y"], max(tree["ellipse"][0], _LEAST_SIGMA), *dbh])
+    return rows
 
 
 #: The name of a robot without a namespace; a namespace contains no spaces.
@@ -123,8 +149,10 @@ MOST_POINTS = 400
 
 
 def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
-    """Return state and key figures of a robot as JSON values; without an open run, of the source that the
-    dashboard will open.
+    """Return the state of a robot for the page: `name`, `source`, `rate_hz`, `behind` (scans that wait),
+    `warnings` (their number), `clearance` (see `clearance_payload`), and as in `Status` `state`, `detail`,
+    `live`, `time_s`, `mapping_ms`, `health`, `trees`, `distance_m` and `recording`. Without an open run, the
+    source is the one that the dashboard will open.
 
     Args:
         name: Name of the robot on the page.
@@ -152,8 +180,9 @@ def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
 
 
 def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
-    """Return trees, path and pose of the robot of a dashboard in the frame of its map, as JSON values; None
-    before the first scan. The path has at most about 400 points, the newest among them."""
+    """Return `trees` (see `trees_payload`), `path` ([x, y] of each point) and `pose` ([x, y, yaw]) of a
+    dashboard in the frame of its map; None before the first scan. The path has at most about 400 points, the
+    newest among them."""
     shown = dashboard.shown
     if shown is None:
         return None
@@ -168,8 +197,9 @@ def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
 
 
 def drawn(own: dict[str, Any], pose: Pose2 | None, how: str) -> dict[str, Any]:
-    """Return a map as the page draws it: [x, y, DBH in cm or None] of each tree, path, pose of the robot, the
-    pose [x, y, yaw] of its frame in the common one or None, and how that was found.
+    """Return a map as the page draws it: `trees`, [x, y, DBH in cm or None] of each; `path` and `pose` as in
+    `shown_map`; `common`, the pose [x, y, yaw] of its frame in the common one or None; and `how` that was
+    found.
 
     Args:
         own: Result of `shown_map`.
@@ -281,7 +311,6 @@ class Fleet:
     Attributes:
         live: Broadcast of states and maps to the connected pages.
         members: Dashboard by name.
-        remote: Card and map by name, for robots that map by themselves.
         notice: Message for the page, "" for none.
     """
 
@@ -292,13 +321,12 @@ class Fleet:
         token: str,
         make_parameters: Callable[[], ParameterState] = ParameterState,
         make_scene: MakeScene | None = None,
-        make_worker: MakeWorker | None = None,
+        make_worker: MakeWorker = WorkerProcess,
         warm: Callable[[], Awaitable[None]] | None = None,
     ) -> None:
         self.live, self.pages = Broadcast(), ConnectionLimit()
         self.members: dict[str, Member] = {}
         self.notice = ""
-        self.remote: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {}  # card and map, mapped elsewhere
         self._settings, self._port, self._token = settings, port, token
         self._make_parameters = make_parameters
         self._make = (make_scene, make_worker)
@@ -391,14 +419,15 @@ class Fleet:
             _log.exception("a map could not be aligned with the common one")
 
     def send_cards(self) -> None:
-        """Send the states of all robots and the notice to the pages, as the message "fleet"."""
+        """Send the states of all robots (`members`, see `card`, with `answers`) and the `notice` to the
+        pages, as the message "fleet". Before `warm` has ended, and after the end of a dashboard, the state
+        says so."""
         cards = [card(name, m.dashboard) | {"answers": m.answers} for name, m in self.members.items()]
         for shown, member in zip(cards, self.members.values(), strict=True):
             if not self._is_warm:
                 shown |= {"state": "starting", "detail": COMPILING, "source": member.source.uri}
             if member.ended:
                 shown |= {"state": "failed", "detail": "Its dashboard ended; the terminal shows why"}
-        cards += [shown for shown, _ in self.remote.values()]
         self.live.publish("fleet", {"members": cards, "notice": self.notice})
 
     def send_maps(self) -> None:
@@ -410,8 +439,6 @@ class Fleet:
         self.live.publish("maps", {"maps": maps})
 
     def _maps(self) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Return digest and map of each robot that has a map, by name; a robot that maps by itself has the
-        digest "remote:" and its name."""
+        """Return the digest of the run and the map, see `shown_map`, of each robot that has one, by name."""
         found = {name: (m.dashboard.digest, shown_map(m.dashboard)) for name, m in self.members.items()}
-        maps = {name: (digest, own) for name, (digest, own) in found.items() if own is not None}
-        return maps | {name: (f"remote:{name}", own) for name, (_, own) in self.remote.items()}
+        return {name: (digest, own) for name, (digest, own) in found.items() if own is not None}

@@ -1,19 +1,14 @@
-"""Web server of a fleet: the page of all robots on one port, their dashboards on the ports after it.
-
-Robots may also map by themselves; their results are received then, and their scans are not.
-"""
+"""Web server of a fleet: the page of all robots on one port, their dashboards on the ports after it."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import logging
 import time
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlencode
 
 import msgspec
@@ -26,7 +21,6 @@ from app.common.settings import Settings
 from app.common.timers import cancel
 from app.dashboard.parameters import ParameterState
 from app.fleet.fleet import NAMELESS, Fleet
-from app.fleet.hearing import FleetReport, RobotReport
 from app.robot.address import ROOT, ZenohAddress
 from app.robot.link import Inbox
 from app.robot.zenoh import ZenohLink
@@ -38,134 +32,6 @@ from app.web.routes.sockets import telling
 from app.web.serving import run_server
 from app.worker.numba_warmup import PATIENCE_S
 from app.worker.protocol import Open
-from pipeline.errors import StemmapError
-
-_log = logging.getLogger(__name__)
-
-HEARING = python_module("app.fleet.hearing")
-_LONGEST_LINE = 32 << 20
-_RETRY_S = 2.0
-#: A longer silence is shown [s].
-SILENT_S = 3.0
-
-
-class RemoteRobots:
-    """Runs the process that receives the maps, and passes its reports to the fleet.
-
-    Args:
-        fleet: The fleet that shows the robots.
-        uri: Address of the router.
-        command: Program and arguments of the process.
-    """
-
-    def __init__(self, fleet: Fleet, uri: str, command: Sequence[str] = HEARING) -> None:
-        self._fleet, self._uri, self._command = fleet, uri, command
-        self._task: asyncio.Task[None] | None = None
-        self._known: dict[str, tuple[RobotReport, float]] = {}  # with the time of the report [s]
-
-    def start(self) -> None:
-        """Start the process."""
-        self._task = asyncio.create_task(self._keep(), name="hear robots")
-
-    async def close(self) -> None:
-        """End the process."""
-        await cancel(self._task)
-
-    async def _keep(self) -> None:
-        """Run the process and restart it after 2 s whenever it ends or fails, until the task is cancelled;
-        `notice` of the fleet has the reason."""
-        while True:
-            try:
-                await self._receive()
-                self._fleet.notice = "Waiting: the process that receives the maps ended and is started again"
-            except StemmapError as error:
-                _log.exception("the process that receives the maps failed")
-                self._fleet.notice = f"Waiting: {error}"
-            self._show(receiving=False)
-            await asyncio.sleep(_RETRY_S)
-
-    async def _receive(self) -> None:
-        """Start the process and process its reports until it ends.
-
-        Raises:
-            StemmapError: The process cannot be started, or sends something else.
-        """
-        command = (*self._command, self._uri)
-        async with await ChildProcess.start(command, line_limit=_LONGEST_LINE) as child:
-            while (report := await child.receive(FleetReport)) is not None:
-                self._take(report)
-
-    def _take(self, report: FleetReport) -> None:
-        """Merge a report with the known robots and pass them to the fleet. A robot that a restarted process
-        does not know keeps its last map and is not alive."""
-        self._fleet.notice = f"Waiting: {report.problem}" if report.problem else ""
-        if not report.robots and not report.problem:
-            self._fleet.notice = f"Waiting: {report.place}; no robot publishes a map of its own"
-        now_s = time.monotonic()
-        for name, robot in self._known.items():
-            if name not in report.robots:  # a process that was started again does not know it
-                self._known[name] = (msgspec.structs.replace(_aged(*robot, now_s), alive=False), now_s)
-        for name, new in report.robots.items():
-            if new.silence_s is None and name in self._known:  # nor its map: the last one stays
-                new = msgspec.structs.replace(_aged(*self._known[name], now_s), alive=new.alive)
-            self._known[name] = (new, now_s)
-        self._show(receiving=True)
-
-    def _show(self, *, receiving: bool) -> None:
-        """Pass cards and maps to the fleet; without `receiving`, no robot counts as live."""
-        now_s = time.monotonic()
-        self._fleet.remote = {}
-        for robot, known in self._known.items():
-            name, aged = robot or NAMELESS, _aged(*known, now_s)
-            self._fleet.remote[name] = (card_of(name, self._uri, aged, receiving=receiving), aged.map)
-
-
-def _aged(robot: RobotReport, reported_s: float, now_s: float) -> RobotReport:
-    """Return a report of an earlier time, with its silence extended to the present; an unknown silence stays
-    None.
-
-    Args:
-        robot: The report.
-        reported_s, now_s: Time of the report and present time, from the same origin [s].
-    """
-    silence_s = None if robot.silence_s is None else robot.silence_s + now_s - reported_s
-    return msgspec.structs.replace(robot, silence_s=silence_s)
-
-
-def card_of(name: str, uri: str, robot: RobotReport, *, receiving: bool) -> dict[str, Any]:
-    """Return the card of a robot, in the form of `app.fleet.fleet.card`. The state is "waiting" if there was
-    no pose for more than SILENT_S or `receiving` is False, otherwise "playing".
-
-    Args:
-        name: Name of the robot.
-        uri: Address of the router.
-        robot: Its newest report.
-        receiving: Whether the process that receives the reports runs.
-    """
-    silent = not receiving or robot.silence_s is None or robot.silence_s > SILENT_S
-    since = "" if robot.silence_s is None else f"Nothing heard for {robot.silence_s:.0f} s: "
-    reason = "it is announced and silent" if robot.alive else "its mapping is gone"
-    if not receiving:
-        reason = "the process that receives the maps ended"
-    return {
-        "name": name,
-        "source": f"{uri}, mapped on the robot",
-        "remote": True,
-        "state": "waiting" if silent else "playing",
-        "detail": f"{since}{reason}" if silent else "",
-        "live": True,
-        "time_s": 0.0,
-        "rate_hz": robot.rate_hz,
-        "mapping_ms": 0.0,
-        "behind": None,
-        "health": None,
-        "trees": len(robot.map["trees"]),
-        "distance_m": robot.distance_m,
-        "recording": "",
-        "warnings": robot.unreadable,
-        "clearance": robot.clearance,
-    }
-
 
 WARMING = python_module("app.worker.numba_warmup", "warm_up")
 
@@ -320,7 +186,7 @@ def build_fleet(
     port: int,
     token: str,
     fleet: Fleet,
-    watching: RobotWatch | RemoteRobots | None = None,
+    watching: RobotWatch | None = None,
 ) -> FastAPI:
     """Return the application of the page of the fleet. It starts the fleet and `watching` when it starts, and
     closes both when it ends.
@@ -398,7 +264,7 @@ def serve_fleet(
     make_parameters: Callable[[], ParameterState],
     watched: tuple[ZenohAddress, Open] | None,
     open_browser: bool,
-    viewer: bool = False,
+    viewer: bool,
 ) -> int:
     """Serve until SIGINT or SIGTERM; return the exit code: 0, or 1 if the server could not start.
 
@@ -414,15 +280,14 @@ def serve_fleet(
         StemmapError: The port is in use, or the address is not an address of this machine.
     """
 
-    def make_app(port: int, token: str) -> FastAPI:
+    async def make_app(port: int, token: str) -> FastAPI:
         fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warm_kernels)
         for name, source in sources.items():
             fleet.add(name, source)
-        watching: RobotWatch | RemoteRobots | None = None
+        watching: RobotWatch | None = None
         if watched is not None:
             address, source = watched
-            there = address.mapped_there
-            watching = RemoteRobots(fleet, address.uri) if there else RobotWatch(fleet, address, source)
+            watching = RobotWatch(fleet, address, source)
         return build_fleet(settings, port=port, token=token, fleet=fleet, watching=watching)
 
     return run_server(settings, make_app, open_browser=open_browser, viewer=viewer)

@@ -22,7 +22,7 @@ SCHEME, VELODYNE, DDS = "zenoh:", "velodyne:", "dds:"
 _ENDPOINT = re.compile(r"(tcp|tls|quic)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9._-]+):([0-9]{1,5})")
 _FILES = ("ca", "cert", "key")
 _TOPICS = ("scan", "odometry", "imu", "gnss", "pose", "camera")
-_OPTIONS = ("robot", "domain", "mapped", *_TOPICS, *_FILES)
+_OPTIONS = ("robot", "domain", *_TOPICS, *_FILES)
 _DDS_OPTIONS = ("domain", "interface", "peer", "robot", *_TOPICS)
 #: Network interfaces (IPv4 address or name) and hosts, without characters that could change a configuration.
 _INTERFACE = re.compile(r"[A-Za-z][A-Za-z0-9._-]{0,14}|[0-9]{1,3}(\.[0-9]{1,3}){3}")
@@ -60,14 +60,12 @@ class ZenohAddress(Address):
 
     Attributes:
         endpoint: Router that is connected, e.g. "tcp/192.168.1.5:7447".
-        mapped_there: Whether the robots map by themselves; only their results are received then.
         files: Certificates: "ca" of the authority of the router, "cert" and "key" of this machine.
     """
 
     kind: ClassVar[str] = "ROS 2 over Zenoh"
     endpoint: str
     files: dict[str, str] = field(default_factory=dict)
-    mapped_there: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,10 +174,6 @@ def _zenoh(uri: str) -> ZenohAddress:
     if found is None or not 0 < int(found.group(3)) < 1 << 16:
         raise SourceError("this is not the address of a Zenoh router", where=uri, remedy=_REMEDY)
     options = _known(uri, query, _OPTIONS)
-    mapped = options.get("mapped", "here")
-    if mapped not in ("here", "robot"):
-        remedy = "Use mapped=robot for robots that map themselves, or mapped=here."
-        raise SourceError(f"mapped={mapped!r} is unknown", where=uri, remedy=remedy)
     files = _files(uri, endpoint, {name: options[name] for name in _FILES if options.get(name)})
     named = options.get("robot", "")
     robot = named.strip("/") or (ROOT if named else "")
@@ -190,7 +184,6 @@ def _zenoh(uri: str) -> ZenohAddress:
         topics=_topics(options),
         endpoint=endpoint,
         files=files,
-        mapped_there=mapped == "robot",
     )
 
 

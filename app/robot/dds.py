@@ -29,6 +29,9 @@ def idl_type(msgtype: str) -> Any:  # noqa: ANN401 - cyclonedds is an extra, and
 
     Returns:
         A class of cyclonedds, named e.g. "sensor_msgs.msg.dds_.PointCloud2_".
+
+    Raises:
+        KeyError: The type is not known to rosbags.
     """
     from cyclonedds.idl import make_idl_struct
 

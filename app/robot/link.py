@@ -102,7 +102,7 @@ class Inbox:
 
     def put(self, message: Message, *, is_scan: bool) -> None:
         """Record and queue a message; without room, the oldest messages are skipped: first scans, then
-        others. It never waits.
+        others, but not fixed transforms, see `begin`. It never waits.
 
         Args:
             message: The message.
@@ -154,7 +154,8 @@ class Inbox:
                 count_loss(self.losses, PICTURES_SKIPPED)
 
     def take(self) -> Message | None:
-        """Remove and return the message that arrived first; None when the queue is empty."""
+        """Remove and return the message that arrived first, pictures included; None when the queue is empty.
+        After the first call, scans do not count as early any more."""
         with self._lock:
             self._mapping = True
             lanes = [lane for lane in (self._scans, self._others, self._fixed, self._pictures) if lane]

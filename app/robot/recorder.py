@@ -214,7 +214,7 @@ class RawFile:
         self._length = 0
 
     def write(self, data: bytes) -> int:
-        """Write all bytes.
+        """Write all bytes and return their number.
 
         Raises:
             OSError: The disk refuses; a part may be written.

@@ -4,13 +4,11 @@ stored until the end of the run, when the positions of the trees are known."""
 from __future__ import annotations
 
 import math
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
-from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import Any
 
 from app.robot.address import (
     ALL_ROBOTS,
@@ -24,13 +22,13 @@ from app.robot.address import (
 from app.robot.dds import DdsLink
 from app.robot.link import PICTURE_PAUSE_NS, PICTURES_SKIPPED, PICTURES_TOO_LARGE, Inbox, Link
 from app.robot.recorder import Recorder
-from app.robot.topics import SCAN_TYPES, Choice, Publisher, choose
+from app.robot.topics import SCAN_TYPES, Choice, choose
 from app.robot.velodyne import VelodyneLink
 from app.robot.zenoh import RosPublisher, ZenohLink
 from app.sources.opening import open_source
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
-from pipeline.io.block_file import SPARE_BYTES, free_space
+from pipeline.io.block_file import BlockFile
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions, count_loss
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
@@ -40,39 +38,18 @@ from pipeline.types.records import Frame, Path, Record, Truth
 #: Motion between two stored pictures, which shows every tree from near, and limits of the disk space.
 STEP_M, TURN_RAD = 1.0, math.radians(22.5)
 MOST_BYTES, MOST_PICTURES = 1 << 30, 20_000
-FULL = "pictures not stored for trees: the limit of 1 GB is reached"
-REFUSED = "pictures not stored for trees: the disk cannot be written"
-SPARED = f"pictures not stored for trees: less than {SPARE_BYTES / 1e9:.0f} GB of the disk would be left"
-
-
-class _Kept(NamedTuple):
-    """A picture without its bytes, and their position and length in the file."""
-
-    picture: Picture
-    begin: int
-    length: int
 
 
 class PictureStore:
-    """Temporary file without a name, which the system deletes when the process ends.
-
-    Args:
-        folder: Selects the disk; the nearest existing parent is used.
+    """Pictures of a run in a temporary file.
 
     Attributes:
         losses: Number of pictures that were not stored, by reason.
-
-    Raises:
-        OSError: The file cannot be created.
     """
 
-    def __init__(self, folder: FilePath) -> None:
-        there = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.is_dir())
-        # Without a buffer: bytes that a full disk refused would raise an error at a later read or at the end.
-        self._file = tempfile.TemporaryFile(dir=there, buffering=0)  # noqa: SIM115 - open until `close`
-        self._folder = there
-        self._kept: dict[int, _Kept] = {}
-        self._length = 0
+    def __init__(self) -> None:
+        self._file = BlockFile(MOST_BYTES)
+        self._kept: dict[int, Picture] = {}  # by time, without their bytes
         self._last: tuple[float, float, float] | None = None
         self.losses: dict[str, int] = {}
 
@@ -94,33 +71,21 @@ class PictureStore:
 
     def add(self, picture: Picture, path: Path) -> None:
         """Store a picture. A picture that cannot be stored (limit, disk) is counted in `losses`; one with a
-        known time is ignored.
+        known time is ignored. In any case `is_due` counts the motion from this pose on.
 
         Args:
             picture: The picture.
-            path: Path up to the pose at which it was taken.
+            path: Path up to the pose at which it was taken, at least one.
         """
         self._last = float(path.x[-1]), float(path.y[-1]), float(path.yaw[-1])
         if picture.stamp_ns in self._kept:
             return
-        size = len(picture.data)
-        if self._length + size > MOST_BYTES or len(self._kept) >= MOST_PICTURES:
-            count_loss(self.losses, FULL)
+        is_full = len(self._kept) >= MOST_PICTURES
+        if is_full or not self._file.put_block(len(self._kept), picture.data):
+            reason = "there are too many" if is_full else self._file.refusal
+            count_loss(self.losses, f"pictures not stored for trees: {reason}")
             return
-        try:
-            if free_space(self._folder) < SPARE_BYTES + size:
-                count_loss(self.losses, SPARED)
-                return
-            self._file.seek(self._length)
-            is_whole = self._file.write(picture.data) == size
-        except OSError:
-            is_whole = False
-        if not is_whole:
-            count_loss(self.losses, REFUSED)
-            return
-        empty = Picture(picture.stamp_ns, picture.encoding, picture.width, picture.height, picture.step, b"")
-        self._kept[picture.stamp_ns] = _Kept(empty, self._length, size)
-        self._length += size
+        self._kept[picture.stamp_ns] = replace(picture, data=b"")
 
     def stamps(self) -> list[int]:
         """Return the times of the pictures, ascending [ns]."""
@@ -129,11 +94,13 @@ class PictureStore:
     def at(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
         """Yield the pictures of some of `stamps`, each once, in the order of their times; other times are
         ignored."""
+        numbers = {stamp_ns: number for number, stamp_ns in enumerate(self._kept)}
         for stamp_ns in sorted(set(wanted_ns) & self._kept.keys()):
-            empty, begin, length = self._kept[stamp_ns]
-            self._file.seek(begin)
-            data = self._file.read(length)
-            yield Picture(stamp_ns, empty.encoding, empty.width, empty.height, empty.step, data)
+            data = self._file.read_block(numbers[stamp_ns], bytes)
+            if data is None:
+                count_loss(self.losses, "pictures stored for trees that cannot be read")
+            else:
+                yield replace(self._kept[stamp_ns], data=data)
 
     def close(self) -> None:
         """Close and delete the file."""
@@ -309,16 +276,9 @@ class LiveSource:
             f"one every {PICTURE_PAUSE_NS / 1e9:g} s at most; {lost:,} were dropped"
         )
 
-    def keep_pictures(self, folder: FilePath) -> None:
-        """Store pictures during the run, for the pictures of trees at its end.
-
-        Args:
-            folder: Folder on whose disk they are stored.
-
-        Raises:
-            OSError: The file cannot be created.
-        """
-        self._kept = PictureStore(folder)
+    def keep_pictures(self) -> None:
+        """Store pictures during the run, for the pictures of trees at its end."""
+        self._kept = PictureStore()
 
     # --- live -----------------------------------------------------------------------
 
@@ -336,10 +296,6 @@ class LiveSource:
     def robots(self) -> list[str]:
         """Namespaces of all robots that publish scans now."""
         return self._link.robots()
-
-    def publishers(self) -> list[Publisher]:
-        """Return all topics that are published on the network of the robot, each once."""
-        return self._link.publishers()
 
     @property
     def scans_waiting(self) -> int:
@@ -493,7 +449,8 @@ class LiveSource:
             )
 
     def _note_presence(self, choice: Choice) -> None:
-        """Update whether the scans of the robot are still announced, and add a notice if that changed."""
+        """Update whether the chosen scans are still announced, and add a notice if that changed, not at the
+        first call."""
         self._version = self._link.version
         publishers = self._link.publishers()
         scan = choice.channels[0].topic
@@ -549,12 +506,6 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
         SourceError: The address is invalid, or names robots that cannot be mapped here.
     """
     address = parse_address(uri)
-    if isinstance(address, ZenohAddress) and address.mapped_there:
-        raise SourceError(
-            "a robot that maps itself is shown and not mapped again",
-            where=uri,
-            remedy="Use `stemmap serve`, or leave out mapped=robot",
-        )
     if isinstance(address, ZenohAddress) and address.robot == ALL_ROBOTS:
         raise SourceError(
             "only one robot can be mapped at a time",

@@ -117,6 +117,9 @@ def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publish
         there: Publishers of the robot.
         topics: Topic by role where the user named it.
         where: The address, for errors.
+
+    Raises:
+        SourceError: The named topic has another type.
     """
     if "pose" not in topics:
         return None
@@ -125,7 +128,8 @@ def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publish
 
 def _camera(there: list[Publisher], topics: dict[str, str], where: str) -> list[Publisher]:
     """Return the topic of the pictures and, where one exists, the CameraInfo with the most similar name; []
-    without a camera. Compressed pictures are preferred; arguments as in `_pose`."""
+    without a camera or for the topic NO_CAMERA. Compressed pictures are preferred, and those that show no
+    scene (depth, masks) count only if named; arguments as in `_pose`, errors as in `_of_role`."""
     if topics.get("camera") == NO_CAMERA:
         return []
     seen = there if "camera" in topics else [p for p in there if not _has_word(p, _NO_SCENE)]

@@ -178,7 +178,7 @@ class VelodyneLink(Link):
         self._hand_over(self._sweeps.add(self.times.now_ns(), packet))
 
     def _hand_over(self, sweep: bytes | None) -> None:
-        """Put a sweep into the inbox; nothing for None, or before `subscribe`."""
+        """Count a sweep and put it into the inbox; nothing for None, or before `subscribe`."""
         if sweep is None or self._number is None:
             return
         self.scans += 1

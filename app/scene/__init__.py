@@ -1,7 +1,6 @@
 """The 3D scene with its sliders. Only this package uses viser."""
 
-from app.scene.panel import SceneCommands
 from app.scene.scene import Scene
 from app.scene.viser_server import SECRET_HEADER
 
-__all__ = ["SECRET_HEADER", "Scene", "SceneCommands"]
+__all__ = ["SECRET_HEADER", "Scene"]

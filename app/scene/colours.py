@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from app.scene import colours
 from pipeline.errors import ParameterError
 from pipeline.types.records import Verdict
 
@@ -150,27 +149,27 @@ class Layer(NamedTuple):
     """
 
     title: str
-    colour: colours.Rgb | None
+    colour: Rgb | None
     on: bool = True
 
 
 # In the order of their keys, 1 to 9 and 0.
 LAYERS = {
-    "ground": Layer("Ground", colours.GROUND),
-    "raw": Layer("Raw scan", colours.RAW),
-    "filtered": Layer("Filtered", colours.FILTERED),
-    "clusters": Layer("Clusters", colours.TREE),
-    "fits": Layer("Fitted circles", colours.TREE),
+    "ground": Layer("Ground", GROUND),
+    "raw": Layer("Raw scan", RAW),
+    "filtered": Layer("Filtered", FILTERED),
+    "clusters": Layer("Clusters", TREE),
+    "fits": Layer("Fitted circles", TREE),
     "labels": Layer("Labels", None),
     "gathered": Layer("Accumulated map", None, on=False),
-    "trees": Layer("Trees", colours.TREE),
-    "truth": Layer("Ground truth", colours.TRUTH),
-    "errors": Layer("Errors (10 times as long)", colours.ERROR, on=False),
-    "particles": Layer("Particles", colours.PARTICLES),
-    "path": Layer("Path", colours.PATH),
-    "odometry": Layer("Path by odometry", colours.ODOMETRY, on=False),
-    "voxels": Layer("Voxels", colours.VOXELS, on=False),
-    "way": Layer("Path ahead and obstacles", colours.PATH),
+    "trees": Layer("Trees", TREE),
+    "truth": Layer("Ground truth", TRUTH),
+    "errors": Layer("Errors (10 times as long)", ERROR, on=False),
+    "particles": Layer("Particles", PARTICLES),
+    "path": Layer("Path", PATH),
+    "odometry": Layer("Path by odometry", ODOMETRY, on=False),
+    "voxels": Layer("Voxels", VOXELS, on=False),
+    "way": Layer("Path ahead and obstacles", PATH),
 }
 CHOICES = {"colour_by": COLOUR_BY, "label_by": LABEL_BY}
 
@@ -211,7 +210,8 @@ class ViewSettings:
             self.layers[name] = value
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the layers in order with title, colour and visibility, and the choices, for the page."""
+        """Return the state for the page: `layers` in order, each with `name`, `title`, `on` and `colour`
+        ("#rrggbb" or None), `follow`, and each of CHOICES with its `value` and the possible values (`of`)."""
         layers = [
             {"name": name, "title": layer.title, "on": self.layers[name], "colour": _hex(layer.colour)}
             for name, layer in LAYERS.items()
@@ -220,6 +220,6 @@ class ViewSettings:
         return {"layers": layers, "follow": self.follow, **choices}
 
 
-def _hex(colour: colours.Rgb | None) -> str | None:
+def _hex(colour: Rgb | None) -> str | None:
     """Return a colour as "#rrggbb"; None for None."""
     return None if colour is None else "#{:02x}{:02x}{:02x}".format(*colour)

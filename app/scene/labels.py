@@ -14,10 +14,12 @@ from pipeline.types.records import Frame, Verdict
 
 MOST_LABELS = 60  # more than 200 halve the frame rate of a browser
 STEM_HEIGHT = 2.0  # [m], drawn where no height was measured
-# Width of a label as a share of its distance from a camera BEHIND metres behind the robot: a text keeps its
-# size on the screen.
-BEHIND = 6.0  # [m]
-TREE_WIDTH, CLUSTER_WIDTH = 0.09, 0.11
+#: Usual position of a camera relative to the robot [m].
+BEHIND = (-8.0, -4.5, 6.0)
+# Sizes of labels [rad], measured in the middle of a picture with viser's field of view of 75 degrees: a text
+# keeps its share of the height of the picture.
+TREE_WIDTH, CLUSTER_WIDTH, TEXT_HEIGHT = 0.17, 0.15, 0.05
+OWN_TREE = 0.5  # m; a cluster this near to a labelled tree is that tree
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,11 +60,6 @@ class LabelNodes:
                 self._node_of[key] = self._free.pop() if self._free else self._another()
             self._place(key, label)
 
-    @property
-    def texts(self) -> list[str]:
-        """The visible texts."""
-        return [label.text for label in self._shown.values()]
-
     def _another(self) -> viser.LabelHandle:
         """Add a hidden node to the pool and return it."""
         return self._scene.add_label(
@@ -85,7 +82,7 @@ class LabelNodes:
         node.text, node.position, node.visible = label.text, label.place, True
 
 
-Place = tuple[float, float]
+Place = tuple[float, float, float]
 
 
 def apart(
@@ -96,27 +93,37 @@ def apart(
     most: int,
     taken: Sequence[Place] = (),
 ) -> list[int]:
-    """Return rows of places whose labels do not overlap, in order of preference, at most `most`.
+    """Return rows of places whose labels do not overlap as seen from BEHIND the robot, in order of
+    preference, at most `most`.
 
     Args:
-        places: x, y in the frame of the map, shape (N, 2) [m].
+        places: x, y, z in the frame of the map, shape (N, 3) [m].
         order: Rows, the preferred ones first.
-        robot: Position of the robot, shape (2,) [m].
-        width: Width of a label as a share of its distance.
+        robot: x, y, z of the robot, shape (3,) [m].
+        width: Width of a label [rad].
         most: Largest number of labels, at least 1.
         taken: Places of other labels.
     """
     kept: list[int] = []
-    used: list[Place] = list(taken)
+    used = [_direction(np.array(place), robot) for place in taken]
     for row in order.tolist():
-        room = width * (BEHIND + float(np.hypot(*(places[row] - robot))))
-        place = (float(places[row, 0]), float(places[row, 1]))
-        if all(math.dist(place, other) >= room for other in used):
+        azimuth, elevation = _direction(places[row], robot)
+        if all(
+            abs(math.remainder(azimuth - other, math.tau)) * math.cos(elevation) >= width
+            or abs(elevation - above) >= TEXT_HEIGHT
+            for other, above in used
+        ):
             kept.append(row)
-            used.append(place)
+            used.append((azimuth, elevation))
             if len(kept) == most:
                 break
     return kept
+
+
+def _direction(place: NDArray[np.float64], robot: NDArray[np.float64]) -> tuple[float, float]:
+    """Return azimuth and elevation [rad] of a place (x, y, z) [m] as seen from BEHIND the robot."""
+    x, y, z = (place - robot - BEHIND).tolist()
+    return math.atan2(y, x), math.atan2(z, math.hypot(x, y))
 
 
 def cluster_labels(
@@ -129,21 +136,26 @@ def cluster_labels(
         frame: Results of the scan.
         numbers: Persistent number of each cluster, shape (K,).
         label_by: One of colours.LABEL_BY.
-        taken: Places of the labels of trees.
+        taken: Places of the labels of trees; a cluster at one of these trees has no label.
     """
     if label_by == "none":
         return []
     clusters, pose = frame.clusters, frame.estimate.T_map_base
     base = clusters.centroid + frame.sensor_offset
-    places = pose.apply(base[:, :2])
     tops = frame.base_z + base[:, 2] + 0.5 * shown_height(clusters.extent[:, 2]) + 0.1
+    places = np.column_stack([pose.apply(base[:, :2]), tops])
     order = np.lexsort((np.linalg.norm(base[:, :2], axis=1), clusters.verdict != Verdict.TREE))
     texts = [_cluster_text(frame, k, label_by) for k in range(len(order))]
-    named = order[[bool(texts[k]) for k in order.tolist()]] if len(order) else order
-    robot = np.array([pose.x, pose.y])
+    trees = np.array(taken).reshape(-1, 3)[:, :2]
+    named = [
+        k
+        for k in order.tolist()
+        if texts[k] and not (np.linalg.norm(trees - places[k, :2], axis=1) < OWN_TREE).any()
+    ]
+    robot = np.array([pose.x, pose.y, frame.base_z])
     return [
-        Label(int(numbers[k]), texts[k], (float(places[k, 0]), float(places[k, 1]), float(tops[k])))
-        for k in apart(places, named, robot, CLUSTER_WIDTH, MOST_LABELS, taken)
+        Label(int(numbers[k]), texts[k], tuple(places[k].tolist()))
+        for k in apart(places, np.array(named, np.int64), robot, CLUSTER_WIDTH, MOST_LABELS, taken)
     ]
 
 

@@ -33,7 +33,7 @@ class MapNodes:
         on_tree: Called in the thread of viser with the number of a clicked tree.
 
     Attributes:
-        labelled: Places of the labels (x, y) [m].
+        labelled: Places of the labels [m].
     """
 
     def __init__(self, scene: viser.SceneApi, on_tree: Callable[[int], None]) -> None:
@@ -69,11 +69,11 @@ class MapNodes:
         self._numbers = trees.number.tolist()
         self._show_trees(trees, np.round(foot, 1), frame.of_cloud, view)
         self._show_mark(trees, selected, ring, frame.base_z)
-        robot = np.array([pose.x, pose.y])
+        robot = np.array([pose.x, pose.y, frame.base_z])
         named = view.layers["trees"] and view.layers["labels"]
         labels = tree_labels(trees, robot, selected, foot) if named else []
         self._labels.show(labels)
-        self.labelled = [label.place[:2] for label in labels]
+        self.labelled = [label.place for label in labels]
 
     def place_of(self, frame: Frame, tree: int | None, ring: Ring) -> tuple[float, float, float] | None:
         """Return x, y and height of the ground of the selected cluster, else of the selected tree [m]; None
@@ -87,7 +87,8 @@ class MapNodes:
         return float(places[0, 0]), float(places[0, 1]), float(z[0])
 
     def show_truth(self, trees: TruthTrees | None, view: ViewSettings) -> None:
-        """Show rings at the objects of the ground truth, on the known ground; None removes them."""
+        """Show rings at the objects of the ground truth, on the known ground, 12 cm outside their trunks;
+        hidden for None and while the layer is off."""
         on = view.layers["truth"] and trees is not None and len(trees.x) > 0
         drawn = (trees, self.ground.shown)
         if trees is None or not on or (drawn[0] is self._drawn[0] and drawn[1] is self._drawn[1]):
@@ -104,11 +105,6 @@ class MapNodes:
             colours.choose(is_tree, colours.TRUTH, colours.OTHER),
             self.ground.heights(place, 0.0),
         )
-
-    @property
-    def texts(self) -> list[str]:
-        """The visible labels."""
-        return self._labels.texts
 
     def _show_trees(self, trees: Trees, foot: Float, of_cloud: bool, view: ViewSettings) -> None:
         """Send the trunks; those of a whole cloud are as thick as their circles, which are drawn on their
@@ -163,28 +159,26 @@ def tree_labels(
 
     Args:
         trees: Trees of the map.
-        robot: Position of the robot (x, y) [m].
+        robot: Position of the robot, shape (3,) [m].
         selected: Number of the selected tree, or None.
         foot: Height of the ground at each tree, shape (T,) [m].
     """
-    distance = np.linalg.norm(trees.position - robot, axis=1)
+    distance = np.linalg.norm(trees.position - robot[:2], axis=1)
     order = np.lexsort((distance, trees.number != (-1 if selected is None else selected)))
+    places = np.column_stack([trees.position, np.round(foot, 1) + TREE_HEIGHT + 0.15])
     return [
         Label(
             int(trees.number[row]),
             _tree_text(trees, row, int(trees.number[row]) == selected),
-            (
-                float(trees.position[row, 0]),
-                float(trees.position[row, 1]),
-                round(float(foot[row]), 1) + TREE_HEIGHT + 0.15,
-            ),
+            tuple(places[row].tolist()),
         )
-        for row in apart(trees.position, order, robot, TREE_WIDTH, NUMBERS)
+        for row in apart(places, order, robot, TREE_WIDTH, NUMBERS)
     ]
 
 
 def _tree_text(trees: Trees, row: int, selected: bool) -> str:
-    """Return the number of a tree; with its DBH where it was measured.
+    """Return the label of a tree: "7: 24 cm" or, without a DBH, "7"; of the selected one "tree 7, DBH 24.1
+    cm" or "tree 7, DBH not measured".
 
     Args:
         trees: Trees of the map.
@@ -352,6 +346,8 @@ class Accumulated:
         room = MOST_POINTS - len(self.points)
         self.left_out += max(0, len(new) - room)
         new = new[:room]
+        if self._scans and self._scans[-1][1] == len(self.points):
+            self._scans.pop()  # it added no point, and only the last such scan is needed, for its pose
         self._scans.append((frame.index, len(self.points), pose))
         self.points = np.vstack([self.points, placed[new].astype(np.float32)])
         self._keys = np.concatenate([self._keys, _keys(placed[new])])

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from app.scene import colours
 from app.scene.colours import Colours, Rgb
+from app.scene.viser_server import send_properties
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Frame, HeightMap
 
@@ -98,19 +99,28 @@ class Node(Generic[N]):
         self._sent: dict[str, Any] = {}
 
     def update(self, on: bool, **content: Any) -> None:  # noqa: ANN401 - the properties of the node
-        """Set properties of the node and show it, or hide it; a hidden node keeps its content.
+        """Set properties of the node and show it, or hide it; a hidden node keeps its content, and `content`
+        is not sent to it.
 
         Args:
             on: Whether it is visible.
             content: Properties by name; those that are unchanged are not sent.
         """
-        if on:
-            for name, value in content.items():
-                if name not in self._sent or not np.array_equal(self._sent[name], value):
-                    self._sent[name] = value
-                    setattr(self.node, name, value)
+        changed = [
+            name
+            for name, value in content.items()
+            if name not in self._sent or not np.array_equal(self._sent[name], value)
+        ]
+        if on and changed:
+            self._sent = content
+            self._send(content, changed)
         if self.node.visible != on:
             self.node.visible = on
+
+    def _send(self, content: dict[str, Any], changed: list[str]) -> None:
+        """Send the changed ones of all properties of the node."""
+        for name in changed:
+            setattr(self.node, name, content[name])
 
 
 class Batch(Node[viser.BatchedMeshHandle]):
@@ -163,6 +173,11 @@ class Batch(Node[viser.BatchedMeshHandle]):
             batched_scales=scales.astype(np.float32),
             batched_colors=colours,
         )
+
+    def _send(self, content: dict[str, Any], changed: list[str]) -> None:  # noqa: ARG002 - see the base class
+        """Send all properties together, because viser's client drops colours of another number than the
+        copies."""
+        send_properties(self.node, content)
 
 
 def _turned(count: int, yaw: float = 0.0) -> NDArray[np.float32]:
@@ -335,7 +350,8 @@ class GroundNode(Node[viser.MeshHandle]):
         self._raster, self._low, self._cell = NOTHING, np.zeros(2), 1.0
 
     def show(self, on: bool, ground: HeightMap | None) -> None:
-        """Show a height map; None keeps the present one."""
+        """Show the ground of a height map, or hide it (`on` False); `heights` are then those of this map as
+        well. None keeps the present map."""
         if ground is not None and ground is not self.shown:
             self.shown = ground
             self._raster, self._low, self._cell = raster(ground)

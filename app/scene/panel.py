@@ -99,10 +99,6 @@ class TunePanel:
         for folder in self._folders:
             folder.visible = not cloud
 
-    def widget(self, name: str) -> viser.GuiSliderHandle[Any]:
-        """Return the slider of a parameter, by its dotted name; KeyError for one that is not in MAIN."""
-        return self._widgets[name]
-
     def _add_widget(self, gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiSliderHandle[Any]:
         """Add the slider of a parameter, whose changes by people call `on_change`.
 

@@ -11,11 +11,11 @@ from app.scene.colours import ViewSettings
 from app.scene.nodes import CloudNode, Float, GroundNode, LineNode, Mesh, Node, Segments
 from pipeline.config.stages import Obstacles
 from pipeline.geometry.poses import Pose2
-from pipeline.types.clearance import Zone
-from pipeline.types.records import Frame
+from pipeline.types.records import Frame, Zone
 
 ROBOT = "/world/robot"
 STEP = 0.05  # m
+MOST_POINTS = 10_000  # of a line; they are less than 1 m apart in the first hours of a drive
 
 
 class RobotNodes:
@@ -30,7 +30,8 @@ class RobotNodes:
         self._particles = CloudNode(scene, "/world/particles", 0.06)
         self._path = LineNode(scene, "/world/path", colours.PATH, 0.05)
         self._odometry = LineNode(scene, "/world/odometry", colours.ODOMETRY, 0.03)
-        self._dead_reckoning: list[tuple[int, float, float]] = []
+        self._by_odometry: Float = np.zeros((MOST_POINTS, 3))  # scan, x, y
+        self._count, self._spacing = 0, 1
         self._start = Pose2()
 
     def show(self, frame: Frame, path: Float, view: ViewSettings, ground: GroundNode) -> None:
@@ -52,19 +53,36 @@ class RobotNodes:
             colours.PARTICLES,
         )
         self._follow_odometry(frame)
+        path = _thinned(path)
         self._path.show(view.layers["path"], path, _stepped(ground, path))
-        places = np.array(self._dead_reckoning)[:, 1:]
+        places = self._by_odometry[: self._count, 1:]
         self._odometry.show(view.layers["odometry"], places, _stepped(ground, places))
 
     def _follow_odometry(self, frame: Frame) -> None:
         """Add the pose by odometry only of a scan. Both paths begin at the pose of the first scan that is
-        shown."""
-        while self._dead_reckoning and self._dead_reckoning[-1][0] >= frame.index:  # the run went back
-            self._dead_reckoning.pop()
-        if not self._dead_reckoning:  # both paths start at the same pose, so that the drift is visible
-            self._start = frame.estimate.T_map_base @ frame.T_odom_base.inverse()
+        shown. Of more than MOST_POINTS poses, every second one is dropped."""
+        self._count = int(np.searchsorted(self._by_odometry[: self._count, 0], frame.index))
+        if self._count == 0:  # both paths start at the same pose, so that the drift is visible
+            self._start, self._spacing = frame.estimate.T_map_base @ frame.T_odom_base.inverse(), 1
+        if self._count == MOST_POINTS:
+            self._spacing *= 2
+            self._count = MOST_POINTS // 2
+            self._by_odometry[: self._count] = self._by_odometry[::2]
+        scans = self._by_odometry[: self._count, 0]
+        if self._count >= 2 and scans[-1] - scans[-2] < self._spacing:
+            self._count -= 1  # the newest pose is always shown
         at = self._start @ frame.T_odom_base
-        self._dead_reckoning.append((frame.index, at.x, at.y))
+        self._by_odometry[self._count] = frame.index, at.x, at.y
+        self._count += 1
+
+
+def _thinned(path: Float) -> Float:
+    """Return a path with at most MOST_POINTS + 1 points: those at multiples of a power of two, and the last
+    one, shape (N, 2) [m]."""
+    spacing = 1
+    while len(path) > spacing * MOST_POINTS:
+        spacing *= 2
+    return np.concatenate([path[:-1:spacing], path[-1:]])
 
 
 def _stepped(ground: GroundNode, places: Float) -> Float:
@@ -74,11 +92,13 @@ def _stepped(ground: GroundNode, places: Float) -> Float:
 
 
 def _part(mesh: Mesh, size: tuple[float, float, float], place: tuple[float, float, float]) -> Mesh:
+    """Return a mesh that is scaled along x, y, z and then moved [m]."""
     vertices, faces = mesh
     return (vertices * np.array(size) + np.array(place)).astype(np.float32), faces
 
 
 def _wheel(y: float) -> Mesh:
+    """Return a wheel on the ground of the base frame, with its axle along y and its middle at `y` [m]."""
     vertices, faces = _part(nodes.cylinder(), (0.15, 0.15, 0.08), (0.0, 0.0, -0.04))
     return vertices[:, [0, 2, 1]] + np.array((0.0, y, 0.15), np.float32), faces[:, ::-1]
 

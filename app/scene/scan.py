@@ -94,11 +94,6 @@ class ScanNodes:
         """
         return meant(origin, direction, *self._axes, instance)
 
-    @property
-    def texts(self) -> list[str]:
-        """The visible labels."""
-        return self._labels.texts
-
     @staticmethod
     def _ramp_or(
         points: NDArray[np.float32], view: ViewSettings, plain: colours.Rgb, ends: tuple[float, float]
@@ -169,8 +164,12 @@ def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
 
 def cloud_point_size(frame: Frame) -> float:
     """Return the diameter of the points of a whole cloud [m]; it grows with the width of the plot."""
-    width = float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
-    return float(np.clip(width / POINTS_ACROSS, *CLOUD_SIZES))
+    return float(np.clip(extent(frame) / POINTS_ACROSS, *CLOUD_SIZES))
+
+
+def extent(frame: Frame) -> float:
+    """Return the greater side of the area of the points of a frame [m]; 0 without points."""
+    return float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
 
 
 def height_range(frame: Frame) -> tuple[float, float]:
@@ -183,8 +182,8 @@ def height_range(frame: Frame) -> tuple[float, float]:
 
 
 def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:
-    """Return the colours of the filtered points, uint8, shape (M, 3). Points without a cluster have one
-    colour, except by height.
+    """Return the colours of the filtered points, uint8, shape (M, 3). Points without a cluster have the
+    colour FILTERED, except by height. By "stage", clusters have one colour and detections another.
 
     Args:
         frame: Results of the scan.

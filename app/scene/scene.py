@@ -14,10 +14,11 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene.colours import COLOUR_BY, ViewSettings
+from app.scene.labels import BEHIND
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
 from app.scene.panel import PanelCommands, SceneCommands, TunePanel, Value
 from app.scene.robot import RobotNodes, WayNode
-from app.scene.scan import ScanNodes, Vector, VoxelNode
+from app.scene.scan import ScanNodes, Vector, VoxelNode, extent
 from app.scene.viser_server import add_posed, messages_sent, silenced, start_server
 from pipeline.config import Parameters, preset
 from pipeline.geometry.poses import Pose2
@@ -79,7 +80,7 @@ class Scene:
         first = self._frame is None
         self._frame, self._path = frame, np.asarray(path, dtype=np.float64).reshape(-1, 2)
         if first:
-            self._follower.frame_plot(_extent(frame) if frame.of_cloud else 0.0)
+            self._follower.frame_plot(extent(frame) if frame.of_cloud else 0.0)
         self._accumulated.take(frame)
         if self.messages > RENEW_AFTER:
             self._renew()
@@ -129,7 +130,7 @@ class Scene:
 
     @property
     def view(self) -> dict[str, Any]:
-        """Visible layers, choices and counts, for the page."""
+        """State of the view for the page: `layers` and choices, see `ViewSettings.as_plain`, and `counts`."""
         return {**self._view.as_plain(), "counts": self.counts}
 
     @property
@@ -301,13 +302,7 @@ class Scene:
         self.show_parameters(self._parameters, self._preset)
 
 
-def _extent(frame: Frame) -> float:
-    """Return the greater side of the area of the points of a frame [m]; 0 without points."""
-    return float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
-
-
 WORLD = "/world"  # parent of all nodes; its children are in the frame of the map
-BEHIND = (-8.0, -4.5, 6.0)  # position of a camera relative to its target [m]
 ABOVE = (0.0, -0.01, 28.0)
 SEEN = 12.0  # width of the area that these cameras show [m]
 

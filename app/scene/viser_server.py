@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 from urllib.parse import unquote
 
+import numpy as np
 import viser
 import websockets.asyncio.server
 from viser import _messages
@@ -100,6 +101,26 @@ def _check_first(secret: str, then: Callable[..., Any] | None) -> Callable[..., 
 def messages_sent(server: viser.ViserServer) -> int:
     """Return how many message numbers the server has used since it started, for all browsers together."""
     return server._websock_server.get_message_buffer().message_counter
+
+
+def send_properties(node: viser.SceneNodeHandle, content: dict[str, Any]) -> None:
+    """Set properties of a node by one message.
+
+    viser sends each property by a message of its own and keeps the last one of each for browsers that connect
+    later. Such a browser may get the colours before the positions, if only the positions changed last.
+
+    Args:
+        node: The node.
+        content: Properties by name; an array is sent with the type of the present one.
+    """
+    properties = node._impl.props
+    for name, value in content.items():
+        present = getattr(properties, name)
+        if isinstance(present, np.ndarray):
+            value = np.array(value, present.dtype)  # a copy, because viser packs it later
+        setattr(properties, name, value)
+    updates = {name: getattr(properties, name) for name in content}
+    node._impl.api._queue_scene_message(_messages.SceneNodeUpdateMessage(node.name, updates))
 
 
 def _refuse_tunnels(server: viser.ViserServer) -> None:

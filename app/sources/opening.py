@@ -9,13 +9,16 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from app.common.limited_process import ProcessLimits, run_limited
 from app.robot.address import is_live, parse_address
-from pipeline.inventory.cloud import WholeCloud
-from pipeline.io.readers import Source, SourceOptions, check_existence, clouds
+from pipeline.io.readers import Source, SourceOptions, check_existence, is_cloud
 from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
+
+if TYPE_CHECKING:
+    from pipeline.types.clouds import WholeCloud
 
 
 def check_address(uri: str) -> bool:
@@ -45,7 +48,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     Raises:
         SourceError: It cannot be read, or takes more time or memory than a file of its size should.
     """
-    if clouds.is_cloud(uri):
+    if is_cloud(uri):
         open_cloud(uri)
     else:
         _check(lambda: _open_source(uri, options).truth(), uri)
@@ -58,8 +61,10 @@ def open_cloud(uri: str) -> WholeCloud:
     Raises:
         SourceError: As for `open_source`.
     """
-    check_cloud(uri)
-    return clouds.open_cloud(uri)
+    from pipeline.io.readers.clouds import open_cloud as _open_cloud
+
+    _check(lambda: _open_cloud(uri), uri)
+    return _open_cloud(uri)
 
 
 def check_cloud(uri: str) -> None:
@@ -68,7 +73,9 @@ def check_cloud(uri: str) -> None:
     Raises:
         SourceError: As for `open_source`.
     """
-    _check(lambda: clouds.open_cloud(uri), uri)
+    from pipeline.io.readers.clouds import open_cloud as _open_cloud
+
+    _check(lambda: _open_cloud(uri), uri)
 
 
 def _check(opening: Callable[[], object], uri: str) -> None:

@@ -65,13 +65,15 @@ class SourceRequest(msgspec.Struct, frozen=True):
         return SourceOptions(dict(self.topics), mounted, self.seed)
 
     def kept_choices(self) -> dict[str, Any] | None:
-        """Return topics and mounting as JSON for the store and run.json; None where neither was chosen."""
+        """Return `topics` (name by role) and `mount` (x, y, z [m], roll, pitch, yaw [rad], or None) for the
+        store and run.json; None where neither was chosen."""
         if not self.topics and self.mount is None:
             return None
         return {"topics": dict(self.topics), "mount": None if self.mount is None else list(self.mount)}
 
     def for_page(self) -> dict[str, Any]:
-        """Return the fields as `POST /api/open` takes them: the mounting angles are degrees."""
+        """Return `uri`, `odometry`, `seed`, `topics` and `mount` as `POST /api/open` takes them: the mounting
+        angles are degrees. Preset and parameters are left out."""
         mount = None if self.mount is None else [*self.mount[:3], *map(degrees, self.mount[3:])]
         return {
             "uri": self.uri,
@@ -115,21 +117,16 @@ def request_of_kept(
     return SourceRequest(uri, odometry, seed, topics, kept.mount, preset, dict(parameters or {}))
 
 
-def request_of_options(uri: str, options: SourceOptions, odometry: str = "auto") -> SourceRequest:
-    """Return the request of a run that a command opened with reader options.
-
-    Args:
-        uri: URI of the source.
-        options: Topics, mounting and seed.
-        odometry: Choice of the odometry.
-    """
+def request_of_options(uri: str, options: SourceOptions) -> SourceRequest:
+    """Return the request of a run that a command opened with topics, mounting and seed as reader options; its
+    odometry is "auto", and parameters are not part of it."""
     mounted = options.T_base_lidar
     mount = None if mounted is None else mount_of(mounted)
-    return SourceRequest(uri, odometry, options.seed, dict(options.topics), mount)
+    return SourceRequest(uri, "auto", options.seed, dict(options.topics), mount)
 
 
 def mount_of(pose: Pose3) -> Mount:
-    """Return x, y, z [m], roll, pitch, yaw [rad] of a pose."""
+    """Return x, y, z [m], roll, pitch, yaw [rad] of a pose as Python floats."""
     x, y, z = map(float, pose.t)
     roll, pitch, yaw = map(float, pose.euler())
     return (x, y, z, roll, pitch, yaw)

@@ -32,7 +32,7 @@ class AsyncStore:
     """
 
     def __init__(self, folder: Path | None) -> None:
-        self._folder = folder
+        self.folder = folder
         self._store: Store | None = None
         # One thread runs the requests in their order and never two at once.
         self._thread = ThreadPoolExecutor(1, "store")
@@ -69,7 +69,7 @@ class AsyncStore:
         from app.store.store import Store
 
         if self._store is None:
-            self._store = Store(self._folder)
+            self._store = Store(self.folder)
         try:
             return function(self._store)
         except SQLAlchemyError as error:  # a full disk

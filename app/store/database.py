@@ -12,14 +12,17 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.errors import StemmapError
 
 # Version of the tables, in a table that keeps the name under which Alembic reads it.
-VERSION = "0005"
+VERSION = "0006"
+# Columns that the version before does not have; they are added to its databases.
+_BEFORE, _ADDED = "0005", ("annotations ADD COLUMN plot JSON", "run_maps ADD COLUMN files BLOB")
 _version = sa.Table(
     "alembic_version", sa.MetaData(), sa.Column("version_num", sa.String(32), primary_key=True)
 )
 
 
 def _prepare_tables(connection: sa.Connection) -> None:
-    """Create the tables of a new database, or check the version of an existing one.
+    """Create the tables of a new database, or check the version of an existing one and bring that of the
+    version before up to date.
 
     Raises:
         StemmapError: The tables are of another version or of another program.
@@ -33,6 +36,11 @@ def _prepare_tables(connection: sa.Connection) -> None:
     if _version.name not in names:
         raise StemmapError("this database belongs to another program")
     version = str(connection.execute(sa.select(_version.c.version_num)).scalar())
+    if version == _BEFORE:
+        for column in _ADDED:
+            connection.execute(sa.text(f"ALTER TABLE {column}"))
+        connection.execute(sa.update(_version).values(version_num=VERSION))
+        return
     if version != VERSION:
         author = "a newer stemmap" if version > VERSION else "an older stemmap"
         raise StemmapError(
@@ -154,6 +162,7 @@ annotated = sa.Table(
     sa.Column("y", sa.Float, nullable=False),
     sa.Column("kind", sa.String(10), nullable=False),
     sa.Column("dbh", sa.Float),
+    sa.Column("plot", sa.JSON(none_as_null=True), comment="values of a plot or frame"),
     sa.Column("who", sa.String(60), nullable=False),
     sa.Column("at_ns", sa.BigInteger, nullable=False),
     sa.Column("version", sa.Integer, nullable=False),
@@ -238,6 +247,7 @@ maps = sa.Table(
     metadata,
     sa.Column("record", sa.ForeignKey("run_records.id"), primary_key=True),
     sa.Column("map", sa.JSON(none_as_null=True), nullable=False),
+    sa.Column("files", sa.LargeBinary, comment="zip of its result files, from the end of the run"),
 )
 
 revisions = sa.Table(

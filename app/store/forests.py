@@ -12,32 +12,32 @@ import os
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from app.common.settings import data_folder
-from pipeline.classification.forest import (
-    ALL_AROUND,
-    FREE_END,
-    ONE_WAY,
-    PACKAGE,
-    Forest,
-    read_forests,
-    standard_forest,
-)
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.io.atomic_files import write_beside
 
+# Other names are imported where they are used, because the web process starts without Numba.
+if TYPE_CHECKING:
+    from pipeline.classification.forest import Forest
+
 FOLDER = "forests"
-# Keys that enter the name, with FREE_END where it exists; the others are provenance.
-DECIDES = ("classes", ALL_AROUND, ONE_WAY)
+#: Name of the forest of the package, the default of the parameter.
+PACKAGE = Parameters().classification.forest
+#: Annotated trees and other objects that a training needs.
+LEAST_TREES, LEAST_OTHERS = 10, 5
 _NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def name_of(data: dict[str, Any]) -> str:
     """Return the name of a forest from its JSON: 16 hex digits of the SHA-256 of its classes and trees,
     without provenance."""
-    decides = [data.get(key) for key in DECIDES] + ([data[FREE_END]] if FREE_END in data else [])
+    from pipeline.classification.forest import ALL_AROUND, FREE_END, ONE_WAY
+
+    decides = [data.get(key) for key in ("classes", ALL_AROUND, ONE_WAY)]
+    decides += [data[FREE_END]] if FREE_END in data else []
     text = json.dumps(decides, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -61,6 +61,8 @@ class Forests:
             StemmapError: There is no such forest, or its file is damaged.
         """
         if name == PACKAGE:
+            from pipeline.classification.forest import standard_forest
+
             return standard_forest(all_around)
         if (name, all_around) not in self._known:
             _, (around, one_way) = self._read(name)
@@ -68,24 +70,25 @@ class Forests:
         return self._known[name, all_around]
 
     def check(self, parameters: Parameters) -> None:
-        """Check that the forest of the parameters exists and can be read.
+        """Check that the forest of the parameters exists and can be read. That of the package is not read.
 
         Raises:
             StemmapError: See `__call__`.
         """
-        self(parameters.classification.forest, True)
+        if parameters.classification.forest != PACKAGE:
+            self(parameters.classification.forest, True)
 
     def read(self, name: str) -> dict[str, Any]:
-        """Return the JSON of a learned forest, with its provenance.
+        """Return the JSON of a learned forest, with its provenance. It is read from the file each time.
 
         Raises:
-            StemmapError: See `__call__`.
+            StemmapError: See `__call__`; also for the forest of the package.
         """
         return self._read(name)[0]
 
     def provenance(self, name: str) -> dict[str, Any] | None:
-        """Return date, number of objects by class and number of runs of a learned forest; None for the forest
-        of the package and for files that are missing or have no provenance."""
+        """Return `name`, `date`, `things` (number of objects by class) and `runs` (their number) of a learned
+        forest; None for the forest of the package and for files that are missing or have no provenance."""
         if name == PACKAGE:
             return None
         if name not in self._provenance:
@@ -99,7 +102,8 @@ class Forests:
         return self._provenance[name]
 
     def _read(self, name: str) -> tuple[dict[str, Any], list[Forest]]:
-        """Return the JSON of a learned forest and its two forests, for all around and one way.
+        """Return the JSON of a learned forest and its two forests, for sensors that see all around and for
+        sensors that look one way, from its file.
 
         Raises:
             StemmapError: The name or file does not exist, or the file is damaged.
@@ -111,6 +115,8 @@ class Forests:
                 where=str(file or ""),
                 remedy=f"Copy its file there, or set classification.forest = {PACKAGE}",
             )
+        from pipeline.classification.forest import ALL_AROUND, ONE_WAY, read_forests
+
         data, forests = read_forests(file, ALL_AROUND, ONE_WAY)
         if name_of(data) != name:
             raise StemmapError(
@@ -160,7 +166,4 @@ def kept_forests() -> Forests:
     return _of(data_folder(os.environ))
 
 
-@cache
-def _of(folder: Path | None) -> Forests:
-    """Return the forests of a data folder, always the same object for the same folder."""
-    return Forests(folder)
+_of = cache(Forests)

@@ -17,6 +17,10 @@ KINDS = ("tree", "pole", "person", "bush", "other")
 # Class of an annotation of a tree about which a person did not decide. It states nothing, so it is no
 # ground truth, but it is stored, undone and shared like the others.
 SKIPPED = "skipped"
+# Class of an annotation that is a plot for stand figures.
+PLOT = "plot"
+# Class of the annotation that is the reference system of the map; a run has at most one.
+FRAME = "frame"
 MOST_ANNOTATIONS = 5000
 
 
@@ -31,20 +35,27 @@ class UnknownError(StemmapError):
     """The annotation, run or parameter set does not exist."""
 
 
+class NoFilesError(StemmapError):
+    """The run was recorded by an earlier version, without its result files."""
+
+
 @dataclass(frozen=True, slots=True)
 class Content:
     """Content of an annotation.
 
     Attributes:
         x, y: Position [m].
-        kind: Class, one of KINDS, or SKIPPED.
+        kind: Class, one of KINDS, SKIPPED, PLOT or FRAME.
         dbh: Diameter at breast height [m], None if not measured.
+        plot: Name and shape of a plot, see `pipeline.stand.plots.plot_of`; of a FRAME the values of the route
+            `georeference`; None for other classes.
     """
 
     x: float
     y: float
     kind: str = "tree"
     dbh: float | None = None
+    plot: dict[str, Any] | None = None
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:

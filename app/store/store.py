@@ -14,7 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from sqlalchemy import Connection, Engine, Insert, Row, Select, delete, func, insert, select, update
+from sqlalchemy import Connection, Engine, Insert, Row, Select, delete, func, insert, select, true, update
 
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.database import annotated as _annotations
@@ -28,14 +28,16 @@ from app.store.database import runs as _runs
 from app.store.database import steps as _steps
 from app.store.database import uploads as _uploads
 from app.store.records import (
+    FRAME,
+    KINDS,
     MOST_ANNOTATIONS,
     MOST_SETS,
-    SKIPPED,
     Annotation,
     Author,
     Change,
     Content,
     NewRun,
+    NoFilesError,
     RunFigures,
     SavedSet,
     StaleError,
@@ -177,8 +179,8 @@ class RunRecords:
                 _revise(connection, record, change, now)
 
     def listed(self) -> list[dict[str, Any]]:
-        """Return the runs without their maps, those that changed last first, at most MOST_LISTED; deleted
-        runs are left out."""
+        """Return the runs without their maps as dicts of the columns of `run_records` and `source`, the key
+        of the recording; those that changed last first, at most MOST_LISTED. Deleted runs are left out."""
         query = (
             _with_source()
             .where(_records.c.deleted_ns.is_(None))
@@ -189,7 +191,8 @@ class RunRecords:
             return [_plain(row) for row in connection.execute(query).all()]
 
     def whole(self, record: int) -> dict[str, Any]:
-        """Return a run with its map and its parameter revisions, oldest first.
+        """Return a run as in `listed`, with its `map` and `revisions`, dicts of the columns of
+        `parameter_revisions`, oldest first.
 
         Raises:
             UnknownError: The run does not exist or was deleted.
@@ -200,6 +203,28 @@ class RunRecords:
             query = select(_revisions).where(_revisions.c.record == record).order_by(_revisions.c.id)
             changes = [_plain(each) for each in connection.execute(query).all()]
         return {**_plain(row), "map": stored, "revisions": changes}
+
+    def put_files(self, record: int, files: bytes) -> None:
+        """Store the result files of a run, a zip archive; nothing happens if it does not exist."""
+        with self._engine.begin() as connection:
+            connection.execute(update(_maps).where(_maps.c.record == record).values(files=files))
+
+    def files(self, record: int) -> bytes:
+        """Return the result files of a run, a zip archive.
+
+        Raises:
+            UnknownError: The run does not exist or was deleted.
+            NoFilesError: It has none.
+        """
+        with self._engine.begin() as connection:
+            _found(connection, record)
+            files = connection.execute(select(_maps.c.files).where(_maps.c.record == record)).scalar()
+        if files is None:
+            raise NoFilesError(
+                "this run was recorded without its result files",
+                remedy="Replay it; then it can be used here",
+            )
+        return bytes(files)
 
     def rename(self, record: int, name: str) -> None:
         """Rename a run.
@@ -252,7 +277,8 @@ class RunRecords:
             connection.execute(insert(_uploads).values(file=file, **values))
 
     def uploads(self) -> dict[str, dict[str, Any]]:
-        """Return the records of uploaded files by their names in the folder."""
+        """Return the records of uploaded files by their names in the folder: dicts with `file`, original
+        `name`, `kind`, `bytes` and `at_ns`."""
         with self._engine.begin() as connection:
             return {row.file: _plain(row) for row in connection.execute(select(_uploads)).all()}
 
@@ -384,11 +410,23 @@ class Store:
             rows = connection.execute(query.order_by(_annotations.c.id)).all()
         return [Annotation(row.id, _content(row), row.who, row.at_ns, row.version) for row in rows]
 
+    def contents(self, source: str, kind: str = "") -> list[Content]:
+        """Return the annotations of a class ("" for all) of a source by its digest or URI, in the order of
+        their creation; [] for an unknown source."""
+        query = (
+            select(_annotations)
+            .join(_runs, _runs.c.id == _annotations.c.run)
+            .where(_runs.c.source == _key(source), _annotations.c.deleted.is_(False))
+            .where(_annotations.c.kind == kind if kind else true())
+        )
+        with self._engine.begin() as connection:
+            return [_content(row) for row in connection.execute(query.order_by(_annotations.c.id))]
+
     def annotated_sources(self) -> list[AnnotatedSource]:
-        """Return all sources with annotations other than SKIPPED, in the order in which they were first
-        opened, and how each was mapped last."""
+        """Return all sources with annotations of KINDS, in the order of their first opening, and how each was
+        mapped last."""
         a = _annotations.c
-        query = select(a.run, a.x, a.y, a.kind, a.dbh).where(a.deleted.is_(False), a.kind != SKIPPED)
+        query = select(a.run, a.x, a.y, a.kind, a.dbh).where(a.deleted.is_(False), a.kind.in_(KINDS))
         with self._engine.begin() as connection:
             contents: dict[int, list[Content]] = {}
             for row in connection.execute(query.order_by(a.id)):
@@ -409,34 +447,45 @@ class Store:
 
         Raises:
             StemmapError: There would be more than MOST_ANNOTATIONS annotations; none is added.
+            StaleError: The run has a reference system (FRAME) already, and the contents have one.
         """
         with self._engine.begin() as connection:
             counted = select(func.count()).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
             if connection.execute(counted).scalar_one() + len(contents) > MOST_ANNOTATIONS:
                 raise StemmapError(f"a run may have {MOST_ANNOTATIONS} annotations")
+            frame = _frame(connection, run)
+            if frame is not None and any(content.kind == FRAME for content in contents):
+                raise _stale(frame)
             step = self._step(connection, run, author)
             return [self._add(connection, run, step, author, content) for content in contents]
 
-    def change(self, run: int, author: Author, id_: int, version: int, content: Content) -> None:
-        """Change the content of an annotation. The same content as before changes nothing and is no step.
+    def change(self, run: int, author: Author, id_: int, version: int, content: Content | None) -> None:
+        """Change the content of an annotation, or delete it, in one step. The same content as before changes
+        nothing and is no step.
 
         Args:
             run: Number of the source, see `open_run`.
             author: Author of the edit.
             id_: Identifier of the annotation.
             version: Version that the author has seen.
-            content: New content.
+            content: New content; None deletes it.
 
         Raises:
-            UnknownError: The run has no annotation with this id.
+            UnknownError: The run has no annotation with this id, or it is a plot or reference system and the
+                new content is not, or the reverse.
             StaleError: The annotation has another version or is deleted; the message names author and time of
                 the last change.
         """
-        self._edit(run, author, id_, version, content)
-
-    def delete(self, run: int, author: Author, id_: int, version: int) -> None:
-        """Delete an annotation; arguments and errors as in `change`."""
-        self._edit(run, author, id_, version, None)
+        with self._engine.begin() as connection:
+            row = connection.execute(
+                select(_annotations).where(_annotations.c.id == id_, _annotations.c.run == run)
+            ).one_or_none()
+            if row is None or (content is not None and (content.plot is None) != (row.plot is None)):
+                raise UnknownError("there is no such annotation", where=f"annotation {id_}")
+            if row.version != version or row.deleted:
+                raise _stale(row)
+            if content != _content(row):
+                self._change(connection, self._step(connection, run, author), author, row, content)
 
     def undo(self, run: int, author: Author) -> None:
         """Undo the last step of a browser that is not undone, with all its annotations.
@@ -471,21 +520,6 @@ class Store:
         return counts.get("done", 0), counts.get("undone", 0)
 
     # --- one edit --------------------------------------------------------------------------------
-
-    def _edit(self, run: int, author: Author, id_: int, version: int, content: Content | None) -> None:
-        """Set the content of an annotation, or delete it (None), as a new step; arguments and errors as in
-        `change`."""
-        with self._engine.begin() as connection:
-            row = connection.execute(
-                select(_annotations).where(_annotations.c.id == id_, _annotations.c.run == run)
-            ).one_or_none()
-            if row is None:
-                raise UnknownError("there is no such annotation", where=f"annotation {id_}")
-            if row.version != version or row.deleted:
-                raise _stale(row)
-            if content == _content(row):
-                return
-            self._change(connection, self._step(connection, run, author), author, row, content)
 
     def _step(self, connection: Connection, run: int, author: Author) -> int:
         """Store a new step of a browser and return its number; steps that this browser undid before can no
@@ -562,8 +596,9 @@ class Store:
     # --- back and forth --------------------------------------------------------------------------
 
     def _turn(self, run: int, author: Author, to: Literal["done", "undone"]) -> None:
-        """Undo or redo the next step of a browser. If another person has changed one of its annotations, none
-        changes, and the step can never be undone or redone again.
+        """Undo or redo the next step of a browser. If another person has changed one of its annotations, or
+        the run would get a second reference system, none changes, and the step can never be undone or redone
+        again.
 
         Args:
             run: Number of the source.
@@ -572,7 +607,7 @@ class Store:
 
         Raises:
             StemmapError: There is no such step.
-            StaleError: Another person has changed an annotation since.
+            StaleError: Another person has changed an annotation or added a reference system since.
         """
         with self._engine.begin() as connection:
             step = _next_step(connection, run, author, to)
@@ -582,6 +617,8 @@ class Store:
             ]
             back = to == "undone"
             stale = next((row for c, row in pairs if row.made_by != (c.id if back else c.made_before)), None)
+            if stale is None and any(row.deleted and row.kind == FRAME for _, row in pairs):
+                stale = _frame(connection, run)
             state = to if stale is None else "left"
             connection.execute(update(_steps).where(_steps.c.id == step).values(state=state))
             for change, row in () if stale is not None else pairs:
@@ -636,13 +673,21 @@ def _next_step(connection: Connection, run: int, author: Author, to: str) -> int
 
 
 def _row(connection: Connection, id_: int) -> Row[Any]:
-    """Return the row of an annotation, also of a deleted one."""
+    """Return the row of an existing annotation, also of a deleted one."""
     return connection.execute(select(_annotations).where(_annotations.c.id == id_)).one()
+
+
+def _frame(connection: Connection, run: int) -> Row[Any] | None:
+    """Return the row of the reference system of a run that is not deleted; None without one."""
+    a = _annotations.c
+    return connection.execute(
+        select(_annotations).where(a.run == run, a.kind == FRAME, a.deleted.is_(False)).limit(1)
+    ).one_or_none()
 
 
 def _content(row: Row[Any]) -> Content:
     """Return the content of the row of an annotation."""
-    return Content(row.x, row.y, row.kind, row.dbh)
+    return Content(row.x, row.y, row.kind, row.dbh, row.plot)
 
 
 def _key(source: str) -> str:

@@ -20,10 +20,10 @@ from app.store.records import Content
 from app.store.store import AnnotatedSource
 from app.training.examples import Examples, stored_or_computed
 from pipeline.classification.features import COUNT, NAMES
-from pipeline.classification.forest import CLASSES, PACKAGE
+from pipeline.classification.forest import CLASSES, PACKAGE, is_seen_all_around
 from pipeline.config import PRESETS, Parameters, preset
 from pipeline.errors import ParameterError, SourceError
-from pipeline.io.readers.clouds import is_cloud
+from pipeline.io.readers import is_cloud
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Columns, Float, Verdict
@@ -80,7 +80,7 @@ class ExampleCollector:
 
         Args:
             scene: Name of the scene.
-            all_around: Whether the sensor sees all around.
+            all_around: Which forest classifies the columns, see `is_seen_all_around`.
         """
         axis, rows, label = [], [], []
         for a, marked, last in zip(self._annotations, self._marked, self._last, strict=True):
@@ -182,7 +182,7 @@ def _key(run: AnnotatedRun) -> str:
 
 
 def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
-    """Map a run from its source and return its examples, as one set.
+    """Map a run from its source, by columns whatever its method was, and return its examples, as one set.
 
     Args:
         run: The run.
@@ -217,4 +217,5 @@ def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
             if step.index % PROGRESS_SCANS == 0:
                 of = f" of {known.scans:,}" if known.scans else ""
                 progress(f"Mapping {run.name}: scan {step.index:,}{of}")
-        return [collector.examples(run.name, all_around=known.sensor.rings > 0)]
+        xy = np.column_stack([mapper.path.x, mapper.path.y])
+        return [collector.examples(run.name, all_around=is_seen_all_around(known.sensor.rings, xy))]

@@ -19,7 +19,7 @@ import numpy as np
 from app.batch.summary import rate_text
 from app.common.child_process import ParentConnection, run_child
 from app.common.text import count, version
-from app.store.forests import Forests
+from app.store.forests import LEAST_OTHERS, LEAST_TREES, Forests
 from app.store.store import AnnotatedSource
 from app.training.annotated_runs import AnnotatedRun, Progress, annotated_run, examples_of
 from app.training.examples import Examples, object_numbers
@@ -35,8 +35,6 @@ from pipeline.classification.forest import (
 )
 from pipeline.config.stages import Classification
 from pipeline.errors import SourceError, StemmapError
-
-LEAST_TREES, LEAST_OTHERS = 10, 5
 
 _ABOUT = "Random forest of the package, extended with annotations."
 
@@ -243,7 +241,8 @@ class LearningRequest(msgspec.Struct, frozen=True):
 
 
 def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Train a forest, store it under its name, and return the result for the page. It is not in force yet.
+    """Train a forest, store it under its name, and return the result for the page, see `as_plain`. It is not
+    in force yet.
 
     Args:
         request: What is trained.
@@ -259,7 +258,8 @@ def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str
 
 
 def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
-    """Return the result for the page, with at most 20 warnings.
+    """Return the result for the page: `name`, `against` (the present forest), `things` (number of objects by
+    class), `old_saw`, at most 20 `warnings`, and `tables`, the `Validation` of each `kind` of sensor.
 
     Args:
         learned: The result.

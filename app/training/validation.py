@@ -1,21 +1,18 @@
-"""Validation of forests on left-out data: scenes that are left out one by one, and cross-validation of
-forests that are trained with annotations."""
+"""Cross-validation of forests that are trained with annotations."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from app.training.augmentation import is_of
-from app.training.examples import TREE, UNKNOWN, Examples, object_numbers
-from app.training.fit_forest import all_expanded, as_json, can_fit, fit_all
+from app.training.examples import TREE, Examples, object_numbers
+from app.training.fit_forest import all_expanded
 from pipeline.classification.decision_rule import too_few
-from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, vote
+from pipeline.classification.forest import Forest, forest_of, vote
 from pipeline.evaluation import Rate
-from pipeline.evaluation.matching import match
 from pipeline.types.records import Bool, Float, Int
 
 FOLDS = 5
@@ -149,61 +146,3 @@ def _accepted(figures: Float, forest: Forest, share: float) -> Bool:
     """
     accepted: Bool = (vote(figures, forest)[:, 0] >= share) & ~too_few(figures)
     return accepted
-
-
-APART = 0.5  # m; columns within this distance belong to one tree
-
-
-def leave_one_out(examples: list[Examples], augmented: list[Examples], share: float) -> Iterator[str]:
-    """Yield a line per real scene: trees that are found, number of trees, and false ones, by trees fitted to
-    all other scenes. A scene is skipped if the other ones have too few examples to fit trees.
-
-    Args:
-        examples: Examples of all scenes; the last set of a scene, which holds all its scans, is scored.
-        augmented: Examples of augmented scans; those of the left-out scene are left out too.
-        share: Share of votes that makes a tree.
-    """
-    for scene in dict.fromkeys(e.scene for e in examples if not e.simulated):
-        others = [e for e in examples if e.scene != scene]
-        last = [e for e in examples if e.scene == scene][-1]
-        kind = ALL_AROUND if last.all_around else ONE_WAY
-        if can_fit(others, kind):
-            fitted = fit_all(others, [e for e in augmented if not is_of(e.scene, scene)], (kind,))
-            votes = vote(last.figures, forest_of(as_json(fitted, []), kind))
-            hit, of, false = count(last, votes[:, TREE], share)
-            yield f"left out {scene}: {hit} of {of} trees, {false} false"
-
-
-def count(scene: Examples, votes: Float, share: float) -> tuple[int, int, int]:
-    """Return the number of trees that are found, of all trees, and of false trees.
-
-    Columns with the required share of votes are accepted, those with most votes first; of columns within
-    APART only the first counts. An accepted column is right within APART of a tree, and false elsewhere
-    unless its class is unknown. Each tree is found at most once.
-
-    Args:
-        scene: Examples of one scene.
-        votes: Share of the votes for a tree of each example, shape (N,).
-        share: Required share.
-    """
-    place = scene.axis[:, :2]
-    accepted = np.argsort(-votes, kind="stable")
-    kept = _apart(place, accepted[votes[accepted] >= share])
-    truth = place[_apart(place, np.flatnonzero(scene.label == TREE))]
-    truth_of = match(place[kept], truth, APART)
-    false = np.count_nonzero((truth_of < 0) & (scene.label[kept] != UNKNOWN))
-    return int(np.count_nonzero(truth_of >= 0)), len(truth), int(false)
-
-
-def _apart(place: Float, rows: Int) -> list[int]:
-    """Return the rows of which no two are within APART; the earlier one is kept.
-
-    Args:
-        place: Positions of all examples, shape (N, 2) [m].
-        rows: Rows in the order of preference.
-    """
-    kept: list[int] = []
-    for k in rows.tolist():
-        if all(np.hypot(*(place[k] - place[j])) > APART for j in kept):
-            kept.append(k)
-    return kept

@@ -1,8 +1,8 @@
 """The parameter search of the page: its process, its state, and what the browsers show of it.
 
 A search maps the open run and other runs of the list in a child process, with the true trees and parameters
-at its start. A stopped search can continue with its trials, which are removed when the run is closed or
-another search begins.
+at its start. The search is removed when the run is closed or another search begins; the results of its trials
+are stored, so that a stopped search that begins again makes them at once.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from app.store.records import Content
 from app.store.store import AnnotatedSource
 from app.tuning.jobs import check_run
 from app.tuning.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
-from app.tuning.result import Result, SearchMessage, SearchStart, best_parameters, for_page, toml_of
+from app.tuning.result import Result, SearchMessage, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
@@ -59,8 +59,7 @@ class TuneSearch:
         self.result: Result | None = None
         self.request: SearchRequest | None = None
         self._start: Trial | None = None
-        self._trials: dict[int, Trial] = {}
-        self._began = False  # whether the process has scored the start
+        self._trials: list[Trial] = []
 
     @property
     def is_under_way(self) -> bool:
@@ -74,7 +73,7 @@ class TuneSearch:
         return self.plan is not None and not self.is_under_way and len(self._trials) < self.plan.trials
 
     async def start(self, plan: Plan, request: SearchRequest | None = None) -> None:
-        """Start a search in a child process, and send its state. A stopped search and its trials are removed.
+        """Start a search in a child process, and send its state. A stopped search is removed.
 
         Args:
             plan: The search.
@@ -83,27 +82,16 @@ class TuneSearch:
         Raises:
             StemmapError: Another search runs, or no process can be started.
         """
-        self._check_idle()
+        if self.is_under_way or self._turn.locked():
+            raise StemmapError("a search is under way", remedy="Stop it first")
         async with self._turn:
             self._forget()
-            await self._run(plan, request)
-
-    async def go_on(self, now: Plan) -> None:
-        """Continue the stopped search with its trials and its time limit from 0 on.
-
-        Args:
-            now: The plan that the same request gives now.
-
-        Raises:
-            StemmapError: Another search runs, no search was stopped, no process can be started, or true trees
-                or parameters have changed since it began.
-        """
-        self._check_idle()
-        if self.plan is None or not self.can_go_on:
-            raise StemmapError("there is no stopped search", remedy="Search")
-        check_same(self.plan, now)
-        async with self._turn:
-            await self._run(self.plan, self.request)
+            process = self._process = await ChildProcess.start(self._command)
+            self.plan, self.request, self._state = plan, request, "looking"
+            self._task = asyncio.create_task(self._listen(process), name="search")
+            self._task.add_done_callback(lambda _: self.show())  # from now on it can continue
+            await process.send(plan)
+            self.show()
 
     async def stop(self) -> None:
         """Ask the process to stop; it then sends the result. Does nothing if no search runs."""
@@ -119,25 +107,6 @@ class TuneSearch:
             task, self._task = self._task, None
             await cancel(task)
             self._forget()
-        self.show()
-
-    def _check_idle(self) -> None:
-        """Raise StemmapError if a search runs, or is being started or removed."""
-        if self.is_under_way or self._turn.locked():
-            raise StemmapError("a search is under way", remedy="Stop it first")
-
-    async def _run(self, plan: Plan, request: SearchRequest | None) -> None:
-        """Start the child process, send it the plan with the trials so far, and listen to it in a task.
-
-        Raises:
-            StemmapError: No process can be started.
-        """
-        process = self._process = await ChildProcess.start(self._command)
-        self.plan, self.request, self._state, self._error = plan, request, "looking", ""
-        self._began = False
-        self._task = asyncio.create_task(self._listen(process), name="search")
-        self._task.add_done_callback(lambda _: self.show())  # from now on it can continue
-        await process.send(SearchStart(plan, tuple(self._made())))
         self.show()
 
     def found(self) -> tuple[str, Parameters, str]:
@@ -156,25 +125,22 @@ class TuneSearch:
         self._tell(self.as_plain())
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state and the progress for the browsers; only the state "none" without a search."""
+        """Return `state`, `error`, `go_on` (see `can_go_on`) and the values of `for_page` for the browsers;
+        only the state "none" without a search."""
         if self.plan is None:
             return {"state": "none"}
         return {
             "state": self._state,
             "error": self._error,
             "go_on": self.can_go_on,
-            **for_page(self.plan, self._made(), self._start, self.result),
+            **for_page(self.plan, self._trials, self._start, self.result),
         }
 
     def _forget(self) -> None:
         """Remove the search, its trials and its result. The child process is not ended."""
         self._state, self._error = "none", ""
         self.plan = self.result = self._start = self.request = None
-        self._trials = {}
-
-    def _made(self) -> list[Trial]:
-        """Return the trials so far, by number."""
-        return [self._trials[number] for number in sorted(self._trials)]
+        self._trials = []
 
     async def _listen(self, process: ChildProcess) -> None:
         """Process the messages of the child process until it ends, and send the state after each. The state
@@ -191,10 +157,11 @@ class TuneSearch:
             self._fail("the search ended unexpectedly. Start it again; the terminal may show why")
 
     def _take(self, message: SearchMessage) -> None:
-        """Update trials, result and state from a message of the child process."""
-        self._trials |= {trial.number: trial for trial in message.trials}
+        """Update trials, result and state from a message of the child process. An empty message after a stop
+        before the first score removes the search."""
+        self._trials += message.trials
         if message.start is not None:
-            self._start, self._began = message.start, True
+            self._start = message.start
             if self._state == "looking":
                 self._state = "searching"
         if message.result is not None:
@@ -202,9 +169,8 @@ class TuneSearch:
         elif message.error is not None:
             what, where, remedy = message.error
             self._fail(str(StemmapError(what, where=where, remedy=remedy)))
-        elif message == SearchMessage() and self._state == "stopping" and not self._began:
-            if self._start is None:  # there is no result, also not from before
-                self._forget()
+        elif message == SearchMessage() and self._state == "stopping" and self._start is None:
+            self._forget()  # there is no result
             self._state = "done"
 
     def _fail(self, why: str) -> None:
@@ -262,7 +228,8 @@ class OtherRun(msgspec.Struct, frozen=True):
     why_not: str
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the run for the browsers."""
+        """Return the run for the browsers: the number of its newest `record`, `name`, `truth`, a description
+        of its true trees, and `why_not`."""
         truth = count(len(self.annotations), "annotation") if self.annotations else "its own true trees"
         return {"record": self.records[0], "name": self.name, "truth": truth, "why_not": self.why_not}
 
@@ -277,7 +244,7 @@ def other_runs(
     Runs that cannot be scored are included, with the reason in `why_not`. Checks whether their files exist.
 
     Args:
-        rows: Records of the store, the newest first.
+        rows: Records of the store, the newest first, see `RunRecords.listed`.
         annotated: Sources with annotations.
         open_digest: Digest of the open run; empty if none is open.
         may_be_opened: Returns the URI that is opened for a URI, or None if that is not allowed.
@@ -317,6 +284,7 @@ def plan_of(
     parameters: Parameters,
     preset: str,
     others: Sequence[OtherRun],
+    kept: Path | None,
 ) -> Plan:
     """Return the plan of a search over the open run and the other runs that the request names.
 
@@ -326,6 +294,7 @@ def plan_of(
             true trees are known.
         parameters, preset: Those in force.
         others: The other runs of the list.
+        kept: Folder of stored results; None keeps them in memory.
 
     Raises:
         StemmapError: No run is open, it is live or has no true trees; a parameter or its bounds are invalid;
@@ -340,7 +309,7 @@ def plan_of(
         runs=(shown, *_planned(request, others)),
         axes=axes,
         start=parameters.model_dump(),
-        journal="",
+        kept="" if kept is None else str(kept),
         preset=preset,
         goal=request.goal,
         false_max=request.false_max,
@@ -349,35 +318,6 @@ def plan_of(
         trials=request.trials,
         seconds=60.0 * request.minutes,
     )
-
-
-def check_same(stopped: Plan, now: Plan) -> None:
-    """Check that a stopped search can continue under the same conditions.
-
-    Args:
-        stopped: Plan of the stopped search.
-        now: Plan that the same request gives now.
-
-    Raises:
-        StemmapError: Something has changed since it began.
-    """
-    before, after = stopped.parameters.flat(), now.parameters.flat()
-    changed = [name for name in before if before[name] != after[name]]
-    if changed:
-        most = ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
-        raise StemmapError(
-            "parameters were changed since the search began", where=most, remedy="Undo that, or search again"
-        )
-    for old, new in zip(stopped.runs, now.runs, strict=True):
-        if (old.truth, old.annotations) != (new.truth, new.annotations):
-            remedy = "Undo that, or search again"
-            raise StemmapError(
-                "true trees were edited since the search began", where=new.source.uri, remedy=remedy
-            )
-    if msgspec.structs.replace(stopped, preset=now.preset) != now:
-        raise StemmapError(
-            "the runs were opened in another way since the search began", remedy="Search again"
-        )
 
 
 def _planned(request: SearchRequest, others: Sequence[OtherRun]) -> list[PlannedRun]:

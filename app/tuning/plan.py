@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,11 +10,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from app.common.text import value_text, version
+from app.common.text import value_text
 from app.sources.request import SourceRequest
 from app.store.records import Content
 from app.tuning.grid import checked_value, grid_axis, spec_of
-from app.tuning.jobs import RunWithTruth
 from pipeline.config import FieldSpec, Parameters
 from pipeline.config.model import Value, validated
 from pipeline.errors import ParameterError
@@ -27,8 +25,8 @@ GoalName = Literal["f1", "ta", "position", "pairs"]
 
 
 @dataclass(frozen=True, slots=True)
-class GoalTexts:
-    """How a goal is shown.
+class GoalDeclaration:
+    """Texts of a goal, and the loss that separates the sets that break its bound.
 
     Attributes:
         words: Description.
@@ -43,32 +41,12 @@ class GoalTexts:
     broken: float
 
 
-GOALS: dict[GoalName, GoalTexts] = {
-    "f1": GoalTexts("F1", "F1", "", math.inf),
-    "ta": GoalTexts("true acceptance (TA), false trees bounded", "TA", "", 2.0),
-    "position": GoalTexts("position RMSE, F1 not below that of the start", "RMSE", "cm", 1e3),
-    "pairs": GoalTexts("mean pair error, F1 not below that of the start", "pair error", "%", 1e6),
+GOALS: dict[GoalName, GoalDeclaration] = {
+    "f1": GoalDeclaration("F1", "F1", "", math.inf),
+    "ta": GoalDeclaration("true acceptance (TA), false trees bounded", "TA", "", 2.0),
+    "position": GoalDeclaration("position RMSE, F1 not below that of the start", "RMSE", "cm", 1e3),
+    "pairs": GoalDeclaration("mean pair error, F1 not below that of the start", "pair error", "%", 1e6),
 }
-
-
-class RunScore(msgspec.Struct, frozen=True):
-    """Counts and errors of one run.
-
-    Attributes:
-        TA, FR: True trees that were found, and that were missed.
-        FA, TR: Other objects that were mapped as trees, and that were not.
-        spurious: Mapped trees where no object is known.
-        position_rmse: Of the TA matched trees [m]; None without any.
-        pair_error: Mean error of the distances between each two of them [%]; None with fewer than two.
-    """
-
-    TA: int
-    FR: int
-    FA: int
-    TR: int
-    spurious: int
-    position_rmse: float | None
-    pair_error: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,14 +97,14 @@ class Goal:
             return 1.0 - pooled.f1
         if self.name == "ta":
             beyond = pooled.false_share - self.false_max
-            return 1.0 - pooled.ta if beyond <= 0.0 else self.texts.broken + beyond
+            return 1.0 - pooled.ta if beyond <= 0.0 else self.declaration.broken + beyond
         error = pooled.position_rmse if self.name == "position" else pooled.pair_error
         short = start.f1 - pooled.f1
-        return self.texts.broken + max(short, 0.0) if error is None or short > 1e-12 else error
+        return self.declaration.broken + max(short, 0.0) if error is None or short > 1e-12 else error
 
     def is_kept(self, loss: float) -> bool:
         """Return whether a loss is that of a set that satisfies the bound of the goal; True for "f1"."""
-        return loss < self.texts.broken
+        return loss < self.declaration.broken
 
     def figure(self, loss: float) -> float:
         """Return the score, in the unit of the goal, of a loss that satisfies the bound: 1 - loss for "f1"
@@ -149,40 +127,31 @@ class Goal:
         if not self.is_kept(loss):
             return "outside the bound"
         digits = 2 if self.name == "position" else 3
-        return f"{self.texts.label} {self.figure(loss):.{digits}f} {self.texts.unit}".rstrip()
+        return f"{self.declaration.label} {self.figure(loss):.{digits}f} {self.declaration.unit}".rstrip()
 
     @property
-    def texts(self) -> GoalTexts:
+    def declaration(self) -> GoalDeclaration:
         """How the goal is shown."""
         return GOALS[self.name]
 
     @property
     def words(self) -> str:
-        """Description of the goal with its bound."""
+        """Description of the goal; for "ta" with its bound on false trees [%]."""
         bound = f" (at most {100.0 * self.false_max:g} % of the mapped trees)" if self.name == "ta" else ""
-        return self.texts.words + bound
+        return self.declaration.words + bound
 
 
-def score_of(e: MapScores) -> RunScore:
-    """Return the scores of a run that a search stores."""
-    return RunScore(
-        e.TA.count,
-        e.FR.count,
-        e.FA.count,
-        e.TR.count,
-        e.spurious,
-        e.position_rmse,
-        e.mean_pair_error_percent,
-    )
-
-
-def pool(scores: Sequence[RunScore]) -> Pooled:
+def pool(scores: Sequence[MapScores]) -> Pooled:
     """Return the scores of several runs together, see `Pooled`. Without scores, f1, ta and false_share are 0
     and the errors are None."""
-    ta, fr = sum(s.TA for s in scores), sum(s.FR for s in scores)
-    wrong = sum(s.FA + s.spurious for s in scores)
-    squares = [(s.TA, s.position_rmse**2) for s in scores if s.position_rmse is not None]
-    pairs = [(s.TA * (s.TA - 1) // 2, s.pair_error) for s in scores if s.pair_error is not None]
+    ta, fr = sum(s.TA.count for s in scores), sum(s.FR.count for s in scores)
+    wrong = sum(s.FA.count + s.spurious for s in scores)
+    squares = [(s.TA.count, s.position_rmse**2) for s in scores if s.position_rmse is not None]
+    pairs = [
+        (s.TA.count * (s.TA.count - 1) // 2, s.mean_pair_error_percent)
+        for s in scores
+        if s.mean_pair_error_percent is not None
+    ]
     rms = _mean(squares)
     return Pooled(
         f1=2.0 * ta / (2.0 * ta + fr + wrong) if ta else 0.0,
@@ -385,8 +354,6 @@ def _ends(axis: SearchAxis) -> tuple[Value, ...]:
 
 # --- plan and trials --------------------------------------------------------------------------------
 
-FORMAT = 2
-
 
 class PlannedRun(msgspec.Struct, frozen=True):
     """A run of a search.
@@ -415,19 +382,19 @@ class Plan(msgspec.Struct, frozen=True):
         runs: At least one that is not held out.
         axes: The parameters that are searched, with their bounds.
         start: All parameters with which the search begins, by stage. They are the first trial.
-        journal: Path of the file of the trials; "" keeps them in memory.
+        kept: Folder of stored results; empty keeps them in memory.
         preset: Name of the preset from which the parameters come.
         goal, false_max: See `app.tuning.plan.Goal`.
         seed: Random seed of the mapping and of the sampler.
         odometry: Default source of the motion, see `app.sources.request`.
-        trials: Number of trials in all, earlier ones included.
+        trials: Number of trials.
         seconds: Time limit [s]; 0 for none.
     """
 
     runs: tuple[PlannedRun, ...]
     axes: tuple[SearchAxis, ...]
     start: dict[str, dict[str, Any]]
-    journal: str
+    kept: str = ""
     preset: str = "forest"
     goal: GoalName = "f1"
     false_max: float = 0.1
@@ -452,7 +419,7 @@ class Trial(msgspec.Struct, frozen=True):
     """The result of one set of parameters.
 
     Attributes:
-        number: Trials are numbered in the order in which they end; -1 is the start of the search.
+        number: Trials are numbered in the order in which they are suggested; -1 is the start of the search.
         values: The values that were tried, by parameter name.
         loss: See `Goal.loss`; None where the values contradict one another.
         training, held_out: Scores by run. Held-out runs are scored only for a set that is the best so far.
@@ -461,36 +428,5 @@ class Trial(msgspec.Struct, frozen=True):
     number: int
     values: dict[str, Value]
     loss: float | None
-    training: tuple[RunScore, ...] = ()
-    held_out: tuple[RunScore, ...] = ()
-
-
-def identity(plan: Plan, digests: list[str]) -> dict[str, Any]:
-    """Return all that decides the result of a trial, as values that JSON can store. Searches with the same
-    identity share their trials; neither the location of a recording nor the held-out runs belong to it.
-
-    Args:
-        plan: The search.
-        digests: Digests of the runs that are not held out, with their true trees, in their order.
-    """
-    return {
-        "format": FORMAT,
-        "version": version(),
-        "runs": digests,
-        "goal": [plan.goal, plan.false_max if plan.goal == "ta" else None],
-        "parameters": [axis.words for axis in plan.axes],
-        "start": plan.start,
-        "seed": plan.seed,
-        "odometry": plan.odometry,
-    }
-
-
-def digest_with_truth(plan: Plan, run: RunWithTruth) -> str:
-    """Return a SHA-256 (hex) of a run of a search: its source, its true trees, and the choices with which it
-    is opened if they differ from those of the plan."""
-    source = run.source
-    default = SourceRequest(source.uri, plan.odometry, plan.seed)
-    chosen = [source.seed, source.odometry, source.topics, source.mount]
-    differs = chosen != [default.seed, default.odometry, default.topics, default.mount]
-    text = msgspec.json.encode([run.digest, run.truth, *([chosen] if differs else [])])
-    return hashlib.sha256(text).hexdigest()
+    training: tuple[MapScores, ...] = ()
+    held_out: tuple[MapScores, ...] = ()

@@ -271,7 +271,8 @@ def files(comparison: Comparison, folder: Path) -> list[str]:
 
 
 def json_text(comparison: Comparison) -> str:
-    """Return everything but the times as JSON text that ends with a newline."""
+    """Return everything but the times as JSON text that ends with a newline: `stemmap`, `runs`, `sets`,
+    `results` (a row per set and run), `means` (a row per set) and `best` (number of the set by criterion)."""
     plan = comparison.plan
     record: dict[str, Any] = {
         "stemmap": version(),
@@ -295,7 +296,7 @@ def json_text(comparison: Comparison) -> str:
 
 
 def _record(row: Row) -> dict[str, Any]:
-    """Return a row for JSON: set, run (not for a mean), and either all scores or the error."""
+    """Return a row for JSON: `set`, `run` (not for a mean), and either the scores of COLUMNS or `error`."""
     numbers = {"set": row.set_number, **({"run": row.run} if row.run else {})}
     if row.error:
         return {**numbers, "error": row.error}
@@ -451,15 +452,13 @@ def _f1_by_value(comparison: Comparison) -> dict[str, dict[float, list[float]]]:
 
 
 def _chart(axis: str, points: dict[float, list[float]]) -> dict[str, Any]:
-    """Return a chart of F1 over a parameter for the template.
+    """Return a chart of F1 over a parameter for the template: `axis`, the name of the parameter; `best` and
+    `mean`, "x,y" coordinates [px] of the lines through the best and the mean F1 at each value; and the labels
+    of the ends of the axes, `low`, `high` (F1) and `first`, `last` (value).
 
     Args:
         axis: Name of the parameter.
         points: F1 [%] of the sets by value; at least two values.
-
-    Returns:
-        Name of the parameter, "x,y" coordinates [px] of the lines through the best and the mean F1 at each
-            value, and the labels of the ends of both axes.
     """
     xs = sorted(points)
     best, mean = [max(points[x]) for x in xs], [sum(points[x]) / len(points[x]) for x in xs]

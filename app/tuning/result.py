@@ -11,9 +11,10 @@ import tomli_w
 
 from app.common.text import count, value_text, version
 from app.dashboard.parameters import file_of
-from app.tuning.plan import Goal, Plan, RunScore, Trial, pool
+from app.tuning.plan import Goal, Plan, Trial, pool
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
+from pipeline.evaluation import MapScores
 
 if TYPE_CHECKING:
     from app.tuning.search import Search
@@ -29,7 +30,7 @@ class Result(msgspec.Struct, frozen=True):
         start, best: The start of the search, and the best trial; the start where no trial was better.
         better: Whether a trial was better than the start.
         made, refused: Number of trials, and of those whose values contradict one another.
-        importance: See `app.tuning.search.importances`.
+        importance: See `app.tuning.search.Search.importances`.
         sources: URI, source hash and whether it was held out, by run.
     """
 
@@ -42,25 +43,13 @@ class Result(msgspec.Struct, frozen=True):
     sources: tuple[tuple[str, str, bool], ...]
 
 
-class SearchStart(msgspec.Struct, frozen=True):
-    """Request to a process for a search.
-
-    Attributes:
-        plan: The search.
-        trials: Its trials before it was stopped.
-    """
-
-    plan: Plan
-    trials: tuple[Trial, ...] = ()
-
-
 class SearchMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     """Progress of a search in another process. A message without any field means that the search was stopped
     before it had a score.
 
     Attributes:
         start: Scores of the parameters with which the search begins.
-        trials: Trials since the last message; with `start`, those of the search before it was stopped.
+        trials: Trials since the last message.
         result: The result; the last message.
         error: What happened, where, and what to do; the last message.
     """
@@ -72,13 +61,11 @@ class SearchMessage(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def result_of(search: Search) -> Result:
-    """Return the result of the trials so far.
+    """Return the result of the trials so far; the best is the start if no trial is better.
 
     Raises:
         StemmapError: The search was stopped before its start was scored.
     """
-    from app.tuning.search import importances
-
     if search.start is None:
         raise StemmapError("the search was stopped before its first score")
     trials, best = search.trials(), search.best()
@@ -89,7 +76,7 @@ def result_of(search: Search) -> Result:
         better,
         len(trials),
         sum(trial.loss is None for trial in trials),
-        importances(search.study),
+        search.importances(),
         tuple(search.sources),
     )
 
@@ -116,8 +103,9 @@ def best_parameters(plan: Plan, result: Result) -> Parameters:
 
 
 def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
-    """Return the provenance of the best set: goal, trials, runs with their digests, scores before and after.
-    Without None, because TOML has no null.
+    """Return the provenance of the best set: `tuned`, a dict with goal, numbers of trials, searched
+    parameters and their importance; and `run`, a list with URI, digest and scores before and after of each
+    run. Unknown values are left out, because TOML has no null.
 
     Args:
         plan: The search.
@@ -195,7 +183,7 @@ def warning_of(result: Result) -> str:
     )
 
 
-def _change(before: Sequence[RunScore], after: Sequence[RunScore]) -> str:
+def _change(before: Sequence[MapScores], after: Sequence[MapScores]) -> str:
     """Return the pooled scores before and after as text, "-" for unknown ones."""
     a, b = _file_scores(before), _file_scores(after)
     return ", ".join(
@@ -212,7 +200,7 @@ _LABELS = {
 }
 
 
-def _file_scores(scores: Sequence[RunScore]) -> dict[str, float]:
+def _file_scores(scores: Sequence[MapScores]) -> dict[str, float]:
     """Return the pooled scores for a file, rounded to 6 decimals. Unknown ones are omitted, because TOML has
     no null."""
     pooled = pool(scores)
@@ -226,13 +214,13 @@ def _file_scores(scores: Sequence[RunScore]) -> dict[str, float]:
     return {name: round(value, 6) for name, value in values.items() if value is not None}
 
 
-def _scores(trial: Trial, held_out: bool) -> tuple[RunScore, ...]:
+def _scores(trial: Trial, held_out: bool) -> tuple[MapScores, ...]:
     """Return the scores of a trial for the held-out runs or for the search runs; () for a trial whose
     held-out runs were not scored."""
     return trial.held_out if held_out else trial.training
 
 
-def _by_run(trial: Trial, sources: Sequence[tuple[str, str, bool]]) -> list[RunScore]:
+def _by_run(trial: Trial, sources: Sequence[tuple[str, str, bool]]) -> list[MapScores]:
     """Return the scores of a trial in the order of the runs. The trial must have held-out scores if a run is
     held out.
 
@@ -267,7 +255,10 @@ def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
 def for_page(
     plan: Plan, trials: Sequence[Trial], start: Trial | None, result: Result | None
 ) -> dict[str, Any]:
-    """Return the progress of a search for the page, without its state.
+    """Return the progress of a search for the page, without its state: the goal (`goal`, `label`, `unit`),
+    the axes (`over`), numbers of trials (`wanted`, `made`), `start` and `best` (see `_trial_figures`), the
+    chart (`points`, `held_out`), the table of `scores` (see `_rows`), and of the result `warning`,
+    `importance`, `better` and `changes` (see `_changes`), which are empty or False before.
 
     The points of the chart are (number, score); the score is None for contradicting values. Trials outside
     the bound of the goal are omitted, and of more than 400 points only every n-th is sent.
@@ -287,8 +278,8 @@ def for_page(
     every = -(-len(points) // _POINTS_LIMIT) or 1
     return {
         "goal": goal.words,
-        "label": goal.texts.label,
-        "unit": goal.texts.unit,
+        "label": goal.declaration.label,
+        "unit": goal.declaration.unit,
         "over": [axis.words for axis in plan.axes],
         "wanted": plan.trials,
         "made": len(trials),
@@ -305,14 +296,16 @@ def for_page(
 
 
 def _trial_figures(plan: Plan, trial: Trial | None) -> dict[str, Any] | None:
-    """Return number, loss as text and pooled scores of the search runs of a trial; None for None."""
+    """Return `number` of a trial, its loss as text (`shown`) and the pooled scores of the search runs (see
+    `_figures`); None for None."""
     if trial is None:
         return None
     return {"number": trial.number, "shown": plan.aim.shown(trial.loss or 0.0), **_figures(trial.training)}
 
 
-def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
-    """Return pooled scores for the page, with units in the names; unknown errors are None."""
+def _figures(scores: Sequence[MapScores]) -> dict[str, Any]:
+    """Return pooled scores for the page: `f1`, `TA`, `false_share`, `rmse_cm` and `pair_error_percent`;
+    unknown errors are None."""
     pooled = pool(scores)
     return {
         "f1": pooled.f1,
@@ -324,8 +317,9 @@ def _figures(scores: Sequence[RunScore]) -> dict[str, Any]:
 
 
 def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str, Any]]:
-    """Return a row of scores for the search runs, and one for the held-out runs if there are any, each at the
-    start and with the best set; [] before the first result.
+    """Return a row of scores for the search runs, and one for the held-out runs if there are any: `held_out`,
+    number of `runs`, and the scores at the `start` and with the `best` set, see `_figures`; [] before the
+    first result.
 
     Args:
         plan: The search.

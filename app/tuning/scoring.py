@@ -9,7 +9,6 @@ recording nor the points again.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 import time
 from collections.abc import Iterator
@@ -31,8 +30,8 @@ from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers import open_source
-from pipeline.io.readers.clouds import is_cloud, open_cloud
+from pipeline.io.readers import is_cloud, open_source
+from pipeline.io.readers.clouds import open_cloud
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import ScanCache, ScanCaches
@@ -40,8 +39,6 @@ from pipeline.types.records import Frame, Path, Step, Trees, TruthTrees
 
 #: Points of the scans that are held in memory [bytes]; a longer run is read again when the front end runs.
 _STEPS_LIMIT = 512 << 20
-# The temporary folder of the system may be in memory. The file has no name.
-_CACHE_FOLDER = FilePath("/var/tmp")  # noqa: S108
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,7 +87,7 @@ class OpenDrive:
         self.digest = self._source.description.digest
         self.preset = self._source.description.preset
         self._steps: list[Step] | None = None
-        self._caches = ScanCaches(_CACHE_FOLDER if _CACHE_FOLDER.is_dir() else None)
+        self._caches = ScanCaches()
         self._scans = -1  # unknown before the first mapping
 
     def map(self, parameters: Parameters) -> MappedRun:
@@ -101,50 +98,34 @@ class OpenDrive:
 
         Raises:
             SourceError: There is no scan.
-            StemmapError: The source cannot be read.
+            StemmapError: The source or the cache cannot be read.
         """
-        cache, mapper = self._caches.of(parameters), self._mapper(parameters)
-        if self._scans > 0 and cache.has_all(self._scans):
-            with contextlib.suppress(_DamagedCacheError):
-                return self._mapped(mapper, self._from_cache(mapper, cache), front_end_ran=False)
-            mapper = self._mapper(parameters)
-        mapped = self._mapped(mapper, self._from_scans(mapper, cache), front_end_ran=True)
-        self._scans = mapped.scans
-        return mapped
-
-    def close(self) -> None:
-        """Close the source and delete the caches."""
-        self._caches.close()
-        self._source.close()
-
-    def _mapper(self, parameters: Parameters) -> Mapper:
-        """Return a mapper of the source before its first scan."""
-        return mapper_of(self._source.description, parameters, self._seed)
-
-    def _mapped(self, mapper: Mapper, frames: Iterator[Frame], *, front_end_ran: bool) -> MappedRun:
-        """Consume the frames and return the map after the last one; raises SourceError without a frame.
-
-        Args:
-            mapper: The mapper that makes the frames.
-            frames: One frame per scan; the scans are mapped while it is consumed.
-            front_end_ran: As in `MappedRun`.
-        """
+        cache = self._caches.of(parameters)
+        mapper = mapper_of(self._source.description, parameters, self._seed)
+        is_cached = self._scans > 0 and cache.has_all(self._scans)
+        frames = self._from_cache(mapper, cache) if is_cached else self._from_scans(mapper, cache)
         start_ns, frame = 0, None
         for frame in frames:
             if frame.index == 0:
                 start_ns = frame.stamp_ns
         if frame is None:
             raise SourceError("there is no scan in it", where=self._uri)
+        self._scans = frame.index + 1
         trees, path = as_written(frame.trees, mapper.path, start_ns)
-        return MappedRun(trees, path, frame.index + 1, front_end_ran)
+        return MappedRun(trees, path, self._scans, not is_cached)
+
+    def close(self) -> None:
+        """Close the source and delete the caches."""
+        self._caches.close()
+        self._source.close()
 
     def _from_cache(self, mapper: Mapper, cache: ScanCache) -> Iterator[Frame]:
-        """Yield the frames of all scans, with the cached results of the front end; raises
-        `_DamagedCacheError` if one cannot be read."""
+        """Yield the frames of all scans, with the cached results of the front end; raises StemmapError if one
+        cannot be read."""
         for index in range(self._scans):
             cached = cache.read(index)
-            if cached is None:  # the source still has the scan
-                raise _DamagedCacheError
+            if cached is None:
+                raise StemmapError("a temporary file of cached scans is damaged", remedy="Start again")
             yield mapper.process(*cached)
 
     def _from_scans(self, mapper: Mapper, cache: ScanCache) -> Iterator[Frame]:
@@ -202,10 +183,6 @@ class OpenCloud:
 
     def close(self) -> None:
         """Do nothing: no file is open."""
-
-
-class _DamagedCacheError(Exception):
-    """A cached scan cannot be read."""
 
 
 OpenRun = OpenDrive | OpenCloud
@@ -308,13 +285,13 @@ class Scorer:
             parameters = validated(job.parameters)
             kept_forests().check(parameters)
             mapped = self._run(job.run).map(parameters)
+            scores = score_map(mapped.trees, mapped.path, as_truth(job.run.truth), parameters)
         except StemmapError as error:
             return JobResult(None, error=str(error))
         except MemoryError:
             return JobResult(None, error="this needs more memory than the machine has")
         except Exception as error:  # a fault with one set must not end the others
             return JobResult(None, error=f"this is a fault in stemmap: {type(error).__name__}: {error}")
-        scores = score_map(mapped.trees, mapped.path, as_truth(job.run.truth), parameters)
         seconds = time.perf_counter() - begun
         return JobResult(scores, mapped.scans, len(mapped.trees.number), seconds, mapped.front_end_ran)
 

@@ -1,7 +1,8 @@
 """The search: Optuna suggests a parameter set, processes map the runs with it, and the scores are stored.
 
-A suggestion depends only on the trials before it, its number and the seed. A stopped search therefore
-continues with the trials that it would have made, and with one process the same input gives the same result.
+The suggestion with number n of P processes depends only on its number, the seed and the trials with numbers
+below n - P + 1. The same input therefore gives the same result, and a stopped search that begins again finds
+the stored results of the trials that it made.
 """
 
 from __future__ import annotations
@@ -21,19 +22,14 @@ from app.common.child_process import ParentConnection, run_child
 from app.tuning.jobs import Job, JobResult
 from app.tuning.plan import (
     Plan,
-    RunScore,
     Trial,
     check,
-    digest_with_truth,
-    identity,
     pool,
-    score_of,
     values_of,
 )
-from app.tuning.result import SearchMessage, SearchStart, best_of, result_of
+from app.tuning.result import SearchMessage, best_of, result_of
 from app.tuning.scoring import prepare_run
-from app.tuning.trials import Journal, Trials
-from app.tuning.workers import COMMAND, ScoringProcesses
+from app.tuning.workers import COMMAND, ResultStore, ScoringProcesses
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.evaluation import MapScores
@@ -69,19 +65,19 @@ class _Attempt:
 
     Attributes:
         values: Its values by parameter name.
-        parameters: All parameters, by stage.
+        parameters: All parameters, by stage; None where the values contradict one another.
         runs: Numbers of the runs on which it is scored.
         begun: How many of these were given to a process.
         scores: Scores by number of the run.
     """
 
     values: dict[str, Value]
-    parameters: dict[str, dict[str, Any]]
+    parameters: dict[str, dict[str, Any]] | None
     runs: list[int]
     begun: int = 0
-    scores: dict[int, RunScore] = field(default_factory=dict)
+    scores: dict[int, MapScores] = field(default_factory=dict)
 
-    def scores_of(self, runs: Sequence[int]) -> tuple[RunScore, ...]:
+    def scores_of(self, runs: Sequence[int]) -> tuple[MapScores, ...]:
         """Return the scores of some runs; () unless all of them are known."""
         known = [self.scores[run] for run in runs if run in self.scores]
         return tuple(known) if len(known) == len(runs) else ()
@@ -91,24 +87,21 @@ _Tag = tuple[_Attempt, int]  # a set and the number of a run
 
 
 class Search:
-    """A search whose sets of parameters are scored by processes. The constructor opens every run of the plan
-    and the journal, but starts no job.
+    """A search whose sets of parameters are scored by processes. The constructor opens every run of the
+    plan, but starts no job.
 
     Args:
         plan: The search.
         processes: Map and score the runs; the caller closes them.
-        known: Earlier trials, where the plan has no journal.
 
     Attributes:
         start: Scored start of the search; None before.
-        study: Study of Optuna.
 
     Raises:
-        StemmapError: A run cannot be read, the search space has no set without contradictions, or the journal
-            cannot be used or belongs to another search.
+        StemmapError: A run cannot be read, or the search space has no set without contradictions.
     """
 
-    def __init__(self, plan: Plan, processes: ScoringProcesses[_Tag], known: Sequence[Trial] = ()) -> None:
+    def __init__(self, plan: Plan, processes: ScoringProcesses[_Tag]) -> None:
         import optuna
 
         optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -118,21 +111,14 @@ class Search:
         self._runs = [prepare_run(planned).run for planned in plan.runs]
         self._training = [k for k, planned in enumerate(plan.runs) if not planned.held_out]
         self._held_out = [k for k, planned in enumerate(plan.runs) if planned.held_out]
-        digests = [digest_with_truth(plan, self._runs[k]) for k in self._training]
-        self._trials = Journal(Path(plan.journal), identity(plan, digests)) if plan.journal else Trials(known)
-        self.study = optuna.create_study(direction="minimize")
+        self._trials: list[Trial] = []
+        self._study = optuna.create_study(direction="minimize")
         self.start: Trial | None = None
         self._beginning = _Attempt(
             self._start_values(), self._parameters.model_dump(), list(range(len(self._runs)))
         )
-        self._attempts = [self._beginning]
-        self._completed: list[Trial] = []
+        self._attempts = [self._beginning]  # sets that are not trials yet, in the order of their suggestion
         self._learned = 0
-        self._learn()
-
-    def close(self) -> None:
-        """Close the journal; the processes remain open."""
-        self._trials.close()
 
     @property
     def sources(self) -> list[tuple[str, str, bool]]:
@@ -150,16 +136,16 @@ class Search:
     @property
     def is_complete(self) -> bool:
         """Whether all trials are made."""
-        return self.start is not None and len(self._trials.all) >= self.plan.trials
+        return self.start is not None and len(self._trials) >= self.plan.trials
 
     def trials(self) -> list[Trial]:
         """Return all completed trials, by number."""
-        return list(self._trials.all)
+        return list(self._trials)
 
     def best(self) -> Trial | None:
         """Return the trial with the smallest loss, the earliest of equals; None before the first scored
         trial. The start is not included."""
-        return best_of(self._trials.all, None)
+        return best_of(self._trials, None)
 
     def advance(self, wait_s: float = 0.2) -> list[Trial]:
         """Give jobs to the free processes and wait for results. The parameters with which the search begins
@@ -170,48 +156,49 @@ class Search:
                 in progress.
 
         Returns:
-            The trials that were completed in this call, with those that need no mapping (repeated or
-                contradicting values).
+            The trials that were completed in this call.
 
         Raises:
-            StemmapError: A run cannot be mapped or scored, or the trials cannot be stored.
+            StemmapError: A run cannot be mapped or scored.
         """
-        self._completed = []
+        before = len(self._trials)
         for (attempt, run), result in self._processes.advance(self._next_job, wait_s):
             self._receive(attempt, run, result)
-        return self._completed
+        return self._trials[before:]
 
     # --- one trial ---------------------------------------------------------------------------------
 
     def _next_job(self, _worker: int) -> tuple[_Tag, Job] | None:
         """Return the next run to be mapped with a set, and take it from the queue; a new set is suggested if
-        no known one waits. None if there is nothing to do now: before the start is scored, and when all
-        trials are made or in progress."""
+        no known one waits. None if there is nothing to do now: before the start is scored, while there is a
+        set for each process, and when all trials are made or in progress."""
         attempt = next((each for each in self._attempts if each.begun < len(each.runs)), None)
-        if attempt is None and self.start is not None:
-            while attempt is None and len(self._trials.all) + len(self._attempts) < self.plan.trials:
-                attempt = self._suggested()
-            if attempt is not None:
-                self._attempts.append(attempt)
-        if attempt is None:
+        while attempt is None and self._may_suggest():
+            suggested = self._suggested()
+            self._attempts.append(suggested)
+            if suggested.parameters is None:
+                self._complete_in_order()
+            else:
+                attempt = suggested
+        if attempt is None or attempt.parameters is None:
             return None
         run = attempt.runs[attempt.begun]
         attempt.begun += 1
         return (attempt, run), Job(self._runs[run], attempt.parameters)
 
-    def _suggested(self) -> _Attempt | None:
-        """Return the next set to score. None for a set that needs no scoring: one whose values equal an
-        earlier trial, or contradict one another. Such a set is stored as a trial at once."""
+    def _may_suggest(self) -> bool:
+        """Return whether the trials on which the next suggestion depends are made, and it is not the last."""
+        in_progress = len(self._attempts)
+        is_left = len(self._trials) + in_progress < self.plan.trials
+        return self.start is not None and is_left and in_progress < self._processes.count
+
+    def _suggested(self) -> _Attempt:
+        """Return the next set to score; one whose values contradict one another needs no scoring."""
         values = self._suggestion()
-        known = next((trial for trial in self._trials.all if trial.values == values), None)
-        if known is not None:
-            self._complete(known)
-            return None
         try:
             parameters = self._parameters.replace(dict(values))
         except ParameterError:
-            self._complete(Trial(-1, values, None))
-            return None
+            return _Attempt(values, None, [])
         return _Attempt(values, parameters.model_dump(), list(self._training))
 
     def _suggestion(self) -> dict[str, Value]:
@@ -220,20 +207,20 @@ class Search:
         from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 
-        axes, number = self.plan.axes, len(self._trials.all) + len(self._attempts)
+        axes, number = self.plan.axes, len(self._trials) + len(self._attempts)
+        self._learn(number - self._processes.count + 1)
         values = self._start_values()
         if not number and all(axis.holds(values[axis.name]) for axis in axes):
             return values
         key = (self.plan.seed, number, 0)  # the 0 keeps the suggestions of earlier versions
-        self.study.sampler = TPESampler(seed=int(np.random.SeedSequence(key).generate_state(1)[0]))
-        trial = self.study.ask({axis.name: axis.distribution() for axis in axes})
+        self._study.sampler = TPESampler(seed=int(np.random.SeedSequence(key).generate_state(1)[0]))
+        trial = self._study.ask({axis.name: axis.distribution() for axis in axes})
         # Optuna learns of the set when it is scored, see `_learn`.
-        self.study.tell(trial, state=TrialState.FAIL)
+        self._study.tell(trial, state=TrialState.FAIL)
         return values_of(axes, trial.params)
 
     def _receive(self, attempt: _Attempt, run: int, result: JobResult) -> None:
-        """Store the score of a run of a set. When all its runs are scored, the set is complete, or becomes
-        `start`. If it is the best so far and has held-out runs without scores, these are queued first.
+        """Store the score of a run of a set, and complete the sets whose turn it is.
 
         Raises:
             StemmapError: The job failed, or the start cannot be scored (see `check_start`).
@@ -243,62 +230,62 @@ class Search:
         if attempt is self._beginning:
             uri = self.plan.runs[run].source.uri
             check_start(uri, result.scores, self._parameters.evaluation.match_distance)
-        attempt.scores[run] = score_of(result.scores)
-        if len(attempt.scores) < len(attempt.runs):
-            return
-        training, held_out = attempt.scores_of(self._training), attempt.scores_of(self._held_out)
-        if attempt is self._beginning:
-            loss = self.plan.aim.loss(pool(training), pool(training))
-            self.start = Trial(-1, attempt.values, loss, training, held_out)
-        else:
-            assert self.start is not None  # noqa: S101 - it is scored before all others
-            loss, best = self.plan.aim.loss(pool(training), pool(self.start.training)), self.best()
-            is_best = best is None or best.loss is None or loss < best.loss
-            if is_best and len(held_out) < len(self._held_out):
-                attempt.runs += self._held_out
-                return
-            self._complete(Trial(-1, attempt.values, loss, training, held_out))
-        self._attempts.remove(attempt)
+        attempt.scores[run] = result.scores
+        self._complete_in_order()
 
-    def _complete(self, trial: Trial) -> None:
-        """Store a trial, and let Optuna learn from it."""
-        self._completed.append(self._trials.add(trial))
-        self._learn()
+    def _complete_in_order(self) -> None:
+        """Make trials of the sets whose runs are all scored, up to the first one that is not; the first set
+        of all becomes `start`. If a set is the best so far and has held-out runs without scores, these are
+        queued first."""
+        while self._attempts and len(self._attempts[0].scores) == len(self._attempts[0].runs):
+            attempt, loss = self._attempts[0], None
+            training, held_out = attempt.scores_of(self._training), attempt.scores_of(self._held_out)
+            if attempt is self._beginning:
+                loss = self.plan.aim.loss(pool(training), pool(training))
+                self.start = Trial(-1, attempt.values, loss, training, held_out)
+            else:
+                assert self.start is not None  # noqa: S101 - it is scored before all others
+                if attempt.parameters is not None:
+                    loss = self.plan.aim.loss(pool(training), pool(self.start.training))
+                    best = self.best()
+                    is_best = best is None or best.loss is None or loss < best.loss
+                    if is_best and len(held_out) < len(self._held_out):
+                        attempt.runs += self._held_out
+                        return
+                number = len(self._trials)
+                self._trials.append(Trial(number, attempt.values, loss, training, held_out))
+            self._attempts.pop(0)
 
-    def _learn(self) -> None:
-        """Add the trials to Optuna's study that it does not have yet. Contradicting sets count as the worst,
-        so that the sampler avoids them."""
+    def _learn(self, until: int) -> None:
+        """Add the trials with numbers below `until` to Optuna's study that it does not have yet.
+        Contradicting sets count as the worst, so that the sampler avoids them."""
         from optuna.trial import TrialState, create_trial
 
         distributions = {axis.name: axis.distribution() for axis in self.plan.axes}
-        for trial in self._trials.all[self._learned :]:
+        for trial in self._trials[self._learned : max(until, 0)]:
             state = TrialState.PRUNED if trial.loss is None else TrialState.COMPLETE
-            self.study.add_trial(
+            self._study.add_trial(
                 create_trial(state=state, value=trial.loss, params=trial.values, distributions=distributions)
             )
-        self._learned = len(self._trials.all)
+        self._learned = max(self._learned, until)
 
     def _start_values(self) -> dict[str, Value]:
         """Return the values of the searched parameters at the start, by name."""
         flat = self._parameters.flat()
         return {axis.name: flat[axis.name] for axis in self.plan.axes}
 
+    def importances(self) -> dict[str, float]:
+        """Return the share of the variance of the loss that each parameter explains (fANOVA, Hutter et al.
+        2014), by name, the largest first. Shares that are not finite are omitted. Empty if there are too few
+        trials or all have the same loss."""
+        from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 
-def importances(study: Any) -> dict[str, float]:  # noqa: ANN401 - Optuna has no types
-    """Return the share of the variance of the loss that each parameter explains (fANOVA, Hutter et al. 2014),
-    by name, the largest first. Shares that are not finite are omitted. Empty if there are too few trials or
-    all have the same loss.
-
-    Args:
-        study: Study of Optuna.
-    """
-    from optuna.importance import FanovaImportanceEvaluator, get_param_importances
-
-    try:
-        found = get_param_importances(study, evaluator=FanovaImportanceEvaluator(seed=0))
-    except (RuntimeError, ValueError):
-        return {}
-    return {name: float(value) for name, value in found.items() if np.isfinite(value)}
+        self._learn(len(self._trials))
+        try:
+            found = get_param_importances(self._study, evaluator=FanovaImportanceEvaluator(seed=0))
+        except (RuntimeError, ValueError):
+            return {}
+        return {name: float(value) for name, value in found.items() if np.isfinite(value)}
 
 
 def search_processes(plan: Plan, number: int = 1) -> ScoringProcesses[_Tag]:
@@ -308,37 +295,34 @@ def search_processes(plan: Plan, number: int = 1) -> ScoringProcesses[_Tag]:
         plan: The search.
         number: Number of processes.
     """
-    return ScoringProcesses(number, (*COMMAND, "--runs", str(len(plan.runs))))
+    kept = ResultStore(Path(plan.kept) if plan.kept else None)
+    return ScoringProcesses(number, (*COMMAND, "--runs", str(len(plan.runs))), kept)
 
 
 _MESSAGE_INTERVAL_S = 0.25
 
 
 def search_for_page(parent: ParentConnection) -> None:
-    """Receive a `SearchStart`, search until a further message arrives, all trials are made or the time is
+    """Receive a `Plan`, search until a further message arrives, all trials are made or the time is
     over, and send `SearchMessage`s; the program of the child process of the page. Errors are sent as the last
     message, not raised."""
-    begin = parent.receive(SearchStart)
+    plan = parent.receive(Plan)
     try:
-        with (
-            closing(search_processes(begin.plan)) as processes,
-            closing(Search(begin.plan, processes, begin.trials)) as search,
-        ):
-            _search_for_page(search, begin, parent)
+        with closing(search_processes(plan)) as processes:
+            _search_for_page(Search(plan, processes), parent)
     except StemmapError as error:
         parent.send(SearchMessage(error=(error.what, error.where, error.remedy)))
     except MemoryError:
         parent.send(SearchMessage(error=("the search needs more memory than this machine has", "", "")))
 
 
-def _search_for_page(search: Search, begin: SearchStart, parent: ParentConnection) -> None:
+def _search_for_page(search: Search, parent: ParentConnection) -> None:
     """Advance a search and send its progress, at most every 0.25 s, and its result. If a message arrives
     before the start is scored, an empty `SearchMessage` is sent and there is no result. The time limit counts
     from the scored start on.
 
     Args:
         search: The search.
-        begin: Its request, with the earlier trials and the time limit.
         parent: Connection to the server.
     """
     while search.start is None:
@@ -346,9 +330,9 @@ def _search_for_page(search: Search, begin: SearchStart, parent: ParentConnectio
             parent.send(SearchMessage())
             return
         search.advance()
-    parent.send(SearchMessage(start=search.start, trials=begin.trials))
+    parent.send(SearchMessage(start=search.start))
     sent_s = time.monotonic()
-    until_s = sent_s + begin.plan.seconds if begin.plan.seconds else float("inf")
+    until_s = sent_s + search.plan.seconds if search.plan.seconds else float("inf")
     news: list[Trial] = []
     while not (parent.has_message or search.is_complete) and time.monotonic() < until_s:
         news += search.advance()

@@ -9,6 +9,7 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from app.common.timers import cancel
@@ -16,7 +17,7 @@ from app.sources.request import SourceRequest
 from app.tuning.grid import spec_of
 from app.tuning.jobs import Job, JobResult, RunWithTruth, check_run
 from app.tuning.workers import COMMAND as SCORING
-from app.tuning.workers import ScoringProcesses
+from app.tuning.workers import ResultStore, ScoringProcesses
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
@@ -70,14 +71,14 @@ def question_of(
 
 
 class Sensitivity:
-    """Computes the newest sensitivity curve, point by point. Results of earlier points are reused until
-    `leave`.
+    """Computes the newest sensitivity curve, point by point.
 
     Args:
         tell: Called with the curve and its points so far after each point (see `_state_of`), and with {} when
             the curve is removed.
         command: Program and arguments of the child process.
         idle_s: Time without a new curve after which the process ends [s].
+        kept: Folder of stored results; None keeps them in memory.
     """
 
     def __init__(
@@ -85,12 +86,13 @@ class Sensitivity:
         tell: Callable[[dict[str, Any]], None],
         command: Sequence[str] = COMMAND,
         idle_s: float = IDLE_S,
+        kept: Path | None = None,
     ) -> None:
         self._tell, self._command, self._idle_s = tell, command, idle_s
+        self._kept = ResultStore(kept)
         self._question: Question | None = None
         self._changed = asyncio.Event()
         self._task: asyncio.Task[None] | None = None
-        self._known: dict[str, JobResult] = {}
 
     def ask(self, question: Question) -> None:
         """Start a curve, and send it without points. It replaces the one before, whose current point is still
@@ -109,16 +111,15 @@ class Sensitivity:
             self._task = asyncio.create_task(self._work(), name="sensitivity")
 
     async def leave(self) -> None:
-        """Cancel the curve, wait until the process has ended, forget all results and send {}, because the run
+        """Cancel the curve, wait until the process has ended, and send {}, because the run
         or the curve is closed. Without a curve only {} is sent."""
         task, self._task, self._question = self._task, None, None
         await cancel(task)
-        self._known.clear()
         self._tell({})
 
     async def _work(self) -> None:
         """Compute curves until none was requested for `idle_s`; then end the process."""
-        process: ScoringProcesses[None] = ScoringProcesses(1, self._command)
+        process: ScoringProcesses[None] = ScoringProcesses(1, self._command, self._kept)
         try:
             while (question := self._question) is not None:
                 self._changed.clear()
@@ -150,13 +151,13 @@ class Sensitivity:
     async def _point(
         self, question: Question, value: Value, process: ScoringProcesses[None]
     ) -> dict[str, Any]:
-        """Return a point for the page: the value with its scores, or with an error if the value contradicts
-        other parameters or the job failed.
+        """Return a point for the page: `value` with its scores (see `_figures`), or with `error` if the value
+        contradicts other parameters or the job failed.
 
         Args:
             question: The curve.
             value: Value of its parameter.
-            process: Computes the job, unless its result is known.
+            process: Computes the job.
 
         Raises:
             StemmapError: The process cannot be started, or ended too often.
@@ -165,11 +166,8 @@ class Sensitivity:
             parameters = question.parameters.replace({question.name: value})
         except ParameterError as error:  # it contradicts another one
             return {"value": value, "error": error.what}
-        job = Job(question.run, parameters.model_dump())
-        key = job.key()
-        if key not in self._known:
-            self._known[key] = await asyncio.wrap_future(process.submit(job))
-        return {"value": value, **_figures(self._known[key])}
+        answer = await asyncio.wrap_future(process.submit(Job(question.run, parameters.model_dump())))
+        return {"value": value, **_figures(answer)}
 
 
 def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
@@ -191,8 +189,9 @@ def _state_of(question: Question, points: list[dict[str, Any]], error: str = "")
 
 
 def _figures(answer: JobResult) -> dict[str, Any]:
-    """Return the scores of a point for the page, with units in the names; only "error" if the job failed or
-    no ground truth is near the path."""
+    """Return the scores of a point for the page: `f1`, `TA` and `TA_of`, `false` (number of false trees),
+    `position_rmse_m`, `mean_pair_error_percent` and `trees`; only `error` if the job failed or no ground
+    truth is near the path."""
     s = answer.scores
     if s is None or answer.problem:
         return {"error": answer.problem}

@@ -1,27 +1,22 @@
-"""Comparison of parameter sets: its plan, the order of its jobs, and the store of its results."""
+"""Comparison of parameter sets: its plan, and the order of its jobs."""
 
 from __future__ import annotations
 
-import hashlib
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import dataclass
 
 import msgspec
 
 from app.common.text import count
 from app.tuning.grid import PRESET, words_of
-from app.tuning.jobs import Job, JobResult, code_digest
+from app.tuning.jobs import Job, JobResult
 from app.tuning.scoring import PreparedRun
 from app.tuning.workers import ScoringProcesses
 from pipeline.config import Parameters
 from pipeline.config.model import Value, validated
-from pipeline.errors import ParameterError, StemmapError
-from pipeline.io.atomic_files import write_beside
+from pipeline.errors import ParameterError
 from pipeline.remapping import segmentation_key
-
-_LARGEST_FILE = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,114 +66,26 @@ def plan_jobs(
     return SweepPlan(tuple(runs), tuple(sets), jobs, left_out)
 
 
-class ResultStore:
-    """Results on disk, each under the key of its job and of the code, so that no job is computed twice.
-
-    Args:
-        folder: Folder with one file per result; None stores nothing.
-
-    Attributes:
-        damaged: Number of files that could not be read; their results are computed again.
-        refusal: Reason why nothing is written any more; empty otherwise.
-    """
-
-    def __init__(self, folder: Path | None) -> None:
-        self._folder = folder
-        self.damaged = 0
-        self.refusal = ""
-
-    def get(self, key: str) -> JobResult | None:
-        """Return the result of the job with this key; None if it is not stored, is larger than 1 MB or cannot
-        be read. A file that cannot be used counts in `damaged`."""
-        file = self._file(key)
-        if file is None:
-            return None
-        try:
-            if file.stat().st_size <= _LARGEST_FILE:
-                answer = msgspec.json.decode(file.read_bytes(), type=JobResult)
-                if answer.scores is not None:
-                    return answer
-        except FileNotFoundError:
-            return None
-        except (OSError, msgspec.MsgspecError):
-            pass
-        self.damaged += 1
-        return None
-
-    def put(self, key: str, answer: JobResult) -> None:
-        """Store a result that has scores, in place of an earlier one. Failures are not stored, because they
-        may not happen again. After a disk error nothing is written any more, and `refusal` has the reason;
-        nothing is raised."""
-        file = self._file(key)
-        if file is None or answer.scores is None or self.refusal:
-            return
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with write_beside(file) as partial:
-                partial.write_bytes(msgspec.json.encode(answer))
-        except (OSError, StemmapError) as error:
-            why = getattr(error, "strerror", None) or str(error)
-            self.refusal = f"results are not stored for later: {why}"
-
-    def warnings(self) -> list[str]:
-        """Return warnings on stored results that could not be read or written."""
-        unread = f"{count(self.damaged, 'stored result')} could not be read; computed again"
-        return [*([unread] if self.damaged else []), *([self.refusal] if self.refusal else [])]
-
-    def _file(self, key: str) -> Path | None:
-        """Return the file of a job by its key; None if nothing is stored."""
-        if self._folder is None:
-            return None
-        name = hashlib.sha256(f"{code_digest()} {key}".encode()).hexdigest()
-        return self._folder / name[:2] / f"{name}.json"
-
-
-@dataclass(slots=True, eq=False)
-class SweepResult:
-    """The results of all jobs.
-
-    Attributes:
-        answers: One result per job, in their order.
-        known: Number of results that were stored before.
-        warnings: Messages for people.
-    """
-
-    answers: list[JobResult]
-    known: int = 0
-    warnings: list[str] = field(default_factory=list)
-
-
 def sweep(
     jobs: Sequence[Job],
     processes: ScoringProcesses[int],
-    kept: ResultStore,
     progress: Callable[[int], object] = lambda _jobs: None,
-) -> SweepResult:
-    """Compute all jobs, or read their stored results. Equal jobs are computed once. A job that fails has an
-    error in its result.
+) -> list[JobResult]:
+    """Compute all jobs, or read their stored results; return the results in the order of the jobs. A job that
+    fails has an error in its result.
 
     Args:
-        jobs: The jobs; the results have the same order.
+        jobs: The jobs.
         processes: Compute the jobs; the caller closes them.
-        kept: Stored results; each new result is added at once.
-        progress: Called with the number of jobs that were completed since the last call; first with the
-            number of stored results.
+        progress: Called with 1 for each job that was completed.
 
     Raises:
         StemmapError: No process can be started.
     """
-    keys = [job.key() for job in jobs]
-    first = {key: number for number, key in reversed(list(enumerate(keys)))}
     answers: dict[int, JobResult] = {}
     waiting: dict[bytes, deque[int]] = {}  # by group: jobs that share the results of the front end
-    for number in sorted(first.values()):
-        answer = kept.get(keys[number])
-        if answer is None:
-            waiting.setdefault(_group(jobs[number]), deque()).append(number)
-        else:
-            answers[number] = answer
-    known = len(answers)
-    progress(known)
+    for number, job in enumerate(jobs):
+        waiting.setdefault(_group(job), deque()).append(number)
     group_of: dict[int, bytes] = {}  # the last group of each process
 
     def next_job(worker: int) -> tuple[int, Job] | None:
@@ -195,12 +102,11 @@ def sweep(
             del waiting[group]
         return number, jobs[number]
 
-    while len(answers) < len(first):
+    while len(answers) < len(jobs):
         for number, answer in processes.advance(next_job):
             answers[number] = answer
-            kept.put(keys[number], answer)
             progress(1)
-    return SweepResult([answers[first[key]] for key in keys], known, kept.warnings())
+    return [answers[number] for number in range(len(jobs))]
 
 
 def _group(job: Job) -> bytes:

@@ -7,8 +7,6 @@ import logging
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fastapi import FastAPI, Request
@@ -32,26 +30,38 @@ from app.web import uploads as upload_routes
 from app.web.auth import Guard, viewer_token
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
-from app.web.routes import page, parameters, results, run, runs, sockets, tuning
+from app.web.routes import georeference, page, parameters, plots, results, run, runs, sockets, tuning
 from app.web.routes.access import Limits
 from app.web.routes.run import NotPermittedError
 from app.web.uploads import UploadError, Uploads
 from app.worker.protocol import Open, WorkerBusyError
+from app.worker.supervisor import WorkerProcess
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
     from app.scene import Scene
-    from app.worker.supervisor import WorkerProcess
 
 _log = logging.getLogger(__name__)
 
 ROUTERS = tuple(
     module.router
-    for module in (page, run, runs, parameters, results, annotation_routes, tuning, upload_routes, sockets)
+    for module in (
+        page,
+        run,
+        runs,
+        parameters,
+        results,
+        annotation_routes,
+        plots,
+        georeference,
+        tuning,
+        upload_routes,
+        sockets,
+    )
 )
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], "Scene"]
-MakeWorker = Callable[[Dashboard], "WorkerProcess"]
+MakeWorker = Callable[[], WorkerProcess]
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +97,7 @@ def build(
     source: Open,
     parameter_state: ParameterState,
     make_scene: MakeScene | None = None,
-    make_worker: MakeWorker | None = None,
+    make_worker: MakeWorker = WorkerProcess,
     fleet: FleetLink | None = None,
 ) -> FastAPI:
     """Return the application of one dashboard. Worker, scene and source are started when the application
@@ -99,7 +109,8 @@ def build(
         token: Token of the owner's link.
         source: Source that is opened at the start.
         parameter_state: Parameters at the start.
-        make_scene, make_worker: Replace viser and the worker process in tests.
+        make_scene: Replaces viser in tests.
+        make_worker: Returns the worker, which may run already; tests replace it.
         fleet: The fleet that the dashboard belongs to, if any.
     """
     parameter_state.check = Forests(settings.folder).check
@@ -113,10 +124,9 @@ def build(
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await asyncio.to_thread(uploads.clear)
-        dashboard.worker = (make_worker or partial(_worker, settings.folder))(dashboard)
+        dashboard.worker = make_worker()
         loop = asyncio.get_running_loop()
-        dashboard.scene = await asyncio.to_thread(make_scene or _scene, dashboard, loop)
-        await dashboard.start(source)
+        await dashboard.start(source, lambda: (make_scene or _scene)(dashboard, loop))
         try:
             yield
         finally:
@@ -223,14 +233,6 @@ def _answer_errors(app: FastAPI) -> None:
     async def unexpected(_: Request, error: Exception) -> Response:
         _log.error("a request failed", exc_info=error)
         return error_reply(500, "this is a fault in stemmap", remedy="The terminal shows where it happened")
-
-
-def _worker(folder: Path | None, dashboard: Dashboard) -> WorkerProcess:
-    """Return the worker process of a dashboard, which caches maps in the data folder, if there is one."""
-    from app.worker.supervisor import WORKER, WorkerProcess
-
-    kept = () if folder is None else (str(folder / "kept"),)
-    return WorkerProcess(dashboard.receive, (*WORKER, *kept))
 
 
 def _scene(dashboard: Dashboard, loop: asyncio.AbstractEventLoop) -> Scene:

@@ -39,6 +39,7 @@ SESSION_S = 7 * 86_400
 TICKET_S = 60
 _SAFE_METHODS = frozenset({"GET", "HEAD"})
 _CHANGES_NOTHING = frozenset({("POST", "/api/compare")})  # a query with a body
+_OF_OWNERS = frozenset({"/api/export/laz"})  # reads a whole recording again: minutes of work
 _FORWARDING = (
     "forwarded",
     "via",
@@ -249,11 +250,13 @@ class Guard:
         return None
 
     def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return 403 for a viewer who tries to change something; None otherwise, also for all websockets.
-        Stores the role of the request in `scope`."""
+        """Return 403 for a viewer who tries to change something or asks for work of minutes; None otherwise,
+        also for all websockets. Stores the role of the request in `scope`."""
         role = self._role(headers)
         scope.setdefault("state", {})["role"] = role
-        if role == "owner" or scope["type"] == "websocket" or scope["method"] in _SAFE_METHODS:
+        if role == "owner" or scope["type"] == "websocket":
+            return None
+        if scope["method"] in _SAFE_METHODS and scope["path"] not in _OF_OWNERS:
             return None
         if (scope["method"], scope["path"]) in _CHANGES_NOTHING:
             return None
@@ -271,7 +274,7 @@ class Guard:
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
         """Return the response to a link with a valid token or ticket (see `_welcome`), 401 for a request
-        without a session, else None. A ticket is used up."""
+        without a session, except one about the health of the server, else None. A ticket is used up."""
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             given = dict(query)
@@ -323,8 +326,8 @@ class Guard:
         return host in self._hosts or (self._any_address and self._is_own_address(host))
 
     def _is_own_address(self, host: str) -> bool:
-        """Return whether a Host is a bare address with our port. Only names can be rebound to this
-        machine."""
+        """Return whether a Host is a bare IP address with our port, 80 without a port. Only names can be
+        rebound to this machine."""
         try:
             parts = urlsplit(f"//{host}")
             ipaddress.ip_address(parts.hostname or "")

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Annotated, Any
 
 import msgspec
-from fastapi import Path
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.responses import Response
 
@@ -15,10 +14,8 @@ from pipeline.errors import StemmapError
 
 LARGEST_NUMBER = 2**31 - 1
 
-#: A number in the path, as of a run or of a tree.
-Number = Annotated[int, Path(ge=0, le=LARGEST_NUMBER)]
-#: The same in a body.
-Id = Annotated[int, Field(ge=0, le=LARGEST_NUMBER)]
+#: A number in a path or a body, as of a run or of a tree.
+Number = Annotated[int, Field(ge=0, le=LARGEST_NUMBER)]
 #: A name that the server looks up, as of a parameter.
 Word = Annotated[str, Field(max_length=100)]
 #: A parameter's value. The bounds of each parameter are checked by its declaration.
@@ -87,18 +84,22 @@ def invalid_reply(errors: Sequence[Any]) -> Response:
     return error_reply(422, f"the request does not fit: {'.'.join(place)}: {words}".replace(": :", ":"))
 
 
-def file_reply(text: str, filename: str, media_type: str = "text/csv") -> Response:
-    """Return a text that the browser saves as a file; UTF-8, not cached.
+def text_reply(text: str, filename: str, media_type: str = "text/csv") -> Response:
+    """Return a text, in UTF-8, that the browser saves as a file; arguments as in `bytes_reply`, the type
+    without the character set."""
+    return bytes_reply(text.encode(), f"{media_type}; charset=utf-8", filename)
+
+
+def bytes_reply(content: bytes, media_type: str = "application/octet-stream", filename: str = "") -> Response:
+    """Return bytes that are not cached.
 
     Args:
-        text: Contents.
-        filename: Name of the file; without quotes or characters beyond ASCII.
-        media_type: Type without the character set.
+        content: Contents.
+        media_type: Their type.
+        filename: Name under which the browser saves them, without quotes or characters beyond ASCII; empty
+            to show them.
     """
-    headers = {"Content-Disposition": f'attachment; filename="{filename}"', "Cache-Control": "no-store"}
-    return Response(text, 200, headers, media_type=f"{media_type}; charset=utf-8")
-
-
-def block_reply(content: bytes) -> Response:
-    """Return a binary block, see `app.dashboard.payload.packed`."""
-    return Response(content, 200, {"Cache-Control": "no-store"}, media_type="application/octet-stream")
+    reply = Response(content, 200, {"Cache-Control": "no-store"}, media_type=media_type)
+    if filename:
+        reply.headers["Content-Disposition"] = f'attachment; filename="{filename}"'
+    return reply

@@ -13,7 +13,7 @@ import socket
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from pathlib import Path
 
 import uvicorn
@@ -21,10 +21,10 @@ from starlette.types import ASGIApp
 
 from app.common.settings import DEFAULT_PORT, Settings
 from app.dashboard.parameters import ParameterState
-from app.web.app import build
 from app.web.auth import new_token, viewer_token
 from app.web.http_protocol import HttpProtocol
 from app.worker.protocol import Open
+from app.worker.supervisor import WorkerProcess
 from pipeline.errors import StemmapError
 
 _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="referrer" content="no-referrer">
@@ -35,8 +35,8 @@ _PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><meta name="refe
 
 @contextlib.contextmanager
 def page_that_leads_to(link: str) -> Iterator[Path]:
-    """Create a file that redirects a browser to a link, readable only by its owner; remove it at the end of
-    the context.
+    """Yield the path of an HTML file that redirects a browser to a link, readable only by its owner; it is
+    removed at the end of the context.
 
     Command-line arguments are visible to all users of a machine, so the link with its token is not passed to
     the browser.
@@ -63,8 +63,12 @@ _PORTS_TRIED = 10
 # A small send buffer: data that waits in the kernel for a slow link is outdated when it arrives.
 _SEND_BUFFER = 128 * 1024
 _GRACE_S = 1
-# Messages of uvicorn about a client that sends no HTTP, or whose websocket is refused.
-_OF_REFUSED = ("Invalid HTTP request", "ASGI callable returned without completing handshake")
+# Messages of uvicorn about one client, which sends no HTTP, is refused, or does not read at the end.
+_OF_CLIENTS = (
+    "Invalid HTTP request",
+    "ASGI callable returned without completing handshake",
+    "Cancel %s running task(s), timeout graceful shutdown exceeded",
+)
 _OF_THE_PORT = (errno.EADDRINUSE, errno.EACCES)
 _OTHER_HOST = "Give an address of this machine with --host, or omit it"
 
@@ -90,19 +94,27 @@ def serve(
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
     """
-    return run_server(
-        settings,
-        lambda port, token: build(
-            settings, port=port, token=token, source=source, parameter_state=parameter_state
-        ),
-        open_browser=open_browser,
-        viewer=viewer,
-    )
+
+    async def make_app(port: int, token: str) -> ASGIApp:
+        worker = WorkerProcess()
+        await worker.spawn()  # first: it imports its modules while this process imports those of the page
+        from app.web.app import build
+
+        return build(
+            settings,
+            port=port,
+            token=token,
+            source=source,
+            parameter_state=parameter_state,
+            make_worker=lambda: worker,
+        )
+
+    return run_server(settings, make_app, open_browser=open_browser, viewer=viewer)
 
 
 def run_server(
     settings: Settings,
-    make_app: Callable[[int, str], ASGIApp],
+    make_app: Callable[[int, str], Awaitable[ASGIApp]],
     *,
     open_browser: bool,
     viewer: bool,
@@ -112,7 +124,7 @@ def run_server(
 
     Args:
         settings: Settings of the deployment; without a token a random one is used.
-        make_app: Called on the event loop with port and token; returns the application.
+        make_app: Awaited with port and token; returns the application.
         open_browser: Whether to open the page in the browser of this machine.
         viewer: Whether to print the view-only link.
 
@@ -126,7 +138,7 @@ def run_server(
         print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
 
     async def served() -> bool:
-        config, link = uvicorn_config(make_app(port, token), settings), link_of(settings, port, token)
+        config, link = uvicorn_config(await make_app(port, token), settings), link_of(settings, port, token)
         server = LinkedServer(config, settings, link, open_browser=open_browser)
         await server.serve(sockets=[listening])
         return server.started
@@ -148,8 +160,10 @@ def link_of(settings: Settings, port: int, token: str) -> str:
 
 
 def _is_of_this_server(record: logging.LogRecord) -> bool:
-    """Return whether a message of uvicorn is about this server, and not about a request that was refused."""
-    return not record.getMessage().startswith(_OF_REFUSED)
+    """Return whether a message of uvicorn is about this server, and not about a client. A request whose
+    answer is cancelled at the end is about its client, too."""
+    is_cancelled = record.exc_info is not None and isinstance(record.exc_info[1], asyncio.CancelledError)
+    return not is_cancelled and not str(record.msg).startswith(_OF_CLIENTS)
 
 
 def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:

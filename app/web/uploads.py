@@ -86,7 +86,7 @@ class Uploads:
             self._under_way -= 1
 
     async def _take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Receive a file; as `take`, without the limit of simultaneous uploads."""
+        """Receive a file; results and errors as in `take`, without the limit of simultaneous uploads."""
         free = await asyncio.to_thread(self._free)
         room = self._room(free)  # without an await in between, other uploads cannot take the same space
         if size > room:

@@ -12,7 +12,7 @@ import logging
 import math
 import socket
 from pathlib import Path
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 from urllib.parse import quote
 
 import msgspec
@@ -119,15 +119,6 @@ _PROTOCOLS = 4
 _TRY_AGAIN_LATER = 1013
 
 
-class ViserServer(Protocol):
-    """Port and secret of viser; the port may change when viser is restarted."""
-
-    @property
-    def port(self) -> int: ...
-
-    secret: str
-
-
 def client_page() -> Path:
     """Return the client page of the installed viser version."""
     import viser
@@ -137,10 +128,11 @@ def client_page() -> Path:
 
 async def bridge(
     browser: WebSocket,
-    viser: ViserServer,
     *,
+    port: int,
+    secret: str,
     user: str,
-    looks_only: bool = False,
+    looks_only: bool,
 ) -> None:
     """Carry messages between a browser and viser until one of them leaves, then close the websocket. If viser
     cannot be reached, the websocket is closed with 1013 before it is accepted, which is logged. Messages that
@@ -148,13 +140,13 @@ async def bridge(
 
     Args:
         browser: The websocket of the browser, not accepted yet.
-        viser: Port and secret of viser.
+        port, secret: Port of viser on 127.0.0.1, and the secret that it requires.
         user: Name of the person at the browser, to whom its changes are credited.
         looks_only: Whether the browser may move its own camera and nothing else.
     """
     protocols = [Subprotocol(p) for p in browser.scope["subprotocols"] if p.startswith("viser-v")]
     try:
-        upstream = await _connect(viser, user, protocols[:_PROTOCOLS])
+        upstream = await _connect(port, secret, user, protocols[:_PROTOCOLS])
     except (OSError, InvalidHandshake, TimeoutError) as error:
         _log.warning("the 3D scene cannot be reached: %s", error)
         await browser.close(_TRY_AGAIN_LATER)
@@ -167,11 +159,11 @@ async def bridge(
             await browser.close()
 
 
-async def _connect(viser: ViserServer, user: str, protocols: list[Subprotocol]) -> ClientConnection:
+async def _connect(port: int, secret: str, user: str, protocols: list[Subprotocol]) -> ClientConnection:
     """Return a connection to viser.
 
     Args:
-        viser: Port and secret of viser.
+        port, secret: Port of viser, and the secret that it requires.
         user: Name of the person.
         protocols: Subprotocols of the browser.
 
@@ -182,12 +174,12 @@ async def _connect(viser: ViserServer, user: str, protocols: list[Subprotocol]) 
     loopback.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _SOCKET_BUFFER)
     loopback.setblocking(False)
     try:
-        await asyncio.get_running_loop().sock_connect(loopback, ("127.0.0.1", viser.port))
+        await asyncio.get_running_loop().sock_connect(loopback, ("127.0.0.1", port))
         return await connect(
-            f"ws://127.0.0.1:{viser.port}/",
+            f"ws://127.0.0.1:{port}/",
             sock=loopback,
             subprotocols=protocols or None,
-            additional_headers={"X-Stemmap-Secret": viser.secret, "X-Stemmap-User": quote(user)},
+            additional_headers={"X-Stemmap-Secret": secret, "X-Stemmap-User": quote(user)},
             compression=None,
             max_size=_LARGEST_FROM_VISER,
             max_queue=_QUEUE,

@@ -99,8 +99,12 @@ class Cursor:
         return None if self._store is None else self._store.read(index)
 
     def again(self, index: int) -> Iterator[Step]:
-        """Yield the steps from an index on, from the store or else from the start of the source. The position
-        does not change."""
+        """Yield the steps from an index on, from the store or else by reading the source from its start. The
+        position does not change.
+
+        Raises:
+            SourceError: The source cannot be read.
+        """
         for number in count(index):
             step = self.stored(number)
             if step is None:
@@ -142,8 +146,8 @@ def _fingerprint(step: Step) -> int:
 
 
 def live_steps(source: LiveSource, chosen: ChosenOdometry, moving: Source) -> Iterator[Step | None]:
-    """Yield the steps of a live robot as they arrive, and None while none has arrived. An unreadable message
-    raises SourceError.
+    """Yield the steps of a live robot as they arrive, and None while no message waits, without end. An
+    unreadable message raises SourceError.
 
     Args:
         source: The robot.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path as FilePath
 
 import numpy as np
 
@@ -16,14 +15,15 @@ from app.batch.run_folder import NO_PATH
 from app.common.timers import Stopwatch
 from app.store.forests import kept_forests
 from app.worker.tree_numbers import TreeNumbers
+from pipeline.classification.column_extraction import BREAST
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.inventory import PARAMETERS, Inventory, PlotMap, finish
-from pipeline.inventory.cloud import CloudDescription, WholeCloud
-from pipeline.inventory.stem_tracing import BREAST
 from pipeline.inventory.terrain_raster import TerrainRaster
+from pipeline.io.block_file import LARGE
 from pipeline.io.readers.base import FileSource, SourceDescription
+from pipeline.types.clouds import CloudDescription, WholeCloud
 from pipeline.types.records import (
     Clusters,
     Detections,
@@ -85,7 +85,6 @@ class InventoryRun:
     Args:
         source: The cloud; `close` closes it.
         parameters: All parameters.
-        folder: Folder of the temporary file with the points; None for that of the system.
 
     Attributes:
         frame, confirmed_s: The map as a frame, and 0 for each of its trees [s]; None before it is complete.
@@ -101,14 +100,14 @@ class InventoryRun:
     cache_notice = ""
     preview: Trees | None = None
 
-    def __init__(self, source: CloudSource, parameters: Parameters, folder: FilePath | None = None) -> None:
+    def __init__(self, source: CloudSource, parameters: Parameters) -> None:
         self.source = source
         self.stopwatch = Stopwatch()
         self.frame: Frame | None = None
         self.confirmed_s: Float | None = None
         self.plot: PlotMap | None = None
         self.current = -1
-        self._inventory = Inventory(source.cloud, kept_forests(), folder)
+        self._inventory = Inventory(source.cloud, kept_forests(), LARGE)
         self._parameters = self._mapped_with = parameters
         self._numbers = TreeNumbers()
         self._job: Generator[float, None, PlotMap] | None = None
@@ -136,6 +135,10 @@ class InventoryRun:
             return np.zeros((0, 3), np.float32)
         return self.plot.points[:, [0, 1, 3]].astype(np.float32)
 
+    def take_views(self) -> list[tuple[int, Float]]:
+        """Return nothing: what a whole cloud observed is its ground."""
+        return []
+
     @property
     def known(self) -> int:
         """Number of scans that were read."""
@@ -146,7 +149,7 @@ class InventoryRun:
         return 0 if self.current < 0 else None
 
     def index_at(self, stamp_ns: int) -> int | None:
-        """Return the index of the only scan."""
+        """Return 0, the index of the only scan."""
         del stamp_ns
         return 0
 
@@ -211,7 +214,7 @@ class InventoryRun:
         return self.frame, dict.fromkeys(self.frame.trees.number.tolist(), 0.0)
 
     def map_again(self) -> Frame | None:
-        """Return the present frame."""
+        """Return the present frame; None before the map is complete."""
         return self.frame
 
     def map_with(self, sets: Sequence[Parameters]) -> list[Frame]:

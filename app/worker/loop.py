@@ -179,10 +179,11 @@ class WorkerLoop:
         return command
 
     def _await_command(self) -> protocol.ToWorker | None:
-        """Wait for the next command until the next scan is due; report at intervals that the worker is alive.
+        """Wait for the next command until work is due, see `_patience`, and return it; None ends the worker.
+        Report at intervals that the worker is alive.
 
         Raises:
-            queue.Empty: A scan is due.
+            queue.Empty: Work is due.
         """
         while (patience_s := self._patience()) is not None and patience_s > _HEARTBEAT_S:
             with contextlib.suppress(queue.Empty):
@@ -191,7 +192,8 @@ class WorkerLoop:
         return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
-        """Return the time until work is due [s]: 0 while a rerun works, else as `_due_in`."""
+        """Return the time until work is due [s]: 0 while a rerun works, else as `_due_in`; None if only a
+        command can start work."""
         return 0.0 if self._session.is_remapping else self._due_in()
 
     def _due_in(self) -> float | None:
@@ -288,7 +290,8 @@ class WorkerLoop:
             self._send_opened(opened)
 
     def _play(self) -> None:
-        """Continue the run; a run that was opened again is announced as the next run."""
+        """Continue the run; a run that was opened again is announced as the next run. Raises SourceError if
+        it cannot be read."""
         self._held = False
         opened_again = self._session.play()
         if opened_again is not None:
@@ -327,7 +330,8 @@ class WorkerLoop:
 
     def compiling(self) -> None:
         """Report that the mapping waits for the compilation of a kernel; called during the compilation. The
-        status "playing" becomes "waiting"; further calls report the progress at intervals of _HEARTBEAT_S."""
+        status "playing" becomes "waiting"; further calls report the progress at intervals of _HEARTBEAT_S.
+        Before the first status nothing is reported."""
         self._session.disturb()
         now = self._clock()
         if now > self._compiled_at + _COMPILES_ON_S:
@@ -362,7 +366,11 @@ class WorkerLoop:
             self._put(protocol.Shown(self._run, session.time_s, frame, 0, path, session.confirmed_s))
 
     def _report(self) -> None:
-        """Queue the present status."""
+        """Queue the views that were not sent yet, and the present status with speed, rate and scans behind.
+        Before the preparation the state is "starting"; a seek that takes long is named in `detail`."""
+        run = self._session.run
+        for stamp_ns, free in () if run is None else run.take_views():
+            self._put(protocol.View(self._run, stamp_ns, free))
         now = self._clock()
         if self._session.pace not in ("idle", "live") and not self._prepared:
             # Nothing plays yet: the first scan is read and the kernels are compiled before.
@@ -503,7 +511,8 @@ class ReplayClock:
 
     def delay(self, stamp_ns: int, now: float) -> float:
         """Return the time until the scan of `stamp_ns` is due [s], at most `LONGEST_DELAY_S`; 0 if it is
-        late. Without an anchor, the scan becomes the anchor."""
+        late, and at maximum speed. Without an anchor, the scan becomes the anchor, unless the speed is
+        maximal."""
         if self.speed == 0.0:
             return 0.0
         if self._anchor is None:

@@ -1,7 +1,8 @@
 """Compilation of the kernels of the mapper before the first scan.
 
-Two processes compile them: `python -m app.worker.numba_warmup map_scene` begins with the front end, while
-`... warm_tree_map` compiles SLAM and the filters of the trees, which the first one then finds in the cache.
+Two processes compile them: `python -m app.worker.numba_warmup map_scene` maps a scene and begins with the
+front end, while `... warm_tree_map` compiles SLAM and the filters of the trees, which the first one then
+finds in the cache.
 """
 
 from __future__ import annotations
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
 
 #: Longest wait for another process that compiles. Kernels that are compiled until then are cached.
 PATIENCE_S = 1800.0
-_HALVES = ("map_scene", "warm_tree_map")
+_PROGRAMS = ("map_scene", "warm_tree_map")
 _POLL_S = 0.2
-_KERNELS = 238  # that both halves compile; only the displayed progress depends on it
+_KERNELS = 238  # that both programs compile; only the displayed progress depends on it
 
 
 def compile_ahead() -> None:
@@ -37,7 +38,7 @@ def compile_ahead() -> None:
     Kernels that remain uncompiled, also after errors of the processes, are compiled at their first call.
     While another process of the user compiles, it waits for up to half an hour.
     """
-    if _cores() < len(_HALVES) or is_compiled():
+    if _cores() < len(_PROGRAMS) or is_compiled():
         return
     with _one_at_a_time():
         if not is_compiled():  # another process may have compiled them meanwhile
@@ -45,7 +46,7 @@ def compile_ahead() -> None:
 
 
 def is_compiled() -> bool:
-    """Return whether the kernels of both halves are cached for the current sources."""
+    """Return whether the kernels of both programs are cached for the current sources."""
     from pipeline.jit import is_kept
     from pipeline.tracking.track_classification import classify, nearest_other
 
@@ -53,7 +54,7 @@ def is_compiled() -> bool:
 
 
 def compiled_share() -> float:
-    """Return the share of the kernels of both halves that are cached for the current sources, from 0 to 1."""
+    """Return the share of the kernels of both programs that are cached for the current sources, 0 to 1."""
     from pipeline.jit import count_kept
 
     return min(1.0, count_kept() / _KERNELS)
@@ -64,20 +65,20 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count() or 1
 
 
-def _start(half: str) -> BlockingChildProcess:
-    """Start the process that compiles a half, one of `_HALVES`."""
-    return BlockingChildProcess(python_module("app.worker.numba_warmup", half))
+def _start(program: str) -> BlockingChildProcess:
+    """Start the process that runs one of `_PROGRAMS`."""
+    return BlockingChildProcess(python_module("app.worker.numba_warmup", program))
 
 
 def _compile() -> None:
-    """Compile both halves in processes of their own and wait for them, at most PATIENCE_S; then they are
+    """Run both programs in processes of their own and wait for them, at most PATIENCE_S; then they are
     ended."""
     from pipeline.jit import others_compile
 
     with contextlib.ExitStack() as stack:
         children = []
-        for half in _HALVES:
-            children.append(_start(half))
+        for program in _PROGRAMS:
+            children.append(_start(program))
             stack.callback(children[-1].end)
         until_s = time.monotonic() + PATIENCE_S
         while any(child.returncode is None for child in children) and time.monotonic() < until_s:

@@ -124,7 +124,9 @@ class Outbox:
         return Report(replace(report.status, warnings=[*report.status.warnings, self._refused]))
 
     def _next(self) -> FromWorker | None:
-        """Wait for the next message to send; None after `close`, when nothing waits."""
+        """Wait for the next message to send; None after `close`, when nothing waits. A frame waits for
+        _SHORTEST_PAUSE_S after the one before and for other messages, but not for the status of a run that
+        does not play."""
         with self._changed:
             while True:
                 if self._messages and (self._picture is None or not _is_standing(self._messages[0])):
@@ -169,28 +171,13 @@ def _replaces(newer: FromWorker, older: FromWorker) -> bool:
 
 
 def path_columns(path: Path) -> list[np.ndarray]:
-    """Return the columns of a path, in the order of its fields."""
+    """Return the columns of a path, shape (N,) each, in the order of its fields; not copies."""
     return [getattr(path, name) for name in Path.__slots__]
 
 
 def rows_in_common(old: Path, new: Path) -> int:
     """Return the number of equal leading rows of two paths."""
     return min(map(first_difference, path_columns(old), path_columns(new)))
-
-
-def joined(old: Path | None, start: int, tail: Path) -> Path:
-    """Return a path whose rows from `start` onwards are replaced by others; only `tail` without an old path
-    or with start 0.
-
-    Args:
-        old: The path; None for none. It is not changed.
-        start: Number of its rows that stay.
-        tail: Rows that follow.
-    """
-    if old is None or start == 0:
-        return tail
-    columns = zip(path_columns(old), path_columns(tail), strict=True)
-    return Path(*(np.concatenate([before[:start], rest]) for before, rest in columns))
 
 
 MOST_POINTS = 200_000

@@ -1,6 +1,6 @@
-"""The process that owns the source and the mapper: `python -m app.worker.process [FOLDER]`.
+"""The process that owns the source and the mapper: `python -m app.worker.process`.
 
-The scan caches are stored in the folder. Commands arrive on stdin and messages are written to stdout, both
+Commands arrive on stdin and messages are written to stdout, both
 encoded by `app.worker.protocol`. The process ends when stdin ends, so it never outlives the web process.
 """
 
@@ -12,7 +12,6 @@ import signal
 import sys
 import threading
 from functools import cache
-from pathlib import Path
 from typing import BinaryIO
 
 from app.common.child_process import private_streams
@@ -25,8 +24,8 @@ from app.worker.outbox import Outbox
 from app.worker.protocol import ToWorker, WireError, to_worker
 from app.worker.session import Session
 from pipeline.config import Parameters
+from pipeline.io.readers import is_cloud
 from pipeline.io.readers.base import Source, SourceOptions
-from pipeline.io.readers.clouds import is_cloud
 from pipeline.jit import on_compiling
 
 # A scan that is being mapped, or a large file that is being opened, may take a moment to notice. A robot is
@@ -34,13 +33,9 @@ from pipeline.jit import on_compiling
 _GRACE_S, _LIVE_GRACE_S = 1.0, 9.0
 
 
-def new_session(folder: Path | None = None) -> Session:
-    """Return a session that uses the real pipeline, for the worker and for commands that map in this process.
-
-    Args:
-        folder: Folder of the scan caches, which the next opening of a recording uses again; None for
-            temporary caches.
-    """
+def new_session() -> Session:
+    """Return a session that uses the real pipeline, for the worker and for commands that map in this
+    process."""
     from app.worker.mapper_factory import mapper_of
     from app.worker.numba_warmup import compile_ahead, warm_up
 
@@ -48,7 +43,6 @@ def new_session(folder: Path | None = None) -> Session:
         open_source=open_any_or_cloud,
         make_mapper=mapper_of,
         parameters=Parameters(),
-        folder=folder,
         compile_ahead=compile_ahead,
         warm_up=warm_up,
     )
@@ -132,4 +126,4 @@ def run_as_worker(session: Session) -> None:
 
 
 if __name__ == "__main__":
-    run_as_worker(new_session(Path(sys.argv[1]) if len(sys.argv) > 1 else None))
+    run_as_worker(new_session())

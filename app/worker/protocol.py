@@ -420,7 +420,21 @@ class Rough(msgspec.Struct, frozen=True, tag="rough"):
     trees: Trees
 
 
-FromWorker = Opened | Shown | Report | Answer | Remapped | Rough
+class View(msgspec.Struct, frozen=True, tag="view"):
+    """A scan for the observed area.
+
+    Attributes:
+        run: As in `Shown`.
+        stamp_ns: Its time [ns].
+        free: Free range by direction in the base frame [m].
+    """
+
+    run: int
+    stamp_ns: int
+    free: Float
+
+
+FromWorker = Opened | Shown | Report | Answer | Remapped | Rough | View
 Question = AskCluster | AskTree | AskCompare | AskCamera | AskTreePicture | AskSection
 ToWorker = Command | Begin | Question
 
@@ -431,10 +445,10 @@ LENGTH_BYTES = 4
 # A scan of 4 million points with all its layers, more than any sensor produces.
 LARGEST_MESSAGE = 128 * 1024 * 1024
 _DTYPES = frozenset({"<f4", "<f8", "<i4", "<i8", "|b1"})
-_MOST_DIMENSIONS = 3
+_MOST_DIMENSIONS = 4
 
 
-class WireError(Exception):
+class WireError(ValueError):
     """A message is too large, incomplete, or of an unexpected type."""
 
 
@@ -450,7 +464,8 @@ class MessageCodec(Generic[M]):
     """Encodes and decodes the messages of one direction.
 
     Args:
-        message_type: A union of msgspec Structs with tags; fields may be dataclasses with arrays.
+        message_type: A union of msgspec Structs with tags, or one type; fields may be dataclasses with
+            arrays.
     """
 
     def __init__(self, message_type: Any) -> None:  # noqa: ANN401 - a union is no `type`
@@ -465,6 +480,7 @@ class MessageCodec(Generic[M]):
         Raises:
             WireError: It is larger than LARGEST_MESSAGE, or has an array of a dtype or number of dimensions
                 that cannot be sent.
+            NotImplementedError: It has a value of a type that cannot be sent.
         """
         packed = bytearray(LENGTH_BYTES)
         self._encoder.encode_into(message, packed, LENGTH_BYTES)
@@ -533,7 +549,7 @@ def _read_exactly(stream: BinaryIO, size: int) -> bytes:
 
 
 def _to_plain(value: object) -> object:
-    """Return an array or NumPy scalar as msgpack encodes it.
+    """Return an array as dtype, shape and bytes (see `_EncodedArray`), a NumPy scalar as a Python number.
 
     Raises:
         WireError: The array has a dtype or number of dimensions that cannot be sent.
@@ -557,7 +573,8 @@ def _from_plain(expected: Any, plain: object) -> object:  # noqa: ANN401 - the h
         plain: Decoded msgpack.
 
     Raises:
-        ValueError: dtype or shape differ from the declaration or from the number of bytes.
+        ValueError, msgspec.ValidationError: `plain` is no encoded array, has another dtype than the declared
+            type, more than four dimensions, or a shape that contradicts the number of bytes.
         NotImplementedError: The declared type is not an array.
     """
     if getattr(expected, "__origin__", None) is not np.ndarray:

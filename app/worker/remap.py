@@ -8,22 +8,22 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
 from app.explain.history import TreeHistory
 from app.worker.frame_store import FrameStore
-from app.worker.protocol import MapChanges, TreeChange
+from app.worker.protocol import LENGTH_BYTES, MapChanges, MessageCodec, TreeChange, WireError
 from app.worker.tree_numbers import SAME
 from pipeline.config import Parameters
 from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
+from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
 from pipeline.remapping import ClusterTable, Rerun
 from pipeline.remapping.rerun import Segment
-from pipeline.slam import Genealogy, KeyframeGraph
 from pipeline.types.records import Columns, Float, Frame, Step, Trees, Verdict
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
@@ -38,9 +38,10 @@ class RunMap:
         mapper: A mapper before its first scan.
         parameters: Parameters from the first scan onwards.
         start_ns: Returns the time of the first scan [ns].
-        frames: Stores the frames; None stores none.
+        is_live: Whether the run cannot go back; then neither states nor frames are stored.
 
     Attributes:
+        frames: The stored frames; None for a live run.
         before: State of the mapper before the current scan.
         snapshots: Earlier states of the mapper.
         history: Estimate of each tree over time.
@@ -53,12 +54,14 @@ class RunMap:
         mapper: Mapper,
         parameters: Parameters,
         start_ns: Callable[[], int],
-        frames: FrameStore | None = None,
+        *,
+        is_live: bool = False,
     ) -> None:
-        self.mapper, self.frames = mapper, frames
+        self.mapper = mapper
+        self.frames = None if is_live else FrameStore()
         self.parameters = ParameterHistory(parameters)
         self.before = mapper.snapshot()
-        self.snapshots = Snapshots(self.before)
+        self.snapshots = Snapshots(self.before, 0 if is_live else _MOST_STATES)
         self.history, self.clusters = TreeHistory(), ClusterTable()
         self.confirmed_s: dict[int, float] = {}
         self._start_ns, self._time_s = start_ns, -math.inf
@@ -101,7 +104,8 @@ class RunMap:
         return changes
 
     def close(self) -> None:
-        """Delete the stored frames."""
+        """Delete the stored states and frames."""
+        self.snapshots.close()
         if self.frames is not None:
             self.frames.close()
 
@@ -177,39 +181,30 @@ class MapComparison:
 S = TypeVar("S")
 
 _SPACING = 50
-_MOST_STATES = 40
-_MOST_BYTES = 256 << 20
-
-
-def nbytes(state: object) -> int:
-    """Return the number of bytes of all arrays in nested dataclasses, lists and tuples; 0 for other
-    values."""
-    if isinstance(state, np.ndarray | Genealogy | KeyframeGraph):
-        return state.nbytes
-    if isinstance(state, list | tuple):
-        return sum(map(nbytes, state))
-    if is_dataclass(state):
-        return sum(nbytes(getattr(state, field.name)) for field in fields(state))
-    return 0
+_MOST_STATES = 20
 
 
 class Snapshots(Generic[S]):
-    """States of the mapper by the number of scans they contain (0: before the first scan).
+    """States of the mapper by the number of scans they contain (0: before the first scan), in temporary
+    files.
 
-    At most 40 states and 256 MB are kept: beyond that, every second state is dropped and the spacing doubles,
-    so that the memory is bounded for a run of any length. The first state is always kept.
+    Beyond the largest number of states, every second one is dropped and the spacing doubles. The first state
+    is in memory. A state that the disk refuses is not stored.
 
     Args:
         start: State before the first scan.
+        most: Largest number of states after it; 0 for a run that cannot go back.
     """
 
-    def __init__(self, start: S) -> None:
-        self._states: dict[int, S] = {0: start}
-        self._sizes: dict[int, int] = {0: nbytes(start)}
+    def __init__(self, start: S, most: int = _MOST_STATES) -> None:
+        self._start, self._most = start, most
+        self._codec: MessageCodec[S] = MessageCodec(type(start))
+        self._files: dict[int, BlockFile] = {}
         self._spacing = _SPACING
 
     def offer(self, scans: int, state: S) -> None:
-        """Store a state if `is_due`.
+        """Store a state if `is_due`; nothing if it is too large or the disk is full. Above the greatest
+        number of states, those at every second place are dropped and the distance doubles.
 
         Args:
             scans: Number of scans that the state contains.
@@ -217,31 +212,43 @@ class Snapshots(Generic[S]):
         """
         if not self.is_due(scans):
             return
-        self._states[scans], self._sizes[scans] = state, nbytes(state)
-        while len(self._states) > 1 and self._are_too_many():
+        self._files[scans] = file = BlockFile()
+        try:
+            is_stored = file.put_block(0, self._codec.encode(state)[LENGTH_BYTES:])
+        except WireError:  # it is too large
+            is_stored = False
+        if not is_stored:
+            self._keep(lambda n: n != scans)
+        if len(self._files) > self._most:
             self._spacing *= 2
-            self._states = {n: s for n, s in self._states.items() if n % self._spacing == 0}
-
-    def _are_too_many(self) -> bool:
-        """Return whether the states exceed their number or memory."""
-        return (
-            len(self._states) > _MOST_STATES or sum(map(self._sizes.__getitem__, self._states)) > _MOST_BYTES
-        )
+            self._keep(lambda n: n % self._spacing == 0)
 
     def is_due(self, scans: int) -> bool:
         """Return whether `offer` would store a state with this number of scans: a multiple of the spacing
         that is not stored yet."""
-        return scans % self._spacing == 0 and scans not in self._states
+        return self._most > 0 and scans > 0 and scans % self._spacing == 0 and scans not in self._files
 
     def newest(self, scans: int) -> tuple[int, S]:
-        """Return the newest state with at most this number of scans (0 or more), as (number of scans,
-        state)."""
-        best = max(n for n in self._states if n <= scans)
-        return best, self._states[best]
+        """Return the newest state with at most this number of scans (0 or more), as (number of scans, state).
+        A stored state that cannot be read is skipped; 0 and the first state are left."""
+        for n in sorted((n for n in self._files if n <= scans), reverse=True):
+            state = self._files[n].read_block(0, self._codec.decode)
+            if state is not None:
+                return n, state
+        return 0, self._start
 
     def forget_after(self, scans: int) -> None:
         """Drop the states that contain more than this number of scans."""
-        self._states = {n: s for n, s in self._states.items() if n <= scans}
+        self._keep(lambda n: n <= scans)
+
+    def close(self) -> None:
+        """Delete the files."""
+        self._keep(lambda _: False)
+
+    def _keep(self, which: Callable[[int], bool]) -> None:
+        """Drop the states for whose number of scans `which` is False."""
+        for scans in [n for n in self._files if not which(n)]:
+            self._files.pop(scans).close()
 
 
 class ParameterHistory:
@@ -318,7 +325,8 @@ def changes_between(
     time_s: float,
     confirmed_s: Mapping[int, float],
 ) -> MapChanges:
-    """Return the differences between two maps of the same scans.
+    """Return the differences between the confirmed trees of two maps of the same scans. Trees within SAME are
+    the same one; it has moved if its positions differ by more than MOVED.
 
     Args:
         before: Last scan in the old map.
@@ -330,17 +338,18 @@ def changes_between(
     old, new = np.flatnonzero(before.trees.confirmed), np.flatnonzero(after.trees.confirmed)
     old_at, new_at = before.trees.position[old], after.trees.position[new]
     old_of = match(new_at, old_at, SAME)
-    stayed = [(k, int(row)) for k, row in enumerate(old_of.tolist()) if row >= 0]
-    gone = sorted(set(range(len(old))) - {row for _, row in stayed})
-    changes = [
-        *(_came(before, after.trees, int(new[k])) for k, row in enumerate(old_of.tolist()) if row < 0),
-        *(_went(before.trees, int(old[row]), after) for row in gone),
-        *(
-            _moved(after.trees, int(new[k]), float(np.hypot(*(new_at[k] - old_at[row]))))
-            for k, row in stayed
-            if np.hypot(*(new_at[k] - old_at[row])) > MOVED
-        ),
-    ]
+    changes: list[TreeChange] = []
+    for k, row in enumerate(old_of.tolist()):
+        moved = 0.0 if row < 0 else float(np.hypot(*(new_at[k] - old_at[row])))
+        if row < 0:
+            why = f"before: {_why_not(before, new_at[k])}"
+            changes.append(_change("appeared", after.trees, int(new[k]), why))
+        elif moved > MOVED:
+            changes.append(_change("moved", after.trees, int(new[k]), f"by {100 * moved:.0f} cm"))
+    for row in sorted(set(range(len(old))) - set(old_of.tolist())):
+        why = f"now: {_why_not(after, old_at[row])}"
+        changes.append(_change("vanished", before.trees, int(old[row]), why))
+    changes.sort(key=lambda change: ("appeared", "vanished", "moved").index(change.kind))
     dbh = before.trees.dbh[old]
     return MapChanges(
         revision=revision,
@@ -355,32 +364,6 @@ def changes_between(
         changes=changes,
         confirmed=sorted(confirmed_s.items(), key=lambda item: (item[1], item[0])),
     )
-
-
-def _came(before: Frame, trees: Trees, row: int) -> TreeChange:
-    """Return the description of a tree that only the new map has.
-
-    Args:
-        before: Last scan in the old map.
-        trees, row: Trees of the new map, and the row of the tree.
-    """
-    place = trees.position[row]
-    return _change("appeared", trees, row, f"before: {_why_not(before, place)}")
-
-
-def _went(trees: Trees, row: int, after: Frame) -> TreeChange:
-    """Return the description of a tree that only the old map has.
-
-    Args:
-        trees, row: Trees of the old map, and the row of the tree.
-        after: The same scan in the new map.
-    """
-    return _change("vanished", trees, row, f"now: {_why_not(after, trees.position[row])}")
-
-
-def _moved(trees: Trees, row: int, distance: float) -> TreeChange:
-    """Return the description of a tree of the new map that moved by a distance [m]."""
-    return _change("moved", trees, row, f"by {100 * distance:.0f} cm")
 
 
 def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: int, why: str) -> TreeChange:
@@ -422,7 +405,7 @@ def _why_not(frame: Frame, place: Float) -> str:
 
 
 def _column(columns: Columns, row: int) -> str:
-    """Return the verdict of a column as text; "" for a tree."""
+    """Return the verdict of a column as text, with its share of votes for a tree; "" for a tree."""
     verdict = Verdict(int(columns.verdict[row]))
     if verdict is Verdict.TREE:
         return ""

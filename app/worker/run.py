@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path as FilePath
 
 import msgspec
 
@@ -18,7 +17,7 @@ from app.explain.records import History
 from app.robot.source import LiveSource
 from app.sources.request import with_odometry
 from app.worker.cursor import Cursor, live_steps
-from app.worker.frame_store import FrameStore, StepStore
+from app.worker.frame_store import StepStore
 from app.worker.protocol import Shown
 from app.worker.remap import (
     NOT_OF_THE_MAP,
@@ -37,13 +36,11 @@ from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import KnownMap, Rerun, ScanCaches, preview_trees, sample_scans
 from pipeline.stage_timer import StageTimer
+from pipeline.stand.seen_area import ViewSelection
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
 #: Returns a mapper of a source for parameters and a seed, see `mapper_of`.
 MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
-_DISK = FilePath("/var/tmp")  # noqa: S108 - the default may be in memory; the files have no name
-#: Folder of large temporary files; None for the default.
-LARGE = _DISK if _DISK.is_dir() else None
 
 
 class Run:
@@ -95,16 +92,18 @@ class Run:
         self._caches = caches
         self._cache = caches.of(parameters)
         self._numbers = TreeNumbers()
+        self._views: list[tuple[int, Float]] = []
+        self._newest_ns = -1  # of the scans that were asked for a view
+        self._view_selection = ViewSelection()
         self._remapping: Remapping | None = None
         self._preview: Trees | None = None
 
     def _new_map(self, mapper: Mapper) -> RunMap:
         """Return an empty map of a mapper before its first scan."""
-        frames = None if self._is_live else FrameStore(LARGE)
-        return RunMap(mapper, mapper.parameters, lambda: self.start_ns, frames)
+        return RunMap(mapper, mapper.parameters, lambda: self.start_ns, is_live=self._is_live)
 
     def history(self, number: int, scan: int) -> History:
-        """Return the estimates of a tree up to a scan, see `TreeHistory.of`."""
+        """Return the estimates of a tree up to a scan, see `TreeHistory.of`; empty for an unknown number."""
         in_map = self._numbers.in_map(number)
         return self._map.history.of(-1 if in_map is None else in_map, scan)
 
@@ -118,7 +117,7 @@ class Run:
 
     @property
     def path(self) -> Path:
-        """The path up to the current scan."""
+        """The path up to the current scan; it has no rows before the first."""
         return self._map.mapper.path
 
     @property
@@ -133,8 +132,8 @@ class Run:
         return self._map.mapper.voxels
 
     def peek_ns(self) -> int | None:
-        """Return the time of the next scan [ns]; None at the end of the run, or before a live scan
-        arrived."""
+        """Return the time of the next scan [ns]; None at the end of the run, or before a live scan arrived.
+        Raises SourceError if nothing more can be read."""
         step = self._cursor.peek()
         return None if step is None else step.scan.stamp_ns
 
@@ -148,6 +147,7 @@ class Run:
 
         Raises:
             SourceError: Nothing more can be read.
+            StemmapError: The scan cannot be mapped; the mapper is broken until `approach`.
         """
         step = self._cursor.take()
         if step is None:
@@ -241,7 +241,19 @@ class Run:
         self.is_bare = cached is not None
         scan = mapper.segment(step) if cached is None else cached[1]
         self._cache.put(step, scan)
-        return mapper.process(step, scan)
+        frame = mapper.process(step, scan)
+        if frame.stamp_ns > self._newest_ns:
+            self._newest_ns = frame.stamp_ns
+            if self._view_selection.take(frame.estimate.T_map_base):
+                self._views.append((frame.stamp_ns, scan.free))
+        return frame
+
+    def take_views(self) -> list[tuple[int, Float]]:
+        """Return the time [ns] and the free range by direction [m], see `SegmentedScan.free`, of the scans
+        that are due for the observed area, and that were not returned before. A scan that is mapped again
+        gives no other view."""
+        taken, self._views = self._views, []
+        return taken
 
     def remap(self, parameters: Parameters) -> None:
         """Begin to map the run again from its first scan, in place of a rerun that is not complete, and
@@ -284,7 +296,7 @@ class Run:
     @property
     def remapped(self) -> float | None:
         """Share of the scans up to the current one that are mapped again, from 0 to 1; None without a
-        rerun."""
+        rerun, or if the mapper does not have the state after the current scan."""
         remapping = self._remapping
         if remapping is None or not self.is_whole:
             return None
@@ -298,7 +310,9 @@ class Run:
     @property
     def cache_notice(self) -> str:
         """Reason why scans are not cached, or cached scans are not used; empty if they are."""
-        return "; ".join(filter(None, (self._cache.refusal, self._cache.notice)))
+        cache = self._cache
+        first = f"scan {cache.refused} and possibly later scans are not cached: {cache.refusal}"
+        return "; ".join(filter(None, (cache.refusal and first, cache.notice)))
 
     def remap_next(self) -> tuple[Frame, dict[int, float]] | None:
         """Map the next scan of the rerun. After the last one the run continues with the new map, as if its
@@ -306,7 +320,8 @@ class Run:
 
         Returns:
             The current scan in the new map, and the time at which each tree was confirmed, by its number [s];
-            None while scans are left.
+            None while scans are left, without a rerun, and if the mapper does not have the state after the
+                current scan.
 
         Raises:
             StemmapError: A scan cannot be read again. The map does not change.
@@ -375,6 +390,9 @@ class Run:
         Args:
             index: Index of the scan; if it was not read yet, the scans from the last one that was read
                 onwards are mapped.
+
+        Raises:
+            SourceError: The run is live, and the state is not the present one.
         """
         scans, state = self._map.snapshots.newest(min(index, self._cursor.known))
         if not self._broken and self.current < index and scans <= self.current + 1:
@@ -385,7 +403,8 @@ class Run:
         self.current, self._step, self._broken = scans - 1, None, False
 
     def use(self, parameters: Parameters, index: int) -> bool:
-        """Use other parameters from the scan with an index onwards, see `RunMap.use`."""
+        """Use other parameters from the scan with an index onwards; return whether any value changes. No scan
+        is mapped."""
         return self._map.use(parameters, index)
 
     def close(self) -> None:
@@ -403,7 +422,6 @@ def open_run(
     seed: int,
     parameters: Parameters,
     make_mapper: MakeMapper,
-    folder: FilePath | None = None,
 ) -> tuple[Run, tuple[str, ...]]:
     """Return a run before its first scan, and warnings.
 
@@ -413,8 +431,6 @@ def open_run(
         seed: Random seed.
         parameters: Parameters from the first scan onwards.
         make_mapper: Returns a new mapper.
-        folder: Folder of scan caches that the next opening of the recording uses again; None deletes them
-            when the run is closed, as always for live runs and sources without a digest.
 
     Raises:
         SourceError: The odometry is not available for this source; the source is closed.
@@ -426,13 +442,9 @@ def open_run(
         raise
     stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
     description = source.description
-    if folder is None or live is not None or not description.digest:
-        caches = ScanCaches(LARGE)
-    else:
-        caches = ScanCaches(folder, f"{description.digest}\n{description.uri}\n{chosen.words}\n{seed}")
     if live is None:
         cursor = Cursor(
-            lambda: steps(moving.records(None), odometry=chosen.steps), description.uri, StepStore(LARGE)
+            lambda: steps(moving.records(None), odometry=chosen.steps), description.uri, StepStore()
         )
     else:
         cursor = Cursor(lambda: live_steps(live, chosen, moving), description.uri)
@@ -443,7 +455,7 @@ def open_run(
         parameters,
         stopwatch,
         chosen.words,
-        caches,
+        ScanCaches(),
         is_live=live is not None,
     )
     return run, (*description.warnings, *([chosen.warning] if chosen.warning else []))

@@ -21,7 +21,7 @@ from app.robot.source import LiveSource
 from app.worker.inventory_run import CloudSource, InventoryRun
 from app.worker.protocol import LONGEST_S, CameraPicture, CloudFrame, MapChanges, Opened, Shown, State, Status
 from app.worker.remap import MapComparison
-from app.worker.run import LARGE, MakeMapper, Run, open_run
+from app.worker.run import MakeMapper, Run, open_run
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
 from pipeline.inventory import PARAMETERS
@@ -49,7 +49,6 @@ class Session:
         open_source: Opens a source by its URI and options.
         make_mapper: Returns a new mapper.
         parameters: Parameters at the beginning.
-        folder: Folder of the scan caches, see `open_run`.
         compile_ahead: Compiles the kernels that are not compiled on this machine yet.
         warm_up: Loads the kernels; called while a robot is already received and recorded.
 
@@ -63,14 +62,13 @@ class Session:
         open_source: OpenSource,
         make_mapper: MakeMapper,
         parameters: Parameters,
-        folder: FilePath | None = None,
         compile_ahead: Callable[[], None] = lambda: None,
         warm_up: Callable[[], None] = lambda: None,
     ) -> None:
         self._open_source = open_source
         self._warm_up = warm_up
         self._compile_ahead = compile_ahead
-        self._make_mapper, self._folder = make_mapper, folder
+        self._make_mapper = make_mapper
         self._parameters = parameters
         self._revision = 0
         self._requested: tuple[str, str, int] | None = None
@@ -103,23 +101,21 @@ class Session:
     def frame(self) -> Frame | None:
         """Frame of the current scan, or of the sought scan if it was mapped; None without a run, or before
         its first scan."""
-        if self._kept is not None:
-            return self._kept.frame
-        return self._run.frame if self._run else None
+        shown = self._kept or self._run
+        return shown.frame if shown else None
 
     @property
     def path(self) -> Path | None:
         """Path up to the scan of `frame`, without rows before its first scan; None without a run."""
-        if self._kept is not None:
-            return self._kept.path
-        return self._run.path if self._run else None
+        shown = self._kept or self._run
+        return shown.path if shown else None
 
     @property
     def confirmed_s(self) -> Float | None:
-        """Confirmation time of each tree of `frame` [s since the first scan]; None without a frame."""
-        if self._kept is not None:
-            return self._kept.confirmed_s
-        return self._run.confirmed_s if self._run else None
+        """Confirmation time of each tree of `frame`, shape (T,) [s since the first scan], NaN for trees that
+        never were confirmed; None without a frame."""
+        shown = self._kept or self._run
+        return shown.confirmed_s if shown else None
 
     @property
     def is_shown(self) -> bool:
@@ -139,7 +135,7 @@ class Session:
 
     def next_ns(self) -> int | None:
         """Return the time of the next scan [ns]; None without a run, at the end of the run, or before a live
-        scan arrived."""
+        scan arrived. Raises SourceError if nothing more can be read."""
         return self._run.peek_ns() if self._run else None
 
     def open(
@@ -166,7 +162,7 @@ class Session:
         Raises:
             SourceError: It cannot be read.
         """
-        self._leave()
+        self.close()
         self._requested = uri, odometry, seed
         self._open_again = lambda: self.open(uri, odometry, seed, record, publish=publish, options=options)
         source = self._open_source(uri, replace(options or SourceOptions(), seed=seed))
@@ -206,22 +202,20 @@ class Session:
         """
         warnings: tuple[str, ...]
         if isinstance(source, CloudSource):
-            self._run = InventoryRun(source, self._parameters, LARGE)
+            self._run = InventoryRun(source, self._parameters)
             warnings = source.description.warnings
         else:
-            self._run, warnings = open_run(
-                source, odometry, seed, self._parameters, self._make_mapper, self._folder
-            )
+            self._run, warnings = open_run(source, odometry, seed, self._parameters, self._make_mapper)
         self._state, self._detail = "paused", ""
         self._warn(warnings)
         return opened_of(self._run)
 
     def prepare(self) -> None:
-        """Compile the kernels and prepare the first scan, which can take a minute the first time on a
-        machine. Nothing without a run.
+        """Compile the kernels by mapping the first scan, whose result is discarded. It can take minutes the
+        first time on a machine. Nothing without a run, and for a whole cloud.
 
         Raises:
-            SourceError: There is no scan.
+            SourceError: There is no scan, or it cannot be read.
         """
         if isinstance(self._run, Run):
             self._compile_ahead()
@@ -229,7 +223,8 @@ class Session:
             stories.warm_up(self._run.source.description.sensor)
 
     def disturb(self) -> None:
-        """Discard the current time measurement, since the mapping waits for something else."""
+        """Discard the time measurement of the scan that is mapped now, since the mapping waits for something
+        else. Nothing without a run."""
         if self._run is not None:
             self._run.stopwatch.disturb()
 
@@ -237,7 +232,11 @@ class Session:
         """Map the next scan and return its frame, or the frame of the seek target once it is reached.
 
         None if no run is open, if nothing is to be mapped (`pace` is "idle"), while a whole cloud is not
-        mapped completely, and at the end of the run, whose state then becomes "finished".
+        mapped completely, before a live scan arrived, and at the end of another run, whose state then becomes
+        "finished".
+
+        Raises:
+            StemmapError: Nothing more can be read, or the scan cannot be mapped.
         """
         run = self._run
         if run is None or self.pace == "idle":
@@ -259,7 +258,8 @@ class Session:
         return frame
 
     def play(self) -> Opened | None:
-        """Continue the run; at its end, play from the start. A failed run is opened again.
+        """Continue the run; at its end, play from the start. A failed or closed run is opened again. Nothing
+        before the first scan of a live robot, which plays when it arrives, and if nothing was ever opened.
 
         Returns:
             The run that was opened again, or None.
@@ -315,8 +315,8 @@ class Session:
         return self._show_kept(self._run)
 
     def _show_kept(self, run: AnyRun) -> Frame | None:
-        """Show the sought scan from its stored results, and return it. None if it is the current scan, is not
-        stored, or would be mapped with other parameters on arrival."""
+        """Show the sought scan from its stored results, and return it. None if its index is not known yet, it
+        is the current scan, is not stored, or would be mapped with other parameters on arrival."""
         index, self._kept = self._target.index, None
         if index is None or (index == run.current and run.is_whole):
             return None
@@ -327,7 +327,9 @@ class Session:
     def set_parameters(
         self, parameters: Parameters, revision: int, *, whole: bool = False, step: int | None = None
     ) -> Frame | None:
-        """Use other parameters from the next scan onwards; if paused, from the sought or the current scan.
+        """Use other parameters from the next scan onwards; if the run does not play, from the current scan.
+        During a seek they apply from its target onwards; without a run, to the run that is opened next. A
+        rerun that is not complete is cancelled.
 
         Args:
             parameters, revision: The parameters.
@@ -335,7 +337,8 @@ class Session:
             step: Changes with the same step are compared with the map before the first of them.
 
         Returns:
-            The current scan, mapped again, if the run is paused; else None.
+            The current scan, mapped again; None if the run plays, has failed or has no scan yet, and during a
+                seek.
         """
         self._parameters, self._revision = parameters, revision
         self._comparison.begin(step)
@@ -352,8 +355,7 @@ class Session:
         if self._robot is not None:
             self._robot.use_parameters(revision, from_scan, parameters)
         if whole and run.current >= 0:
-            run.remap(parameters)
-            self._send_preview(run)
+            self._begin_remapping(run)
         return run.map_again() if paused and self._state != "failed" else None
 
     @property
@@ -405,8 +407,8 @@ class Session:
             self._run.cancel_remapping()
 
     def status(self) -> Status:
-        """Return the status of the run. Its speed, scan rate and number of scans behind are those of a new
-        `Status`, because the loop knows them."""
+        """Return the status of the run, also if none is open. The loop knows its speed, its scan rate and,
+        unless it is live, its number of scans behind; here they have the defaults of `Status`."""
         run, robot = self._run, self._robot
         status = Status(
             state=self._state,
@@ -422,8 +424,16 @@ class Session:
         return status if robot is None else with_robot(status, robot)
 
     def close(self) -> None:
-        """Close the run or the robot, if one is open."""
-        self._leave()
+        """Close the run or the robot, if one is open, and forget seek, warnings and comparison. The state
+        stays."""
+        owner = self._run or self._robot
+        if owner is not None:
+            owner.close()
+        self._run, self._robot, self._comparison = None, None, MapComparison()
+        self._remaps_on_arrival = False
+        self._warnings.clear()
+        self._target.forget()
+        self._kept = None
 
     def end_recording(self) -> bool:
         """Finish the recording of a live run and return whether the run is live; callable from any thread."""
@@ -443,32 +453,23 @@ class Session:
         self._state, self._detail = "paused", ""
 
     def _arrive(self, run: AnyRun) -> Frame | None:
-        """Stop at the sought scan and return its frame; None before the first scan. Parameters that were
-        changed during the seek apply from this scan onwards."""
+        """End the seek and return the frame of the current scan; None before the first scan. The scan is
+        mapped again if its frame has no points. Parameters that were changed during the seek apply from this
+        scan onwards, and a rerun that was requested begins."""
         self._target.forget()
         self._kept = None
         changed = run.use(self._parameters, run.current)
         if self._remaps_on_arrival:
             self._remaps_on_arrival = False
-            run.remap(self._parameters)
-            self._send_preview(run)
+            self._begin_remapping(run)
         return run.map_again() if changed or run.is_bare else run.frame
 
-    def _send_preview(self, run: AnyRun) -> None:
-        """Call `on_preview` with the preview of a run, if there is one."""
+    def _begin_remapping(self, run: AnyRun) -> None:
+        """Begin to map a run again with the present parameters, and call `on_preview` with its preview, if
+        there is one."""
+        run.remap(self._parameters)
         if run.preview is not None:
             self.on_preview(self._revision, run.preview)
-
-    def _leave(self) -> None:
-        """Close the run or the robot and forget seek, warnings and comparison. The state stays."""
-        owner = self._run or self._robot
-        if owner is not None:
-            owner.close()
-        self._run, self._robot, self._comparison = None, None, MapComparison()
-        self._remaps_on_arrival = False
-        self._warnings.clear()
-        self._target.forget()
-        self._kept = None
 
     def _warn(self, warnings: Iterable[str]) -> None:
         """Add warnings, each once and the newest last; only the last 20 are kept."""
@@ -480,8 +481,8 @@ class Session:
 
 
 def with_robot(status: Status, robot: LiveSource) -> Status:
-    """Return the status with the fields of a live run: state, namespaces, waiting scans and recording of its
-    robot."""
+    """Return the status with the fields of a live run: namespaces, waiting scans and recording of its robot.
+    If the run plays or waits and the robot is silent, the state is "waiting" and `detail` has the reason."""
     # While scans wait the robot is not silent, even if its link had no time to note it during a compilation.
     is_asked = status.state in ("playing", "waiting") and not robot.scans_waiting
     silent = robot.waiting_for() if is_asked else ""
@@ -539,8 +540,8 @@ def _with_cloud(status: Status, run: InventoryRun) -> Status:
 
 
 def opened_of(run: AnyRun) -> Opened:
-    """Return the message for an opened source. Its length is None unless the source has a known begin and
-    end."""
+    """Return the message for an opened source, without `run` and `requested`. `end_s` is None unless the
+    source has a known begin and end."""
     description = run.source.description
     truth = run.source.truth()
     end_s = None
@@ -593,8 +594,13 @@ class SeekTarget:
         self._index, self._stamp_ns, self._under_way = None, None, False
 
     def set_out(self, run: AnyRun) -> None:
-        """Restore a state of the run before the target, once for each target. This happens when mapping
-        begins, so that targets that are replaced while the timeline is dragged cost nothing."""
+        """Restore a state of the run before the target, once for each target; nothing if the target is the
+        current scan. This happens when mapping begins, so that targets that are replaced while the timeline
+        is dragged cost nothing.
+
+        Raises:
+            SourceError: The run is live.
+        """
         if self._under_way or not self.sought:
             return
         self._under_way = True
@@ -634,7 +640,7 @@ class SeekTarget:
 
 
 def clock(seconds: float) -> str:
-    """Return a time [s] as minutes and seconds, for example "1:05"."""
+    """Return a time of 0 s or more as whole minutes and seconds, for example "1:05" or "75:00"."""
     whole = int(seconds)
     return f"{whole // 60}:{whole % 60:02d}"
 
@@ -645,7 +651,8 @@ def has_camera(description: SourceDescription) -> bool:
 
 
 def pictures_of(source: Source | None) -> PictureSource:
-    """Return the camera pictures of an open source; raises StemmapError without a source or a camera."""
+    """Return an open source as the reader of its camera pictures, without a wrapper for its odometry; raises
+    StemmapError without a source or a camera."""
     origin: object = source.source if isinstance(source, OdometryOverride) else source
     if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
         raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
@@ -685,7 +692,8 @@ def tree_picture(run: Run | InventoryRun | None, number: int) -> CameraPicture:
         number: Number of the tree.
 
     Raises:
-        StemmapError: The source has no camera or an unknown one, or no picture shows the tree.
+        StemmapError: Nothing is mapped, the source has no camera or an unknown one, or no picture shows the
+            tree.
     """
     frame = None if run is None else run.frame
     if run is None or frame is None:

@@ -11,12 +11,14 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
-from app.common.child_process import exit_reason, python_module
+from app.common.child_process import exit_reason, python_module, starved_s
 from app.common.timers import cancel
 from app.robot.address import is_live
 from app.worker import protocol
 
 WORKER = python_module("app.worker.process")
+
+OnMessage = Callable[[protocol.FromWorker], Awaitable[None]]
 
 _log = logging.getLogger(__name__)
 
@@ -55,11 +57,10 @@ class WorkerProcess:
     restarted until the next `Play` or `Open`.
 
     Args:
-        on_message: Awaited on the event loop for each message in turn; must not block it.
         command: Program and arguments of the process.
         clock: Returns the time [s] from any origin.
         opening_limit_s: Maximum time without a message while a source is being opened or kernels are compiled
-            [s].
+            [s]. Time in which the worker waits for a processor is not counted, here and below.
         silence_limit_s: Maximum time without a message while a run plays or a command is executed [s].
 
     Attributes:
@@ -68,16 +69,15 @@ class WorkerProcess:
 
     def __init__(
         self,
-        on_message: Callable[[protocol.FromWorker], Awaitable[None]],
         command: Sequence[str] = WORKER,
         clock: Callable[[], float] = time.monotonic,
         opening_limit_s: float = OPENING_LIMIT_S,
         silence_limit_s: float = SILENCE_LIMIT_S,
     ) -> None:
-        self._on_message = on_message
         self._command = command
         self._clock = clock
         self._codec_in, self._codec_out = protocol.from_worker(), protocol.to_worker()
+        self._on_message: OnMessage  # set by `start`
         self._process: asyncio.subprocess.Process | None = None
         self._task: asyncio.Task[None] | None = None
         self._open: protocol.Open | None = None
@@ -102,10 +102,16 @@ class WorkerProcess:
         """Process number of the worker; None while it does not run."""
         return self._process.pid if self._process else None
 
-    async def start(self) -> None:
-        """Start the worker and restart it whenever it ends. A worker that cannot be started is tried
-        again."""
-        await self._spawn()
+    async def start(self, on_message: OnMessage) -> None:
+        """Start the worker, unless it runs, and restart it whenever it ends. A worker that cannot be
+        started is tried again.
+
+        Args:
+            on_message: Awaited on the event loop for each message in turn; must not block it.
+        """
+        self._on_message = on_message
+        if self._process is None:
+            await self.spawn()
         self._task = asyncio.create_task(self._watch(), name="worker")
 
     async def send(self, command: protocol.ToWorker) -> None:
@@ -139,9 +145,9 @@ class WorkerProcess:
         await cancel(self._task)
         await self._end()
 
-    async def _spawn(self) -> None:
-        """Start the process, and send it the stored parameters, speed and source. If the system cannot start
-        it, it counts as ended."""
+    async def spawn(self) -> None:
+        """Start the process, and send it the stored parameters, speed and source. Its messages wait in the
+        pipe until `start`. If the system cannot start it, it counts as ended."""
         try:
             self._process = await asyncio.create_subprocess_exec(
                 *self._command,
@@ -194,7 +200,7 @@ class WorkerProcess:
                 self._ends_without_result += 1
                 await self._pause(reason)
                 self.restarts += 1
-            await self._spawn()
+            await self.spawn()
 
     # --- a source that does not finish opening ---------------------------------------------------
 
@@ -252,8 +258,10 @@ class WorkerProcess:
         return "it did not answer"
 
     async def _head(self, stdout: asyncio.StreamReader) -> bytes | None:
-        """Wait for the length of the next message; None if the worker hangs, which is reported before."""
-        silent_s = 0.0
+        """Wait for the length of the next message; None if the worker hangs, which is reported before. Time
+        in which the worker waits for a processor is not counted. Raises IncompleteReadError at its end."""
+        silent_s = hung_s = 0.0
+        before_s = starved_s(self.pid or 0)
         while True:
             limit_s = self._limit_s()
             pause_s = None if limit_s is None else limit_s / _NOTICE_SHARE
@@ -263,10 +271,13 @@ class WorkerProcess:
             except TimeoutError:
                 limit_s = self._limit_s()
                 if limit_s is None:
-                    silent_s = 0.0
+                    silent_s = hung_s = 0.0
                     continue
+                now_s = starved_s(self.pid or 0)
                 silent_s += pause_s or 0.0
-                if silent_s >= limit_s:
+                hung_s += max(0.0, (pause_s or 0.0) - (now_s - before_s))
+                before_s = now_s
+                if hung_s >= limit_s:
                     return None
                 if limit_s == self._silence_limit_s:
                     detail = f"The mapping process has not answered for {silent_s:.0f} s"
@@ -291,8 +302,8 @@ class WorkerProcess:
         return self._silence_limit_s if self._has_command or status.state in ("playing", "waiting") else None
 
     async def _deliver(self, message: protocol.FromWorker) -> None:
-        """Await `on_message` with a message. Its errors are logged and reported as a failure; they do not end
-        the supervision."""
+        """Await the function given to `start` with a message. Its errors are logged and reported as a
+        failure; they do not end the supervision."""
         self._note_opening(message)
         if isinstance(message, protocol.Shown):
             self._ends_without_result = 0

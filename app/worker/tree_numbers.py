@@ -34,7 +34,8 @@ class TreeNumbers:
         self._next = 1
 
     def renumber(self, trees: Trees) -> Trees:
-        """Return the trees of a frame of the present map with their numbers."""
+        """Return a copy of the trees of a frame of the present map with their numbers. Trees without a number
+        get one, and the positions of confirmed trees are remembered."""
         numbers = trees.number
         if self._number_of is not None:
             known = self._number_of
@@ -70,8 +71,9 @@ class TreeNumbers:
         return next((in_map for in_map, known in self._number_of.items() if known == number), None)
 
     def stored(self, trees: Trees) -> tuple[Trees, NDArray[np.int64]]:
-        """Return the trees of an earlier frame of the present map with their numbers, and their rows. Trees
-        that were never numbered are left out: they ended in a rerun, and were not confirmed."""
+        """Return a copy of the trees of an earlier frame of the present map with their numbers, and the rows
+        of `trees` that they come from. Trees that were never numbered are left out: they ended in a rerun,
+        and were not confirmed."""
         known = [self.known(number) for number in trees.number.tolist()]
         rows = np.array([row for row, number in enumerate(known) if number is not None], np.int64)
         numbers = np.array([number for number in known if number is not None], np.int64)
@@ -100,9 +102,11 @@ class TreeNumbers:
 
 
 def _places(trees: Trees, rows: NDArray[np.int64]) -> dict[int, Place]:
+    """Return the position [m] of each tree in some rows, by its number."""
     places = [(x, y) for x, y in trees.position[rows].tolist()]
     return dict(zip(trees.number[rows].tolist(), places, strict=True))
 
 
 def _array(places: list[Place]) -> NDArray[np.float64]:
+    """Return positions as an array of shape (N, 2)."""
     return np.array(places, dtype=np.float64).reshape(-1, 2)

@@ -71,7 +71,7 @@ def _room(room: int, keys: Int) -> int:
 
     Args:
         room: Rows so far, a power of two.
-        keys: Keys of the voxels, see `keys_of`, without negative ones, shape (N,).
+        keys: Keys of the voxels (`keys_of`), not negative, int64, shape (N,).
     """
     tiles = len(np.unique(tiles_of(keys)))
     while room <= tiles:
@@ -178,7 +178,7 @@ class ColumnClassifier:
 
     Args:
         parameters: Parameters of this stage.
-        all_around: Whether the sensor sees all around.
+        all_around: Initial value of the attribute.
         forests: Finds the random forest by its name.
 
     Raises:
@@ -195,6 +195,18 @@ class ColumnClassifier:
         self.columns = no_columns()
         self._base = PackedVoxelMap.of(self.memory)
         self._since: list[tuple[Float32, int, int]] = []
+
+    @property
+    def all_around(self) -> bool:
+        """Whether the forest for sensors that see all around votes, see `is_seen_all_around`. After a change,
+        the next scan classifies all columns again."""
+        return self._all_around
+
+    @all_around.setter
+    def all_around(self, all_around: bool) -> None:
+        if all_around != self._all_around:
+            self._all_around = all_around
+            self.parameters = self._parameters
 
     @property
     def parameters(self) -> Classification:
@@ -337,7 +349,7 @@ def _rows(axis: Float, tile: Int) -> Columns:
     """Return columns with zeros for statistics, features and votes, and the verdict OTHER.
 
     Args:
-        axis: Axes, shape (K, 5), see `find_columns`; not copied.
+        axis: Axes, shape (K, 5): x, y at 1.3 m [m], shift per metre of height, strength; not copied.
         tile: Tile of each, int64, shape (K, 2); not copied.
     """
     n = len(axis)

@@ -6,12 +6,14 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.classification.voxel_map import SIDE, SLICE, SLICES
+from pipeline.config.stages import Tracking
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import RING_FAR, Bool, Float32, Int, Int32
 
-BUCKET = 0.9  # m; radius of the neighbourhood of a column
+BREAST = Tracking().breast_height  # m above the ground; height of the position of an axis
+BUCKET = RING_FAR  # m; radius of the neighbourhood of a column
 MARGIN = 1.2  # m around a tile in which neighbours are considered
 MOVES = 0.5  # m; a column outside of a tile may move into it by this distance when its axis is fitted
 LOW, LOW_HIGH, HIGH = 1, 7, 15  # slices: 0.2 to 1.4 m, and to 3 m, in which a column has returns
@@ -21,7 +23,7 @@ APART = 0.2  # m; of two columns within this distance along x and y the weaker o
 INSIDE, RING_NEAR = 0.3, 0.45  # m around the axis
 OCTANTS = 8
 ARC = 11  # first column of the moments of an arc, see `profile`
-PROFILE = 20  # columns of a profile, see `profile`
+PROFILE = ARC + 9  # columns of a profile, see `profile`
 
 
 @compiled
@@ -219,8 +221,8 @@ def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: floa
             s = int(h / SLICE)
             if s < LOW or s >= HIGH:
                 continue
-            dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
-            dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
+            dx = mean[i, 0] - axis[0] - axis[2] * (h - BREAST)
+            dy = mean[i, 1] - axis[1] - axis[3] * (h - BREAST)
             r2 = dx * dx + dy * dy
             if r2 < reach * reach:
                 w[s] += returns[i]
@@ -231,7 +233,7 @@ def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: floa
     n, sh, shh, sx, sy, shx, shy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for s in range(SLICES):
         if w[s] > 0.0:
-            h = (s + 0.5) * SLICE - 1.3
+            h = (s + 0.5) * SLICE - BREAST
             clean = w[s] / (w[s] + around[s])
             v = w[s] / (w[s] + 2.0) * clean * clean
             n += v
@@ -274,8 +276,8 @@ def profile(axis: Float, mean: Float32, returns: Int32, runs: Int, rows: Float) 
             s = int(h / SLICE)
             if s < 0 or s >= SLICES:
                 continue
-            dx = mean[i, 0] - axis[0] - axis[2] * (h - 1.3)
-            dy = mean[i, 1] - axis[1] - axis[3] * (h - 1.3)
+            dx = mean[i, 0] - axis[0] - axis[2] * (h - BREAST)
+            dy = mean[i, 1] - axis[1] - axis[3] * (h - BREAST)
             _count(dx, dy, float(returns[i]), rows[s], octants[s])
     for s in range(SLICES):
         rows[s, 4] = octants[s].sum()

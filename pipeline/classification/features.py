@@ -208,7 +208,7 @@ def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
     slices the plate of a sign is flat, foliage is not.
 
     Args:
-        rows: Profile of the column.
+        rows: Profile of the column, shape (SLICES, PROFILE).
         first, end: First slice, and one past the last slice.
     """
     xx, xy, yy, n, total, squares = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -314,7 +314,7 @@ def _run(rows: Float, part: float, ring: float) -> tuple[int, int, int]:
     A slice is clean if enough of its returns are at the axis. The run ends at a gap of more than GAP slices.
 
     Args:
-        rows: Profile of the column.
+        rows: Profile of the column, shape (SLICES, PROFILE); slice 0 is not used.
         part: Least share of the returns that is at the axis.
         ring: Weight of the returns in the ring.
     """

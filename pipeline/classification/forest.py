@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pipeline.classification.column_extraction import BUCKET
 from pipeline.classification.features import NAMES
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
@@ -22,6 +23,7 @@ from pipeline.types.records import Bool, Int32, Verdict
 ALL_AROUND, ONE_WAY = "all around", "one way"
 FREE_END = "one way, ends in free air"  # key of the forest that separates trees from poles with a free end
 PACKAGE = "package"  # name of the forest of the package
+MOVED = BUCKET  # m; the features describe a column and its surroundings up to this distance
 FILE = Path(__file__).with_name("forest.json")
 _MOST_BYTES = 4_000_000
 _MOST_NODES = 100_000
@@ -66,12 +68,24 @@ class Forest:
     free_end: Forest | None = None
 
 
-# Returns a forest by its name (parameter `classification.forest`) and whether the sensor sees all around.
+# Returns a forest by its name (parameter `classification.forest`) and by `is_seen_all_around`.
 ForestOf = Callable[[str, bool], Forest]
 
 
+def is_seen_all_around(rings: int, xy: Float) -> bool:
+    """Return whether the forest for sensors that see all around classifies the columns of a run: the sensor
+    does, or it has moved, so that it has seen the columns from several positions. The other forest is for a
+    sensor that stands still and looks one way: it sees one side of each trunk and nothing behind it.
+
+    Args:
+        rings: Rings of the sensor; 0 for a sensor that looks one way.
+        xy: Positions of the robot so far, shape (N, 2) [m].
+    """
+    return rings > 0 or (len(xy) > 0 and bool((np.ptp(xy, axis=0) > MOVED).any()))
+
+
 def package_alone(name: str, all_around: bool) -> Forest:
-    """Return the forest of the package for sensors that see all around, or for those that look one way.
+    """Return the forest of the package for runs with `is_seen_all_around`, or for the others.
 
     Raises:
         StemmapError: The name is not PACKAGE, or the file cannot be read.
@@ -83,11 +97,11 @@ def package_alone(name: str, all_around: bool) -> Forest:
 
 @cache
 def standard_forest(all_around: bool) -> Forest:
-    """Return the forest of the package for sensors that see all around, or for sensors that look one way:
-    their views of a trunk differ too much for a common forest. The file is read once per process.
+    """Return the forest of the package for runs with `is_seen_all_around`, or for the others: their views of
+    a trunk differ too much for a common forest. The file is read once per process.
 
     Raises:
-        StemmapError: See `read_forest`.
+        StemmapError: The file is missing or damaged.
     """
     return read_forest(FILE, ALL_AROUND if all_around else ONE_WAY)
 
@@ -106,7 +120,8 @@ def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]
     """Return the JSON of a file, and the forests for some kinds of sensors in their order.
 
     Raises:
-        StemmapError: See `read_forest`.
+        StemmapError: The file is missing, too large (4 MB), not such JSON, without one of the kinds, trained
+            for other classes, or names unknown features.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -124,7 +139,7 @@ def _damaged(path: Path, why: str) -> StemmapError:
     return StemmapError(
         f"the decision trees cannot be read: {why}",
         where=str(path),
-        remedy="`stemmap train` trains them again",
+        remedy="Restore the file of the package, or `stemmap train` trains another one",
     )
 
 
@@ -253,7 +268,8 @@ def feature_effects(figures: Float, forest: Forest, kind: Verdict) -> Float:
 
 @compiled
 def _feature_effects(figures: Float, trees: DecisionTrees, kind: int) -> Float:
-    """Return the result of `feature_effects` for the trees of a forest; `kind` is the index in CLASSES."""
+    """Return by how much each feature raises the share of votes for the class with the index `kind` in
+    CLASSES, see `feature_effects`, shape (F,); `figures` are the features of one column, shape (F,)."""
     effects = np.zeros(figures.shape[0])
     for root in trees.root:
         known = _share(figures, -2, root, trees, kind)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.classification.column_extraction import RING_NEAR
 from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.detection.free_space import BEHIND, BINS
 from pipeline.geometry.azimuth_bins import direction_bin
@@ -39,7 +40,7 @@ class ScanView:
 
 ELEVATIONS, LOWEST, STEP = 96, -0.84, 0.0175  # of a depth image, as tangents; a step is about one degree
 # m; a ray that ends this near to the axis met the column, one this far behind passed it.
-MET, PASSED = 0.45, 0.5
+MET, PASSED = RING_NEAR, 0.5
 NEAR = 0.6  # m; a return this near to a column belongs to it
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from pipeline.geometry.voxel_grid import SPREAD
 from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int, Int32
 
@@ -22,8 +23,8 @@ SMALL = 1 << 16  # bytes; smaller arrays use the heap
 
 
 def zeros(shape: int | tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros like numpy.zeros; of a large array (SMALL bytes or more) only pages that were written to
-    take memory.
+    """Return zeros of a shape and type, like numpy.zeros; of a large array (SMALL bytes or more) only pages
+    that were written to take memory.
 
     The system provides a page at the first write and takes back all pages when the array is deleted. On the
     heap of the allocator, long-lived arrays of different sizes leave holes, which the process keeps.
@@ -43,7 +44,8 @@ def _mapped(size: int) -> mmap.mmap:
 
 
 def copied(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a copy, on separate pages if it is large, see `zeros`."""
+    """Return a copy of the same shape and type; one of SMALL bytes or more is on pages of its own, which the
+    system takes back when it is deleted."""
     copy = zeros(array.shape, array.dtype)
     copy[...] = array
     return copy
@@ -55,10 +57,10 @@ SLICES = 30  # voxels up to 6 m above the ground
 TILE_CELLS = 40  # columns are classified by tiles of 4 m
 TILE = TILE_CELLS * SIDE
 MOST_TILES = 4  # classified per scan,
-FIRST_SCANS = 10  # except in the first scans, because a map may be short
+# except in the first scans, which all update columns and terrain, so that a short recording uses all its data
+FIRST_SCANS = 10
 _OFFSET = TILE_CELLS << 18  # cells; keys stay positive within 1,000 km of the origin
 _FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
-_SPREAD = np.uint64(0x9E3779B97F4A7C15)
 KEPT = ("key", "mean", "returns", "scans", "latest")  # columns from which all others follow
 
 
@@ -255,7 +257,7 @@ def _first_place(key: int | np.int64, mask: int) -> int:
     """Return the position in a hash table at which the search for a key begins; `mask` is the length of the
     table, a power of two, minus 1."""
     # The upper bits of the product are well mixed; 26 bits are enough for the largest table.
-    return int(np.int64((np.uint64(key) * _SPREAD) >> np.uint64(38)) & mask)
+    return int(np.int64((np.uint64(key) * SPREAD) >> np.uint64(38)) & mask)
 
 
 @compiled
@@ -289,7 +291,8 @@ def index(memory: VoxelMap, rows: int) -> None:
 
 @compiled
 def _tile_of(key: int | np.int64) -> int:
-    """Return the key of the tile of one cell, see `tiles_of`."""
+    """Return the key of the tile that contains a cell, by the key of the cell (`keys_of`), which must not be
+    negative; the same as `tiles_of` of one key."""
     ix, iy = key >> 36, (key >> 5) & ((1 << 31) - 1)
     return int(((ix // TILE_CELLS) << 31) | (iy // TILE_CELLS))
 
@@ -477,7 +480,7 @@ class PackedVoxelMap:
         )
 
     def unpacked(self) -> VoxelMap:
-        """Return an independent voxel map with the same bits."""
+        """Return an independent voxel map with the same bits; the columns are not checked, see `checked`."""
         n = len(self.key)
         memory = VoxelMap.empty(self.room, self.tile_room)
         for name in KEPT:

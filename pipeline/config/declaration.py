@@ -68,12 +68,22 @@ def count(default: int, title: str, unit: str, low: int, high: int, *, main: boo
 
 
 def name(default: str, title: str, pattern: str) -> Any:  # noqa: ANN401
-    """Return the declaration of a parameter that holds a name; the regular expression `pattern` defines the
-    valid names. See `number` for the other arguments."""
+    """Return the declaration of a parameter that holds a name.
+
+    Args:
+        default: Value in the preset `forest`.
+        title: Label on the page.
+        pattern: Regular expression of the valid names.
+    """
     return Field(default=default, title=title, pattern=pattern)
 
 
 def choice(default: str | bool, title: str) -> Any:  # noqa: ANN401
     """Return the declaration of a parameter of type bool or Literal, which lists the valid words; the type is
-    that of the annotation. See `number` for the arguments."""
+    that of the annotation.
+
+    Args:
+        default: Value in the preset `forest`.
+        title: Label on the page.
+    """
     return Field(default=default, title=title)

@@ -19,13 +19,21 @@ Value = float | int | bool | str
 # Names of earlier versions, which files, saved sets and the command line may still use.
 RENAMED_STAGES = {"gathering": "classification"}
 RENAMED = {
-    "slam.looks": "slam.independent_views_max",
     "shape.slices": "shape.split_slices",
 }
 # Choices of earlier versions and their replacement: a graph of keyframes now always corrects FastSLAM.
 RENAMED_CHOICES = {("slam.method", "graph"): "fastslam2"}
 # Parameters of earlier versions that no longer exist; their values are ignored.
-REMOVED = frozenset({"shape.plane", "tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"})
+REMOVED = frozenset(
+    {
+        "shape.plane",
+        "slam.independent_views_max",
+        "slam.looks",
+        "tracking.gate",
+        "tracking.distance_max",
+        "tracking.misses_per_hit",
+    }
+)
 
 
 class RenamedParameterWarning(FutureWarning):
@@ -142,8 +150,8 @@ def validated(tree: Mapping[str, Any]) -> Parameters:
 
 def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
     """Return nested mappings (stage, parameter) with the names of earlier versions replaced by the current
-    names, see `current_names`; a stage whose value is not a mapping is returned as it is, to be refused by
-    the validation."""
+    names and without removed parameters, each with a RenamedParameterWarning; a stage whose value is not a
+    mapping is returned as it is, to be refused by the validation."""
     nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
     result = {stage: values for stage, values in tree.items() if stage not in nested}
     flat = {f"{stage}.{name}": value for stage, values in nested.items() for name, value in values.items()}

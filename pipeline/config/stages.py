@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, Self
 
-from pydantic import model_validator
+from pydantic import Field, field_validator, model_validator
 
 from pipeline.config.declaration import Stage, choice, count, name, number
 
@@ -231,17 +231,17 @@ class Slam(Stage):
     weight_power: float = number(0.1, "Weight power", "", 0.01, 1.0, 0.05)
     """Exponent of the scan likelihood in the particle weights; 1 treats successive views as independent."""
 
-    independent_views_max: float = number(100.0, "Independent views", "", 1.0, 10000.0, 1.0)
-    """Lower bound of a landmark covariance: the measurement covariance divided by this number of views."""
-
     merge_gate: float = number(1.0, "Merge gate", "sigma", 0.0, 10.0, 0.1)
     """Landmarks within this Mahalanobis distance of which a scan shows only one are merged; 0 is off."""
 
     resample_below: float = number(0.5, "Resampling threshold", "", 0.0, 1.0, 0.05, (0.0, 1.0))
     """The filter resamples when N_eff falls below this fraction of the particles."""
 
-    update_distance: float = number(0.0, "Update distance", "m", 0.0, 10.0, 0.05)
-    """Motion between two scans that update the filter; 0 uses every scan."""
+    update_distance: float = number(0.25, "Update distance", "m", 0.0, 10.0, 0.05)
+    """Motion between two scans that update the filter, whose views share fewer errors; 0 uses every scan."""
+
+    update_interval: float = number(1.0, "Update interval", "s", 0.0, 60.0, 0.1)
+    """Maximum time between two updates of a robot that hardly moves or has stuck wheels; 0 is no limit."""
 
     keyframe_distance: float = number(1.0, "Keyframe distance", "m", 0.1, 100.0, 0.1)
     """Motion between two keyframes of the graph that corrects path and map; 1 rad of turn counts as 1 m."""
@@ -384,3 +384,16 @@ class Stand(Stage):
 
     correction: Literal["half_normal", "none"] = choice("half_normal", "Correction")
     """half_normal: detection probability over distance; none: every tree in view is found."""
+
+    volume: str = Field(default="", title="Volume formula")
+    """Stem volume in m3 of dbh_cm and height_m, with + - * / ^ ( ), exp, log and sqrt; empty: no volume."""
+
+    @field_validator("volume")
+    @classmethod
+    def _readable(cls, text: str) -> str:
+        """Return the formula, which may be empty; ValueError if it is not one."""
+        from pipeline.stand.volume import VolumeFormula
+
+        if text:
+            VolumeFormula.parse(text)
+        return text

@@ -57,7 +57,7 @@ def parsed(spec: FieldSpec, text: str) -> Value:
 
 
 def to_toml(parameters: Parameters) -> str:
-    """Return all values as TOML text with one table per stage."""
+    """Return all values as TOML text with one table per stage, in the order of the stages."""
     import tomli_w
 
     return tomli_w.dumps(parameters.model_dump())

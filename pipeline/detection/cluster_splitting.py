@@ -12,7 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.detection.cylinder_fit import BARK
+from pipeline.config.stages import Detection
+from pipeline.detection.cylinder_fit import BARK, PRIOR_LEAN_SIGMA
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
@@ -20,15 +21,16 @@ from pipeline.types.records import Bool, Clusters, Float32, Int, Int32, Labels, 
 
 SLICE = 0.2  # m; of height
 LEAST = 3  # minimum returns of a run
-# A cluster beyond one of these limits is not a single trunk: radial deviation, width and radius [m], as the
-# defaults of the stage `detection`.
-ROUGH, WIDE, THICK = 0.06, 1.2, 0.6
+_TRUNK = Detection()  # the limits of a trunk by default, which do not depend on the parameters of a run
+# A cluster beyond one of these limits is not a single trunk: radial deviation, width and radius [m].
+ROUGH, WIDE, THICK = _TRUNK.cylindrical_stddev_thresh, _TRUNK.size_max, _TRUNK.radius_max
 WIDEST = 2.5  # m; wider clusters (hedges, walls) are not split
 SHOTS = 2.6  # maximum distance between returns of a run in shots; one may be missing
 JUMP, JUMP_SIGMA = 0.06, 3.0  # m, and multiples of the range sigma: maximum range jump within a run
 BENT = 2.0  # sigma; maximum root mean square distance of a run to its circle
-RADIUS_MIN, RADIUS_MAX = 0.04, 0.5  # m
-APART, LEAN = 0.06, 0.08  # m, and m per metre of height: maximum distance between circles of one trunk
+RADIUS_MIN, RADIUS_MAX = _TRUNK.radius_min, 0.5  # m
+# m, and m per metre of height: maximum distance between circles of one trunk
+APART, LEAN = 0.06, PRIOR_LEAN_SIGMA
 ALIKE, ALIKE_LEAST = 0.3, 0.02  # fraction of the radius, and m: maximum difference between their radii
 SHARE = 0.6  # minimum share of agreeing slices among those with returns between the lowest and highest circle
 FRONT = 0.95  # distance between the middle half of a run and the axis, as a fraction of the radius
@@ -60,7 +62,8 @@ class Runs(NamedTuple):
 def split_trunks(
     points: Float32, labels: Labels, clusters: Clusters, sensor: Sensor, slices: int
 ) -> tuple[Labels, Int]:
-    """Separate a trunk from each cluster that is not a single trunk but shows one in enough slices.
+    """Separate a trunk from each cluster that is not a single trunk but shows one in enough slices. The
+    arguments are not changed.
 
     Only clusters are examined that are too rough, wide or thick for a trunk (ROUGH, WIDE, THICK), narrower
     than WIDEST, high enough for the slices, and not hidden at an edge.

@@ -461,45 +461,41 @@ def _cut(
     return label, hidden[:clusters].copy()
 
 
-class Dbscan(NamedTuple):
-    """Labels, int32, shape (N,), -1 for noise; and the mask of core points, None if the engine gives none."""
-
-    label: Int32
-    core: Bool | None
-
-
 class Engine(Protocol):
-    """DBSCAN on points of shape (N, 2 or 3) [m] with weights, int32, shape (N,), None for 1 each."""
+    """DBSCAN on points of shape (N, 2 or 3) [m] with weights, int32, shape (N,), None for 1 each. It returns
+    the cluster of each point, int32, shape (N,), numbered in the order of the first points, -1 for noise."""
 
     def __call__(
         self, points: Float32, eps: float, min_points: int, weight: Int32 | None = None
-    ) -> Dbscan: ...
+    ) -> Int32: ...
 
 
-def _grid(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
-    """Run `dbscan_grid`, which returns core points and raises its errors."""
-    return Dbscan(*dbscan_grid(points.astype(np.float64), eps, min_points, weight))
+def _grid(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Int32:
+    """Return the labels of `dbscan_grid`, see `Engine`.
+
+    Raises:
+        ValueError: The cloud is too wide for its cells.
+    """
+    return dbscan_grid(points.astype(np.float64), eps, min_points, weight)[0]
 
 
-def _sklearn(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
-    """Run DBSCAN of scikit-learn, with core points; no points give empty arrays."""
+def _sklearn(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Int32:
+    """Return the labels of DBSCAN of scikit-learn, see `Engine`; no points give an empty array."""
     from sklearn.cluster import DBSCAN
 
     if len(points) == 0:
-        return Dbscan(np.zeros(0, np.int32), np.zeros(0, np.bool_))
+        return np.zeros(0, np.int32)
     fitted = DBSCAN(eps=eps, min_samples=min_points).fit(points.astype(np.float64), sample_weight=weight)
-    core = np.zeros(len(points), np.bool_)
-    core[fitted.core_sample_indices_] = True
-    return Dbscan(number_by_first_point(fitted.labels_.astype(np.int32)), core)
+    return number_by_first_point(fitted.labels_.astype(np.int32))
 
 
-def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Dbscan:
-    """Run DBSCAN of Open3D, without core points (None); no points give empty labels. Memory grows with the
-    sum of the weights, because Open3D gets each point repeated."""
+def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None = None) -> Int32:
+    """Return the labels of DBSCAN of Open3D, see `Engine`; no points give an empty array. Memory grows with
+    the sum of the weights, because Open3D gets each point repeated."""
     import open3d
 
     if len(points) == 0:
-        return Dbscan(np.zeros(0, np.int32), None)
+        return np.zeros(0, np.int32)
     space = np.zeros((len(points), 3))
     space[:, : points.shape[1]] = points
     # Open3D has no weights; repeated points have the same effect.
@@ -509,7 +505,7 @@ def _open3d(points: Float32, eps: float, min_points: int, weight: Int32 | None =
     # Open3D uses distance < radius, the other engines distance <= radius.
     radius = float(np.nextafter(eps, np.inf))
     label = np.asarray(cloud.cluster_dbscan(radius, min_points), np.int32)[first]
-    return Dbscan(number_by_first_point(label), None)
+    return number_by_first_point(label)
 
 
 ENGINES: dict[str, Engine] = {
@@ -541,6 +537,6 @@ def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
         return Labels(label, len(hidden), hidden)
     plane = np.ascontiguousarray(points[:, : parameters.dimensions])
     weight = weigh(points, sensor, parameters) if parameters.stem_area > 0.0 else None
-    label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points, weight).label
+    label = ENGINES[parameters.engine](plane, parameters.eps, parameters.min_points, weight)
     clusters = int(label.max(initial=-1)) + 1
     return Labels(label, clusters, np.zeros(clusters, np.bool_))

@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.config.stages import Detection
 from pipeline.geometry.gaussian import factorise, solve
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_sums
@@ -256,7 +257,14 @@ def _from_axis(rays: Float, i: int, p: Float) -> tuple[float, float]:
 
 @compiled
 def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
-    """Return the visible arc [rad] for returns on any side of the axis; arguments as in `visible_arc`."""
+    """Return the visible arc [rad] for returns on any side of the axis: a full turn minus the largest gap; 0
+    for one return.
+
+    Args:
+        rays: shape (RAY, capacity), of which n columns are valid.
+        n: Number of returns, at least 1.
+        p: x, y of the axis at z0 [m] and its shift in x and y per metre of height.
+    """
     angle = np.empty(n)
     for i in range(n):
         x, y = _from_axis(rays, i, p)
@@ -269,7 +277,7 @@ def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
 
 
 MODEL = 0.003  # m; model error of a circular section
-RADIUS_MIN, RADIUS_MAX = 0.03, 0.6  # m; bounds of the initial radius
+RADIUS_MIN, RADIUS_MAX = 0.03, Detection().radius_max  # m; bounds of the initial radius
 SIGMA_MIN = 0.001  # m; lower bound of the range sigma, which keeps weights finite
 # Maximum number of points of a fit; bark and lean limit the accuracy beyond it. A prime number, because
 # points may be ordered by ring: a stride of 16 would select a single ring.
@@ -513,8 +521,8 @@ class StemFit:
 
 
 def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
-    """Return the fit for the points of one cluster, or None with fewer than five points or if the fit is not
-    finite.
+    """Return the fit for the points of one cluster, or None with fewer than five points or if its radius is
+    not finite.
 
     Args:
         points: Shape (N, 3) [m], level sensor frame; `offset` and `residual` of the result have their rows.

@@ -66,7 +66,9 @@ def _levelling(step: Step, stems: Stems, T_base_lidar: Pose3, parameters: Acquis
 
 
 def _clusters(place: Float, dbh: Float) -> Clusters:
-    """Return clusters of one point each with the verdict TREE, see `external_clusters`.
+    """Return clusters of one point each with the verdict TREE: the centre is the position, the radius half of
+    the DBH with the sigma DBH_SIGMA / 2, the horizontal extent the DBH, covariance and arc 0, `hidden` and
+    `cut` False, and what is unknown NaN.
 
     Args:
         place: Positions, level sensor frame, shape (N, 3) [m].

@@ -33,21 +33,18 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
         filtered: The scan after the filters, float32, shape (M, 3) [m], same frame.
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
     """
+    bins = directions(raw, sensor_offset)
     looked = np.zeros(BINS, np.bool_)
-    for k in directions(raw, sensor_offset):
+    for k in bins:
         looked[k] = True
     free = np.full(BINS, np.inf)
     for i in range(filtered.shape[0]):
         x, y = filtered[i, 0] + sensor_offset[0], filtered[i, 1] + sensor_offset[1]
         k = direction_bin(x, y, BINS)
         free[k] = min(free[k], np.sqrt(x * x + y * y))
-    length, largest, end = 0, 0, 0
-    for k in range(2 * BINS):  # twice around, because a gap may contain the first bin
-        length = 0 if looked[k % BINS] else min(length + 1, BINS)
-        if length > largest:
-            largest, end = length, k
+    first, largest = widest_gap(bins)
     if np.count_nonzero(looked) >= DENSE * (BINS - largest):
-        for k in range(end - largest + 1, end + 1):
+        for k in range(first, first + largest):
             free[k % BINS] = 0.0
     for k in range(BINS):
         near = False
@@ -60,6 +57,21 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
     for k in range(BINS):
         safe[k] = min(free[k], free[(k + 1) % BINS], free[k - 1])
     return safe
+
+
+@compiled
+def widest_gap(bins: NDArray[np.uint16]) -> tuple[int, int]:
+    """Return the first bin and the length of the longest run of bins without a return, which may extend over
+    the seam; length 0 for an empty scan. `bins` are the bins of the returns, see `directions`, shape (N,)."""
+    lit = np.zeros(BINS, np.bool_)
+    for k in bins:
+        lit[k] = True
+    first, most, run = 0, 0, 0
+    for k in range(2 * BINS):  # two turns, so that a run across the seam counts once
+        run = 0 if lit[k % BINS] else run + 1
+        if most < run <= BINS:
+            first, most = k + 1 - run, run
+    return first % BINS, most if most < BINS else 0
 
 
 @compiled

@@ -14,8 +14,7 @@ import numpy as np
 from pipeline.config.stages import Obstacles
 from pipeline.ground.terrain import Terrain, ground_at
 from pipeline.jit import compiled
-from pipeline.types.clearance import Clearance, Zone
-from pipeline.types.records import Float, Float32
+from pipeline.types.records import Clearance, Float, Float32, Zone
 
 #: Below this speed [m/s] the robot counts as standing and its path is straight ahead.
 STANDING = 0.05
@@ -40,7 +39,7 @@ def find_clearance(
     parameters: Obstacles,
 ) -> Clearance | None:
     """Return the clearance of the path of the robot, or None if obstacle detection is off (`method` is
-    "none").
+    "none"). Of a robot that drives backwards it is the path behind.
 
     An obstacle beside the robot, within the path width, has distance 0. Without terrain and with a sensor
     below the minimum obstacle height (for example with an unknown mounting), lower obstacles would be missed;
@@ -61,8 +60,8 @@ def find_clearance(
     backward = twist[0] < -STANDING
     reach = _reach(sensor_offset, backward, parameters)
     beyond = _beyond_the_robot(near, sensor_offset, parameters)
-    curvature = way_of(twist)
-    zone, ahead, beside, x, y = _along(
+    curvature = path_curvature(twist)
+    zone, ahead, beside, x, y = _find_obstacles(
         np.vstack([points, beyond]) if len(beyond) else points,
         _NO_GROUND if terrain is None else terrain.height,
         sensor_offset,
@@ -109,7 +108,7 @@ def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles
     return beyond
 
 
-def way_of(twist: tuple[float, float, float]) -> float:
+def path_curvature(twist: tuple[float, float, float]) -> float:
     """Return the curvature [1/m] of the path that results from the velocities forward, left [m/s] and turn
     [rad/s], positive to the left, at most 1 / TIGHTEST in size. It is 0 below the forward speed STANDING and
     for NaN. When driving backwards it is turn / forward too."""
@@ -120,7 +119,7 @@ def way_of(twist: tuple[float, float, float]) -> float:
 
 
 @compiled
-def _along(
+def _find_obstacles(
     points: Float32,
     ground: Float,
     sensor: Float,
@@ -163,10 +162,10 @@ def _along(
         looks += abs(y) < way * x * _LOOKING
         if not x * x + y * y < farthest:  # also false for NaN
             continue
-        off = _beside_the_way(way * x, y, curvature)
+        off = _lateral_distance(way * x, y, curvature)
         if off > half + BESIDE:  # checked first: most ground returns fail here
             continue
-        along = _on_the_way(way * x, y, curvature)
+        along = _arc_length(way * x, y, curvature)
         if along <= -behind or along > most:
             continue
         height = points[i, 2] + sensor[2]
@@ -192,7 +191,7 @@ def _along(
 
 
 @compiled
-def _beside_the_way(x: float, y: float, curvature: float) -> float:
+def _lateral_distance(x: float, y: float, curvature: float) -> float:
     """Return the lateral distance [m] of a place x, y [m] from the arc through the origin that begins along
     +x with a curvature [1/m], positive to the left."""
     if abs(curvature) < STRAIGHT:
@@ -203,9 +202,10 @@ def _beside_the_way(x: float, y: float, curvature: float) -> float:
 
 
 @compiled
-def _on_the_way(x: float, y: float, curvature: float) -> float:
-    """Return the arc length from the origin to the foot of a place x, y [m] on the arc of `_beside_the_way`
-    [m]; up to half a turn is in front of the robot, the rest is negative."""
+def _arc_length(x: float, y: float, curvature: float) -> float:
+    """Return the arc length [m] from the origin to the foot of a place x, y [m] on the arc through the origin
+    that begins along +x with a curvature [1/m], positive to the left; up to half a turn is in front of the
+    robot, the rest is negative."""
     if abs(curvature) < STRAIGHT:
         return x
     radius = 1.0 / abs(curvature)

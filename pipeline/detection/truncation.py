@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.config.stages import Acquisition, Filters
-from pipeline.detection.free_space import BINS, directions
+from pipeline.detection.free_space import BINS, directions, widest_gap
 from pipeline.geometry.azimuth_bins import bin_direction
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
@@ -75,28 +75,13 @@ def field_of_view(raw: Float32) -> FieldOfView:
     """Estimate the horizontal field of view from the points of a scan, shape (M, 3) [m], sensor frame. It is
     360 degrees unless BLIND bins or more in a row have no return; also for an empty scan."""
     bins = directions(raw, np.zeros(3))
-    first, blind = _widest_gap(bins)
+    first, blind = widest_gap(bins)
     if blind < BLIND:
         return FieldOfView(1.0, 0.0, -np.inf, np.inf, np.zeros(0), np.zeros(0))
     c, s = bin_direction(first + blind + (BINS - blind) // 2, BINS)
     right, at_right = _end(raw[_within(bins, first + blind)], c, s, -1.0)
     left, at_left = _end(raw[_within(bins, first - EDGE)], c, s, 1.0)
     return FieldOfView(c, s, -right, left, at_right, at_left)
-
-
-@compiled
-def _widest_gap(bins: UInt16) -> tuple[int, int]:
-    """Return the first bin and the length of the longest run of empty bins, which may extend over the seam;
-    length 0 for an empty scan. `bins` are the bins of the returns, shape (N,)."""
-    lit = np.zeros(BINS, np.bool_)
-    for k in bins:
-        lit[k] = True
-    first, most, run = 0, 0, 0
-    for k in range(2 * BINS):  # two turns, so that a run across the seam counts once
-        run = 0 if lit[k % BINS] else run + 1
-        if most < run <= BINS:
-            first, most = k + 1 - run, run
-    return first % BINS, most if most < BINS else 0
 
 
 def _within(bins: UInt16, first: int) -> Bool:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 
@@ -52,6 +53,11 @@ def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) 
     )
 
 
+AT_LEAST: Final = "at least"
+AT_MOST: Final = "at most"
+NO_LIMIT: Final = ""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Check:
     """One check of all clusters.
@@ -61,10 +67,10 @@ class Check:
         figure: Name of the checked quantity.
         unit: Unit of `value` and `limit`.
         value: shape (K,), NaN if unknown.
-        relation: "at least" or "at most" the limit; empty for a yes/no check, which fails for yes (1).
+        relation: AT_LEAST or AT_MOST the limit, which passes; NO_LIMIT for a yes/no check, which fails for
+            yes (1).
         limit: NaN without a limit.
         parameter: Dotted name of the parameter that sets the limit, empty without one.
-        fails: shape (K,); a check of an unknown value does not fail.
     """
 
     verdict: Verdict
@@ -72,9 +78,15 @@ class Check:
     unit: str
     value: Float
     relation: Literal["at least", "at most", ""]
-    limit: float
-    parameter: str
-    fails: Bool
+    limit: float = math.nan
+    parameter: str = ""
+
+    @property
+    def fails(self) -> Bool:
+        """Whether each cluster fails, shape (K,); a check of an unknown value does not fail."""
+        if self.relation == AT_LEAST:
+            return np.asarray(self.value < self.limit)
+        return np.asarray(self.value > (self.limit if self.relation == AT_MOST else 0.0))
 
 
 def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
@@ -84,64 +96,27 @@ def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
     p, c = parameters, clusters
     has_circle = np.isfinite(c.radius)
     radius = np.where(has_circle, c.radius, np.nan)
-    arc = np.where(has_circle, c.arc, np.nan)
-    cut = c.cut & p.whole
+    arc = np.degrees(np.where(has_circle, c.arc, np.nan))
+    cut, whole = c.cut & p.whole, "detection.whole" if p.whole else ""
     width, up = np.maximum(c.extent[:, 0], c.extent[:, 1]), c.extent[:, 2]
+    e, spread, flat = c.eccentricity, c.radial_std, p.cylindrical_stddev_thresh
     return (
-        _flag(Verdict.HIDDEN, "edge hidden", c.hidden, ""),
-        _at_most(Verdict.TOO_THICK, "width", "m", width, p.size_max, "size_max"),
-        _at_least(Verdict.TOO_LOW, "visible height", "m", up, p.height_extent_min, "height_extent_min"),
-        _flag(Verdict.AT_BORDER, "cut off at the border", cut, "detection.whole" if p.whole else ""),
-        _at_least(Verdict.TOO_ROUND, "eccentricity", "", c.eccentricity, p.e_min, "e_min"),
-        _at_most(Verdict.TOO_LONG, "eccentricity", "", c.eccentricity, p.e_max, "e_max"),
-        _at_most(
-            Verdict.NOT_ROUND,
-            "radial deviation",
-            "m",
-            c.radial_std,
-            p.cylindrical_stddev_thresh,
-            "cylindrical_stddev_thresh",
+        Check(Verdict.HIDDEN, "edge hidden", "", c.hidden.astype(np.float64), NO_LIMIT),
+        Check(Verdict.TOO_THICK, "width", "m", width, AT_MOST, p.size_max, "detection.size_max"),
+        Check(
+            Verdict.TOO_LOW, "visible height", "m", up, AT_LEAST, p.height_extent_min,
+            "detection.height_extent_min",
         ),
         Check(
-            Verdict.NO_ARC,
-            "visible arc",
-            "deg",
-            np.degrees(arc),
-            "at least",
-            p.arc_min,
-            "detection.arc_min",
-            arc < np.radians(p.arc_min),
+            Verdict.AT_BORDER, "cut off at the border", "", cut.astype(np.float64), NO_LIMIT, parameter=whole
         ),
-        _at_least(Verdict.TOO_THIN, "radius", "m", radius, p.radius_min, "radius_min"),
-        _at_most(Verdict.TOO_THICK, "radius", "m", radius, p.radius_max, "radius_max"),
-    )
-
-
-def _flag(verdict: Verdict, figure: str, is_set: Bool, parameter: str) -> Check:
-    """Return a yes/no check that fails where `is_set`, shape (K,), is true.
-
-    Args:
-        verdict: Verdict of a cluster that fails.
-        figure: Name of the checked quantity.
-        is_set: Whether each cluster fails.
-        parameter: Dotted name of the parameter; empty without one.
-    """
-    return Check(verdict, figure, "", is_set.astype(np.float64), "", np.nan, parameter, is_set)
-
-
-def _at_least(verdict: Verdict, figure: str, unit: str, value: Float, limit: float, name: str) -> Check:
-    """Return a check that fails below a limit, not for NaN.
-
-    Args:
-        verdict: Verdict of a cluster that fails.
-        figure, unit: Name and unit of the quantity.
-        value: Quantity of each cluster, shape (K,).
-        limit: The limit, which passes.
-        name: Name of the parameter of the stage `detection` that sets it.
-    """
-    return Check(verdict, figure, unit, value, "at least", limit, f"detection.{name}", value < limit)
-
-
-def _at_most(verdict: Verdict, figure: str, unit: str, value: Float, limit: float, name: str) -> Check:
-    """Return a check that fails above a limit, not for NaN; arguments as in `_at_least`."""
-    return Check(verdict, figure, unit, value, "at most", limit, f"detection.{name}", value > limit)
+        Check(Verdict.TOO_ROUND, "eccentricity", "", e, AT_LEAST, p.e_min, "detection.e_min"),
+        Check(Verdict.TOO_LONG, "eccentricity", "", e, AT_MOST, p.e_max, "detection.e_max"),
+        Check(
+            Verdict.NOT_ROUND, "radial deviation", "m", spread, AT_MOST, flat,
+            "detection.cylindrical_stddev_thresh",
+        ),
+        Check(Verdict.NO_ARC, "visible arc", "deg", arc, AT_LEAST, p.arc_min, "detection.arc_min"),
+        Check(Verdict.TOO_THIN, "radius", "m", radius, AT_LEAST, p.radius_min, "detection.radius_min"),
+        Check(Verdict.TOO_THICK, "radius", "m", radius, AT_MOST, p.radius_max, "detection.radius_max"),
+    )  # fmt: skip

@@ -64,8 +64,8 @@ def rows_of(covariance: Float) -> Float:
 
 @compiled_within
 def rotated(R: Float, d: int, c: float, s: float) -> tuple[float, float, float]:
-    """Return xx, xy, yy of C R[d] C^T, where C is the rotation by the angle with cosine c and sine s; row d
-    of R holds the elements xx, xy, yy of a covariance."""
+    """Return xx, xy, yy of C R[d] C^T, where C is the rotation by the angle with cosine c and sine s; R holds
+    the elements xx, xy, yy of covariances, shape (D, 3)."""
     xx, xy, yy = R[d, 0], R[d, 1], R[d, 2]
     return (
         c * c * xx - 2.0 * c * s * xy + s * s * yy,

@@ -59,8 +59,9 @@ def cell_of(u: int, v: int) -> int:
 
 @compiled_within
 def first_of_four(x: float, y: float, scale: float) -> tuple[int, int]:
-    """Return row and column of the first of the two by two cells that contain all positions within the radius
-    of x, y [m]; `scale` is the result of `per_metre`."""
+    """Return row and column (see `cell_of`) of the first of the two by two cells that contain all positions
+    within the radius of x, y [m]; the others have a row, a column or both larger by 1. `scale` are the cells
+    per metre for this radius."""
     return int(np.floor(scale * x - 0.5)), int(np.floor(scale * y - 0.5))
 
 
@@ -72,7 +73,7 @@ def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
         cells: Empty cells with room for `known` positions.
         mean: Finite positions, x, y first, shape (L, 2 or more) [m].
         known: Number of rows of `mean` to put in, from row 0 on.
-        scale: Cells per metre, see `per_metre`.
+        scale: Cells per metre, the result of `per_metre` for the largest radius of later searches.
     """
     for j in range(known - 1, -1, -1):
         put_in(cells, mean, j, scale)
@@ -80,8 +81,8 @@ def fill(cells: Cells, mean: Float, known: int, scale: float) -> None:
 
 @compiled_within
 def put_in(cells: Cells, mean: Float, j: int, scale: float) -> None:
-    """Put row j of `mean`, x, y first [m], which is in no cell, into its cell, in place, at the start of the
-    chain; see `fill`."""
+    """Put row j of `mean`, finite positions with x, y first, shape (L, 2 or more) [m], which is in no cell,
+    into its cell, in place, at the start of the chain; `scale` are the cells per metre."""
     at = cell_of(int(np.floor(scale * mean[j, 0])), int(np.floor(scale * mean[j, 1])))
     cells.cell[j] = at
     cells.following[j] = cells.head[at]
@@ -137,9 +138,11 @@ def nearest_in(cells: Cells, mean: Float, x: float, y: float, reach: float, scal
     a reach.
 
     Args:
-        cells, mean, scale: See `fill`.
+        cells: Grid of the positions.
+        mean: Positions, x, y first, shape (L, 2 or more) [m].
         x, y: Centre of the search [m].
         reach: Maximum distance [m], exclusive, at most the radius of `scale`.
+        scale: Cells per metre of the grid, see `per_metre`.
     """
     u, v = first_of_four(x, y, scale)
     best, nearest = reach * reach, -1

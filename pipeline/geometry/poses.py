@@ -101,17 +101,7 @@ class Pose3:
     def from_euler(cls, t: ArrayLike, roll: float, pitch: float, yaw: float) -> Pose3:
         """Return the pose of a translation (3,) [m] and R = Rz(yaw) Ry(pitch) Rx(roll), angles [rad]; numbers
         are not checked."""
-        cr, sr = np.cos(roll), np.sin(roll)
-        cp, sp = np.cos(pitch), np.sin(pitch)
-        cy, sy = np.cos(yaw), np.sin(yaw)
-        R = np.array(
-            [
-                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                [-sp, cp * sr, cp * cr],
-            ]
-        )
-        return cls(R, np.asarray(t, dtype=np.float64))
+        return cls(euler_rotation(roll, pitch, yaw), np.asarray(t, dtype=np.float64))
 
     def __matmul__(self, other: Pose3) -> Pose3:
         """Compose: `T_a_c = T_a_b @ T_b_c`."""
@@ -163,6 +153,19 @@ class Pose3:
     def planar(self) -> Pose2:
         """Return the planar pose: x, y and yaw; z, roll and pitch are dropped."""
         return Pose2(float(self.t[0]), float(self.t[1]), self.euler()[2])
+
+
+def euler_rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:
+    """Return R = Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3), of numbers [rad]; of arrays of shape (N,), shape
+    (N, 3, 3)."""
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    cy, sy = np.cos(yaw), np.sin(yaw)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
 
 def interpolate(a: Pose2, b: Pose2, fraction: float) -> Pose2:

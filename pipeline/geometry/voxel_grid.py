@@ -14,7 +14,7 @@ Int32 = NDArray[np.int32]
 
 AXIS_CELLS = 1 << 21  # three axes of 21 bits fit one 64-bit key
 # Odd 64-bit constant that distributes neighbouring cells over the hash table (Fibonacci hashing).
-_SPREAD = np.uint64(0x9E3779B97F4A7C15)
+SPREAD = np.uint64(0x9E3779B97F4A7C15)
 
 
 @compiled
@@ -52,7 +52,7 @@ def add_to_voxels(
             key = (key << 21) | (cell & (AXIS_CELLS - 1))
         # The hash table stores row numbers; keys are stored per row. Most voxels are new and need no key
         # comparison.
-        slot = np.int64((np.uint64(key) * _SPREAD) >> shift)
+        slot = np.int64((np.uint64(key) * SPREAD) >> shift)
         while slots[slot] >= 0 and keys[slots[slot]] != key:
             slot = (slot + 1) & mask
         row = slots[slot]

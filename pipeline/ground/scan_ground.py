@@ -70,8 +70,9 @@ def lowest_returns(points: Float32) -> tuple[Int32, Float]:
 
 @compiled
 def _cell_of(points: Float32) -> tuple[Int32, int]:
-    """Return the cell of each point, see `lowest_returns`, int32, shape (N,), and the number of rings up to
-    the farthest valid point, at least 1."""
+    """Return the cell of each point (shape (N, 3) [m]), sector * RINGS + ring, int32, shape (N,), -1 for a
+    point that is not finite or has |z| >= FARTHEST; and the number of rings up to the farthest valid point,
+    at least 1."""
     n = points.shape[0]
     sector, ring = on_the_grid(points)
     cell = np.empty(n, np.int32)
@@ -190,8 +191,8 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
 
 @compiled
 def _above_plane(points: Float32, plane: Float) -> Float32:
-    """Return the height of each point (shape (N, 3) [m]) above a plane (see `evidence`), float32, shape (N,)
-    [m]."""
+    """Return the height of each point (shape (N, 3) [m]) above a plane, float32, shape (N,) [m]; `plane` is
+    the height at the origin [m] and the slopes along x and y, shape (3,)."""
     above = np.empty(points.shape[0], np.float32)
     at, along, across = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     for i in range(points.shape[0]):
@@ -343,7 +344,13 @@ def _solve_rays(h: Float, w: Float, wz: Float, along: Float, across: Float) -> N
 @compiled
 def _solve_circles(h: Float, w: Float, wz: Float, along: Float, across: Float) -> None:
     """Solve the membrane along all circles, with the neighbouring rings fixed, in place. At the seam the
-    previous heights are used. The arguments are those of `_solve_rays`."""
+    previous heights are used.
+
+    Args:
+        h: Heights above the trend, shape (SECTORS, rings) [m]; changed in place.
+        w, wz: Weights of the candidates, and weights times heights, same shape.
+        along, across: Stiffness to the next ring and to the next sector, shape (rings,).
+    """
     sectors, rings = h.shape
     upper, right = np.empty((sectors, rings)), np.empty((sectors, rings))
     for s in range(sectors):

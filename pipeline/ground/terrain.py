@@ -140,7 +140,9 @@ def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
 
 @compiled
 def _height_above(points: Float32, height: Float) -> Float32:
-    """Return the result of `height_above`, from `Terrain.height`, by bilinear interpolation of the nodes."""
+    """Return the height of each point (float32, shape (N, 3) [m], level sensor frame) above the ground,
+    float32, shape (N,) [m], by bilinear interpolation of the nodes `Terrain.height`; NaN for a point that is
+    not finite."""
     rings = height.shape[1]
     corners = _corners(height)
     node, f, g = _nodes(*on_the_grid(points), height.shape[0], rings)

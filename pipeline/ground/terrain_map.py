@@ -255,8 +255,8 @@ class HeightMapper:
         return np.array([self._at(int(i), int(j)) for i, j in cell])
 
     def _at(self, i: int, j: int) -> float:
-        """Return the height at the cell with the indices i, j along x and y (of the whole map) [m], NaN if it
-        and its neighbours are unknown; see `heights`."""
+        """Return the height at the cell with the indices i, j along x and y (of the whole map) [m]: its own,
+        else the weighted mean of its known neighbours, else NaN."""
         mean, weight = 0.0, 0.0
         for di, dj in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
             tile = self.state.tiles.get(((i + di) // SIDE, (j + dj) // SIDE))

@@ -19,12 +19,13 @@ from pipeline.classification.forest import vote
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
-from pipeline.inventory.cloud import ExtentFinder, SpooledCloud, Thinned, WholeCloud
+from pipeline.inventory.cloud import ExtentFinder, SpooledCloud, Thinned
 from pipeline.inventory.cross_sections import FIGURES, HIGHEST, LOWEST, Slices, cut, slice_heights
-from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of
+from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of, without_heights
 from pipeline.inventory.stem_model import Stems, classify_stems, describe_stems, diameters, is_repeated
 from pipeline.inventory.stem_tracing import find_columns, strongest_first, trace
 from pipeline.inventory.terrain_raster import LowestReturns, TerrainRaster, heights_above
+from pipeline.types.clouds import WholeCloud
 from pipeline.types.records import Float32, Int, Int32, Trees, Verdict
 
 MOST_RASTER = 96 << 20  # bytes
@@ -51,7 +52,7 @@ class PlotMap:
         tree_candidate: Row of each tree in these tables, shape (T,).
         ground: Height map.
         points: Thinned points between LOWEST and HIGHEST above the ground, shape (N, 4).
-        counts: Numbers of points by name.
+        counts: Numbers of points: "read", "apart from the plot", "below the ground", "thinned", "in slices".
         voxel_size: Side of the voxels of the thinning [m].
         whole: Thinned points of all heights (x, y, z, height above the ground), shape (M, 4) [m].
         crowns: Tree of each of these points, and the heights of the trees.
@@ -84,7 +85,7 @@ class PlotPoints:
         slices: These points by height.
         axes, features: Columns, see `find_columns`, strongest first.
         voxels: Points of all heights.
-        counts: Numbers of points by name.
+        counts: Numbers of points by name, as in `PlotMap`.
     """
 
     ground: TerrainRaster
@@ -107,7 +108,12 @@ PARAMETERS = (
 
 
 def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = package_alone) -> PlotMap:
-    """Return the map of the stems of a whole cloud, see `Inventory`.
+    """Return the map of the stems of a whole cloud.
+
+    Args:
+        cloud: The cloud, which is read once.
+        parameters: All parameters; those named in PARAMETERS are used.
+        forests: Returns the random forest by its name.
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or is larger than a plot.
@@ -166,6 +172,8 @@ class Inventory:
         tree = np.flatnonzero(verdict == Verdict.TREE)
         order = tree[np.lexsort((place[tree, 1], place[tree, 0]))]  # numbers increase from west to east
         crowns = find_crowns(p.voxels, stems[order], p.ground)
+        if self._cloud.description.cut_above:
+            crowns = without_heights(crowns, "the sensor of the drive did not see above its field of view")
         return PlotMap(
             trees=_trees(stems[order], np.radians(parameters.tracking.dbh_arc_min), crowns),
             stems=stems,
@@ -188,7 +196,16 @@ class Inventory:
         self._cloud.close()
 
     def _points(self, slope_max: float) -> Generator[float, None, PlotPoints]:
-        """Read the points, and find the ground, the slices and the columns."""
+        """Read the points, and find the ground, the slices and the columns; yield the share of the whole work
+        that is done.
+
+        Args:
+            slope_max: Largest slope of the terrain against the plane of the plot [degrees].
+
+        Raises:
+            SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER
+                bytes.
+        """
         whole = Thinned(SHOWN, SHOWN_SIDE)
         ground, near, counts = yield from ground_steps(self._cloud, slope_max, whole=whole)
         yield 0.38
@@ -204,20 +221,13 @@ class Inventory:
 
 
 def finish(steps: Generator[float, None, T]) -> T:
-    """Return the result of a generator after all of its steps."""
+    """Return the result of a generator after all of its steps; what they yield is discarded."""
     while True:
         try:
             next(steps)
         except StopIteration as end:
             result: T = end.value
             return result
-
-
-def find_ground(
-    cloud: WholeCloud, slope_max: float, *, band: tuple[float, float] = (LOWEST, HIGHEST), most: int = 1 << 21
-) -> tuple[TerrainRaster, Thinned, dict[str, int]]:
-    """Return the result of `ground_steps`; arguments as in it."""
-    return finish(ground_steps(cloud, slope_max, band=band, most=most))
 
 
 def ground_steps(
@@ -330,4 +340,4 @@ def _warnings(cloud: WholeCloud, points: PlotPoints) -> tuple[str, ...]:
     return tuple(warnings)
 
 
-__all__ = ["PARAMETERS", "Inventory", "PlotMap", "find_ground", "finish", "map_plot"]
+__all__ = ["PARAMETERS", "Inventory", "PlotMap", "finish", "ground_steps", "map_plot"]

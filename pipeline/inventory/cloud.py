@@ -1,4 +1,4 @@
-"""Whole clouds: the interface of their sources, the extent of the plot, and thinning in bounded memory."""
+"""Whole clouds: one reading of the source, the extent of the plot, and thinning in bounded memory."""
 
 from __future__ import annotations
 
@@ -6,62 +6,15 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO
 
 import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
 from pipeline.geometry.voxel_grid import add_to_voxels
+from pipeline.types.clouds import CloudDescription, WholeCloud
 from pipeline.types.records import Float32, Int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CloudDescription:
-    """What is known of a whole cloud before its points are read.
-
-    Attributes:
-        uri: As the user wrote it.
-        kind: Name of the format, e.g. "LAS 1.4 compressed".
-        points: Number of points by the header.
-        offset: Offset that is subtracted from the coordinates, so that 32 bits hold the rest, shape (3,) [m].
-        crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
-        digest: SHA-256 (hex) of the file.
-        warnings: Messages for the user.
-        low, high: Corners by the header in the coordinates of the file, shape (3,) [m]; not checked.
-        attributes: Names of the columns besides the coordinates.
-    """
-
-    uri: str
-    kind: str
-    points: int
-    offset: Float
-    crs: str
-    digest: str
-    warnings: tuple[str, ...] = ()
-    low: Float | None = None
-    high: Float | None = None
-    attributes: tuple[str, ...] = ()
-
-
-class WholeCloud(Protocol):
-    """A whole cloud of a plot, read in parts."""
-
-    @property
-    def description(self) -> CloudDescription:
-        """Description that is known before reading."""
-
-    @property
-    def losses(self) -> dict[str, int]:
-        """Points left out in the latest reading, by reason."""
-
-    def parts(self) -> Iterator[Float32]:
-        """Yield all points in parts: x, y, z minus the offset [m], finite, float32, shape (N, 3). Each call
-        reads the cloud from its beginning.
-
-        Raises:
-            SourceError: Nothing can be read.
-        """
 
 
 class SpooledCloud:
@@ -89,7 +42,13 @@ class SpooledCloud:
         return self._cloud.losses
 
     def parts(self) -> Iterator[Float32]:
-        """Yield all points in parts, see `WholeCloud.parts`."""
+        """Yield all points in parts: x, y, z minus the offset [m], float32, shape (N, 3). Each call begins at
+        the first point. The first complete reading is stored; one that is left before its end, or a full
+        disk, stores nothing.
+
+        Raises:
+            SourceError: Nothing can be read from the source.
+        """
         if self._file is not None:
             yield from _read_points(self._file)
             return
@@ -115,7 +74,7 @@ class SpooledCloud:
                 spool.close()
 
     def close(self) -> None:
-        """Delete the temporary file."""
+        """Delete the temporary file; a later reading comes from the source again."""
         if self._file is not None:
             self._file.close()
             self._file = None
@@ -169,7 +128,8 @@ class ExtentFinder:
             raise SourceError("the points are spread too widely for a plot", where=where)
 
     def extent(self, where: str) -> Extent:
-        """Return the extent of all points so far.
+        """Return the extent of the squares with LEAST points and those next to them (of all without such a
+        square), and the numbers of all points and of those in other squares.
 
         Raises:
             SourceError: There are no points; `where` is the name of the cloud.
@@ -239,13 +199,15 @@ class Thinned:
         self._slots = np.full(2 * room, -1, np.int32)
         self._used = 0
 
-    def add(self, points: Float32) -> None:
+    def add(self, points: Float32, weight: Int | None = None) -> None:
         """Add points of shape (N, 4): x, y, z within 10 km of the origin [m], and another value, which is
-        averaged too. `side` grows if the table is full."""
-        self._add(points, np.ones(len(points), np.int64))
+        averaged too. `side` grows if the table is full.
 
-    def _add(self, points: Float32, weight: Int) -> None:
-        """Add points (see `add`), each of which represents `weight` points, shape (N,)."""
+        Args:
+            points: The points.
+            weight: Number of points that each of them represents, shape (N,); None for 1 each.
+        """
+        weight = np.ones(len(points), np.int64) if weight is None else weight
         begin = 0
         while True:
             tables = self._keys, self._sums, self._counts, self._slots, self._used
@@ -258,7 +220,7 @@ class Thinned:
             else:
                 self.side *= COARSER
             self._begin(room)
-            self._add(mean, count)
+            self.add(mean, count)
 
     @property
     def points(self) -> Float32:

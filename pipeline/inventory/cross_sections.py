@@ -11,16 +11,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pipeline.classification.voxel_map import SLICE
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
+from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Float32, Int
 
 TRIES = 500  # circles through three points
 MOST_POINTS = 500  # points that vote
 TUKEY = 4.7  # sigma; 95 % efficiency for normal errors (Holland and Welsch 1977)
 BARK = 0.004  # m; roughness of a trunk, the smallest scatter
-SECTORS = 36
 FIGURES = 11  # cx, cy, r, var x, cov xy, var y, var r, scatter, coverage, inliers, contrast
 RING = 0.5  # width of the ring around a circle, as a share of the radius; at least a tenth of a metre
 
@@ -192,8 +193,10 @@ def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered
     NaN without points on it.
 
     Args:
-        xy, x, y, r, tolerance: As in `_coverage`.
-        covered, on: Result of `_coverage`.
+        xy: Points, shape (N, 2) [m].
+        x, y, r: Centre and radius of the circle [m].
+        tolerance: Maximum distance of a point on the circle [m].
+        covered, on: Visible angle [rad] and number of points on the circle, see `_coverage`.
     """
     near, far = r + tolerance, r + tolerance + max(0.1, RING * r)
     in_ring = 0.0
@@ -222,7 +225,7 @@ def share_inside(xy: Float, x: float, y: float, r: float) -> float:
 
 
 LOWEST, HIGHEST = 0.2, 6.2  # m above the ground; heights in which stems are traced
-STEP = 0.2  # m; between slices
+STEP = SLICE  # m; between slices
 THICK = 2  # thickness of a slice in steps; neighbours overlap
 BUCKET = 0.5  # m
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.classification.column_extraction import BREAST
 from pipeline.geometry.poses import Float
 from pipeline.inventory.stem_model import Stems
-from pipeline.inventory.stem_tracing import BREAST
 from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.types.records import Float32, Int, Int32
 
@@ -63,8 +63,13 @@ class Voxels:
 
 
 def voxels_of(points: Float32, side: float) -> Voxels:
-    """Return the graph of the voxels of a cloud; arguments as in `Voxels`. Each step leads to one of the 80
-    voxels around a voxel whose distance is at most the square root of 5."""
+    """Return the graph of the voxels with points more than CELL above the ground. Each step leads to one of
+    the 80 voxels around a voxel whose distance is at most the square root of 5 cells.
+
+    Args:
+        points: x, y, z, height above the ground, shape (M, 4) [m]; M may be 0.
+        side: Side of the cubes of the thinning [m].
+    """
     from scipy.sparse import coo_matrix
     from scipy.spatial import cKDTree
 
@@ -82,10 +87,11 @@ def voxels_of(points: Float32, side: float) -> Voxels:
 def find_crowns(voxels: Voxels, stems: Stems, ground: TerrainRaster) -> Crowns:
     """Return the points of each tree and its height.
 
-    The height is that of the highest point of the tree. It is not seen if the ground at the stem is not seen,
-    the stem ends abruptly, the top may be cut by the border or the upper end of the cloud, something else
-    rises above it, or the highest returns are far apart. The standard deviation combines the height of the
-    ground, the thinning, and the mean distance between the highest returns, by which the top can be missed.
+    The height is that of the highest point of the tree. It is not seen (NaN, with the reason) if the ground
+    at the stem is not seen, the tree has fewer than TIP points, the stem ends abruptly, the top may be cut by
+    the border or the upper end of the cloud, something else rises above it, or the highest returns are far
+    apart. The standard deviation combines the height of the ground, the thinning, and the mean distance
+    between the highest returns, by which the top can be missed.
 
     Args:
         voxels: The cloud.
@@ -132,6 +138,13 @@ def find_crowns(voxels: Voxels, stems: Stems, ground: TerrainRaster) -> Crowns:
             height[k] = top[2] - z0[k]
             sigma[k] = np.sqrt(GROUND_SIGMA**2 + voxels.side**2 / 12.0 + apart**2)
     return Crowns(tree, height, sigma, tuple(hidden))
+
+
+def without_heights(crowns: Crowns, why: str) -> Crowns:
+    """Return crowns whose heights are all unknown (NaN) for the reason `why`; `tree` is that of the argument,
+    which is not changed."""
+    unknown = np.full(len(crowns.height), np.nan)
+    return Crowns(crowns.tree, unknown, unknown.copy(), (why,) * len(unknown))
 
 
 def _nearest_stems(voxels: Voxels, stems: Stems) -> Int32:

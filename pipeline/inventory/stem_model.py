@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.classification.column_extraction import BREAST
 from pipeline.classification.forest import CLASSES
-from pipeline.detection.verdicts import Check
+from pipeline.detection.cylinder_fit import MODEL
+from pipeline.detection.verdicts import AT_LEAST, AT_MOST, Check
 from pipeline.geometry.poses import Float
 from pipeline.inventory.cross_sections import STEP, TUKEY, slice_heights, without_scatter
-from pipeline.inventory.stem_tracing import BREAST
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Int32, Verdict
 
-_MIN: Final = "at least"
-_MAX: Final = "at most"
-
 LOCAL = 1.0  # m above and below breast height in which the taper is nearly constant
-MODEL = 0.003  # m; deviation of a trunk from a circle
 BESIDE = 0.3  # m outside of a stem; bark, root flares and branches form columns here that are no trees
 LEAST_HIGH = 1.2  # m; least height of a stem
 FILLED = 2.0 / 3.0  # least share of the slices between the lowest and the highest with a circle
@@ -96,10 +93,11 @@ def describe_stems(circles: Float) -> Stems:
 
 
 def _describe(stem: Any, rows: Float, h: Float) -> None:  # noqa: ANN401 - a row of a structured array
-    """Fill the model of a stem.
+    """Fill all fields of a stem but `slices`, by robust lines through its circles near breast height, or near
+    the slices next to it.
 
     Args:
-        stem: Row of the type STEM.
+        stem: Row of the type STEM; changed in place.
         rows: Its circles, shape (N, FIGURES), N at least 2.
         h: Their heights, shape (N,) [m].
     """
@@ -143,44 +141,50 @@ def classify_stems(stems: Stems, share: Float, r_min: float, r_max: float) -> In
 
 
 def stem_checks(stems: Stems, share: Float, r_min: float, r_max: float) -> tuple[Check, ...]:
-    """Return the checks of `classify_stems` in their order, with all values and limits, as an explanation.
-    Limits that differ from stem to stem are 1, and the values are shares of them."""
+    """Return the checks of `classify_stems` in their order, with all values and limits, as an explanation:
+    radius, height, distance from breast height, slices, contrast, taper, roundness, votes. Limits that differ
+    from stem to stem are 1, and the values are shares of them. For a stem without a model all values except
+    the votes are NaN.
+
+    Args:
+        stems: Result of `describe_stems`, shape (K,).
+        share: Votes of the random forest, in the order of CLASSES, shape (K, 6).
+        r_min, r_max: Minimum and maximum radius of a tree [m].
+    """
     r, span, contrast = stems["radius"], stems["last"] - stems["first"], stems["contrast"]
     taper = stems["taper"]
     filled = stems["slices"] / (span / STEP + 1.0)
     checks = [
-        Check(Verdict.TOO_THIN, "radius", "m", r, _MIN, r_min, "detection.radius_min", r < r_min),
-        Check(Verdict.TOO_THICK, "radius", "m", r, _MAX, r_max, "detection.radius_max", r > r_max),
-        Check(Verdict.TOO_LOW, "traced height", "m", span, _MIN, LEAST_HIGH, "", span < LEAST_HIGH),
-        Check(
-            Verdict.OTHER, "distance of a slice from breast height", "m", stems["near"], _MAX, LOCAL, "",
-            stems["near"] > LOCAL,
-        ),
-        Check(Verdict.BUSH, "share of slices", "", filled, _MIN, FILLED, "", filled < FILLED),
-        Check(
-            Verdict.BUSH, "contrast", "", contrast, _MIN, LEAST_CONTRAST, "", contrast < LEAST_CONTRAST
-        ),
-        Check(Verdict.BUSH, "radius gained per metre", "m", taper, _MAX, WIDENS, "", taper > WIDENS),
-    ]  # fmt: skip
-    for figure, value, limit in (
-        ("unevenness of the radii", stems["uneven"], STRAIGHT * r + MODEL),
-        ("offset from a straight axis", stems["crooked"], STRAIGHT * r + MODEL),
-        ("sigma of the radius", stems["radius_sigma"], STRAIGHT * r + MODEL),
+        Check(Verdict.TOO_THIN, "radius", "m", r, AT_LEAST, r_min, "detection.radius_min"),
+        Check(Verdict.TOO_THICK, "radius", "m", r, AT_MOST, r_max, "detection.radius_max"),
+        Check(Verdict.TOO_LOW, "traced height", "m", span, AT_LEAST, LEAST_HIGH),
+        Check(Verdict.OTHER, "distance of a slice from breast height", "m", stems["near"], AT_MOST, LOCAL),
+        Check(Verdict.BUSH, "share of slices", "", filled, AT_LEAST, FILLED),
+        Check(Verdict.BUSH, "contrast", "", contrast, AT_LEAST, LEAST_CONTRAST),
+        Check(Verdict.BUSH, "radius gained per metre", "m", taper, AT_MOST, WIDENS),
+    ]
+    limit = STRAIGHT * r + MODEL
+    for figure, name in (
+        ("unevenness of the radii", "uneven"),
+        ("offset from a straight axis", "crooked"),
+        ("sigma of the radius", "radius_sigma"),
     ):
-        value = value / limit
-        name = f"{figure}, share of the limit"
-        checks.append(Check(Verdict.NOT_ROUND, name, "", value, _MAX, 1.0, "", value > 1.0))
+        share_of_limit = stems[name] / limit
+        checks.append(
+            Check(Verdict.NOT_ROUND, f"{figure}, share of the limit", "", share_of_limit, AT_MOST, 1.0)
+        )
     for kind in (Verdict.POLE, Verdict.PERSON, Verdict.WALL):
         votes = share[:, CLASSES.index(kind)]
-        checks.append(Check(kind, f"votes for {kind.label}", "", votes, _MAX, SURE, "", votes > SURE))
+        checks.append(Check(kind, f"votes for {kind.label}", "", votes, AT_MOST, SURE))
     return tuple(checks)
 
 
 def diameters(stems: Stems, arc_min: float) -> tuple[Float, Float]:
     """Return diameter at breast height and its sigma [m], shape (K,) each.
 
-    Both are NaN for a stem whose visible arc is less than `arc_min`, without a slice within half of LOCAL of
-    breast height, or with a sigma of the radius above a quarter of the radius.
+    Both are NaN for a stem whose visible arc is less than `arc_min`, with fewer than three slices, without a
+    slice within half of LOCAL of breast height, or with a sigma of the radius from a quarter of the radius
+    on.
 
     The diameter is measured across the axis: a level slice of a trunk with lean theta is an ellipse, wider by
     1 / cos theta along the lean, and the circle through it has the mean of both. The bias by the scatter of

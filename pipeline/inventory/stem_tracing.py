@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pipeline.classification.column_extraction import HIGH, MARGIN, examine
+from pipeline.classification.column_extraction import BREAST, HIGH, MARGIN, examine
 from pipeline.classification.features import COUNT, features
 from pipeline.classification.voxel_map import SIDE, SLICE, SLICES, TILE, VoxelMap
 from pipeline.geometry.poses import Float
@@ -25,7 +25,6 @@ from pipeline.inventory.cross_sections import (
 from pipeline.jit import compiled
 from pipeline.types.records import Float32
 
-BREAST = 1.3  # m above the ground
 LEAST = 12  # points on a circle; with fewer, chance places circles above one another
 ARC = np.radians(70.0)  # least arc of a circle of a stem
 HOLLOW = 0.25  # largest share of points inside of a circle
@@ -63,7 +62,8 @@ def find_columns(points: Float32) -> Iterator[tuple[Float, Float]]:
 
 
 def strongest_first(tiles: Sequence[tuple[Float, Float]]) -> tuple[Float, Float]:
-    """Return the columns of all tiles, see `find_columns`, strongest first."""
+    """Return axes, shape (K, 5), and features, shape (K, COUNT), of the columns of all tiles (results of
+    `find_columns`), strongest first; without tiles, no rows."""
     axes = np.concatenate([np.zeros((0, 5)), *(axes for axes, _ in tiles)])
     rows = np.concatenate([np.zeros((0, COUNT)), *(rows for _, rows in tiles)])
     order = np.argsort(-axes[:, 4], kind="stable")
@@ -90,7 +90,8 @@ def trace(slices: Slices, axes: Float, r_min: float, r_max: float) -> Float:
 
 @compiled
 def _trace(slices: Slices, axes: Float, height: Float, r_min: float, r_max: float) -> Float:
-    """Return the result of `trace`; `height` is the result of `slice_heights`."""
+    """Return the circles along the axes of columns, see `trace`, shape (K, S, FIGURES), for the heights of
+    `slice_heights`, shape (S,) [m]."""
     out = np.full((axes.shape[0], height.shape[0], FIGURES), np.nan)
     circles = np.empty((height.shape[0], FIGURES))
     for s in range(axes.shape[0]):

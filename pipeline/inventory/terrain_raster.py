@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Float
+from pipeline.ground.scan_ground import TOLERANCE
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, Int, Int32
 
@@ -24,7 +25,6 @@ KEPT = 8  # lowest returns of a cell
 TOGETHER = 0.3  # m; a ground return has two more returns within this height above it
 PIT = 0.5  # m; a cell this far below its neighbours is noise
 BLOCK = 32  # columns of the raster whose neighbours are sorted at once, to bound the memory
-TOLERANCE = 0.15  # m; grass and noise above the steepest slope
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +57,7 @@ class TerrainRaster:
 
     def cells_seen_around(self, places: Float) -> Int:
         """Return the number of cells with ground returns among the 3 x 3 cells around each position, shape
-        (N,); `places` have the shape (N, 2) [m]."""
+        (N,); outside of the raster, around its nearest cell. `places` have the shape (N, 2) [m]."""
         from scipy.ndimage import convolve
 
         count = convolve(self.seen.astype(np.int64), np.ones((3, 3), np.int64), mode="constant")
@@ -105,7 +105,9 @@ class LowestReturns:
         z = ground[:, :, 2] - ground[:, :, :2] @ trend[:2] - trend[2]
         for _ in range(2):
             _remove_pits(z, upright)
-        _remove_overhanging(z, float(np.tan(slope_max)))
+        # A cell that is steeper above a lower one than the terrain can be is not ground.
+        rise = float(np.tan(slope_max)) * CELL
+        z[z > _lowest_cone(z, rise) + TOLERANCE + rise] = np.inf
         seen = np.isfinite(z)
         centre = self._low + (np.moveaxis(np.indices(z.shape), 0, -1) + 0.5) * CELL
         height = _interpolated(ground[seen][:, :2], z[seen], centre)
@@ -188,7 +190,7 @@ def _continues_upwards(z: Float, occupied: UInt64) -> Bool:
 
     Args:
         z: Heights of the lowest returns [m], infinite for none, shape (columns, rows).
-        occupied: Bits of the occupied height bins of each cell, see `_keep_lowest`.
+        occupied: Bits of the occupied height bins of each cell, half of PIT high and modulo 64, same shape.
     """
     lowest = np.floor(np.where(np.isfinite(z), z, 0.0) / (0.5 * PIT)).astype(np.int64)
     one = np.uint64(1)
@@ -243,17 +245,6 @@ def _remove_pits(z: Float, upright: Bool) -> None:
         known = np.isfinite(around).sum(axis=2)
         quartile = np.take_along_axis(around, np.minimum(known // 4, 23)[:, :, None], axis=2)[:, :, 0]
         part[(known >= 4) & ~upright[first : first + BLOCK] & (part < quartile - PIT)] = np.inf
-
-
-def _remove_overhanging(z: Float, slope: float) -> None:
-    """Remove cells that are steeper above a lower cell than the terrain can be, in place.
-
-    Args:
-        z: Lowest returns above the trend, shape (columns, rows) [m]; removed cells become infinite.
-        slope: Maximum slope (rise over run).
-    """
-    rise = slope * CELL
-    z[z > _lowest_cone(z, rise) + TOLERANCE + rise] = np.inf
 
 
 @compiled
@@ -314,7 +305,8 @@ def _interpolated(places: Float, z: Float, centre: Float) -> Float:
 
 @compiled
 def _evaluate(height: Float, low: Float, cell: float, x: Float, y: Float) -> Float:
-    """Return `ground_at` for positions x, y of shape (N,) each [m], shape (N, 3); arguments as in it."""
+    """Return height [m] and slopes along x and y, see `ground_at`, at positions x, y of shape (N,) each [m];
+    shape (N, 3)."""
     out = np.empty((x.shape[0], 3))
     for i in range(x.shape[0]):
         out[i, 0], out[i, 1], out[i, 2] = ground_at(height, low, cell, x[i], y[i])
@@ -347,7 +339,13 @@ def ground_at(height: Float, low: Float, cell: float, x: float, y: float) -> tup
 
 @compiled
 def _heights_above(points: Float32, height: Float, low: Float, cell: float) -> Float32:
-    """Return the result of `heights_above`; arguments of the raster as in `ground_at`."""
+    """Return the height of each point, shape (N, 3) [m], above the raster, float32, shape (N,) [m].
+
+    Args:
+        points: The points, finite.
+        height, low, cell: Heights at the centres of the cells, shape (columns, rows) [m], corner, shape (2,)
+            [m], and side [m] of the raster.
+    """
     above = np.empty(points.shape[0], np.float32)
     for i in range(points.shape[0]):
         above[i] = points[i, 2] - ground_at(height, low, cell, points[i, 0], points[i, 1])[0]

@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
 
 from pipeline.errors import StemmapError
-
-if sys.platform != "win32":
-    import fcntl
 
 # Prefix of a folder in which files are written before all of them are complete.
 UNFINISHED = ".unfinished-"
@@ -28,7 +22,8 @@ def write_beside(path: Path) -> Iterator[Path]:
     disk and replaces `path` in one step; if the block raises, it is removed and `path` does not change.
 
     Raises:
-        StemmapError: The folder does not exist, `path` is a folder, or writing fails.
+        StemmapError: The folder does not exist, `path` is a folder, or writing fails; an OSError of the block
+            counts as such.
     """
     if not path.parent.is_dir():
         raise StemmapError(
@@ -65,33 +60,6 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
         with write_beside(folder / name) as partial:
             partial.write_text(text, encoding="utf-8", newline="")
     return [folder / name for name in texts]
-
-
-def hold(file: IO[Any]) -> None:
-    """Lock an open file until it is closed or the process ends. Other processes see the lock with `is_held`.
-    On Windows, which locks open files itself, nothing is done.
-
-    Raises:
-        OSError: Another process has locked it (BlockingIOError), or the disk does not support locks.
-    """
-    if sys.platform != "win32":  # Windows locks open files
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
-def is_held(path: Path) -> bool:
-    """Return whether another process has locked a file, see `hold`. False if it does not exist, and always on
-    Windows.
-
-    Raises:
-        OSError: The file cannot be opened, or the disk does not support locks.
-    """
-    if sys.platform != "win32":
-        with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
-            try:
-                fcntl.flock(file.fileno(), fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return True
-    return False
 
 
 def _to_disk(path: Path) -> None:

@@ -3,10 +3,7 @@ recordings."""
 
 from __future__ import annotations
 
-import csv
 import json
-import math
-from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +13,7 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
+from pipeline.io.csv_table import CsvTable
 from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.types.records import HIDDEN, Sensor, Truth, TruthPath, TruthTrees
 
@@ -46,128 +44,41 @@ def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
         SourceError: It cannot be read, is larger than 8 MB, is not such a table, or a coordinate is beyond
             COORDINATE_LIMIT; the message names line and column.
     """
-    return parse_truth_trees(_text_of(path), where=str(path), dbh_unit=dbh_unit)
+    return _trees_of(CsvTable.read(path, "table of trees", LARGEST_FILE), dbh_unit)
 
 
 def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> TruthTrees:
-    """Parse the text of a table, see `read_truth_trees`. A header without rows gives no trees.
+    """Parse the text of a table as `read_truth_trees` does: positions and diameters [m], the latter NaN where
+    unknown, and classes. A header without rows gives no trees.
 
     Args:
         text: The text.
         where: Name of the table in messages.
-        dbh_unit: See `read_truth_trees`.
+        dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit; None refuses such a column.
 
     Raises:
-        SourceError: It is not such a table; the message names line and column.
+        SourceError: It is not such a table, or a coordinate is beyond COORDINATE_LIMIT; the message names
+            line and column.
     """
-    lines, rows = _rows_of(text, where)
-    header = [name.strip().lower() for name in rows[0]] if rows else []
-    column = {name: k for k, name in reversed(list(enumerate(header)))}
-    table = _Table(where, lines[1:], rows[1:], column)
+    return _trees_of(CsvTable(text, "table of trees", where), dbh_unit)
+
+
+def _trees_of(table: CsvTable, dbh_unit: str | None) -> TruthTrees:
+    """Return the trees of a table; arguments as in `parse_truth_trees`.
+
+    Raises:
+        SourceError: A column is missing, a cell is not a number, or the unit of the diameters is unknown.
+    """
     x, y = _positions(table)
     dbh = _diameters(table, dbh_unit)
     return TruthTrees(x, y, dbh, _kinds(table))
 
 
-class _Table:
-    def __init__(self, where: str, lines: list[int], rows: list[list[str]], column: dict[str, int]) -> None:
-        """Store the parts of a table.
-
-        Args:
-            where: Name of the table in errors.
-            lines: Line number of each row in the file.
-            rows: Cells of each row, without the header.
-            column: Index of each column by its name in lower case.
-        """
-        self.where, self.lines, self.rows, self.column = where, lines, rows, column
-
-    def find(self, names: Iterable[str]) -> str | None:
-        """Return the first of some names that is a column; None if none is."""
-        return next((name for name in names if name in self.column), None)
-
-    def text(self, name: str) -> list[str]:
-        """Return the stripped cells of a column, "" where a row is too short.
-
-        Raises:
-            KeyError: There is no such column.
-        """
-        k = self.column[name]
-        return [row[k].strip() if k < len(row) else "" for row in self.rows]
-
-    def numbers(self, name: str, *, required: bool) -> Float:
-        """Return the numbers of a column, shape (N,). Without `required`, empty cells, "nan" and "na" give
-        NaN.
-
-        Raises:
-            SourceError: A cell is not a number, or is beyond COORDINATE_LIMIT.
-        """
-        return np.array(
-            [self._number(text, name, k, required) for k, text in enumerate(self.text(name))], np.float64
-        )
-
-    def _number(self, text: str, name: str, row: int, required: bool) -> float:
-        """Return the number of one cell, see `numbers`.
-
-        Args:
-            text: The cell.
-            name, row: Name of the column and index of the row, for errors.
-            required: Whether an unknown number is an error.
-        """
-        if text == "" and not required:
-            return math.nan
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value) and (required or text.lower() not in ("nan", "na")):
-            raise SourceError(f"line {self.lines[row]}: {name} = {text!r} is not a number", where=self.where)
-        if abs(value) >= COORDINATE_LIMIT:
-            raise SourceError(
-                f"line {self.lines[row]}: {name} = {text!r} is out of range",
-                where=self.where,
-                remedy=f"Give numbers between -{COORDINATE_LIMIT:,.0f} and {COORDINATE_LIMIT:,.0f}",
-            )
-        return value
-
-
-def _text_of(path: Path) -> str:
-    """Return the text of a table of trees, without a byte order mark.
-
-    Raises:
-        SourceError: It cannot be read, is larger than 8 MB, or is not UTF-8.
-    """
-    try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise SourceError("the table of trees is larger than 8 MB", where=str(path))
-        return path.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise SourceError(f"cannot read the table of trees: {error.strerror}", where=str(path)) from None
-    except UnicodeDecodeError:
-        raise SourceError("the table of trees is not text", where=str(path)) from None
-
-
-def _rows_of(text: str, where: str) -> tuple[list[int], list[list[str]]]:
-    """Return the line number and the cells of every row that is not empty, the header first; two empty lists
-    for an empty text. The delimiter is the most frequent one of comma, semicolon and tab in the first line.
-
-    Raises:
-        SourceError: The text is no CSV.
-    """
-    first = text.partition("\n")[0]
-    delimiter = max(",;\t", key=first.count)
-    try:
-        reader = csv.reader(text.splitlines(), delimiter=delimiter)
-        numbered = [(reader.line_num, row) for row in reader if any(row)]
-    except csv.Error as error:
-        raise SourceError(f"the table of trees is not a CSV: {error}", where=where) from None
-    return [line for line, _ in numbered], [row for _, row in numbered]
-
-
-def _positions(table: _Table) -> tuple[Float, ...]:
+def _positions(table: CsvTable) -> tuple[Float, ...]:
     """Return x and y of each row, shape (N,) [m], from columns of coordinates or of azimuth and distance.
 
     Raises:
-        SourceError: The table has neither, or a cell is not a number.
+        SourceError: The table has neither, or a cell is not a number or beyond COORDINATE_LIMIT.
     """
     x, y = table.find(_X), table.find(_Y)
     if x is not None and y is not None:
@@ -185,7 +96,7 @@ def _positions(table: _Table) -> tuple[Float, ...]:
     return reach * np.sin(angle), reach * np.cos(angle)
 
 
-def _diameters(table: _Table, dbh_unit: str | None) -> Float:
+def _diameters(table: CsvTable, dbh_unit: str | None) -> Float:
     """Return diameters [m], shape (N,); NaN without a column of diameters, and for 0 and negative numbers,
     which other programs write for unmeasured ones.
 
@@ -207,7 +118,7 @@ def _diameters(table: _Table, dbh_unit: str | None) -> Float:
     return np.where(diameter > 0.0, diameter, np.nan) * _DBH[unit]
 
 
-def _kinds(table: _Table) -> tuple[str, ...]:
+def _kinds(table: CsvTable) -> tuple[str, ...]:
     """Return the class of each row in lower case; "tree" for an empty cell, and for all rows without a column
     of classes.
 

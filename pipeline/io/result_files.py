@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import itertools
@@ -17,12 +16,15 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.io.atomic_files import UNFINISHED, hold
+from pipeline.io.atomic_files import UNFINISHED
 from pipeline.stand.seen_area import SeenArea
 from pipeline.types.records import Bool, Frame, HeightMap, Int, Path, Trees, Verdict
 
 ROWS = "detections.csv"  # written during the run
-NEW_TREE_COLUMNS = ("height_m", "sigma_height_m", "lean_deg")  # earlier versions did not write them
+# Earlier versions did not write them.
+NEW_TREE_COLUMNS = ("height_m", "sigma_height_m", "lean_deg", "review")
+#: States of a tree in the review by a person.
+OPEN, CONFIRMED, REJECTED = REVIEWS = ("open", "confirmed", "rejected")
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
 SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
 
@@ -37,7 +39,8 @@ def number_text(value: float, digits: int) -> str:
 
 
 def _numbers(values: Iterable[float] | None, digits: int) -> Iterable[str]:
-    """Yield the texts of numbers, see `number_text`; empty ones without end for None."""
+    """Yield the texts of numbers with `digits` decimals, empty for values that are not finite; for None empty
+    texts without end."""
     return itertools.repeat("") if values is None else (number_text(value, digits) for value in values)
 
 
@@ -65,7 +68,7 @@ _TREES: dict[str, Callable[[Trees, int], Iterable[str]]] = {
     "sigma_height_m": lambda trees, _: _numbers(trees.height_sigma, 2),
     "lean_deg": lambda trees, _: _numbers(None if trees.lean is None else np.degrees(trees.lean), 1),
 }
-TREE_COLUMNS = tuple(_TREES)
+TREE_COLUMNS = (*_TREES, "review")
 _PATH: dict[str, Callable[[Path, int], Iterable[str]]] = {
     "t_s": lambda path, start_ns: _seconds(path.stamp_ns, start_ns),
     "x_m": lambda path, _: _numbers(path.x, 4),
@@ -94,10 +97,16 @@ _DETECTIONS: dict[str, Callable[[Frame, str], Iterable[str]]] = {
 DETECTION_COLUMNS = tuple(_DETECTIONS)
 
 
-def tree_rows(trees: Trees, start_ns: int) -> list[tuple[str, ...]]:
-    """Return the confirmed trees as rows of TREE_COLUMNS; unknown values are empty. Seconds count from
-    `start_ns` [ns]; a stamp below 0 is unknown."""
-    rows = zip(*(column(trees, start_ns) for column in _TREES.values()), strict=False)
+def tree_rows(trees: Trees, start_ns: int, reviews: Mapping[int, str] | None = None) -> list[tuple[str, ...]]:
+    """Return the confirmed trees as rows of TREE_COLUMNS; unknown values are empty.
+
+    Args:
+        trees: The map.
+        start_ns: Time from which the seconds count [ns]; a stamp below 0 is unknown.
+        reviews: One of REVIEWS by the number of a tree; OPEN for other trees.
+    """
+    review = ((reviews or {}).get(number, OPEN) for number in trees.number.tolist())
+    rows = zip(*(column(trees, start_ns) for column in _TREES.values()), review, strict=False)
     return list(itertools.compress(rows, trees.confirmed))
 
 
@@ -164,11 +173,12 @@ def geojson(
     *,
     frame: Mapping[str, str] | None = None,
     lon_lat: Float | None = None,
+    reviews: Mapping[int, str] | None = None,
 ) -> str:
-    """Return the text of a GeoJSON FeatureCollection with the confirmed trees; unknown values are null.
-    Positions must be finite.
+    """Return the text of a GeoJSON FeatureCollection with the confirmed trees. The properties are named as
+    TREE_COLUMNS, with null for unknown values; x and y are the geometry. Positions must be finite.
 
-    RFC 7946 requires WGS84; a map without georeference has a member `coordinateFrame`.
+    RFC 7946 requires WGS84; a map without `lon_lat` has a member `coordinateFrame`.
 
     Args:
         trees: The map.
@@ -176,16 +186,18 @@ def geojson(
         frame: Description of the coordinates of `trees`; None means ROBOTS_FRAME.
         lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees], if known. They become
             the geometry, and x and y become properties.
+        reviews: See `tree_rows`.
     """
     features = []
-    for k, row in enumerate(tree_rows(trees, start_ns)):
+    for k, row in enumerate(tree_rows(trees, start_ns, reviews)):
         values = dict(zip(TREE_COLUMNS, row, strict=True))
         if lon_lat is None:
             x, y = float(values.pop("x_m")), float(values.pop("y_m"))
         else:
             x, y = (round(float(v), 8) for v in lon_lat[k])
         properties: dict[str, Any] = {
-            name: None if text == "" else json.loads(text) for name, text in values.items()
+            name: None if text == "" else text if name == "review" else json.loads(text)
+            for name, text in values.items()
         }
         features.append(
             {
@@ -226,7 +238,11 @@ class RunFiles:
 
     def __init__(self, folder: FilePath, earlier: FilePath | None = None) -> None:
         """Create the folder and, in it, a hidden folder for incomplete files, with the detections of the
-        earlier run or a header."""
+        earlier run or a header.
+
+        Raises:
+            OSError: The folder cannot be created, or the disk refuses.
+        """
         self._folder = folder
         self._made_folder = not folder.exists()
         folder.mkdir(parents=True, exist_ok=True)
@@ -238,14 +254,12 @@ class RunFiles:
         else:
             rows.write_text(csv_text(DETECTION_COLUMNS, []), encoding="utf-8", newline="")
         self._detections = rows.open("a", encoding="utf-8", newline="")
-        with contextlib.suppress(OSError):  # a network disk may not support locks
-            hold(self._detections)
 
     def __enter__(self) -> RunFiles:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        """After an exception, remove the incomplete files, see `abandon`."""
+        """After an exception, remove the incomplete files, and the folder if this object created it."""
         if error is not None:
             self.abandon()
 
@@ -273,12 +287,13 @@ class RunFiles:
         Args:
             trees, path: The map; confirmed trees are written.
             start_ns: Time from which the seconds count [ns].
-            run: Content of run.json; numbers are finite.
+            run: Content of run.json, as JSON values.
             state: State for a continuation; None without.
             further: Texts of additional files, or of files to replace, by name.
 
         Raises:
             OSError: The disk refuses.
+            ValueError: A number of `run` is not finite.
         """
         self._detections.close()
         texts = {

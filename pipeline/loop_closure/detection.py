@@ -16,8 +16,7 @@ import numpy as np
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.loop_closure.stem_matching import MapStems, find_constellation
-from pipeline.loop_closure.stem_matching.stem_constellation import worst_sigma
+from pipeline.loop_closure.stem_matching import MapStems, find_constellation, worst_sigma
 from pipeline.slam import Loop
 from pipeline.slam.loop_correction import drift_of, without_jumps
 from pipeline.slam.motion import Noise

@@ -15,8 +15,7 @@ from pipeline.config import Parameters
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.loop_closure import detection
 from pipeline.loop_closure.correction import LoopClosure, RelocalisedPose, Restart, SearchFailure
-from pipeline.loop_closure.stem_matching import MapStems, find_constellation
-from pipeline.loop_closure.stem_matching.stem_constellation import worst_sigma
+from pipeline.loop_closure.stem_matching import MapStems, find_constellation, worst_sigma
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.types.records import Detections, Int, PoseEstimate
 

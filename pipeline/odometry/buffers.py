@@ -100,7 +100,11 @@ class OdometryBuffer:
 
     def pose_at(self, stamp_ns: int) -> Pose2:
         """Return T_odom_base at a time [ns]: interpolated, or that of the nearest reading outside of their
-        range. Raises IndexError without a reading."""
+        range.
+
+        Raises:
+            IndexError: There is no reading.
+        """
         before, after = self._around(stamp_ns)
         span = after.stamp_ns - before.stamp_ns
         fraction = (stamp_ns - before.stamp_ns) / span if span > 0 else 1.0
@@ -126,7 +130,8 @@ class OdometryBuffer:
         )
 
     def _around(self, stamp_ns: int) -> tuple[Reading, Reading]:
-        """Return the readings before and after a time, or the two nearest ones outside of their range."""
+        """Return the readings before and after a time [ns], or the two nearest ones outside of their range;
+        of a single reading twice this one. IndexError without a reading."""
         readings = self._readings
         after = next((k for k, r in enumerate(readings) if r.stamp_ns >= stamp_ns), len(readings) - 1)
         after = max(after, min(1, len(readings) - 1))

@@ -91,7 +91,7 @@ class Gyro:
 
     @property
     def proven(self) -> bool:
-        """Whether the turns of the gyroscope have agreed with those of the wheels."""
+        """Whether the turns of the gyroscope have agreed with those of the wheels; it stays True."""
         return self._proven
 
     def compare(self, by_wheels: float, turn: Turn) -> None:

@@ -155,9 +155,10 @@ def undistorted(points: Float, offset_s: Float | None, delta: Float, span_ns: in
 
     Args:
         points: Points in the sensor frame [m], shape (N, 3).
-        offset_s: Time of each point after the stamp [s], shape (N,); None returns the points unchanged.
+        offset_s: Time of each point after the stamp [s], shape (N,); None returns the points unchanged (the
+            same array).
         delta: Motion of the sensor in `span_ns`, shape (4, 4).
-        span_ns: Duration of the motion [ns].
+        span_ns: Duration of the motion, above 0 [ns].
     """
     if offset_s is None:
         return points

@@ -74,7 +74,8 @@ class OdometryOverride:
             self._motion.end()
 
     def pass_on(self, record: Record) -> Iterator[Record]:
-        """Yield the records that replace one record of a live source; its records are read by the caller."""
+        """Yield the records by which the estimator replaces one record; for a live source, whose records are
+        read by the caller."""
         return self._motion.add(record)
 
     def truth(self) -> Truth | None:
@@ -110,7 +111,11 @@ class FileOdometry:
     """
 
     def __init__(self, path: Path, T_base_lidar: Pose3) -> None:
-        """Read the file of poses."""
+        """Read the file of poses.
+
+        Raises:
+            SourceError: It cannot be read, or has another format.
+        """
         try:
             self._times, self._poses = read_any_poses(path)
         except (TextError, OSError) as error:
@@ -143,8 +148,9 @@ class FileOdometry:
         self.losses = {reason: n for reason, n in ((TOO_MANY, left), (TOO_FEW, -left)) if n > 0}
 
     def _pose_of(self, stamp_ns: int) -> Pose3 | None:
-        """Return the pose of the LiDAR at a scan [ns], T_odom_lidar; None for a scan after the last row, or
-        far from all rows with times (see `pose_at`)."""
+        """Return the pose of the LiDAR at a scan [ns], T_odom_lidar: that of the next row, the same again for
+        a scan that was asked before, or interpolated between rows with times. None for a scan after the last
+        row, or more than a second from all rows with times."""
         if self._times is not None:
             return pose_at(self._times, self._poses, stamp_ns)
         row = self._row_of.setdefault(stamp_ns, len(self._row_of))

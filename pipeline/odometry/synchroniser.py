@@ -113,7 +113,8 @@ class Synchroniser:
                 self._warn(record.text)
 
     def _add_scan(self, scan: Scan) -> None:
-        """Append a scan to the waiting ones; one that is not later than the last one is left out."""
+        """Append a scan to the waiting ones; one that is not later than the last one is left out and
+        counted."""
         if self._last_stamp is not None and scan.stamp_ns <= self._last_stamp:
             self._leave_out("scans that were not later than the one before")
             return
@@ -122,7 +123,8 @@ class Synchroniser:
 
     def _add_odometry(self, odometry: Odometry) -> None:
         """Add a reading of the odometry. Without finite numbers, or not later than the last one, it is left
-        out; without `use_odometry` it is ignored. A jump is reported and makes the odometry doubtful."""
+        out and counted; without `use_odometry` all others are ignored. A jump is reported and makes the
+        odometry doubtful. Old readings are removed."""
         T = odometry.T_odom_base
         if not (np.all(np.isfinite(T.t)) and np.all(np.isfinite(T.R))):
             self._leave_out("odometry readings without finite numbers")
@@ -158,8 +160,9 @@ class Synchroniser:
         self._slack = (float(np.hypot(self._slack[0], slack[0])), float(np.hypot(self._slack[1], slack[1])))
 
     def _add_imu(self, imu: Imu) -> None:
-        """Add a reading of the IMU: its turn rate, and its orientation if that is known. One that is not
-        later than the last one is left out, unless earlier ones were ahead of their time (`_was_ahead`)."""
+        """Add a reading of the IMU: its turn rate, and its orientation if that is known and finite. One that
+        is not later than the last one is left out and counted, unless earlier ones were ahead of their time
+        (`_was_ahead`)."""
         if (
             self._turned_ns is not None
             and imu.stamp_ns <= self._turned_ns

@@ -66,7 +66,8 @@ def acquire_near(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> Fl
 
 def _level_rotation(step: Step, T_base_lidar: Pose3, parameters: Acquisition) -> tuple[Float, Float]:
     """Return R_level_lidar, shape (3, 3), and the position of the sensor in the level base frame, shape (3,)
-    [m]. If `level` is not "imu" or the tilt of the step is unknown, the level frame has the axes of the base.
+    [m], by the tilt of the step and the pose of the LiDAR on the robot. If `level` is not "imu" or the tilt
+    of the step is unknown, the level frame has the axes of the base.
     """
     level = parameters.level == "imu" and step.tilt_known
     R_level_base = Pose3.from_euler(np.zeros(3), step.roll, step.pitch, 0.0).R if level else np.eye(3)

@@ -1,8 +1,8 @@
 """Preview of a rerun: where trees would stand, in a fraction of a second.
 
-The known clusters of all scans get their verdicts again, at the known poses; clusters at one place are a
-tree. The preview knows no gate, no miss and no merging, and keeps the poses, so the rerun that follows may
-differ. Scans of a lost robot are left out.
+The known clusters of all scans, or of every n-th scan of a long run, get their verdicts again, at the known
+poses; clusters at one place are a tree. The preview knows no gate, no miss and no merging, and keeps the
+poses, so the rerun that follows may differ. Scans of a lost robot are left out.
 
 Where the parameters change the clusters themselves, a sample of the scans is segmented again. How often a
 tree is found in the sample, before and after, gives an estimate for all scans.
@@ -10,8 +10,9 @@ tree is found in the sample, before and after, gives an estimate for all scans.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from pipeline.config import Parameters
 from pipeline.config.stages import Detection
 from pipeline.detection.verdicts import classify_clusters
 from pipeline.front_end import SegmentedScan
+from pipeline.geometry.growing_columns import GrowingColumns
 from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
@@ -43,80 +45,101 @@ JUDGED_COLUMNS: dict[str, tuple[str, tuple[int, ...]]] = {
     "arc": ("<f8", ()),
     "centre": ("<f8", (2,)),
 }
-FIRST_ROWS = 4096
+MOST_ROWS = 400_000  # clusters in a table, 39 MB, as its arrays double; a scan among trees has 20 to 50
+MOST_SCANS = 40_000  # scans of a table with clusters, 1 MB
 
 
 class ClusterTable:
     """Clusters of all scans of a run, about 75 bytes each: what their verdicts need, and where they are.
 
+    Above MOST_ROWS clusters or MOST_SCANS scans, every second scan is dropped, repeatedly.
+
     Attributes:
-        start: First row of each scan, then the number of all rows.
+        spacing: Stored are the scans whose number is a multiple of it, a power of two.
+        start: First row of each stored scan, then the number of all rows.
     """
 
     def __init__(self) -> None:
         """Create a table without scans."""
-        self._columns = {
-            name: np.zeros((FIRST_ROWS, *shape), kind) for name, (kind, shape) in JUDGED_COLUMNS.items()
-        }
-        self.start: list[int] = [0]
-        self._offsets: list[Float] = []  # sensor in the base frame, x, y [m]
-        self._lost: list[bool] = []
+        self.spacing = 1
+        self._rows = GrowingColumns(*(np.zeros((0, *shape), kind) for kind, shape in JUDGED_COLUMNS.values()))
+        self.start = array("q", [0])
+        self._offsets = array("d")  # sensor in the base frame, x, y of each stored scan [m]
+        self._lost = array("b")
+        self._scans = 0
 
     def __len__(self) -> int:
-        """Return the number of scans."""
-        return len(self.start) - 1
+        """Return the number of scans, stored or not."""
+        return self._scans
 
     def put(self, index: int, clusters: Clusters, offset: Float, *, lost: bool = False) -> None:
         """Store the clusters of a scan. Those of this and later scans are removed first. A scan beyond the
-        next one is ignored.
+        next one is ignored. While there are more than MOST_ROWS clusters or MOST_SCANS scans, every second
+        scan is removed and `spacing` doubled.
 
         Args:
-            index: Number of the scan.
+            index: Number of the scan; one that is no multiple of `spacing` is counted, not stored.
             clusters: Its clusters; copied.
             offset: Position of the sensor in the base frame, shape (3,) [m].
             lost: Whether the robot was lost, so that the pose is unusable.
         """
         if index > len(self):
             return
-        del self.start[index + 1 :], self._offsets[index:], self._lost[index:]
-        first = self.start[index]
-        last = first + len(clusters.size)
-        for name, column in self._columns.items():
-            while last > len(column):
-                column = np.concatenate([column, np.zeros_like(column)])
-            column[first:last] = getattr(clusters, name)
-            self._columns[name] = column
-        self.start.append(last)
-        self._offsets.append(offset[:2].copy())
+        self._scans = index + 1
+        stored = -(-index // self.spacing)
+        del self.start[stored + 1 :], self._offsets[2 * stored :], self._lost[stored:]
+        if index % self.spacing:
+            return
+        self._rows.write(self.start[-1], *(getattr(clusters, name) for name in JUDGED_COLUMNS))
+        self.start.append(len(self._rows))
+        self._offsets.extend(offset[:2].tolist())
         self._lost.append(lost)
+        while self.start[-1] > MOST_ROWS or len(self._lost) > MOST_SCANS:
+            if len(self._lost) == 1:
+                return
+            self._drop_every_second_scan()
+
+    def _drop_every_second_scan(self) -> None:
+        """Double `spacing`, and drop the scans whose number is no multiple of it."""
+        part = self.of(range(0, len(self), 2 * self.spacing))
+        self.spacing *= 2
+        self.start, self._offsets, self._lost = part.start, part._offsets, part._lost
+        self._rows = part._rows
 
     def record(self, frame: Frame) -> None:
-        """Store the clusters of a mapped scan, see `put`. The robot counts as lost if its health is
-        "lost"."""
+        """Store the clusters of a mapped scan, and remove those of this and later scans before; a scan beyond
+        the next one is ignored. The robot counts as lost if its health is "lost"."""
         lost = frame.estimate.health.state == "lost"
         self.put(frame.index, frame.clusters, frame.sensor_offset, lost=lost)
 
     def of(self, scans: Sequence[int]) -> ClusterTable:
-        """Return the table of some scans, in the given order, as a copy.
+        """Return the table of some scans, in the given order, as a copy. Scans that are not stored have no
+        clusters in it.
 
         Raises:
             IndexError: A scan is not in the table.
         """
-        rows = [np.arange(self.start[k], self.start[k + 1]) for k in scans]
-        part = ClusterTable()
-        part.start = np.cumsum([0, *map(len, rows)]).tolist()
+        number = np.array(scans, np.int64)
+        if number.max(initial=-1) >= len(self):
+            raise IndexError("a scan is not in the table")
+        start, row = np.array(self.start), number // self.spacing
+        sizes = np.where(number % self.spacing == 0, np.diff(start)[row], 0)
+        rows = [np.arange(first, first + size) for first, size in zip(start[row], sizes, strict=True)]
         every = np.concatenate([np.zeros(0, np.int64), *rows])
-        part._columns = {name: column[every] for name, column in self._columns.items()}
-        part._offsets, part._lost = [self._offsets[k] for k in scans], [self._lost[k] for k in scans]
+        part = ClusterTable()
+        part.start = array("q", np.cumsum([0, *sizes]).tolist())
+        part._rows = GrowingColumns(*(column[every] for column in self._columns().values()))
+        part._offsets = array("d", np.array(self._offsets).reshape(-1, 2)[row].ravel().tolist())
+        part._lost = array("b", np.array(self._lost, np.int8)[row].tolist())
+        part._scans = len(number)
         return part
 
     def verdicts(self, parameters: Detection) -> Int:
-        """Return the verdict of each cluster by these parameters, see `Verdict`, int64, shape (K,)."""
-        rows = self.start[-1]
-        columns: dict[str, Any] = {name: column[:rows] for name, column in self._columns.items()}
-        unused = np.zeros(rows)
+        """Return the verdict of each stored cluster by these parameters, a number of `Verdict`, int64, shape
+        (K,)."""
+        unused = np.zeros(self.start[-1])
         clusters = Clusters(
-            **columns,
+            **self._columns(),
             size=unused.astype(np.int64),
             centroid=unused,
             eigenvalues=unused,
@@ -136,11 +159,15 @@ class ClusterTable:
             path: x, y [m], yaw [rad] of the base at each scan of the table, shape (N, 3).
             p: Parameters of the verdicts, and of the distance between two trees.
         """
-        rows, start = self.start[-1], np.array(self.start)
+        start = np.array(self.start)
         tree = self.verdicts(p.detection) == Verdict.TREE
         tree &= ~np.repeat(np.array(self._lost, np.bool_), np.diff(start))
         pose = np.concatenate([path, np.array(self._offsets).reshape(-1, 2)], axis=1)
-        return _grouped(self._columns["centre"][:rows], tree, start, pose, _reach(p), MOST_PLACES)
+        return _grouped(self._columns()["centre"], tree, start, pose, _reach(p), MOST_PLACES)
+
+    def _columns(self) -> dict[str, Any]:
+        """Return the JUDGED_COLUMNS of the stored clusters by name; views that `put` may change."""
+        return {name: self._rows.column(k)[: self.start[-1]] for k, name in enumerate(JUDGED_COLUMNS)}
 
 
 def sample_scans(scans: int, size: int) -> range:
@@ -235,7 +262,8 @@ def _has_same_columns(before: Parameters, now: Parameters) -> bool:
 
 
 def _reach(p: Parameters) -> float:
-    """Return the distance up to which clusters belong to one tree [m]."""
+    """Return the distance up to which clusters belong to one tree [m]: the proximity radius, at least the
+    association distance up to REACH."""
     return max(p.tracking.proximity_radius, min(p.slam.distance_max, REACH))
 
 
@@ -244,8 +272,6 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
     the parameter `classification.method` is "none"."""
     if known.columns is None or p.classification.method == "none":
         return None
-    from dataclasses import replace
-
     return replace(known.columns, verdict=column_votes(known.columns).verdict(p.classification.tree_share))
 
 
@@ -260,6 +286,7 @@ def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters
         p: Parameters of verdicts, tracking and classification.
     """
     place, hits = table.places(path, p)
+    hits *= known.clusters.spacing
     confirmed = hits >= p.tracking.hits_to_confirm
     columns = _columns(known, p)
     if columns is None:
@@ -299,7 +326,7 @@ def _with_sample(
     scans = [k for k in sample if k < len(table)]
     part, fresh = table.of(scans), ClusterTable()
     for n, k in enumerate(scans):
-        fresh.put(n, sample[k].clusters, sample[k].sensor_offset, lost=part._lost[n])
+        fresh.put(n, sample[k].clusters, sample[k].sensor_offset, lost=bool(part._lost[n]))
     old, old_hits = part.places(path[scans], p)
     new, new_hits = fresh.places(path[scans], p)
 
@@ -332,8 +359,8 @@ def _sums(row: Int, hits: Int, rows: int) -> Int:
 
 
 def _trees(known: _Places) -> Trees:
-    """Return places as confirmed trees with the numbers 1 to T; diameters and covariances are NaN, times,
-    velocities and coverage 0."""
+    """Return places as confirmed trees with the numbers 1 to T and their hits as observations; diameters,
+    eccentricities and covariances are NaN, times, velocities and coverage 0."""
     place, hits, n = known.place, known.hits, len(known.place)
     unknown, none = np.full(n, np.nan), np.zeros(n, np.int64)
     return Trees(

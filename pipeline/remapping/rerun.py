@@ -60,7 +60,8 @@ class Rerun:
         return frame
 
     def go_back(self, scans: int, state: MapperState) -> None:
-        """Return to an earlier state of the mapper, taken after `scans` scans."""
+        """Return to an earlier state of the mapper, taken after `scans` scans; where the source is needed, it
+        is read again from there."""
         self.mapper.restore(state)
         self.done, self._segmented = scans, None
 

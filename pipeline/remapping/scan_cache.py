@@ -1,31 +1,22 @@
 """Scan cache: segmented scans on disk, so that a run can be mapped again without its points.
 
-There is one file for each source and each set of the parameters that decide the segmentation. A named file
-is found again when the recording is opened again. It begins with the identity of the source, of these
-parameters and of the code. Then follow the scans in any order, each with a row that holds its length and its
-checksum, so that a cut or damaged file is good up to that place.
+There is one temporary file for each set of the parameters that decide the segmentation.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 from collections import OrderedDict
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 
 import numpy as np
 
-import pipeline
 from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.config import Parameters
 from pipeline.front_end import ColumnInput, SegmentedScan
 from pipeline.geometry.quantisation import POINT
-from pipeline.io.atomic_files import hold, is_held
-from pipeline.io.block_file import MOST_BYTES, BinaryFile, BlockFile, unnamed_file
+from pipeline.io.block_file import MOST_BYTES, BlockFile
 from pipeline.io.checkpoints.codec import record_bytes, record_of
 from pipeline.types.records import Float, Float32, Int32, Scan, Step, UInt16
 
@@ -92,10 +83,7 @@ def unpack(block: bytes) -> tuple[Step, SegmentedScan]:
     return packed.step, replace(packed.scan, column_input=None if given is None else given.unpacked())
 
 
-MOST_IN_FOLDER = 8 << 30  # of all named files of a folder
 MOST_OPEN = 3  # files of one source
-SUFFIX = ".scans"
-MAGIC = b"stemmap scans 4\n"
 SEGMENTATION_STAGES = ("acquisition", "filters", "ground", "clustering", "shape")
 SEGMENTATION_CLASSIFICATION = ("method", "every")  # they decide which scans have input for the columns
 
@@ -115,7 +103,8 @@ class ScanCache(BlockFile):
     """Segmented scans of one source under one set of segmentation parameters; see `BlockFile`."""
 
     def put(self, step: Step, scan: SegmentedScan) -> None:
-        """Store a scan, unless its number is stored already, see `put_block`."""
+        """Store a scan without its points, unless its number is stored already. If the file or the disk is
+        full it is not stored, and `refusal` contains the reason."""
         if step.index not in self:
             self.put_block(step.index, pack(step, scan))
 
@@ -137,15 +126,12 @@ class ScanCaches:
     """The caches of one source, one for each set of segmentation parameters; the last few used are open.
 
     Args:
-        folder: Folder of the files; None uses the folder of the system for temporary files.
-        source: Identity of the source: digest of the recording, odometry and seed. Empty for a source that
-            cannot be found again: its files have no name, and are deleted when they are closed.
         most: Size that a file may reach.
     """
 
-    def __init__(self, folder: Path | None = None, source: str = "", most: int = MOST_BYTES) -> None:
+    def __init__(self, most: int = MOST_BYTES) -> None:
         """Create the collection; no file is opened."""
-        self._folder, self._source, self._most = folder, source, most
+        self._most = most
         self._open: OrderedDict[bytes, ScanCache] = OrderedDict()
 
     def of(self, parameters: Parameters) -> ScanCache:
@@ -155,7 +141,7 @@ class ScanCaches:
         if key not in self._open:
             while len(self._open) >= MOST_OPEN:
                 self._open.popitem(last=False)[1].close()
-            self._open[key] = self._opened(key)
+            self._open[key] = ScanCache(self._most)
         self._open.move_to_end(key)
         return self._open[key]
 
@@ -164,65 +150,3 @@ class ScanCaches:
         for each in self._open.values():
             each.close()
         self._open.clear()
-
-    def _opened(self, key: bytes) -> ScanCache:
-        """Return the cache of a segmentation key: in a named file if source and folder are known and no other
-        process has it, otherwise in a file without a name."""
-        identity = hashlib.sha256(self._source.encode() + key + _code_digest()).digest()
-        header = MAGIC + identity
-        file: BinaryFile = None
-        if self._source and self._folder is not None:
-            with contextlib.suppress(OSError):  # the disk refuses, or another process has the file
-                file = _named_file(self._folder, identity)
-        if file is None:
-            file = unnamed_file(self._folder)
-        return ScanCache(file, header, self._folder, self._most)
-
-
-def _named_file(folder: Path, identity: bytes) -> BinaryFile:
-    """Return the open file of an identity (32 bytes), which this process locks. Creates the folder and the
-    file, and removes old files of the folder, see `_make_room`.
-
-    Raises:
-        OSError: The disk refuses, or another process has the file.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / (identity[:16].hex() + SUFFIX)
-    _make_room(folder, path)
-    file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), "r+b", buffering=0)
-    try:
-        hold(file)
-    except OSError:
-        file.close()
-        raise
-    path.touch()
-    return file
-
-
-def _make_room(folder: Path, keep: Path) -> None:
-    """Delete the cache files that were opened longest ago until all together have at most MOST_IN_FOLDER
-    bytes, except `keep` and files that a process has locked."""
-    sizes: list[tuple[float, int, Path]] = []
-    for path in folder.glob(f"*{SUFFIX}"):
-        with contextlib.suppress(OSError):
-            known = path.stat()
-            sizes.append((known.st_mtime, known.st_size, path))
-    total = sum(size for _, size, _ in sizes)
-    for _, size, path in sorted(sizes):
-        if total <= MOST_IN_FOLDER:
-            return
-        if path != keep and not is_held(path):
-            path.unlink(missing_ok=True)
-            total -= size
-
-
-@cache
-def _code_digest() -> bytes:
-    """Return the digest (32 bytes) of all sources of the pipeline, because any of them may change the
-    segmentation."""
-    folder = Path(pipeline.__file__).parent
-    state = hashlib.sha256()
-    for path in sorted(folder.rglob("*.py")):
-        state.update(path.relative_to(folder).as_posix().encode())
-        state.update(path.read_bytes())
-    return state.digest()

@@ -13,8 +13,7 @@ import numpy as np
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
-from pipeline.inventory import find_ground
-from pipeline.inventory.cloud import WholeCloud
+from pipeline.inventory import finish, ground_steps
 from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.simulation import run as simulated
 from pipeline.simulation.lidar import SpinningLidar, Sweep, scan_of_returns
@@ -26,6 +25,7 @@ from pipeline.simulation.scenarios import RunRequest
 from pipeline.simulation.scene import SimulatedScene
 from pipeline.simulation.surfels import Surfels, first_surfels, lay_surfels
 from pipeline.simulation.terrain import SimulatedTerrain
+from pipeline.types.clouds import WholeCloud
 from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees
 
 # Raise it with every change that only changes the bytes of runs through clouds.
@@ -108,7 +108,7 @@ def open_cloud_run(
     Raises:
         SourceError: The cloud cannot be read, is too large for a plot, or has no path for a robot.
     """
-    ground, near, _ = find_ground(cloud, SLOPE, band=BAND, most=MOST)
+    ground, near, _ = finish(ground_steps(cloud, SLOPE, band=BAND, most=MOST))
     points = near.points
     if len(points) == 0:
         raise SourceError("the cloud has no points", where=cloud.description.uri)
@@ -180,7 +180,7 @@ def _scene(trees: TruthTrees | None, start: Float, yaw: float) -> SimulatedScene
 
     Args:
         trees: Ground truth in the coordinates of the file; None for an empty one.
-        start: Position of the first pose in these coordinates, x, y first [m]. The scene begins there.
+        start: Position of the first pose in these coordinates, x, y first [m]; it becomes the origin.
         yaw: Yaw of the first pose [rad].
     """
     none = np.zeros(0)

@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 
 from pipeline.jit import compiled
-from pipeline.simulation.primitives import Solids
+from pipeline.simulation.primitives import ELLIPSOID, Solids
 from pipeline.simulation.ray_casting import (
     GROUND,
     NOTHING,
@@ -41,7 +41,8 @@ def count_echoes(
     sum of their ranges [m].
 
     Args:
-        kind, shape, surface, o, d: As in `meet_solid`.
+        kind, shape, surface: Row of `Solids`.
+        o, d: Origin [m] and unit direction of the beam, shape (3,).
         d_next: Direction of the ray in the next column.
         divergence: Full width of the beam [rad] times the number of columns.
     """
@@ -176,7 +177,7 @@ def measure(
             else:
                 reflectivity = surface[n, 0]
                 incidence = 0.7
-                if shape[n, 8] == 0.0 or kind[n] != 1:
+                if shape[n, 8] == 0.0 or kind[n] != ELLIPSOID:
                     incidence = solid_incidence(kind[n], shape[n], o[c], directions[c, k], t)
                     incidence = max(incidence, 0.05)
                 if surface[n, 1] > 0.0:
@@ -306,8 +307,8 @@ class SpinningLidar:
 
 @lru_cache(maxsize=4)
 def _beams(lidar: SpinningLidar) -> Float:
-    """Return the rays of a sensor, see `SpinningLidar.beams`, computed once for each of the last four
-    sensors."""
+    """Return the unit directions of all rays of a sensor in its frame, shape (C, K, 3); the results for the
+    last four sensors are stored, and must not be changed."""
     return lidar._directions()
 
 

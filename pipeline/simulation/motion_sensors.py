@@ -91,7 +91,7 @@ class Inertial:
 
 
 def inertial_readings(motion: TrueMotion, rng: np.random.Generator) -> Inertial:
-    """Return the readings of the IMU at 100 Hz for a motion, from its start, with bias and noise.
+    """Return rates, forces and attitude of the IMU at 100 Hz from the start of a motion, with bias and noise.
 
     Args:
         motion: True motion.

@@ -10,8 +10,7 @@ from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.simulation.lidar import SpinningLidar, sweep_scene
 from pipeline.simulation.robot_motion import RATE_HZ, Course, Drive, lay_on_terrain, on_course, speed_limit
 from pipeline.simulation.scene import SimulatedScene
-from pipeline.types.clearance import Zone
-from pipeline.types.records import Step
+from pipeline.types.records import Step, Zone
 
 #: Share of the speed in each zone.
 SPEED = {Zone.CLEAR: 1.0, Zone.SLOW: 0.4, Zone.STOP: 0.0, Zone.UNKNOWN: 0.0}

@@ -145,11 +145,14 @@ class SolidsBuilder:
         *,
         reflectivity: float = 0.35,
     ) -> None:
-        """Add a stem: a tapered cylinder as in `cone` with a section that is not round.
+        """Add a stem: a tapered cylinder without caps, as in `cone`, with a section that is not round.
 
         Args:
-            owner, start, end, radii, reflectivity: See `cone`.
+            owner: Number of the object that it belongs to.
+            start, end: Ends of the axis, shape (3,) [m]; they must differ.
+            radii: Radius r of the section at `start` and at `end` [m].
             section: Shape of the section.
+            reflectivity: Share of the light that is reflected.
         """
         self.cone(owner, start, end, radii, reflectivity=reflectivity)
         _, shape, capsule, surface, _ = self._rows.pop()
@@ -187,13 +190,21 @@ class SolidsBuilder:
     def box(
         self, owner: int, centre: ArrayLike, half: ArrayLike, *, yaw: float = 0.0, reflectivity: float = 0.5
     ) -> None:
-        """Add an upright box; arguments as in `ellipsoid`."""
+        """Add an upright box.
+
+        Args:
+            owner: Number of the object that it belongs to.
+            centre: Centre, shape (3,) [m].
+            half: Half sizes, shape (3,) [m].
+            yaw: Turn about z [rad].
+            reflectivity: Share of the light that is reflected.
+        """
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)
         shape = [*c, *h, np.cos(yaw), np.sin(yaw), 0.0]
         self._rows.append((BOX, shape, [*c, *c, float(np.linalg.norm(h))], _surface(reflectivity), owner))
 
     def extend(self, solids: Solids) -> None:
-        """Add all shapes of a table with the numbers of their objects."""
+        """Add all shapes of a table with the numbers of their objects; the table is copied."""
         self._rows += zip(*(column.tolist() for column in solids), strict=True)
 
     def build(self) -> Solids:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.jit import compiled
-from pipeline.simulation.primitives import Solids
+from pipeline.simulation.primitives import BOX, CONE, STEM, Solids
 from pipeline.simulation.terrain import gradient_at, sine_of_turns
 from pipeline.types.records import Float, Int, Int32
 
@@ -77,10 +77,11 @@ _MARCH, _TOUCH = 0.4, 5e-4  # share of the gap to the bark that is safe to advan
 
 @compiled
 def bark_radius(surface: Float, radius: float, depth: float, angle: float, height: float) -> float:
-    """Return the radius of a stem in a direction [m], see `primitives.Section`.
+    """Return the radius of a stem in a direction [m], with lobes and furrows, see `primitives.Section`; the
+    furrows swing to and fro over FURROW_WAVE of height.
 
     Args:
-        surface: Row of `Solids.surface`.
+        surface: Row of `Solids.surface`, which holds the figures of the section.
         radius: r at this height [m].
         depth: Depth of the furrows at this height [m].
         angle: Angle around the axis [rad].
@@ -137,7 +138,11 @@ def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
 @compiled
 def meet_ellipsoid(shape: Float, o: Float, d: Float) -> tuple[float, float]:
     """Return the ranges [m] at which a ray enters and leaves an ellipsoid, negative behind the origin (both,
-    if the ellipsoid is behind); both are MISS if the line of the ray passes it. Arguments as in `meet_cone`.
+    if the ellipsoid is behind); both are MISS if the line of the ray passes it.
+
+    Args:
+        shape: Row of the shape, see `Solids.shape`.
+        o, d: Origin [m] and unit direction of the ray, shape (3,).
     """
     cos, sin = shape[6], shape[7]
     wx, wy, wz = o[0] - shape[0], o[1] - shape[1], o[2] - shape[2]
@@ -155,8 +160,13 @@ def meet_ellipsoid(shape: Float, o: Float, d: Float) -> tuple[float, float]:
 
 @compiled
 def meet_box(shape: Float, o: Float, d: Float) -> float:
-    """Return the range [m] at which a ray enters an upright box from outside, else MISS; arguments as in
-    `meet_cone`."""
+    """Return the range [m] at which a ray enters an upright box from outside; MISS if it does not, or if the
+    origin is inside.
+
+    Args:
+        shape: Row of the shape, see `Solids.shape`.
+        o, d: Origin [m] and unit direction of the ray, shape (3,).
+    """
     cos, sin = shape[6], shape[7]
     wx, wy = o[0] - shape[0], o[1] - shape[1]
     enter, leave = -np.inf, np.inf
@@ -259,14 +269,14 @@ def solid_incidence(kind: int, shape: Float, o: Float, d: Float, t: float) -> fl
     """Return the absolute cosine of the angle between a ray (origin o, unit direction d) and the normal of
     the shape that it meets at range t [m]; `kind` and `shape` are a row of `Solids`. Furrows are ignored."""
     x, y, z = o[0] + t * d[0] - shape[0], o[1] + t * d[1] - shape[1], o[2] + t * d[2] - shape[2]
-    if kind == 0 or kind == 3:
+    if kind in (CONE, STEM):
         h = x * shape[3] + y * shape[4] + z * shape[5]
         nx, ny, nz = x - h * shape[3], y - h * shape[4], z - h * shape[5]
     else:
         cos, sin = shape[6], shape[7]
         u, v = (cos * x + sin * y) / shape[3], (cos * y - sin * x) / shape[4]
         w = z / shape[5]
-        if kind == 2:
+        if kind == BOX:
             # On a face the scaled coordinate is 1: that axis is the normal.
             if abs(w) >= abs(u) and abs(w) >= abs(v):
                 u, v = 0.0, 0.0
@@ -403,19 +413,20 @@ def ray_directions(R: Float, beams: Float) -> Float:
 
 @compiled
 def meet_solid(kind: int, shape: Float, surface: Float, o: Float, d: Float, chance: float) -> float:
-    """Return the range [m] of the first return from a shape, infinite without one. A ray passes a porous
-    ellipsoid if the drawn depth is greater than its way in it.
+    """Return the range [m] of the first return from a shape, infinite without one. Solid shapes are met from
+    outside only. A ray passes a porous ellipsoid if the drawn depth is greater than its way in it; it may
+    begin inside.
 
     Args:
         kind, shape, surface: Row of `Solids`.
         o, d: Origin [m] and unit direction of the ray, shape (3,).
         chance: Number in (0, 1) that decides the depth of the return in foliage.
     """
-    if kind == 3:
+    if kind == STEM:
         return meet_stem(shape, surface, o, d)
-    if kind == 0:
+    if kind == CONE:
         return meet_cone(shape, o, d)
-    if kind == 2:
+    if kind == BOX:
         return meet_box(shape, o, d)
     enter, leave = meet_ellipsoid(shape, o, d)
     if shape[8] == 0.0:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-from pipeline.geometry.poses import Pose3
+from pipeline.geometry.poses import Pose3, euler_rotation
 from pipeline.types.records import Bool, Float, Int
 
 ACCELERATION = 0.5  # m/s^2
@@ -353,11 +353,11 @@ class TrueMotion:
         x, y, z, roll, pitch, yaw = (
             np.interp(t, grid, column[part]) for column in (d.x, d.y, self.z, self.roll, self.pitch, d.yaw)
         )
-        return rotations(roll, pitch, yaw), np.stack([x, y, z], axis=1)
+        return euler_rotation(roll, pitch, yaw), np.stack([x, y, z], axis=1)
 
     def sensor_at(self, t: Float, T_base_lidar: Pose3) -> tuple[Float, Float]:
-        """Return rotations, shape (T, 3, 3), and positions, shape (T, 3) [m], of a sensor on the base at
-        ascending times t, shape (T,) [s]."""
+        """Return rotations, shape (T, 3, 3), and positions, shape (T, 3) [m], in the world of a sensor on the
+        base at ascending times t since the start, shape (T,) [s], as in `at`; T is at least 1."""
         R, p = self.at(t)
         return np.ascontiguousarray(R @ T_base_lidar.R), p + R @ T_base_lidar.t
 
@@ -382,18 +382,6 @@ def lay_on_terrain(drive: Drive, terrain: TerrainModel, rng: np.random.Generator
         roll=np.arcsin(left / np.sqrt(1.0 + ahead**2 + left**2)) + shake[0],
         pitch=-np.arctan(ahead) + shake[1],
     )
-
-
-def rotations(roll: Float, pitch: Float, yaw: Float) -> Float:
-    """Return R = Rz(yaw) Ry(pitch) Rx(roll), shape (N, 3, 3), of angles (N,) [rad]."""
-    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    cy, sy = np.cos(yaw), np.sin(yaw)
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def _vibration(t: Float, rng: np.random.Generator) -> Float:

@@ -30,7 +30,7 @@ from pipeline.simulation.scenarios import EXACT, QUALITIES, WILD, RunRequest
 from pipeline.simulation.scene import SimulatedScene, build_scene
 from pipeline.simulation.terrain import WheelContact
 from pipeline.simulation.wild_scenes import build_wild_scene, truth_in_view
-from pipeline.types.records import Float, Imu, Int, Odometry, TruthPath, TruthTrees
+from pipeline.types.records import Float, Imu, Odometry, TruthPath, TruthTrees
 
 # Raise it with every change that changes the bytes of a run.
 VERSION = 1
@@ -63,10 +63,6 @@ class SimulatedRun:
     inertial: Inertial
     scans: int
 
-    def scan_stamps(self) -> Int:
-        """Return the stamps of all scans [ns], int64, shape (N,)."""
-        return START_NS + np.arange(self.scans, dtype=np.int64) * self.lidar.period_ns
-
     def sensor_poses(self, k: int) -> tuple[Float, Float, Float]:
         """Return the poses of the LiDAR in scan k (from 0): time of each column since the start of the run
         [s] (C,), rotations (C, 3, 3) and positions (C, 3) [m] in the world."""
@@ -83,7 +79,8 @@ class SimulatedRun:
 
     def odometry_record(self, n: int) -> Odometry:
         """Return reading n of the odometry (50 Hz, from 0): the planar pose by the wheels, or, with the
-        quality "exact", the true pose with height and tilt."""
+        quality "exact", the true pose with height and tilt. IndexError for a reading after the motion by
+        wheels."""
         t_ns = n * (1_000_000_000 // ODOMETRY_HZ)
         if self.request.odometry == EXACT:
             R, p = self.motion.at(np.array([t_ns / 1e9]))
@@ -108,10 +105,11 @@ class SimulatedRun:
     def true_path(self) -> TruthPath:
         """Return the true pose of the base at the stamp of each scan, in the frame of the map, with the yaw
         in [-pi, pi)."""
+        since_ns = np.arange(self.scans, dtype=np.int64) * self.lidar.period_ns
         rows = np.arange(self.scans) * (RATE_HZ * self.lidar.period_ns // 1_000_000_000)
         d = self.motion.drive
         yaw = wrap_angle(d.yaw[rows])
-        return TruthPath(self.scan_stamps(), d.x[rows], d.y[rows], yaw, same_frame=True)
+        return TruthPath(START_NS + since_ns, d.x[rows], d.y[rows], yaw, same_frame=True)
 
     def digest(self) -> str:
         """Return the SHA-256 (hex) of everything that decides the bytes of the run."""
@@ -132,7 +130,7 @@ def open_run(request: RunRequest, T_base_lidar: Pose3 | None = None) -> Simulate
     """Build the scene and drive through it; no scan is simulated yet.
 
     Args:
-        request: A scenario with its options; not a run through a cloud, see `open_cloud_run`.
+        request: A scenario with its options; not a run through a cloud (KeyError).
         T_base_lidar: Extrinsics of the LiDAR; None uses MOUNTING.
 
     Raises:

@@ -404,13 +404,16 @@ def _refusal(uri: str, key: str, text: str) -> UsageError:
 
 
 def _whole(uri: str, key: str, text: str, most: int) -> int:
-    """Return a whole number from 0 to `most`; UsageError for another text.
+    """Return a whole number from 0 to `most`.
 
     Args:
         uri: The URI, for the error.
         key: Name of the option.
         text: Its value; ASCII digits only.
         most: Largest number.
+
+    Raises:
+        UsageError: The text is not such a number.
     """
     if not (text.isascii() and text.isdigit() and len(text) < 20 and int(text) <= most):
         refusal = _refusal(uri, key, text)
@@ -421,13 +424,16 @@ def _whole(uri: str, key: str, text: str, most: int) -> int:
 
 
 def _real(uri: str, key: str, text: str, low: float, high: float) -> float:
-    """Return a decimal number from `low` to `high`, both inclusive; UsageError for another text.
+    """Return a decimal number from `low` to `high`, both inclusive.
 
     Args:
         uri: The URI, for the error.
         key: Name of the option.
         text: Its value; ASCII digits only, an exponent is allowed.
         low, high: Bounds.
+
+    Raises:
+        UsageError: The text is not such a number.
     """
     # float() alone would also take 1_0, spaces and digits of other scripts.
     if not (len(text) < 40 and _NUMBER.fullmatch(text)):

@@ -49,8 +49,9 @@ class Person:
     phase: float
 
     def place(self, t: float) -> tuple[Float, float]:
-        """Return the position (2,) [m] and the heading [rad, not wrapped] at time t since the start of the
-        run [s]."""
+        """Return the position, shape (2,) [m], and the heading [rad, not wrapped] at time t since the start
+        of the run [s]. A person who stands sways by about a centimetre; one who walks faces the end to which
+        they walk."""
         if self.speed == 0.0:
             sway = np.array([np.sin(0.9 * (t + self.phase)), np.cos(0.7 * (t - self.phase))])
             return self.start + 0.012 * sway, self.heading + 0.03 * float(sway[0])

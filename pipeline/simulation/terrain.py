@@ -24,7 +24,8 @@ def sine_of_turns(turns: float) -> float:
 
 @compiled
 def height_at(terrain: Float, x: float, y: float) -> float:
-    """Return the height [m] of the terrain (see `SimulatedTerrain.packed`) at one position x, y [m]."""
+    """Return the height [m] of a terrain at one position x, y [m]; `terrain` is `SimulatedTerrain.packed`,
+    shape (1 + W, 4)."""
     z: float = terrain[0, 0] * x + terrain[0, 1] * y + terrain[0, 2]
     for i in range(1, terrain.shape[0]):
         z += terrain[i, 0] * sine_of_turns(terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3])
@@ -33,7 +34,8 @@ def height_at(terrain: Float, x: float, y: float) -> float:
 
 @compiled
 def gradient_at(terrain: Float, x: float, y: float) -> tuple[float, float]:
-    """Return the slopes dz/dx and dz/dy of the terrain (see `SimulatedTerrain.packed`) at x, y [m]."""
+    """Return the slopes dz/dx and dz/dy of a terrain at x, y [m]; `terrain` is `SimulatedTerrain.packed`,
+    shape (1 + W, 4)."""
     gx, gy = terrain[0, 0], terrain[0, 1]
     for i in range(1, terrain.shape[0]):
         turns = terrain[i, 1] * x + terrain[i, 2] * y + terrain[i, 3]
@@ -45,8 +47,8 @@ def gradient_at(terrain: Float, x: float, y: float) -> tuple[float, float]:
 
 @compiled
 def _evaluate(terrain: Float, x: Float, y: Float) -> Float:
-    """Return height [m], dz/dx and dz/dy of the terrain (see `SimulatedTerrain.packed`) at positions x, y of
-    shape (N,) each [m], shape (N, 3)."""
+    """Return height [m], dz/dx and dz/dy, shape (N, 3), of a terrain at positions x, y of shape (N,) each
+    [m]; `terrain` is `SimulatedTerrain.packed`, shape (1 + W, 4)."""
     out = np.empty((x.shape[0], 3))
     for n in range(x.shape[0]):
         out[n, 0] = height_at(terrain, x[n], y[n])

@@ -17,7 +17,7 @@ from pipeline.simulation.ray_casting import first_returns, ray_directions
 from pipeline.simulation.robot_motion import Course
 from pipeline.simulation.scenarios import Scenario
 from pipeline.simulation.scene import Plot, SimulatedScene
-from pipeline.simulation.scene_objects import BREAST_HEIGHT, KINDS, SceneBuilder, add_hedge
+from pipeline.simulation.scene_objects import BREAST_HEIGHT, KINDS, SceneBuilder, add_hedge, unit_vector
 from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import HIDDEN, Float, TruthTrees
 
@@ -252,8 +252,7 @@ def add_wild_tree(scene: SceneBuilder, plot: Plot, x: float, y: float, dbh: floa
 
 def _towards(rng: np.random.Generator) -> Float:
     """Return a random horizontal direction, shape (2,)."""
-    angle = rng.uniform(0.0, 2.0 * np.pi)
-    return np.array([np.cos(angle), np.sin(angle)])
+    return unit_vector(rng.uniform(0.0, 2.0 * np.pi))[:2]
 
 
 def _add_crown(scene: SceneBuilder, tip: Float, base: float, top: float, dbh: float) -> None:

@@ -19,7 +19,6 @@ from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
-from pipeline.slam.best_particle import are_apart, best_after_resampling, select_best
 from pipeline.slam.frame_uncertainty import NOISE, FrameUncertainty, at_least
 from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, ScanDetections, Solution, combined
 from pipeline.slam.loop_correction import (
@@ -29,25 +28,36 @@ from pipeline.slam.loop_correction import (
     joined,
     same_trees,
 )
+from pipeline.slam.measured_pose import SharedErrors
 from pipeline.slam.measurement_update import against_slip, estimated, use_scan
 from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrapped
 from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
 from pipeline.slam.particle_maps import known_near, shared_map, take_ancestors
 from pipeline.slam.particle_update import Rules
 from pipeline.slam.places import ODDS, PlaceStates, agreement
-from pipeline.slam.pose_quality import is_lost, pose_health
-from pipeline.slam.random_draws import draws
-from pipeline.slam.resampling import low_variance_ancestors, normalised
-from pipeline.slam.running_statistics import OdometryDoubt, RunningStatistics, update_statistics
+from pipeline.slam.pose_quality import (
+    OdometryDoubt,
+    RunningStatistics,
+    is_lost,
+    pose_health,
+    update_statistics,
+)
+from pipeline.slam.resampling import (
+    are_apart,
+    best_after_resampling,
+    draws,
+    low_variance_ancestors,
+    normalised,
+    select_best,
+)
 from pipeline.slam.scan_statistics import ScanStatistics, disagreement, named_statistics
-from pipeline.slam.shared_errors import SharedErrors
 from pipeline.slam.slip_detection import TreeMotion
 from pipeline.slam.state import SlamState
-from pipeline.types.pose_health import Health
-from pipeline.types.records import Detections, Int, Landmarks, PoseEstimate, PoseMeasurement
+from pipeline.types.records import Detections, Health, Int, Landmarks, PoseEstimate, PoseMeasurement
 
 SCANS_MAX = 20  # scans between two keyframes whose detections the graph uses
 LOOP_WEIGHT_MIN = 0.5  # weight of a loop by its kernel; the graph contradicts a loop with less
+REFERENCES = 1024  # at each multiple of it, reference poses without landmarks are dropped
 PLACED = 1  # distinguishes the random numbers of `place` from those of a scan
 
 
@@ -66,10 +76,10 @@ class FastSlam:
         """Predict the particles by the odometry, weigh them by the detections, and resample when it is due;
         replaces `state`.
 
-        Detections are used in the first scan (index 0), after `update_distance`, or when trees contradict the
-        odometry. In other scans the particles only move, the map is unchanged, and `landmark_of` of the
-        result comes from an association with the unchanged map. A changed number of particles takes effect
-        here.
+        Detections are used in the first scan (index 0), after `update_distance`, when the motion is due, and
+        when trees contradict the odometry or the last used scan was strange. In other scans the particles
+        only move, the map is unchanged, and `landmark_of` of the result comes from an association with the
+        unchanged map. A changed number of particles takes effect here.
 
         Args:
             index: Number of the scan; seeds the random numbers of the scan.
@@ -90,7 +100,8 @@ class FastSlam:
         R, rules = rows_of(detections.covariance), rules_of(p)
         places = self._places_in_reach(state, detections.centre)
         trees = self._by_trees(state, detections.centre, R, clear_range, places, rules)
-        used = index == 0 or state.since_update >= p.update_distance or trees.slipped
+        moved_on = state.since_update >= p.update_distance
+        used = index == 0 or moved_on or motion.due or trees.slipped or state.recent.strange > 0
         slipped = trees.slipped or state.recent.slipped
         doubted = OdometryDoubt(bool(doubt), slipped)
         doubt = doubt or slip_detection.slip_message(state.motion, slipped, trees.unsure)
@@ -121,6 +132,8 @@ class FastSlam:
             serial = state.detections - len(detections.cluster)
             at = estimate.T_map_base.as_array()
             frame = frame.with_reference(serial, len(state.genealogy), at, estimate.covariance)
+            if len(frame.serial) % REFERENCES == 0:
+                frame = frame.without_unused(state.maps.birth[state.maps.hits > 0])
         if used and estimate.n_eff < p.resample_below * p.particles:
             ancestors = low_variance_ancestors(weights, offset)
             take_ancestors(ancestors, state.pose, state.maps)
@@ -130,15 +143,16 @@ class FastSlam:
         genealogy = state.genealogy.with_scan(estimate.particles, ancestors, state.best)
         path = state.path.with_pose(estimate.T_map_base.as_array())
         self.state = state = replace(state, genealogy=genealogy, path=path, frame=frame)
-        health = pose_health(
-            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
-        )
         # A survivor of the resampling keeps its row, so that row `best` is still that of the best particle.
         if births is None:
             landmark_of = births_of(detections, estimate, self.landmarks())
+            scan = ScanStatistics(len(landmark_of), recognised=float(np.count_nonzero(landmark_of >= 0)))
         else:
             landmark_of = births[state.best]
             self.state = self._with_keyframe(state, detections, landmark_of)
+        health = pose_health(
+            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
+        )
         return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
 
     def without_shared_error(self, pose: PoseMeasurement) -> PoseMeasurement:
@@ -266,7 +280,8 @@ class FastSlam:
         correction = PathCorrection(self.path(), after)
         self._put(index, Pose2(*after[-1].tolist()), covariance)
         particles = len(self.state.pose)
-        frame = before.frame.corrected(correction, _at_scans(solution.covariance, graph, len(path)))
+        frame = before.frame
+        frame = frame.corrected(correction, _at_scans(solution.covariance, graph, frame.scan))
         self.state = replace(
             self.state,
             maps=shared_map(particles, moved if names is None else joined(moved, *names)),
@@ -551,16 +566,16 @@ class FastSlam:
         return shared.measured(measured)
 
 
-def _at_scans(covariance: Float, graph: KeyframeGraph, scans: int) -> Float:
-    """Return the covariance of each scan's pose, shape (N, 3, 3): that of the last keyframe before or at the
-    scan, or of the first keyframe for earlier scans.
+def _at_scans(covariance: Float, graph: KeyframeGraph, scans: Int) -> Float:
+    """Return the covariance of the pose at some scans, shape (N, 3, 3): that of the last keyframe before or
+    at the scan, or of the first keyframe for earlier scans.
 
     Args:
         covariance: Covariance of each keyframe, shape (K, 3, 3), K > 0.
         graph: Graph with these keyframes.
-        scans: Number of scans N.
+        scans: Numbers of the scans, int64, shape (N,).
     """
-    keyframe = np.searchsorted(graph.scans, np.arange(scans), side="right") - 1
+    keyframe = np.searchsorted(graph.scans, scans, side="right") - 1
     rows: Float = covariance[np.maximum(keyframe, 0)]
     return rows
 
@@ -589,7 +604,6 @@ def rules_of(p: Slam) -> Rules:
         miss=1.0 / p.misses_per_hit,
         miss_weight=p.miss_weight,
         weight_power=p.weight_power,
-        looks=p.independent_views_max,
         merge_gate=p.merge_gate,
     )
 

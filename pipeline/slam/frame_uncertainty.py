@@ -136,6 +136,25 @@ class FrameUncertainty:
             covariance=np.concatenate([self.covariance, covariance[None]]),
         )
 
+    def without_unused(self, birth: Int) -> FrameUncertainty:
+        """Return the state without reference poses to which no landmark belongs, except the last one. It
+        differs for no landmark.
+
+        Args:
+            birth: Birth numbers of all landmarks of all particles, int64, shape (L,).
+        """
+        used = np.zeros(len(self.serial) + 1, np.bool_)
+        used[np.searchsorted(self.serial, birth, side="right")] = True
+        keep = used[1:]
+        keep[-1:] = True
+        return replace(
+            self,
+            serial=self.serial[keep],
+            scan=self.scan[keep],
+            pose=self.pose[keep],
+            covariance=self.covariance[keep],
+        )
+
     def scan_of(self, birth: Int) -> Int:
         """Return the scan of the reference pose of each landmark, int64, shape (L,), by birth numbers of
         shape (L,); 0 for landmarks that precede all reference poses."""
@@ -150,11 +169,9 @@ class FrameUncertainty:
 
         Args:
             correction: Path before and after.
-            covariance: Covariance of the corrected pose of each scan, shape (N, 3, 3).
+            covariance: Covariance of the corrected pose at the scan of each reference pose, shape (M, 3, 3).
         """
-        if not len(self.scan):
-            return self
-        return replace(self, pose=correction.poses(self.pose, self.scan), covariance=covariance[self.scan])
+        return replace(self, pose=correction.poses(self.pose, self.scan), covariance=covariance)
 
     def without_hidden(self) -> FrameUncertainty:
         """Return the state with `hidden` = 0: the particles were drawn with the complete covariance of the

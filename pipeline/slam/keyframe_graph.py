@@ -33,6 +33,8 @@ STEMS_MAX = 64
 GOLDEN = 0.6180339887498949  # golden ratio; its multiples modulo 1 order the stems evenly and reproducibly
 #: Keyframes of the graph; beyond it every second one is dropped, which bounds the cost of a solution.
 KEYFRAMES_MAX = 2000
+#: Loops of a graph that is thinned; beyond it every second one is dropped, because their ends stay.
+LOOPS_MAX = 250
 #: Growth of the graph between two solutions: a share of it, and at least so many keyframes. All solutions
 #: of a run together cost a bounded multiple of the last one.
 GROWTH, GROWTH_MIN = 0.1, 5
@@ -176,15 +178,6 @@ class KeyframeGraph:
         """Scan number of the newest keyframe, -1 without one."""
         return self.keyframes[-1].scan if self.keyframes else -1
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the poses and of the detections and covariances of the keyframes [bytes]; motions and loops
-        are not counted."""
-        size = sum(
-            k.birth.nbytes + k.centre.nbytes + k.R.nbytes + k.covariance.nbytes for k in self.keyframes
-        )
-        return size + self.pose.nbytes
-
     def with_keyframe(self, keyframe: Keyframe, pose: Float) -> KeyframeGraph:
         """Return the graph with one more keyframe, at a pose x, y [m], yaw [rad] by the filter, shape (3,).
         It replaces the newest keyframe if that has the same scan. With more than KEYFRAMES_MAX keyframes the
@@ -272,12 +265,16 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
 
     def thinned(self) -> KeyframeGraph:
-        """Return the graph without every second keyframe. The ends of loops and the newest keyframe stay.
+        """Return the graph without every second keyframe, and without every second loop of more than
+        LOOPS_MAX. The ends of the other loops and the newest keyframe stay.
 
         Motions are compounded; over a keyframe without odometry the covariance is infinite. The next keyframe
         takes the detections of a dropped one at the present relative pose, combined by landmark and at most
         STEMS_MAX of them; without odometry between both they are lost."""
-        ends = {scan for loop in self.loops for scan in loop.scans} | {self.newest_scan}
+        loops = self.loops
+        while len(loops) > LOOPS_MAX:
+            loops = loops[len(loops) % 2 :: 2]
+        ends = {scan for loop in loops for scan in loop.scans} | {self.newest_scan}
         rows, kept = list[int](), list[Keyframe]()
         motion, covariance = np.zeros(3), np.zeros((3, 3))
         dropped = list[int]()
@@ -299,7 +296,7 @@ class KeyframeGraph:
                 motion, covariance = np.zeros(3), np.zeros((3, 3))
                 dropped.clear()
         solved = int(np.searchsorted(rows, self.solved))
-        return replace(self, keyframes=tuple(kept), pose=self.pose[rows], solved=solved)
+        return replace(self, keyframes=tuple(kept), pose=self.pose[rows], loops=loops, solved=solved)
 
     def solve(self, *, new_loop: bool = False) -> Solution | None:
         """Return the minimum next to the present poses. None with fewer than two keyframes, if the problem is

@@ -9,14 +9,15 @@ from pipeline.geometry.poses import Float
 from pipeline.jit import compiled_within
 from pipeline.types.records import Bool, Float32, Int, Int32
 
-VARIANCE_MIN = 1e-4  # m^2; all views of a trunk share an error of about one centimetre
+VARIANCE_MIN = 1e-4  # m^2 in each direction; all views of a trunk share an error of about one centimetre
 
 
 @compiled_within
 def kalman_update(
-    m: Float, Sigma: Float, j: int, z0: float, z1: float, R0: float, R1: float, R2: float, looks: float
+    m: Float, Sigma: Float, j: int, z0: float, z1: float, R0: float, R1: float, R2: float
 ) -> None:
-    """Update a static landmark with a measured position, in place.
+    """Update a static landmark with a measured position, in place. The variance of the result is at least
+    VARIANCE_MIN in every direction.
 
     Args:
         m: Positions of the landmarks, shape (L, 2) [m]; row j is updated.
@@ -24,8 +25,6 @@ def kalman_update(
         j: Row of the landmark.
         z0, z1: Measured position [m].
         R0, R1, R2: Covariance xx, xy, yy of the measurement [m^2].
-        looks: Maximum number of independent views, > 0. Successive views of a trunk share their error, so
-            that the variances never fall below those of R divided by this number.
     """
     S0, S1, S2 = Sigma[j, 0], Sigma[j, 1], Sigma[j, 2]
     a, b, d = S0 + R0, S1 + R1, S2 + R2  # S = Sigma + R, H = I
@@ -36,9 +35,11 @@ def kalman_update(
     m[j, 0] += k00 * y0 + k01 * y1
     m[j, 1] += k10 * y0 + k11 * y1
     # K R is (I - K) Sigma for K = Sigma S^-1, and stays positive in floating point.
-    Sigma[j, 0] = max(k00 * R0 + k01 * R1, VARIANCE_MIN, R0 / looks)
-    Sigma[j, 1] = 0.5 * (k00 * R1 + k01 * R2 + k10 * R0 + k11 * R1)
-    Sigma[j, 2] = max(k10 * R1 + k11 * R2, VARIANCE_MIN, R2 / looks)
+    xx, yy = k00 * R0 + k01 * R1, k10 * R1 + k11 * R2
+    xy = 0.5 * (k00 * R1 + k01 * R2 + k10 * R0 + k11 * R1)
+    smallest = 0.5 * (xx + yy) - np.sqrt(0.25 * (xx - yy) ** 2 + xy * xy)  # eigenvalue
+    lacking = max(VARIANCE_MIN - smallest, 0.0)
+    Sigma[j, 0], Sigma[j, 1], Sigma[j, 2] = xx + lacking, xy, yy + lacking
 
 
 @compiled_within
@@ -93,7 +94,7 @@ def merge_duplicates(
                 continue
             kalman_update(
                 mean, covariance, j, mean[k, 0], mean[k, 1],
-                covariance[k, 0], covariance[k, 1], covariance[k, 2], 1e9,
+                covariance[k, 0], covariance[k, 1], covariance[k, 2],
             )  # fmt: skip
             hits[j] += hits[k]
             score[j] = max(score[j], score[k])

@@ -151,6 +151,7 @@ class Motion(NamedTuple):
         doubt: Message with the reason of the doubt; empty without one.
         measured: Pose that another source measured at this scan, if any.
         turn_sigma: Standard deviation of the yaw of the step [rad] if a gyroscope measured it, else None.
+        due: Whether the scan updates the filter even if the robot has moved less than `update_distance`.
     """
 
     step: Pose2
@@ -158,6 +159,7 @@ class Motion(NamedTuple):
     doubt: str = ""
     measured: PoseMeasurement | None = None
     turn_sigma: float | None = None
+    due: bool = False
 
 
 # m, rad; standard deviations added to each step at full distrust, because wheels that slipped slip again.

@@ -56,9 +56,23 @@ class EstimatedPath:
             return EstimatedPath(self.blocks, newest)
         return EstimatedPath((*self.blocks, newest), np.zeros((0, 3)))
 
-    def poses(self) -> Float:
-        """Return the poses of all scans as a copy, x, y [m], yaw [rad], shape (N, 3)."""
-        return np.concatenate([*self.blocks, self.newest])
+    def poses(self, start: int = 0) -> Float:
+        """Return the poses of the scans from `start` on as a copy, x, y [m], yaw [rad], shape (N - start,
+        3)."""
+        first = min(start // BLOCK, len(self.blocks))
+        return np.concatenate([*self.blocks[first:], self.newest])[start - first * BLOCK :]
+
+    def rows_in_common(self, other: EstimatedPath) -> int:
+        """Return a number of first scans that have the same poses in another path: all of them if the paths
+        share their blocks, else possibly fewer."""
+        ours, theirs = (*self.blocks, self.newest), (*other.blocks, other.newest)
+        rows = 0
+        for a, b in zip(ours, theirs, strict=False):
+            if a is not b:
+                n = min(len(a), len(b))
+                return rows + int(np.logical_and.accumulate((a[:n] == b[:n]).all(axis=1)).sum())
+            rows += len(a)
+        return rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,12 +119,6 @@ class Genealogy:
     def __len__(self) -> int:
         """Return the number of scans."""
         return BLOCK * len(self.settled) + len(self.recent)
-
-    @property
-    def nbytes(self) -> int:
-        """Size of all arrays except the founders [bytes]."""
-        poses = sum(block.nbytes for block in self.settled) + sum(g.pose.nbytes for g in self.recent)
-        return poses + sum(g.ancestors.nbytes for g in self.recent if g.ancestors is not None)
 
     def with_scan(self, pose: Float, ancestors: Int | None, leaf: int) -> Genealogy:
         """Return the ancestry with one more scan. When more than RECENT_POSES poses are kept, the oldest

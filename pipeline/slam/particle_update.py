@@ -12,13 +12,12 @@ from pipeline.geometry.gaussian import draw, rotated
 from pipeline.geometry.hash_grid import Cells, cells_for, clear, fill, per_metre
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
-from pipeline.slam.candidate_pairs import Room
 from pipeline.slam.landmarks import kalman_update, merge_duplicates
+from pipeline.slam.measured_pose import MeasuredPose, correct_by_measured, update_shared_errors
 from pipeline.slam.particle_maps import ROOM, Maps, own_block, widen
 from pipeline.slam.places import ACTIVE, INACTIVE, PlaceStates, state_of
-from pipeline.slam.proposal import recognise
+from pipeline.slam.proposal import Room, recognise
 from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT
-from pipeline.slam.shared_errors import MeasuredPose, correct_by_measured, update_shared_errors
 from pipeline.types.records import Bool, Float32, Int, Int32
 
 SCORE_MAX = 20.0  # upper limit of a score, so that a felled tree is removed after finitely many misses
@@ -38,8 +37,6 @@ class Rules(NamedTuple):
         miss: Decrease of the score of a landmark by one miss.
         miss_weight: Decrease of the log weight by one miss.
         weight_power: Exponent of the likelihood of a scan in the weights.
-        looks: Maximum number of independent views: the variance of a landmark never falls below that of a
-            detection divided by it.
         merge_gate: Maximum Mahalanobis distance of two landmarks that are merged [sigma].
     """
 
@@ -51,7 +48,6 @@ class Rules(NamedTuple):
     miss: float
     miss_weight: float
     weight_power: float
-    looks: float
     merge_gate: float
 
 
@@ -206,9 +202,7 @@ def observe(
         if measured.mean.shape[0] > 0:
             update_shared_errors(pose, measured, p)
         c, s = np.cos(pose[p, 2]), np.sin(pose[p, 2])
-        all_near = _learn(
-            pose, p, c, s, maps, near, known, free, room.landmark_of, centre, R, first_birth, rules
-        )
+        all_near = _learn(pose, p, c, s, maps, near, known, free, room.landmark_of, centre, R, first_birth)
         missed = _miss(pose, p, c, s, near, known, clear_range, farthest, rules, statistics)
         log_weight[p] += rules.weight_power * (likelihood - rules.miss_weight * missed)
         merge_duplicates(
@@ -295,7 +289,6 @@ def _learn(
     centre: Float,
     R: Float,
     first_birth: int,
-    rules: Rules,
 ) -> int:
     """Update the landmarks of particle p that were detected, mark them as seen, and append a new landmark for
     each detection without one; return the number of rows of `near` then.
@@ -315,7 +308,6 @@ def _learn(
         centre: Detections in the base frame, shape (D, 2) [m].
         R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
         first_birth: Birth number of the first detection.
-        rules: Parameters.
     """
     n = known
     for d in range(centre.shape[0]):
@@ -326,7 +318,7 @@ def _learn(
         if j >= 0:
             if near.seen[j]:  # of an uncertain place
                 continue
-            kalman_update(near.mean, near.covariance, j, z0, z1, R0, R1, R2, rules.looks)
+            kalman_update(near.mean, near.covariance, j, z0, z1, R0, R1, R2)
             near.hits[j] += 1
             near.score[j] = min(near.score[j] + 1.0, SCORE_MAX)
             near.seen[j] = near.changed[j] = True

@@ -1,13 +1,222 @@
-"""Quality of the pose: good, weak or lost, with the reason."""
+"""Quality of the pose: good, weak or lost, with the reason, by running statistics of the scans."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.slam.running_statistics import STRANGE_LOST, RunningStatistics
+from pipeline.jit import compiled
+from pipeline.slam.motion import Noise, OdometryTrust
+from pipeline.slam.rigid_shift_test import FAMILIAR, MANY
 from pipeline.slam.scan_statistics import ScanStatistics
-from pipeline.types.pose_health import Health, HealthState
+from pipeline.types.records import Health, HealthState
+
+# A strange scan misses nearly all known trees in free view. After STRANGE_LOST of them in a row the robot is
+# lost. The number exceeds the hits that make a tree well known, so that trees that were hidden by a bend or
+# by leaves become known before. A scan is strange only if the trees it misses have at least STRANGE_MISSED
+# hits together, so that a few new trees do not outvote the map.
+STRANGE_LOST, STRANGE_MISSED = 5, 15.0  # scans; hits
+FADING = 0.1  # weight of the newest scan in a running mean
+FADING_FOUND = 0.2  # the same for shares of recognised trees
+OVERRULED = 0.5  # distrust that remains six scans after the trees contradicted the odometry: 0.9^6
+FEWEST = 2.0  # minimum number of trees for a share, and for a heading from trees
+# In a known place, a scan is strange in spite of a few trees that are recognised by chance if it misses trees
+# with EXPECTED hits and finds less than the share BY_CHANCE of the hits; STILL_BY_CHANCE after a strange
+# scan.
+EXPECTED = 100.0  # hits
+BY_CHANCE, STILL_BY_CHANCE = 0.15, 0.4  # shares of the hits
+NEARBY = 3.0  # m without two known trees, up to which the place counts as known
+# Recognised trees that are needed to trust their motion without an odometry; MANY of them contradict one.
+TREES_WITHOUT_ODOMETRY = 3.0
+TREE_MOTION_SCANS = 20  # scans after which their motion is trusted
+# Bound and increment of the counter of these scans. Scans without a doubt decrease it by one, so that an
+# intermittent doubt does not restart it.
+TREE_MOTION_MAX, TREE_MOTION_STEP = 60, 2
+
+
+@dataclass(frozen=True, slots=True)
+class RunningStatistics:
+    """Running statistics after a scan. "Well known" is a landmark with `slam.hits_to_weigh` hits.
+
+    Attributes:
+        innovation: Running mean of the normalised innovation squared per degree of freedom.
+        found: Running mean of the hits of recognised landmarks, as a share of all well-known landmarks in
+            free view.
+        ambiguous: Running mean of the share of detections with two likely landmarks.
+        odometry: Largest deviation from an odometry without doubt [sigma], decaying by FADING per scan.
+        alone: Distance driven since two known trees were last recognised in one scan [m].
+        mapped: Whether any well-known landmark was ever recognised.
+        distrust: 1 when the trees contradict the odometry, decaying by FADING per scan.
+        strange: Number of strange scans in a row, see STRANGE_LOST.
+        missed: Most hits of well-known landmarks that one of these scans missed.
+        familiar: Running mean of the share of detections that belong to well-known landmarks.
+        led: Counter of the scans in which trees determined the motion while the odometry was doubted: plus
+            TREE_MOTION_STEP for each, minus one for each scan without doubt.
+    """
+
+    innovation: float = 1.0
+    found: float = 1.0
+    ambiguous: float = 0.0
+    odometry: float = 0.0
+    alone: float = 0.0
+    mapped: bool = False
+    distrust: float = 0.0
+    strange: int = 0
+    missed: float = 0.0
+    familiar: float = 0.0
+    led: int = 0
+
+    @property
+    def slipped(self) -> bool:
+        """Whether the trees contradicted the odometry within the last six scans."""
+        return self.distrust >= OVERRULED
+
+    @property
+    def is_tree_motion_reliable(self) -> bool:
+        """Whether trees determined the motion in enough scans (TREE_MOTION_SCANS) to be trusted without the
+        odometry."""
+        return self.led >= TREE_MOTION_STEP * TREE_MOTION_SCANS
+
+    def odometry_trust(self, noise: Noise) -> OdometryTrust:
+        """Return the trust in an odometry with this noise."""
+        return OdometryTrust(noise, self.distrust, self.alone, self.familiar)
+
+
+class OdometryDoubt(NamedTuple):
+    """Reasons not to trust the odometry.
+
+    Attributes:
+        reported: The step came with a doubt, for example because the odometry was missing.
+        contradicted: The trees contradict the odometry, in this scan or in one of the last scans.
+    """
+
+    reported: bool = False
+    contradicted: bool = False
+
+
+NO_DOUBT = OdometryDoubt()
+
+
+def update_statistics(
+    recent: RunningStatistics, scan: ScanStatistics, driven: float, doubted: OdometryDoubt = NO_DOUBT
+) -> RunningStatistics:
+    """Return the running statistics after one more scan.
+
+    Args:
+        recent: Statistics before the scan.
+        scan: Statistics of the scan.
+        driven: Distance since the last used scan [m], with 1 m per radian of turn.
+        doubted: Doubts about the odometry at this scan.
+    """
+    expected, is_measured = scan.found + scan.missed, math.isfinite(scan.innovation)
+    strange = _strange_scans(recent, scan, any(doubted) or recent.alone + driven < NEARBY)
+    return RunningStatistics(
+        innovation=_exponential_mean(recent.innovation, scan.innovation, FADING if is_measured else 0),
+        found=_exponential_mean(
+            recent.found, scan.found / max(expected, 1e-9), FADING_FOUND if expected > 0 else 0
+        ),
+        ambiguous=_exponential_mean(
+            recent.ambiguous,
+            scan.ambiguous / max(scan.detections, 1),
+            FADING if scan.detections >= FEWEST else 0,
+        ),
+        odometry=max(0.0 if any(doubted) else scan.odometry, (1.0 - FADING) * recent.odometry),
+        alone=distance_without_trees(recent.alone, scan.recognised, driven),
+        mapped=recent.mapped or scan.recognised > 0.5,
+        distrust=decayed_distrust(recent.distrust),
+        strange=strange,
+        missed=max(recent.missed, scan.missed) if strange else 0.0,
+        familiar=updated_familiar(recent.familiar, scan.recognised, scan.detections),
+        led=_tree_motion_count(recent.led, scan, doubted),
+    )
+
+
+@compiled
+def distance_without_trees(alone: float, recognised: float, driven: float) -> float:
+    """Return the distance driven since two known trees were last recognised in one scan [m]: 0 after a scan
+    with FEWEST recognised trees.
+
+    Args:
+        alone: The distance before [m].
+        recognised: Number of recognised trees in the scan.
+        driven: Distance since the scan before [m].
+    """
+    return 0.0 if recognised >= FEWEST else alone + driven
+
+
+@compiled
+def decayed_distrust(distrust: float) -> float:
+    """Return the distrust, 0 to 1, after one more scan: 90 % of it, and 0 if it was at most 0.01."""
+    return (1.0 - FADING) * distrust if distrust > 0.01 else 0.0
+
+
+@compiled
+def updated_familiar(familiar: float, recognised: float, detections: int) -> float:
+    """Return the running mean of the share of detections of known trees after one more scan.
+
+    Args:
+        familiar: The mean before.
+        recognised: Number of recognised trees in the scan.
+        detections: Number of detections; with fewer than FEWEST the mean is unchanged.
+    """
+    if detections < FEWEST:
+        return familiar
+    return familiar + FADING_FOUND * (recognised / detections - familiar)
+
+
+def _tree_motion_count(before: int, scan: ScanStatistics, doubted: OdometryDoubt) -> int:
+    """Return `RunningStatistics.led` after a scan. A doubted scan with too few recognised trees resets it to
+    0. `before` is its value before; without doubt it decreases by 1, at least to 0, and otherwise grows to at
+    most TREE_MOTION_MAX."""
+    if not any(doubted):
+        return max(before - 1, 0)
+    leading = TREES_WITHOUT_ODOMETRY if doubted.reported else MANY
+    return min(before + TREE_MOTION_STEP, TREE_MOTION_MAX) if scan.recognised >= leading else 0
+
+
+def _strange_scans(recent: RunningStatistics, scan: ScanStatistics, here: bool) -> int:
+    """Return the number of strange scans in a row after a scan.
+
+    A scan is strange if it misses enough known trees (STRANGE_MISSED) and finds none. A scan that misses none
+    in free view, or detects too little, leaves the number unchanged. In a known place, a scan that finds a
+    few of many known trees (see BY_CHANCE) is strange as well; later scans of such a row may also find young
+    trees, which were begun after its start. Any other scan that finds known trees resets the number to 0.
+
+    Args:
+        recent: Statistics before the scan.
+        scan: Statistics of the scan.
+        here: Whether the robot may be elsewhere than estimated although the place is known: two known trees
+            were seen within the last NEARBY metres, or the odometry is doubted.
+    """
+    before = recent.strange
+    misses_trees = scan.detections >= FEWEST and scan.missed >= STRANGE_MISSED
+    share = scan.found / max(scan.found + scan.missed, 1e-9)
+    if scan.recognised < 0.5 and scan.found == 0.0:
+        return before + 1 if misses_trees else before
+    if before:
+        # The recognised trees have no more hits than trees begun since the first strange scan, and more trees
+        # than one are missed: a single one may have fallen.
+        young = scan.found <= (min(before, STRANGE_LOST) + 2) * scan.recognised
+        young = young and max(recent.missed, scan.missed) >= FEWEST * STRANGE_MISSED
+        return before + 1 if misses_trees and (young or share < STILL_BY_CHANCE) else 0
+    return int(
+        misses_trees
+        and here
+        and recent.familiar >= FAMILIAR
+        and scan.missed >= EXPECTED
+        and share < BY_CHANCE
+    )
+
+
+def _exponential_mean(mean: float, value: float, newest: float) -> float:
+    """Return the exponential running mean after a new value: mean + newest (value - mean). With the weight
+    `newest` 0 the mean is unchanged, even if the value is NaN."""
+    return mean + newest * (value - mean) if newest else mean
+
 
 # Standard deviations of the position up to which a pose is good, and weak: a third of the usual distance
 # between neighbouring trunks, and that distance, beyond which associations become wrong.

@@ -1,23 +1,240 @@
 """Data association and proposal distribution of one particle, in one pass.
 
-FastSLAM 2.0 (Montemerlo et al. 2003) draws the pose from the Gaussian of odometry and scan together: each
-recognised landmark corrects this Gaussian before the next one is associated, so that unambiguous detections
-help to decide ambiguous ones. FastSLAM 1.0 is the same with a pose that was drawn from the odometry and has
-no covariance.
+The pairs of detections and landmarks within the gate are collected, most likely first. FastSLAM 2.0
+(Montemerlo et al. 2003) draws the pose from the Gaussian of odometry and scan together: each recognised
+landmark corrects this Gaussian before the next one is associated, so that unambiguous detections help to
+decide ambiguous ones. FastSLAM 1.0 is the same with a pose that was drawn from the odometry and has no
+covariance. The kernels run for each particle of each scan and allocate no memory.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from pipeline.geometry.gaussian import Pose, corrected, expected_spread, keep_pose, pose_of, turned
-from pipeline.geometry.hash_grid import Cells
+from pipeline.geometry.hash_grid import Cells, cell_of, first_of_four
 from pipeline.geometry.poses import Float
-from pipeline.jit import compiled_within
-from pipeline.slam.candidate_pairs import LIKELY, Room, fill_levels, find_ambiguous, likely_pairs
-from pipeline.slam.joint_association import choose_jointly
+from pipeline.jit import compiled, compiled_borrowing, compiled_within
+from pipeline.slam.joint_association import CHOICES, MOST, JointSearch, choose_jointly, search_for
 from pipeline.slam.scan_statistics import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
-from pipeline.types.records import Int, Int32
+from pipeline.types.records import Bool, Int, Int32
+
+FEW = 64  # rows that are sorted by insertion
+LIKELY = 6.0  # difference in -2 log likelihood below which a second pair makes a detection ambiguous
+
+
+class Room(NamedTuple):
+    """Work arrays for the pairs of one particle, allocated once per scan.
+
+    Attributes:
+        detection, landmark: Rows of each pair, int64, shape (pairs,).
+        cost: -2 log likelihood of each pair up to a constant, shape (pairs,).
+        order: Pairs in ascending cost, int64, shape (pairs,).
+        best, second: The two lowest costs of each detection, shape (D,); infinite without such a pair.
+        landmark_of: Landmark of each detection, -1 for none, int64, shape (D,).
+        sequence: Detections in the order in which their pairs are collected, int64, shape (D,).
+        taken: Whether a landmark has a detection, shape (L,).
+        ambiguous: Whether a detection is decided together with others, shape (D,).
+        claimed: Pair of each landmark with the lowest cost, int64, shape (L,).
+        search: Work arrays of the joint decision.
+    """
+
+    detection: Int
+    landmark: Int
+    cost: Float
+    order: Int
+    best: Float
+    second: Float
+    landmark_of: Int
+    sequence: Int
+    taken: Bool
+    ambiguous: Bool
+    claimed: Int
+    search: JointSearch
+
+
+@compiled
+def room_for(detections: int, landmarks: int) -> Room:
+    """Return work arrays with space for all pairs, with the detections in ascending sequence."""
+    pairs = detections * landmarks
+    return Room(
+        np.empty(pairs, np.int64),
+        np.empty(pairs, np.int64),
+        np.empty(pairs),
+        np.empty(pairs, np.int64),
+        np.empty(detections),
+        np.empty(detections),
+        np.empty(detections, np.int64),
+        np.arange(detections),
+        np.empty(landmarks, np.bool_),
+        np.empty(detections, np.bool_),
+        np.empty(landmarks, np.int64),
+        search_for(),
+    )
+
+
+@compiled_within
+def likely_pairs(
+    pose: Pose,
+    c: float,
+    s: float,
+    centre: Float,
+    R: Float,
+    mean: Float,
+    covariance: Float,
+    cells: Cells,
+    scale: float,
+    gate2: float,
+    distance_max: float,
+    room: Room,
+) -> int:
+    """Collect the pairs within the gate in `room`, sorted by cost; return their number.
+
+    Args:
+        pose: Pose before the scan.
+        c, s: Cosine and sine of its yaw.
+        centre: Detections in the base frame, shape (D, 2) [m].
+        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        mean, covariance: Landmarks, see Maps.
+        cells: Hash grid of the landmarks.
+        scale: Cells per metre.
+        gate2: Square of the maximum Mahalanobis distance.
+        distance_max: Maximum distance [m].
+        room: Work arrays; `sequence` holds each detection once and is sorted for the next particle.
+    """
+    pairs = 0
+    for i in range(centre.shape[0]):
+        d = room.sequence[i]
+        room.landmark_of[d] = -1
+        best = second = np.inf
+        ax, ay = c * centre[d, 0] - s * centre[d, 1], s * centre[d, 0] + c * centre[d, 1]
+        wx, wy = pose.x + ax, pose.y + ay
+        s0, s1, s2 = expected_spread(pose, c, s, ax, ay, R, d)
+        u, v = first_of_four(wx, wy, scale)
+        for quarter in range(4):
+            j = cells.head[cell_of(u + (quarter & 1), v + (quarter >> 1))]
+            while j >= 0:
+                y0, y1 = mean[j, 0] - wx, mean[j, 1] - wy
+                at, j = j, cells.following[j]
+                if not y0 * y0 + y1 * y1 <= distance_max * distance_max:
+                    continue
+                S0, S2 = s0 + covariance[at, 0], s2 + covariance[at, 2]
+                S1 = s1 + covariance[at, 1]
+                det = S0 * S2 - S1 * S1
+                d2 = (S2 * y0 * y0 - 2.0 * S1 * y0 * y1 + S0 * y1 * y1) / det
+                if d2 <= gate2:
+                    cost = d2 + np.log(det)
+                    room.cost[pairs] = cost
+                    room.detection[pairs], room.landmark[pairs], room.order[pairs] = d, at, pairs
+                    if cost < best:
+                        best, second = cost, best
+                    elif cost < second:
+                        second = cost
+                    pairs += 1
+        room.best[d], room.second[d] = best, second
+    _sort(room.cost, room.order, pairs)
+    _sort_sequence(room, pairs, centre.shape[0])
+    return pairs
+
+
+@compiled_within
+def find_ambiguous(pairs: int, found: int, room: Room) -> int:
+    """Mark the ambiguous detections and reset `taken` of all landmarks of the pairs; return the number of
+    ambiguous detections.
+
+    A detection is ambiguous if a second landmark is nearly as likely (LIKELY), or another detection is nearly
+    as likely for the same landmark.
+
+    Args:
+        pairs: Number of pairs, which are sorted in `room.order`.
+        found: Number of detections.
+        room: The pairs; `ambiguous` and `claimed` are written.
+    """
+    count = 0
+    for d in range(found):
+        room.ambiguous[d] = room.second[d] - room.best[d] < LIKELY
+        count += room.ambiguous[d]
+    for i in range(pairs):
+        room.taken[room.landmark[i]] = False
+    for i in range(pairs):
+        k = room.order[i]
+        d, j = room.detection[k], room.landmark[k]
+        if not room.taken[j]:
+            room.taken[j] = True
+            room.claimed[j] = k
+            continue
+        first = room.claimed[j]
+        if room.cost[k] - room.cost[first] < LIKELY:
+            count += 2 - room.ambiguous[d] - room.ambiguous[room.detection[first]]
+            room.ambiguous[d] = room.ambiguous[room.detection[first]] = True
+    for i in range(pairs):
+        room.taken[room.landmark[i]] = False
+    return count
+
+
+@compiled_borrowing
+def fill_levels(pairs: int, room: Room) -> int:
+    """Fill the levels of the search with at most MOST ambiguous detections, lowest cost first, and the free
+    landmarks of their pairs, at most CHOICES each; return the number of levels. `pairs` is the number of
+    pairs, which are sorted in `room.order`; `room.search` is written."""
+    search, n = room.search, 0
+    for i in range(pairs):
+        k = room.order[i]
+        d, j = room.detection[k], room.landmark[k]
+        if not room.ambiguous[d] or room.taken[j]:
+            continue
+        level = 0
+        while level < n and search.detection[level] != d:
+            level += 1
+        if level == MOST:
+            continue
+        if level == n:
+            search.detection[n], search.choices[n] = d, 0
+            n += 1
+        if search.choices[level] < CHOICES:
+            search.landmark[level, search.choices[level]] = j
+            search.choices[level] += 1
+    return n
+
+
+@compiled_within
+def _sort(cost: Float, order: Int, n: int) -> None:
+    """Sort the first n rows of `order` by cost, then by row (Shell sort, in place). Up to FEW rows, which are
+    nearly sorted after the first particle, are sorted by its last pass."""
+    gap = n // 2 if n > FEW else min(n, 1)
+    while gap > 0:
+        for i in range(gap, n):
+            row = order[i]
+            at = i
+            while at >= gap and (
+                cost[order[at - gap]] > cost[row]
+                or (cost[order[at - gap]] == cost[row] and order[at - gap] > row)
+            ):
+                order[at] = order[at - gap]
+                at -= gap
+            order[at] = row
+        gap //= 2
+
+
+@compiled_within
+def _sort_sequence(room: Room, pairs: int, found: int) -> None:
+    """Write the detections in the order of their best pairs, then those without a pair, into `room.sequence`,
+    since the costs of the next particle have nearly the same order; `landmark_of` becomes -1. `landmark_of`
+    must be -1 for all detections before."""
+    n = 0
+    for i in range(pairs):
+        d = room.detection[room.order[i]]
+        if room.landmark_of[d] == -1:
+            room.landmark_of[d] = -2
+            room.sequence[n] = d
+            n += 1
+    for d in range(found):
+        if room.landmark_of[d] == -1:
+            room.sequence[n] = d
+            n += 1
+        room.landmark_of[d] = -1
 
 
 @compiled_within

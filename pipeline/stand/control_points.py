@@ -11,6 +11,7 @@ import numpy as np
 from pipeline.errors import StemmapError
 from pipeline.evaluation.trajectory import fit_rigid
 from pipeline.geometry.poses import Float, Pose2
+from pipeline.stand import POINT_SIGMA
 
 # A set of control points contradicts itself if its residuals exceed this number of standard deviations.
 CONTRADICTION = 4.0
@@ -42,7 +43,7 @@ class ControlFit:
 
 
 def fit_control_points(
-    local: Float, known: Float, *, names: Sequence[str] = (), point_sigma: float | None = None
+    local: Float, known: Float, *, names: Sequence[str] = (), point_sigma: float = POINT_SIGMA
 ) -> ControlFit:
     """Fit the pose of the map to control points.
 
@@ -68,12 +69,12 @@ def fit_control_points(
             "the control points are at one place", remedy="Give points that are far from one another"
         )
     fit = fit_rigid_pairs(local, known)
-    allowed = 0.5 if point_sigma is None else CONTRADICTION * point_sigma
+    allowed = CONTRADICTION * point_sigma
     if fit.sigma_point <= allowed:
         return fit
     if fit_rigid_pairs(a, b[:, ::-1]).sigma_point <= min(allowed, 0.2 * fit.sigma_point) and n > 2:
         raise StemmapError(
-            "east and north of the control points seem to be exchanged", remedy="Check the header of the file"
+            "east and north of the control points seem to be exchanged", remedy="Exchange the two columns"
         )
     scaled = fit_rigid_pairs(a, b * spread_a / spread_b)
     if abs(spread_b / spread_a - 1.0) > SCALE and scaled.sigma_point <= min(allowed, 0.2 * fit.sigma_point):
@@ -82,22 +83,41 @@ def fit_control_points(
             remedy="Check their unit, which is metres, and which tree each point is",
         )
     text = f"the control points contradict one another: {fit.rms:.2f} m (RMS)"
-    if n > 3:
-        others = [_without(local, known, k).sigma_point for k in range(n)]
-        k = int(np.argmin(others))
+    if n == 2:
+        raise StemmapError(text, remedy="Check which tree each point is, and its coordinates")
+    rest = [fit_rigid_pairs(np.delete(local, k, axis=0), np.delete(known, k, axis=0)) for k in range(n)]
+    sigmas = np.array([each.sigma_point for each in rest])
+    best = int(np.argmin(sigmas))
+    if sigmas[best] > allowed:
         raise StemmapError(
-            f"{text}; without point {names[k]} {_without(local, known, k).rms:.2f} m",
-            remedy=f"Check point {names[k]}, or allow it with a greater --point-sigma",
+            f"{text}, and no single point explains it; {_residual_words(fit.residuals, names)}",
+            remedy="Check which tree each point is, and its coordinates",
         )
-    raise StemmapError(text, remedy="Check which tree each point is, or give a greater --point-sigma")
+    residuals = known - rest[best].pose.apply(local)
+    # Points that agree within their expected error cannot be told apart: three points can leave two suspects.
+    suspects = [names[k] for k in np.flatnonzero(sigmas <= max(point_sigma, sigmas[best]))]
+    text += f"; without point {names[best]} {rest[best].rms:.2f} m, {_residual_words(residuals, names)}"
+    which = (
+        f"point {suspects[0]}" if len(suspects) == 1 else f"the points {', '.join(suspects)}: one is wrong"
+    )
+    raise StemmapError(text, remedy=f"Check {which}; which tree it is, and its coordinates")
 
 
-def _without(local: Float, known: Float, k: int) -> ControlFit:
-    return fit_rigid_pairs(np.delete(local, k, axis=0), np.delete(known, k, axis=0))
+def _residual_words(residuals: Float, names: Sequence[str]) -> str:
+    """Return the lengths of the largest residuals for people, with the names of their points."""
+    shown = 6  # points in a message
+    lengths = np.hypot(*residuals.T)
+    largest = np.argsort(-lengths, kind="stable")[:shown]
+    return "residuals " + ", ".join(f"{names[k]}: {lengths[k]:.2f} m" for k in largest)
 
 
 def fit_rigid_pairs(local: Float, known: Float) -> ControlFit:
-    """Return the fit of two or more pairs of points, shape (N, 2), without any check."""
+    """Return the fit of two or more pairs of points, without any check.
+
+    Args:
+        local: Positions in the map, not all at one place, shape (N, 2) [m].
+        known: The same points in the other frame, shape (N, 2) [m].
+    """
     n, pose = len(local), fit_rigid(local, known)
     residuals = known - pose.apply(local)
     squares = float(np.square(residuals).sum())

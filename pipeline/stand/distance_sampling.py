@@ -31,16 +31,17 @@ class DetectionFunction:
     trees: int
 
     def at(self, distance: Float) -> Float:
-        """Return the probability at distances [m]."""
+        """Return the probability at distances [m], in their shape; 1 for an infinite `sigma`."""
         return (
             np.exp(-0.5 * np.square(distance / self.sigma)) if math.isfinite(self.sigma) else distance * 0 + 1
         )
 
     def mean(self, available: Float) -> tuple[float, float]:
-        """Return the mean probability over an area and its standard error (delta method); NaN without area.
+        """Return the mean probability over an area and its standard error (delta method), 0 for an infinite
+        `sigma`; both NaN without area.
 
         Args:
-            available: Distance of each cell of the area [m], cells of equal size.
+            available: Distance of each cell of the area [m], cells of equal size, shape (K,).
         """
         if not len(available):
             return math.nan, math.nan
@@ -63,8 +64,8 @@ def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | No
     sigma^2 = sum r^2 / (2 n); with constant A(r) (a straight path) it is sum r^2 / n.
 
     Args:
-        distance: Distance of each tree found [m].
-        available: Distance of each cell of the area [m].
+        distance: Distance of each tree found [m], shape (N,).
+        available: Distance of each cell of the area [m], shape (K,).
 
     Returns:
         The function; sigma is inf if constant detection explains the distances as well. None with fewer than

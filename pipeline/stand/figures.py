@@ -43,15 +43,19 @@ class PlotTrees:
     Attributes:
         position: shape (T, 2) [m].
         dbh, dbh_sigma: [m]; NaN where unknown.
+        volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None without a volume formula.
     """
 
     position: Float
     dbh: Float
     dbh_sigma: Float
+    volume: Float | None = None
+    volume_sigma: Float | None = None
 
     def where(self, keep: Bool) -> PlotTrees:
         """Return the rows for which `keep`, shape (T,), is true."""
-        return PlotTrees(self.position[keep], self.dbh[keep], self.dbh_sigma[keep])
+        volume, sigma = (None if c is None else c[keep] for c in (self.volume, self.volume_sigma))
+        return PlotTrees(self.position[keep], self.dbh[keep], self.dbh_sigma[keep], volume, sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +66,7 @@ class StandFigures:
         area, seen: Area of the plot and its observed part [m^2].
         trees: Number of trees of at least the minimum diameter in the observed part.
         without_dbh: How many of them have no diameter; they count with the mean basal area of the others.
+        with_volume: How many of them have a volume; None without a volume formula.
         detection: Mean probability that a tree in the observed part is found.
         values: Figures by name, see FIGURES. Those that end in `_plain` refer to the whole area, without any
             correction; `_corrected` are corrected for the probability of detection; the others refer to the
@@ -74,6 +79,7 @@ class StandFigures:
     seen: float
     trees: int
     without_dbh: int
+    with_volume: int | None
     detection: Estimate
     values: Mapping[str, Estimate]
     classes: tuple[DiameterClass, ...] = ()
@@ -88,6 +94,8 @@ FIGURES = {
     "g_ha": ("Basal area", "m2/ha"),
     "g_ha_plain": ("Basal area on the whole area", "m2/ha"),
     "g_ha_corrected": ("Basal area, corrected for detection", "m2/ha"),
+    "v_ha": ("Stem volume", "m3/ha"),
+    "v_ha_corrected": ("Stem volume, corrected for detection", "m3/ha"),
     "dg_cm": ("Quadratic mean diameter", "cm"),
     "mean_dbh_cm": ("Mean diameter", "cm"),
     "dominant_dbh_cm": ("Dominant diameter (100 thickest per hectare)", "cm"),
@@ -122,6 +130,13 @@ def stand_figures(
             index.
         detection: Mean probability of detection in the observed part and its standard error; NaN if unknown.
         parameters: Limits of diameters and classes.
+
+    Returns:
+        The figures. Those that are unknown are NaN: all without observed area, corrected ones without a
+        probability above 0, those of diameters without a diameter, those of volumes without a volume.
+
+    Raises:
+        ValueError: The plot has no area.
     """
     warnings = []
     counted = ~(trees.dbh < parameters.dbh_min)  # trees without a diameter count
@@ -137,12 +152,17 @@ def stand_figures(
         warnings.append(f"only {n} {'tree' if n == 1 else 'trees'}: the figures are uncertain")
     if missing:
         warnings.append(f"{missing} of {n} trees have no diameter; they count with the mean basal area")
+    volumes = None if kept.volume is None else int(np.count_nonzero(np.isfinite(kept.volume)))
+    if volumes is not None and volumes < n:
+        warnings.append(
+            f"volume of {volumes} of {n} trees: the others have no height, no diameter or a negative volume"
+        )
     if 0.0 < seen < 0.5 * area:
         warnings.append(f"only {100.0 * seen / area:.0f} % of the plot was observed")
     p, p_se = detection
     values = dict.fromkeys(FIGURES, Estimate())
     if seen <= 0.0:
-        return StandFigures(area, 0.0, 0, 0, Estimate(p, p_se), values, (), tuple(warnings))
+        return StandFigures(area, 0.0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
     share = min(seen / area, 1.0)
     basal, basal_var = _basal_areas(kept)
     unsure = _threshold_variance(trees, parameters.dbh_min)
@@ -150,10 +170,14 @@ def stand_figures(
     plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))))
     values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)
     values["g_ha_plain"] = Estimate(HECTARE * float(plain.sum()) / area)
-    for name, weights, variance in (
+    totals = [
         ("n_ha", np.ones(n), unsure),
         ("g_ha", basal, float(basal_var.sum()) + unsure * _least_basal(parameters) ** 2),
-    ):
+    ]
+    if kept.volume is not None and kept.volume_sigma is not None and (volumes or not n):
+        variance = float(np.square(np.nan_to_num(kept.volume_sigma)).sum())
+        totals.append(("v_ha", np.nan_to_num(kept.volume), variance))
+    for name, weights, variance in totals:
         total, squares = float(weights.sum()), float(np.square(weights).sum())
         se = math.sqrt((1.0 - share) * squares + variance)
         values[name] = Estimate(HECTARE * total / seen, HECTARE * se / seen)
@@ -165,13 +189,13 @@ def stand_figures(
     values.update(_diameter_figures(kept, found, seen, parameters))
     values.update(_pattern(kept.position, seen, perimeter))
     classes = _classes(kept, share, seen, parameters)
-    return StandFigures(area, seen, n, missing, Estimate(p, p_se), values, classes, tuple(warnings))
+    return StandFigures(area, seen, n, missing, volumes, Estimate(p, p_se), values, classes, tuple(warnings))
 
 
 def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
     """Return the mean of each figure over plots, weighted by their observed area, with the standard error of
     the variation between plots (ratio estimator). The error is NaN with one plot. Plots without the figure do
-    not count."""
+    not count; a figure that none has is NaN."""
     result = {}
     for name in FIGURES:
         rows = [(f.seen, f.values[name].value) for f in plots.values() if math.isfinite(f.values[name].value)]
@@ -191,8 +215,9 @@ def _least_basal(parameters: Stand) -> float:
 
 
 def _basal_areas(trees: PlotTrees) -> tuple[Float, Float]:
-    """Return the basal area of each tree [m^2] and its variance. A tree without a diameter has the mean, and
-    the variance among the others; all are NaN if no tree has one."""
+    """Return the basal area of each tree [m^2] and its variance [m^4], shape (T,) each. A tree without a
+    diameter has the mean, and the variance among the others (of a single one its square); all are NaN if no
+    tree has one. An unknown standard deviation of a diameter counts as 0."""
     d, sigma = trees.dbh, np.nan_to_num(trees.dbh_sigma)
     known = np.isfinite(d)
     basal = 0.25 * math.pi * np.square(d)
@@ -205,7 +230,8 @@ def _basal_areas(trees: PlotTrees) -> tuple[Float, Float]:
 
 
 def _threshold_variance(trees: PlotTrees, least: float) -> float:
-    """Return the variance of the number of trees above the minimum diameter by the errors of diameters."""
+    """Return the variance of the number of trees above the diameter `least` [m] by the errors of diameters;
+    trees without a diameter or its standard deviation add nothing."""
     from scipy.special import ndtr
 
     sigma = np.where(trees.dbh_sigma > 0.0, trees.dbh_sigma, np.nan)
@@ -214,8 +240,9 @@ def _threshold_variance(trees: PlotTrees, least: float) -> float:
 
 
 def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: Stand) -> dict[str, Estimate]:
-    """Return the figures of the diameters. Their errors: jackknife over trees, reduced by the share `found`
-    of all trees, and the errors of the diameters."""
+    """Return the figures "dg_cm", "mean_dbh_cm", "dominant_dbh_cm" and "sdi"; empty without a diameter. Their
+    errors: jackknife over trees, reduced by the share `found` of all trees, and the errors of the diameters.
+    `seen` is the observed area [m^2]."""
     known = np.isfinite(trees.dbh)
     d, sigma = 100.0 * trees.dbh[known], 100.0 * np.nan_to_num(trees.dbh_sigma[known])
     if not len(d):
@@ -250,11 +277,11 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
 def _with_error(
     figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, found: float
 ) -> Estimate:
-    """Return a figure with its standard error.
+    """Return a figure with its standard error, which is NaN for a single tree of an incomplete plot.
 
     Args:
-        figure: Returns the figure of diameters, and its derivatives by them.
-        d, sigma: Diameters and their standard deviations [cm].
+        figure: Returns the figure of diameters, and its derivatives by them, shape (N,).
+        d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
         found: Share of all trees that was found and observed.
     """
     n = len(d)
@@ -268,9 +295,15 @@ def _with_error(
 
 
 def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estimate]:
-    """Return the mean distance to the nearest neighbour, and the Clark-Evans index with the edge correction
-    of Donnelly (1978): 1 for random positions, less for clusters, more for regular ones. The error of the
-    index is that of random positions."""
+    """Return the figures "nearest_neighbour_m", the mean distance to the nearest neighbour, and
+    "clark_evans", the index with the edge correction of Donnelly (1978): 1 for random positions, less for
+    clusters, more for regular ones. The error of the index is that of random positions. Empty for fewer than
+    two trees.
+
+    Args:
+        position: Positions of the trees, shape (N, 2) [m].
+        area, perimeter: Observed area [m^2] and the length of its border [m].
+    """
     from scipy.spatial import cKDTree
 
     n = len(position)
@@ -287,7 +320,16 @@ def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estima
 
 
 def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> tuple[DiameterClass, ...]:
-    """Return the diameter classes up to that of the thickest tree; none without a diameter."""
+    """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
+    included; none without a diameter. Trees without a diameter are left out; thinner ones than the minimum
+    count in the first class.
+
+    Args:
+        trees: Trees of the observed part.
+        share: Share of the plot that was observed.
+        seen: Observed area [m^2].
+        parameters: Minimum diameter and width of a class.
+    """
     known = trees.where(np.isfinite(trees.dbh))
     if not len(known.dbh):
         return ()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,10 +44,10 @@ class SamplePlot:
 
 
 def circle(name: str, x: float, y: float, radius: float) -> SamplePlot:
-    """Return a circle with the exact area of its radius [m].
+    """Return a circle around x, y [m] with the exact area of its radius [m]; the numbers are finite.
 
     Raises:
-        StemmapError: See `checked`.
+        StemmapError: The radius is not above 0, or the area is larger than AREA_MAX.
     """
     # A regular polygon inside of the circle is smaller than it; its corners are moved outwards.
     k = 4 * _ARC
@@ -62,18 +62,42 @@ def rectangle(name: str, x: float, y: float, length: float, width: float, turn: 
         name: Its name.
         x, y: Its centre [m].
         length, width: Along and across its axis [m].
-        turn: Angle of its axis from x towards y [rad].
+        turn: Angle of its axis from x towards y [rad]. All numbers are finite.
 
     Raises:
-        StemmapError: See `checked`.
+        StemmapError: The area is 0 or larger than AREA_MAX.
     """
     corners = 0.5 * np.array([[-length, -width], [length, -width], [length, width], [-length, width]])
     c, s = math.cos(turn), math.sin(turn)
     return checked(SamplePlot(name, shapely.Polygon(corners @ np.array([[c, s], [-s, c]]) + [x, y])))
 
 
+def plot_of(name: str, shape: Mapping[str, Any]) -> SamplePlot:
+    """Return the plot of a shape as it is stored.
+
+    Args:
+        name: Its name.
+        shape: `kind` "circle" with x, y, radius [m]; "rectangle" with x, y, length, width [m] and turn_deg;
+            or "polygon" with `polygons`, the coordinates of a GeoJSON MultiPolygon [m].
+
+    Raises:
+        StemmapError: The plot cannot be used, see `checked`.
+        KeyError, TypeError: A value is missing or unknown.
+    """
+    values = {key: value for key, value in shape.items() if key not in ("kind", "turn_deg")}
+    if shape["kind"] == "circle":
+        return circle(name, **values)
+    if shape["kind"] == "rectangle":
+        return rectangle(name, **values, turn=math.radians(shape["turn_deg"]))
+    try:
+        parts = [shapely.Polygon(rings[0], rings[1:]) for rings in shape["polygons"]]
+    except (ValueError, IndexError, shapely.errors.GEOSException):
+        parts = []  # too few corners
+    return checked(SamplePlot(name, parts[0] if len(parts) == 1 else shapely.MultiPolygon(parts)))
+
+
 def checked(plot: SamplePlot) -> SamplePlot:
-    """Return a plot that can be used.
+    """Return the plot itself, if it can be used.
 
     Raises:
         StemmapError: It is not an area, crosses itself, is empty, is larger than AREA_MAX or has coordinates
@@ -104,6 +128,18 @@ def along(path: Float, every: float, radius: float) -> list[SamplePlot]:
         radius: Radius of the circles [m].
 
     Raises:
+        StemmapError: The path is shorter than half of `every`, there are more than PLOTS_MAX circles, or the
+            radius is not above 0.
+    """
+    centres = centres_along(path, every).tolist()
+    return [circle(f"path {k + 1}", x, y, radius) for k, (x, y) in enumerate(centres)]
+
+
+def centres_along(path: Float, every: float) -> Float:
+    """Return positions on a path of shape (N, 2) [m] at multiples of `every` [m], the first at half of it;
+    shape (K, 2) [m], K at least 1.
+
+    Raises:
         StemmapError: The path is shorter than half of `every`, or there are more than PLOTS_MAX circles.
     """
     steps = np.hypot(*np.diff(path, axis=0).T) if len(path) > 1 else np.zeros(0)
@@ -115,30 +151,30 @@ def along(path: Float, every: float, radius: float) -> list[SamplePlot]:
             remedy="Choose another distance" if count else "Choose a shorter distance",
         )
     at = every * (np.arange(count) + 0.5)
-    places = np.stack([np.interp(at, driven, path[:, axis]) for axis in (0, 1)], axis=1)
-    return [circle(f"path {k + 1}", x, y, radius) for k, (x, y) in enumerate(places.tolist())]
+    return np.stack([np.interp(at, driven, path[:, axis]) for axis in (0, 1)], axis=1)
 
 
 def seen_plot(name: str, seen: SeenArea) -> SamplePlot:
-    """Return the whole observed area as a plot.
+    """Return the whole observed area as a plot with this name.
 
     Raises:
-        StemmapError: Nothing was observed.
+        StemmapError: Nothing was observed, or the area is larger than AREA_MAX.
     """
     low = seen.place * seen.cell
     return checked(SamplePlot(name, shapely.union_all(shapely.box(*low.T, *(low + seen.cell).T))))
 
 
 def within_reach(seen: SeenArea, parameters: Stand) -> SeenArea:
-    """Return the cells that count as observed. Cells with unknown distance, as for a whole cloud,
-    all count."""
+    """Return the cells that count as observed: nearest view within `reach`, and at least `views_min` views.
+    An unknown distance (NaN) or number of views (0), as for a whole cloud, excludes no cell."""
     near = ~(seen.nearest > parameters.reach)
     return seen.where(near & ((seen.views >= parameters.views_min) | (seen.views == 0)))
 
 
 def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> DetectionFunction:
-    """Return the probability of detection over distance, fitted to all trees in the observed area; certain
-    detection if the parameters or too few trees say so, or if the distances are unknown."""
+    """Return the probability of detection over distance, fitted to all trees in the observed area of at least
+    the minimum diameter or without one. It is certain (CERTAIN) if the parameter `correction` is "none", with
+    fewer than LEAST_TREES trees, or if the distances are unknown."""
     if parameters.correction == "none" or not np.isfinite(seen.nearest).any():
         return CERTAIN
     rows = seen.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
@@ -148,12 +184,13 @@ def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> D
 def figures_of(
     plots: Sequence[SamplePlot], trees: PlotTrees, seen: SeenArea, parameters: Stand
 ) -> dict[str, StandFigures]:
-    """Return the figures of each plot by its name.
+    """Return the figures of each plot by its name, see `StandFigures`. A part of a plot that was observed to
+    99.5 % counts as observed completely.
 
     Args:
         plots: Plots with unique names.
-        trees: All trees of the map.
-        seen: Observed area, see `within_reach`.
+        trees: All trees of the map; those in the observed area and the others count separately.
+        seen: Cells that count as observed (`within_reach`).
         parameters: Limits, and whether detection is corrected.
     """
     observed = seen.rows(trees.position) >= 0

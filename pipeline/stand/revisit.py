@@ -68,7 +68,8 @@ class VisitComparison:
 
 
 def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tuple[Pose2, int]:
-    """Return the pose of b in the frame of a and the number of stems that agree, without an initial pose.
+    """Return the pose of b in the frame of a and the number of stems that agree, without an initial pose. A
+    larger and larger distortion of the maps (SLACKS) is tried, in place of the parameter `slack`.
 
     Raises:
         StemmapError: The stems do not agree with certainty.
@@ -102,8 +103,9 @@ def compare_visits(
         a, b: The visits.
         T_a_b: Pose of the frame of b in that of a.
         reach: Largest distance of a pair [m].
-        refine: Whether the pose is fitted again to all pairs.
-        stems: See `VisitComparison`.
+        refine: Whether the pose is fitted again to the pairs, without outliers; with fewer than three it
+            stays.
+        stems: Number of stems that agreed in the alignment, for the result.
     """
     for _ in range(_ROUNDS if refine else 0):
         rows_a, rows_b = _pairs(match(a.position, T_a_b.apply(b.position), reach))

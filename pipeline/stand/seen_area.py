@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.detection.free_space import directions
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.types.records import Bool, Int, Path
+from pipeline.types.records import Bool, Float32, Int, Path
 
 CELL = 0.5  # m
 RANGE = 30.0  # m; views from farther away are not recorded
@@ -18,6 +19,7 @@ RANGE = 30.0  # m; views from farther away are not recorded
 INTO = 0.5
 # A scan is recorded after this motion [m, rad].
 SPACING, TURN = 0.5, math.radians(10.0)
+MOST_VIEWS = 4  # of one place; twice the views that a cell needs in a plot by default
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +58,8 @@ class SeenArea:
         return SeenArea(self.cell, self.place[keep], self.nearest[keep], self.views[keep])
 
     def joined(self, other: SeenArea, T_map_other: Pose2 | None = None) -> SeenArea:
-        """Return the union with the area of another drive, which has cells of the same size.
+        """Return the union with the area of another drive, which has cells of the same size. A cell of both
+        has the smaller distance and the sum of the views.
 
         Args:
             other: The other area.
@@ -81,8 +84,22 @@ class SeenArea:
 
 
 def _grouped(place: Int, nearest: Float, views: Int, of_views: np.ufunc) -> tuple[Int, Float, Int]:
-    """Return one row per cell, with the smallest distance and the views combined by `of_views`."""
-    cells, row = np.unique(place, axis=0, return_inverse=True)
+    """Return one row per cell, sorted by place, with the smallest distance (NaN where all are) and the views
+    combined by `of_views`, beginning with 0.
+
+    Args:
+        place: Cells, shape (N, 2), which may repeat; N may be 0.
+        nearest: Distance of a free view of each [m], shape (N,).
+        views: Number of views of each, shape (N,).
+        of_views: np.add or np.maximum.
+    """
+    if not len(place):
+        return place, nearest, views
+    low = place.min(axis=0)
+    span = int(place[:, 1].max() - low[1]) + 1
+    # One number per cell, in the order of its rows: sorting numbers is much faster than sorting rows.
+    number, row = np.unique((place[:, 0] - low[0]) * span + place[:, 1] - low[1], return_inverse=True)
+    cells = np.stack([number // span, number % span], axis=1) + low
     least = np.full(len(cells), np.nan)
     np.fmin.at(least, row.ravel(), nearest)
     combined = np.zeros(len(cells), np.int64)
@@ -90,39 +107,56 @@ def _grouped(place: Int, nearest: Float, views: Int, of_views: np.ufunc) -> tupl
     return cells, least, combined
 
 
+class ViewSelection:
+    """Selects the scans of a drive whose views are recorded: one after each SPACING or TURN, and at most
+    MOST_VIEWS with the robot in the same cell of SPACING and the same sector of TURN, because further laps
+    observe nothing else."""
+
+    def __init__(self) -> None:
+        self._last: Pose2 | None = None
+        self._views: Counter[tuple[int, int, int]] = Counter()
+
+    def take(self, T_map_base: Pose2) -> bool:
+        """Return whether the view of a scan with this pose is recorded; then it counts as the last one. It is
+        SPACING or TURN away from the last one, and its cell of this size has fewer than MOST_VIEWS."""
+        if self._last is not None:
+            step = self._last.inverse() @ T_map_base
+            if math.hypot(step.x, step.y) < SPACING and abs(step.yaw) < TURN:
+                return False
+        place = (
+            math.floor(T_map_base.x / SPACING),
+            math.floor(T_map_base.y / SPACING),
+            math.floor(T_map_base.yaw / TURN),
+        )
+        if self._views[place] >= MOST_VIEWS:
+            return False
+        self._views[place] += 1
+        self._last = T_map_base
+        return True
+
+
 class SeenRecorder:
     """Collects the free range of scans along a drive. Poses are applied at the end, so that corrections of
     the path also move what was observed."""
 
     def __init__(self) -> None:
-        self._stamps: list[int] = []
-        self._free: list[Float] = []
-        self._last: Pose2 | None = None
+        self._free: dict[int, Float32] = {}
 
-    def is_due(self, T_map_base: Pose2) -> bool:
-        """Return whether the robot has moved since the last recorded scan, so that another one is of use."""
-        if self._last is None:
-            return True
-        step = self._last.inverse() @ T_map_base
-        return math.hypot(step.x, step.y) >= SPACING or abs(step.yaw) >= TURN
-
-    def add(self, stamp_ns: int, T_map_base: Pose2, free: Float) -> None:
-        """Record a scan.
+    def add(self, stamp_ns: int, free: Float) -> None:
+        """Record a scan, in place of one of the same time.
 
         Args:
             stamp_ns: Its time.
-            T_map_base: Its pose as known now.
-            free: Free range by direction in the base frame, see `pipeline.detection.free_space.clear_range`.
+            free: Free range by direction in the base frame, shape (BINS,) [m], see
+                `pipeline.detection.free_space.clear_range`; copied, limited to RANGE.
         """
-        self._stamps.append(stamp_ns)
-        self._free.append(np.minimum(free, RANGE))
-        self._last = T_map_base
+        self._free[stamp_ns] = np.minimum(free, RANGE).astype(np.float32)
 
     def area(self, path: Path) -> SeenArea:
         """Return the observed area; without cells if no scan was recorded.
 
         Args:
-            path: Final path, which has the stamps of the recorded scans.
+            path: Final path; recorded scans whose stamps it does not have are left out.
         """
         cells: list[Int] = []
         distance: list[Float] = []
@@ -130,7 +164,11 @@ class SeenRecorder:
         side = np.arange(-half, half + 1)
         grid = np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
         grid = grid[np.hypot(*grid.T) * CELL <= RANGE + CELL]
-        for row, free in zip(np.searchsorted(path.stamp_ns, self._stamps), self._free, strict=True):
+        row_of = {stamp: row for row, stamp in enumerate(path.stamp_ns.tolist())}
+        for stamp, free in list(self._free.items()):  # another thread may add scans
+            row = row_of.get(stamp)
+            if row is None:
+                continue
             pose = Pose2(float(path.x[row]), float(path.y[row]), float(path.yaw[row]))
             place = grid + np.floor(np.array([pose.x, pose.y]) / CELL).astype(np.int64)
             local = pose.inverse().apply((place + 0.5) * CELL)

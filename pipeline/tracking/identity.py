@@ -2,7 +2,8 @@
 
 SLAM associates detections, counts misses and merges landmarks; the tracks follow it. If the landmark of a
 track no longer exists, because SLAM merged or removed it or because another particle is the best one now, the
-track takes the landmark at its position, joins the track of that landmark, or is removed.
+track takes the landmark at its position, joins the track of that landmark, or is removed. Of two landmarks of
+its trunk it takes the better one.
 """
 
 from __future__ import annotations
@@ -17,6 +18,9 @@ from pipeline.tracking.track_table import NO_LANDMARK, Rows, ScanPose, join
 from pipeline.types.records import Bool, Int, Verdict
 
 AGREE = 3.0  # sigma; maximum distance between a track and its landmark
+# ns; in this time a robot that drives 1 m/s drifts by 0.25 m if its odometry errs by 2.5 %, less than the
+# distance of two landmarks of one trunk. Later, a landmark next to a tree may be that of another tree.
+SAME_VISIT_NS = 10_000_000_000
 TREE = int(Verdict.TREE)
 
 
@@ -117,6 +121,54 @@ def tracks_of(landmark: Int, births: Int) -> Int:
 
 
 @compiled
+def take_better_landmarks(
+    rows: Rows,
+    stamp_ns: int,
+    row: Int,
+    births: Int,
+    position: Float,
+    birth: Int,
+    score: Float,
+    radius: float,
+) -> None:
+    """Give a tree that is not detected, and began within SAME_VISIT_NS, the landmark of a detection without
+    tree next to it, in place, if this landmark has the higher score. Both landmarks are of one trunk: the
+    first views of a distant trunk can be wrong by more than the gate of later ones.
+
+    Args:
+        rows: Tracks; landmark and score are changed.
+        stamp_ns: Time of the scan.
+        row: Row of the track of each detection, -1 for none, int64, shape (D,); changed.
+        births: Birth number of the landmark of each detection, shape (D,); -1 for none.
+        position: Positions of the detections in the map, shape (D, 2) [m].
+        birth: Birth numbers of the landmarks, int64, shape (L,).
+        score: Their hits less misses, shape (L,).
+        radius: Distance below which a detection is of a tree [m].
+    """
+    detected = np.zeros(rows.number.shape[0], np.bool_)
+    for d in range(row.shape[0]):
+        if row[d] >= 0:
+            detected[row[d]] = True
+    for d in range(row.shape[0]):
+        if row[d] >= 0 or births[d] == NO_LANDMARK:
+            continue
+        nearest, least = -1, radius * radius
+        for t in range(rows.number.shape[0]):
+            dx, dy = rows.x[t, 0] - position[d, 0], rows.x[t, 1] - position[d, 1]
+            if dx * dx + dy * dy < least:
+                nearest, least = t, dx * dx + dy * dy
+        if nearest < 0 or detected[nearest] or stamp_ns - rows.first_ns[nearest] > SAME_VISIT_NS:
+            continue
+        for j in range(birth.shape[0]):
+            if birth[j] == births[d] and (
+                rows.landmark[nearest] == NO_LANDMARK or score[j] > rows.score[nearest]
+            ):
+                rows.landmark[nearest], rows.score[nearest] = births[d], score[j]
+                row[d] = nearest
+                detected[nearest] = True
+
+
+@compiled
 def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
     """Join the tracks that are nearer than a radius to a track that moved, in place.
 
@@ -164,9 +216,9 @@ def are_separate(position: Float, x: Float, radius: float) -> Bool:
 
 @compiled_borrowing
 def _fill_spread(rows: Rows, scan: ScanPose, spread: Float) -> None:
-    """Write the covariance xx, xy, yy of each track relative to the landmarks into `spread`, shape (T, 3)
-    [m^2] with the present pose `scan`: P without the part that track and landmarks share, plus that of the
-    pose relative to the landmarks."""
+    """Write the covariance xx, xy, yy of the position of each track relative to the landmarks into `spread`,
+    shape (T, 3) [m^2]: P without its shared part, plus what the covariance of the present pose relative to
+    the landmarks adds at the track."""
     x, P, shared = rows.x, rows.P, rows.shared
     for t in range(spread.shape[0]):
         xx, xy, yy = by_pose(x[t, 0] - scan.pose[0], x[t, 1] - scan.pose[1], scan.relative)

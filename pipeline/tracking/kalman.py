@@ -73,7 +73,8 @@ def _update_rows(
     K: Float,
     M: Float,
 ) -> None:
-    """Do the work of `update_rows` in place; K and M are work arrays of the shapes (4, 2) and (4, 4)."""
+    """Predict and correct the trees `rows` in place, with the arguments of `update_rows`; K and M are work
+    arrays of the shapes (4, 2) and (4, 4)."""
     for k in range(rows.shape[0]):
         row = rows[k]
         _predict(x[row], P[row], dt[k], acceleration_sigma)
@@ -130,7 +131,8 @@ def correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
 def _update_rows_filterpy(
     x: Float, P: Float, rows: Int, dt: Float, acceleration_sigma: float, z: Float, R: Float
 ) -> None:
-    """Predict and correct in place like `update_rows`, with filterpy; the results agree up to rounding."""
+    """Predict the trees `rows` to the times of their measurements and correct them with filterpy, in place;
+    arguments and, up to rounding, results are those of `update_rows`."""
     from filterpy.kalman import predict, update
 
     for k, row in enumerate(rows):

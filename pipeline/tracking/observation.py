@@ -27,7 +27,7 @@ EDGE, UNEVEN = 0.0003, 0.0005
 NEAREST = 1.0  # m; the weight of a radius is limited to that at this distance
 
 
-@compiled
+@compiled_borrowing
 def add_observations(
     tracks: Rows,
     rows: Int,
@@ -57,22 +57,6 @@ def add_observations(
         above_breast: Height of the radius above breast height, shape (D,) [m]; NaN where the ground is
             unknown, which counts as HALF with the radius unchanged.
     """
-    _add(tracks, rows, position, pose, eccentricity, radius, radius_sigma, arc, above_breast)
-
-
-@compiled_borrowing
-def _add(
-    tracks: Rows,
-    rows: Int,
-    position: Float,
-    pose: Float,
-    eccentricity: Float,
-    radius: Float,
-    radius_sigma: Float,
-    arc: Float,
-    above_breast: Float,
-) -> None:
-    """Do the work of `add_observations` in place."""
     for d in range(rows.shape[0]):
         t = rows[d]
         tracks.hits[t] += 1
@@ -146,11 +130,11 @@ class FigureLimits(NamedTuple):
 
 @compiled
 def table_figures(tracks: Rows, limits: FigureLimits) -> tuple[Float, Float, Float, Float, Bool]:
-    """Return the attributes of all tracks for the tree table, each of shape (T,).
+    """Return the attributes of all tracks for the tree table by these limits, each of shape (T,).
 
     Returns:
         Observed arc [rad]; DBH [m]; its standard deviation [m]; mean eccentricity; and which tracks are
-        trees. DBH and eccentricity are NaN where they are unknown.
+        trees. DBH, its standard deviation and eccentricity are NaN where they are unknown.
     """
     T = tracks.sides.shape[0]
     coverage, dbh, dbh_sigma, mean = np.empty(T), np.empty(T), np.empty(T), np.full(T, np.nan)
@@ -169,7 +153,9 @@ def _fill_figures(
     mean: Float,
     confirmed: Bool,
 ) -> None:
-    """Fill the results of `table_figures`; `mean` contains NaN before."""
+    """Write the results of `table_figures` (observed arc [rad], DBH and its standard deviation [m], mean
+    eccentricity, is a tree) into the last five arrays, shape (T,), in place; `mean`, which contains NaN
+    before, is written for tracks with an eccentricity."""
     for t in range(tracks.sides.shape[0]):
         coverage[t] = sides_of(tracks.sides[t]) * WIDTH
         dbh[t], dbh_sigma[t] = diameter(tracks, t, coverage[t], limits)

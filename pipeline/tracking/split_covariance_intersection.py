@@ -60,7 +60,8 @@ def _split(
     P2: Float,
     room: Float,
 ) -> None:
-    """Do the work of `split` in place: P2 contains R before; `room` is a work array, shape (3, 2, 2)."""
+    """Replace P and `shared` of the trees `rows`, and R in P2, by the results of `split`, in place; other
+    arguments as in it. P2 contains R before; `room` is a work array, shape (3, 2, 2)."""
     own, P1, S = room[0], room[1], room[2]
     for d in range(rows.shape[0]):
         t = rows[d]

@@ -112,12 +112,13 @@ def confirm_round(
 
 @compiled_within
 def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
-    """Return whether a column becomes a tree because its track is round; see `confirm_round`.
+    """Return whether a column becomes a tree because its track is round: tree has at least as many votes as
+    pole and person, and at least `tree_share` of the votes weighted by AT_ROUND.
 
     Args:
-        votes: Shares of the votes of the column, shape (6,).
+        votes: Shares of the votes of the column in the order of CLASSES, shape (6,).
         verdict: Class of the column; only a class by votes other than tree can change.
-        tree_share: See `confirm_round`.
+        tree_share: Least share, inclusive.
     """
     voted, below, most = False, 0.0, 0.0
     for k in range(_KINDS.shape[0]):
@@ -136,7 +137,8 @@ def tree_columns(columns: Columns) -> Int:
 
 @compiled
 def _best_first(axis: Float, votes: Float, verdict: Int32) -> Int:
-    """Return the same as `tree_columns`.
+    """Return the rows of the columns of class tree, int64, those with most votes for tree first, without
+    those within ONE_TREE of an earlier one.
 
     Args:
         axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
@@ -293,9 +295,16 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
 
 @compiled_within
 def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
-    """Return the row of the track with most detections within RING_FAR of an axis x, y [m]; -1 for none. It
-    has at least `fewest` detections, and is a tree or a candidate: without class, or of a class by votes for
-    which roundness is evidence against (see `AT_ROUND`)."""
+    """Return the row of the track with most detections within RING_FAR of an axis, the lowest of equal ones;
+    -1 for none. It is a tree or a candidate: without class, or of a class by votes for which roundness is
+    evidence against (`_may_be_stem`).
+
+    Args:
+        tracks: The tracks.
+        cells, scale: Grid of the tracks for searches within RING_FAR, and its cells per metre.
+        x, y: Position of the axis [m].
+        fewest: Minimum number of detections.
+    """
     u, v = first_of_four(x, y, scale)
     best = np.int64(-1)
     for quarter in range(4):
@@ -332,12 +341,17 @@ def _may_be_stem(verdict: int) -> bool:
 
 @compiled_within
 def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
-    """Return the row of the most likely track within REACH of an axis x, y [m] that is not taken; -1 for
-    none.
+    """Return the row of the most likely track within REACH of an axis that is not taken; -1 for none.
 
     The likelihood of a track with the distance d is (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2)); of equal ones
     the lowest row is returned. Hits without the distance would prefer branches near a stem, which are
     observed earlier and as often.
+
+    Args:
+        tracks: The tracks.
+        taken: Tracks that are left out, shape (T,).
+        cells, scale: Grid of the tracks for searches within REACH at least, and its cells per metre.
+        x, y: Position of the axis [m].
     """
     u, v = first_of_four(x, y, scale)
     most, best = 0.0, np.int64(-1)

@@ -10,7 +10,7 @@ from pipeline.config.stages import Classification, Tracking
 from pipeline.geometry.gaussian import in_map, spread_by_pose
 from pipeline.geometry.poses import Float
 from pipeline.loop_closure.map_correction import PathCorrection
-from pipeline.tracking.identity import are_separate, follow, merge_near, tracks_of
+from pipeline.tracking.identity import are_separate, follow, merge_near, take_better_landmarks, tracks_of
 from pipeline.tracking.kalman import ENGINES
 from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
 from pipeline.tracking.split_covariance_intersection import split
@@ -50,10 +50,12 @@ class Tracker:
         landmarks: Landmarks,
         heights: Float | None = None,
     ) -> None:
-        """Update the trees with the detections of one scan, in place: assign them to the landmarks, remove
-        those without landmark and voxel column, filter and describe those that are detected, begin a tree at
-        each new landmark farther than `proximity_radius` from all trees, and join trees nearer than that to a
-        detected one.
+        """Update the trees with the detections of one scan, in place.
+
+        They are assigned to the landmarks; those without landmark and voxel column are removed, and one whose
+        trunk has two landmarks may take the other one. Detected trees are filtered and described. A tree
+        begins at each new landmark farther than `proximity_radius` from all trees, and trees nearer than that
+        to a detected one are joined.
 
         Args:
             stamp_ns: Time of the scan, not before the last one.
@@ -68,6 +70,10 @@ class Tracker:
         births = estimate.landmark_of
         row = tracks_of(self.tracks.landmark, births)
         position, own, added = in_map(d.centre, d.covariance, scan.pose, scan.covariance)
+        take_better_landmarks(
+            self.tracks.as_rows(), stamp_ns, row, births, position, landmarks.birth, landmarks.score,
+            p.proximity_radius,
+        )  # fmt: skip
 
         # Trees that are seen again: one update of the Kalman filter.
         t, seen = self.tracks, np.flatnonzero(row >= 0)

@@ -4,35 +4,230 @@ radians. Tables are columns of equal length, not lists of objects.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pipeline.geometry.poses import Pose2
-from pipeline.types.clearance import Clearance as Clearance
-from pipeline.types.clearance import Zone as Zone
-from pipeline.types.pose_health import Health
-from pipeline.types.sensor_data import HIDDEN as HIDDEN
-from pipeline.types.sensor_data import Bool as Bool
-from pipeline.types.sensor_data import Float as Float
-from pipeline.types.sensor_data import Float32 as Float32
-from pipeline.types.sensor_data import Imu as Imu
-from pipeline.types.sensor_data import Int as Int
-from pipeline.types.sensor_data import Int32 as Int32
-from pipeline.types.sensor_data import Notice as Notice
-from pipeline.types.sensor_data import Odometry as Odometry
-from pipeline.types.sensor_data import PoseMeasurement as PoseMeasurement
-from pipeline.types.sensor_data import Record as Record
-from pipeline.types.sensor_data import Scan as Scan
-from pipeline.types.sensor_data import Sensor as Sensor
-from pipeline.types.sensor_data import Stems as Stems
-from pipeline.types.sensor_data import Truth as Truth
-from pipeline.types.sensor_data import TruthPath as TruthPath
-from pipeline.types.sensor_data import TruthTrees as TruthTrees
-from pipeline.types.sensor_data import Turn as Turn
-from pipeline.types.sensor_data import UInt16 as UInt16
+from pipeline.geometry.poses import Float as Float
+from pipeline.geometry.poses import Pose2, Pose3
+
+Float32 = NDArray[np.float32]
+Int = NDArray[np.int64]
+Int32 = NDArray[np.int32]
+UInt16 = NDArray[np.uint16]
+Bool = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stems:
+    """Stems that another program detected in a scan, one row per point of the scan.
+
+    Attributes:
+        axis: Unit vectors along the stems, upwards, sensor frame, shape (N, 3); NaN if unknown.
+        dbh: Diameter at breast height [m], shape (N,); NaN without a fit.
+    """
+
+    axis: Float
+    dbh: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One scan of the LiDAR (Eq. 1), in the frame of the sensor (`lidar`).
+
+    Attributes:
+        stamp_ns: Time of the scan.
+        points: float32, shape (N, 3) [m], all finite, no returns at the origin.
+        reflectance: float32, shape (N,), in the scale of the sensor, or None.
+        ring: int32, shape (N,), the laser that measured the point (0 = lowest), or None.
+        offset_ns: int32, shape (N,), time of each point relative to `stamp_ns`, or None.
+        dropped: Number of returns that the reader rejected because they were not finite or empty.
+        stems: Stems, if the source provides stems instead of returns; `points` are their positions then.
+    """
+
+    stamp_ns: int
+    points: Float32
+    reflectance: Float32 | None = None
+    ring: Int32 | None = None
+    offset_ns: Int32 | None = None
+    dropped: int = 0
+    stems: Stems | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Odometry:
+    """Pose of the base by wheels or another odometry.
+
+    Attributes:
+        stamp_ns: Time of the pose.
+        T_odom_base: Pose of the base in the frame of the odometry.
+    """
+
+    stamp_ns: int
+    T_odom_base: Pose3
+
+
+SHARED = 4  # most errors that all poses of a source share: two of a shift, two of rotations
+SOURCES = 2  # sources of measured poses, each with its own shared errors: GNSS, another SLAM
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseMeasurement:
+    """Pose of the base in the frame of the map, measured by another source (GNSS, another SLAM).
+
+    z = x + shared e + v, where the error e ~ N(0, I) is the same for all poses of the source, for example the
+    offset of its frame, and v is independent between poses.
+
+    Attributes:
+        stamp_ns: Time of the pose.
+        T_map_base: The pose.
+        covariance: shape (3, 3) of x, y [m], yaw [rad], with the shared errors; the variance of
+            an unknown heading is large.
+        gate: Largest squared Mahalanobis distance from the estimate at which it is used.
+        shared: Effect on x, y [m], yaw [rad] of one sigma of each shared error, shape (3, SHARED); None
+            without shared errors.
+        source: Number of the source, less than SOURCES.
+    """
+
+    stamp_ns: int
+    T_map_base: Pose2
+    covariance: Float
+    gate: float = math.inf
+    shared: Float | None = None
+    source: int = 0
+
+    @property
+    def own(self) -> Float:
+        """Covariance of the independent error v, shape (3, 3): `covariance` less the part of the shared
+        errors."""
+        return self.covariance if self.shared is None else self.covariance - self.shared @ self.shared.T
+
+    def is_sound(self) -> bool:
+        """Return whether all numbers are finite, `covariance` has the shape (3, 3), and the covariance of the
+        independent error is symmetric and positive definite. With shared errors, also whether their shape is
+        (3, SHARED) and the number of the source is valid. The gate is not checked."""
+        C, pose = self.covariance, self.T_map_base.as_array()
+        if C.shape != (3, 3) or not (np.all(np.isfinite(C)) and np.all(np.isfinite(pose))):
+            return False
+        if self.shared is not None:
+            if self.shared.shape != (3, SHARED) or not 0 <= self.source < SOURCES:
+                return False
+            C = self.own
+        return bool(np.allclose(C, C.T) and np.all(np.linalg.eigvalsh(C) > 0.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Imu:
+    """One reading of the inertial measurement unit, in the base frame.
+
+    Attributes:
+        stamp_ns: Time of the reading.
+        angular_velocity: shape (3,) [rad/s].
+        linear_acceleration: shape (3,) [m/s^2], +9.81 along z at rest and level.
+        orientation: Quaternion w, x, y, z of the base in a level frame, shape (4,), or None.
+    """
+
+    stamp_ns: int
+    angular_velocity: Float
+    linear_acceleration: Float
+    orientation: Float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """Rotation of the base about the vertical since the previous scan by the gyroscope: angle and its
+    standard deviation [rad]."""
+
+    angle: float
+    sigma: float
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A message of a source for the user, which becomes a warning of the next step.
+
+    Attributes:
+        stamp_ns: Time.
+        text: The message.
+    """
+
+    stamp_ns: int
+    text: str
+
+
+Record = Scan | Odometry | Imu | PoseMeasurement | Notice
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """Properties of the LiDAR; they determine the distance between neighbouring returns.
+
+    Attributes:
+        name: Displayed name, e.g. "VLP-16".
+        rings: Number of lasers; 1 for a planar laser; 0 if unknown or not a spinning sensor.
+        ring_step: Angle between neighbouring lasers [rad]; 0 if unknown.
+        azimuth_step: Angle between neighbouring shots [rad].
+        range_sigma: Standard deviation of a range [m].
+        range_max: Largest range that it reports [m].
+    """
+
+    name: str = "LiDAR"
+    rings: int = 0
+    ring_step: float = 0.0
+    azimuth_step: float = 0.0035
+    range_sigma: float = 0.02
+    range_max: float = 100.0
+
+
+HIDDEN = "hidden"  # a tree that the sensor could not see
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthTrees:
+    """Ground truth of trees and other objects, in the frame of the map.
+
+    Attributes:
+        x, y: shape (N,) [m].
+        dbh: Diameter at breast height [m], shape (N,); NaN if unknown.
+        kind: Class of each: "tree", "pole", "person", "bush", "other" or HIDDEN.
+    """
+
+    x: Float
+    y: Float
+    dbh: Float
+    kind: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthPath:
+    """Ground truth of the path.
+
+    Attributes:
+        stamp_ns: int64, shape (N,), ascending.
+        x, y: shape (N,) [m].
+        yaw: shape (N,) [rad]; NaN if only the position is known (GNSS).
+        same_frame: Whether x and y are in the frame of the map; if not, the path is aligned before it is
+            compared.
+    """
+
+    stamp_ns: Int
+    x: Float
+    y: Float
+    yaw: Float
+    same_frame: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Ground truth of a run; either part may be missing."""
+
+    trees: TruthTrees | None = None
+    path: TruthPath | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,6 +492,48 @@ class Landmarks:
     distance_max: float
 
 
+HealthState = Literal["good", "weak", "lost"]
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """Quality of the pose after a scan.
+
+    Attributes:
+        state: "good"; "weak": the map may be wrong; "lost": the pose is not usable.
+        reason: Message with the reason; empty if good.
+        n_eff: Effective number of particles.
+        ancestors: Number of particles of 50 to 100 scans ago that have descendants.
+        detections: Number of detections in the scan.
+        recognised: Number of detections of well known landmarks, mean over the particles.
+        ambiguous: Number of detections with two likely landmarks, mean over the particles.
+        innovation: Normalised innovation squared per degree of freedom, mean over the scan: 1 if the errors
+            agree with their covariances; NaN without a known landmark.
+        sigma_xy: Standard deviation of the position [m].
+        sigma_yaw: Standard deviation of the heading [rad].
+        odometry: Difference between the pose and the prediction by odometry [sigma].
+        doubt: Message why the odometry may be wrong; the pose may be good nevertheless.
+    """
+
+    state: HealthState = "good"
+    reason: str = ""
+    n_eff: float = 0.0
+    ancestors: int = 0
+    detections: int = 0
+    recognised: float = 0.0
+    ambiguous: float = 0.0
+    innovation: float = float("nan")
+    sigma_xy: float = 0.0
+    sigma_yaw: float = 0.0
+    odometry: float = 0.0
+    doubt: str = ""
+
+    def warnings(self, reported: str) -> tuple[str, ...]:
+        """Return the doubt about the odometry as a tuple of one warning; empty without a doubt, or if the
+        doubt equals the text `reported`, which was reported before."""
+        return (self.doubt,) if self.doubt not in ("", reported) else ()
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseEstimate:
     """Estimate of SLAM after a scan.
@@ -342,6 +579,49 @@ class Path:
     y: Float
     yaw: Float
     sigma_xy: Float
+
+
+class Zone(IntEnum):
+    """What a robot should do because of obstacles on its path."""
+
+    CLEAR = 0
+    SLOW = 1
+    STOP = 2
+    UNKNOWN = 3
+
+    @property
+    def label(self) -> str:
+        """The zone as text in lower case, e.g. "slow"."""
+        return self.name.lower()
+
+
+@dataclass(frozen=True, slots=True)
+class Clearance:
+    """Obstacles of one scan on the path of the robot, an arc of constant curvature.
+
+    Attributes:
+        zone: UNKNOWN if no obstacle is observed but the sensor does not observe the path, or the height of
+            returns is unknown.
+        ahead: Distance along the path from the end of the robot to the nearest obstacle [m], 0 at its side;
+            infinite if the slow zone is free.
+        beside: Least distance between the sides of the robot and obstacles next to the path [m], 0 for one on
+            the path; infinite without one.
+        x, y: Position of the nearest obstacle in the level base frame [m]; NaN without one.
+        curvature: Curvature of the path [1/m], positive to the left.
+        backward: Whether the robot drives backwards.
+        within: Length of the path that is checked [m].
+        begins: Distance along the path from the base to the end of the robot, where `ahead` begins [m].
+    """
+
+    zone: Zone
+    ahead: float = math.inf
+    beside: float = math.inf
+    x: float = math.nan
+    y: float = math.nan
+    curvature: float = 0.0
+    backward: bool = False
+    within: float = 0.0
+    begins: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,22 +1,21 @@
-"""A tiny source, mapper, worker and scene that stand in for the real ones."""
+"""A tiny source, mapper and worker that stand in for the real ones."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import cast
 from zlib import crc32
 
 import numpy as np
 
-from app.scene import Scene
 from app.worker.protocol import Opened, ToWorker
 from app.worker.session import Session
-from app.worker.supervisor import WorkerProcess
+from app.worker.supervisor import OnMessage, WorkerProcess
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
-from pipeline.errors import ParameterError, SourceError
+from pipeline.errors import SourceError
 from pipeline.front_end import SegmentedScan
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
@@ -279,7 +278,7 @@ class FakeWorker(WorkerProcess):
         self.restarts = 0
         self.closed = False
 
-    async def start(self) -> None:
+    async def start(self, _on_message: OnMessage) -> None:
         pass
 
     async def send(self, command: ToWorker) -> None:
@@ -287,53 +286,6 @@ class FakeWorker(WorkerProcess):
 
     async def close(self) -> None:
         self.closed = True
-
-
-class FakeScene(Scene):
-    """Remembers what it was shown."""
-
-    port = 1
-
-    def __init__(self, port: int = 1) -> None:
-        self.port = port
-        self.secret = "secret"
-        self.calls: list[tuple[str, Any]] = []
-
-    def show(self, frame: Frame, path: Any) -> None:
-        assert path.shape[1] == 2
-        self.calls.append(("show", frame.index))
-
-    def show_parameters(self, parameters: Parameters, preset_name: str) -> None:
-        assert isinstance(parameters, Parameters)
-        self.calls.append(("parameters", preset_name))
-
-    def show_truth(self, trees: TruthTrees | None) -> None:
-        self.calls.append(("truth", trees is not None))
-
-    def select(self, tree: int | None, ring: tuple[float, float, float] | None = None) -> None:
-        self.calls.append(("select", tree if ring is None else (tree, ring)))
-
-    @property
-    def view(self) -> dict[str, Any]:
-        return {"follow": True}
-
-    @property
-    def counts(self) -> dict[str, int]:
-        return {"voxels": 0}
-
-    def choose(self, name: str, value: str | bool) -> None:
-        if name == "nothing":
-            raise ParameterError("there is no such layer")
-        self.calls.append(("choose", (name, value)))
-
-    def suit(self, *, cloud: bool) -> None:
-        self.calls.append(("suit", cloud))
-
-    def clear(self) -> None:
-        self.calls.append(("clear", None))
-
-    def close(self) -> None:
-        self.calls.append(("close", None))
 
 
 def opened(

@@ -18,7 +18,8 @@ from app.web.app import ROUTERS, build
 from app.web.auth import session_value
 from app.web.serving import bind, uvicorn_config
 from app.worker.protocol import Open
-from tests.app.fakes import FakeScene, FakeWorker
+from tests.app.fake_scene import FakeScene
+from tests.app.fakes import FakeWorker
 
 PORT = 8765
 HOST = f"127.0.0.1:{PORT}"
@@ -41,7 +42,7 @@ def build_app(
         source=Open("fake:"),
         parameter_state=ParameterState(),
         make_scene=lambda _dashboard, _loop: scene or FakeScene(),
-        make_worker=lambda _dashboard: FakeWorker(),
+        make_worker=FakeWorker,
     )
 
 

@@ -18,7 +18,6 @@ from pathlib import Path
 
 import numpy as np
 
-from app.training.labelled_scenes import labelled_points, trunks
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.ground.scan_ground import find_terrain
@@ -28,6 +27,7 @@ from pipeline.io.readers.simulated import open_simulated
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing.acquisition import acquire
 from pipeline.types.records import Bool, Float, Float32, Int
+from tests.benchmarks.package_forest.labelled_scenes import labelled_points, trunks
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 GROUND = (40, 44, 48, 49, 72)

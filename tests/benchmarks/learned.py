@@ -9,11 +9,11 @@ import argparse
 from dataclasses import replace
 
 from app.training.examples import UNKNOWN, Examples
-from app.training.labelled_scenes import street_examples
 from app.training.validation import Rates, validate
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, read_forests, standard_forest
 from pipeline.config import Parameters, preset
 from pipeline.types.records import Verdict
+from tests.benchmarks.package_forest.labelled_scenes import street_examples
 
 REACH = 25.0  # m
 APART = 1000.0  # m between two scenes, each of which begins at the origin

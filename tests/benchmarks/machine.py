@@ -52,15 +52,15 @@ def peak_mib() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / MIB
 
 
-def resident_mib() -> float:
-    """The memory that this process holds now [MiB]; the peak where the system does not tell."""
-    now = _status("VmRSS")
+def resident_mib(pid: int | str = "self") -> float:
+    """The memory that a process holds now [MiB]; the peak of this process where the system does not tell."""
+    now = _status("VmRSS", pid)
     return peak_mib() if now is None else now
 
 
-def _status(field: str) -> float | None:
+def _status(field: str, pid: int | str = "self") -> float | None:
     try:
-        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
+        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
     except OSError:
         return None
     kib = [int(line.split()[1]) for line in lines if line.startswith(f"{field}:")]

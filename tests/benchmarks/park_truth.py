@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from sklearn.cluster import DBSCAN
 
-from app.training.labelled_scenes import LEAST_RETURNS, labelled_points, trunks
 from pipeline.types.records import Float
+from tests.benchmarks.package_forest.labelled_scenes import LEAST_RETURNS, labelled_points, trunks
 
 REACH = 25.0  # m
 POLE = 80

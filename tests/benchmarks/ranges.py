@@ -25,8 +25,8 @@ from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing import filters
 from pipeline.preprocessing.acquisition import acquire
-from pipeline.simulation.street_scenes import simulate_street
 from pipeline.types.records import Float, Float32, Sensor, Step
+from tests.benchmarks.package_forest.street_scenes import simulate_street
 
 EDGES = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0)
 NEAR, SEEN, LEAST = 0.4, 0.35, 4

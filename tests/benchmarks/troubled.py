@@ -9,8 +9,7 @@ import numpy as np
 
 from pipeline.config import Parameters, preset
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.types.records import Float, Odometry, Record, Scan, Sensor, Stems
-from pipeline.types.sensor_data import PoseMeasurement
+from pipeline.types.records import Float, Odometry, PoseMeasurement, Record, Scan, Sensor, Stems
 
 MS = 1_000_000
 KNOWN, AFTER = 40, 55  # scans before the trouble, and since it began

@@ -1,6 +1,6 @@
 """How well trunks are found: `python -m tests.benchmarks.trunks [park] [street] [dbh] [sim]`.
 
-park, street: the whole mapper on labelled scans. With `--examples DIR` (as `stemmap train` keeps them) each
+park, street: the whole mapper on labelled scans. With `--examples DIR` (as STEMMAP_EXAMPLES keeps them) each
 scene is judged by decision trees grown from all other scenes; without, by those of the package, which saw
 these scenes: such figures tell how well they are remembered, not how new places will be found.
 sim: scenes that no training saw (seeds 1 to 5), with exact poses.
@@ -20,10 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from app.common.timers import Stopwatch
-from app.training.augmentation import FOLDER, copies, is_of
-from app.training.examples import Examples, read_examples
-from app.training.fit_forest import as_json, can_fit, fit_all
-from app.training.labelled_scenes import labelled_points, trunks
+from app.training.examples import SUFFIX, Examples, read_examples
 from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
 from pipeline.config import preset
 from pipeline.evaluation import evaluate
@@ -35,6 +32,9 @@ from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.types.records import Float, Frame, Int
 from tests.benchmarks.classes import ByClass
+from tests.benchmarks.package_forest.augmentation import FOLDER, copies, is_of
+from tests.benchmarks.package_forest.fit import as_json, can_fit, fit_all
+from tests.benchmarks.package_forest.labelled_scenes import labelled_points, trunks
 
 DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 PARKS = [DATA / "park_trunks" / name for name in ("00", "02", "04", "06")]
@@ -55,7 +55,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("parts", nargs="*", default=["park", "street", "dbh", "sim"])
-    parser.add_argument("--examples", type=Path, help="folder that `stemmap train --examples` filled")
+    parser.add_argument("--examples", type=Path, help="folder of examples, STEMMAP_EXAMPLES")
     parser.add_argument("--scenes", default="stand,slope,dense")
     parser.add_argument("--seeds", default="1,2,3,4,5")
     parser.add_argument("--every", type=int, default=1, help="make every so many-th simulated scan")
@@ -63,7 +63,7 @@ def main() -> None:
     arguments = parser.parse_args()
     examples, pasted = [], []
     if arguments.examples is not None:
-        examples = read_examples(arguments.examples)
+        examples = [e for file in sorted(arguments.examples.glob(f"*{SUFFIX}")) for e in read_examples(file)]
         kept = arguments.examples / FOLDER
         if "park" in arguments.parts:
             pasted = [e for park in PARKS for e in copies(park, kept, preset("forest"), REACH)]

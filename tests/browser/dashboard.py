@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any, cast
 
-from playwright.sync_api import ConsoleMessage, Frame, Locator, Page, Response, Route
+from playwright.sync_api import ConsoleMessage, Error, Frame, Locator, Page, Response, Route
 
 # Of a machine that is busy and compiles the kernels first.
 PATIENCE_S = 150
@@ -43,10 +43,22 @@ class Dashboard:
         self.errors: list[str] = []
         self._has_scene = scene
         if not scene:
-            page.route(SCENE, _leave_empty)
-        page.on("pageerror", lambda error: self.errors.append(str(error)))
+            page.route(SCENE, leave_empty)
+        page.on("pageerror", self._note)
         page.on("console", self._listen)
         page.on("response", self._look_at)
+
+    def leave(self) -> None:
+        """Empty the tab, and forget what the page has stored in the browser."""
+        self.page.remove_listener("pageerror", self._note)
+        self.page.remove_listener("console", self._listen)
+        self.page.remove_listener("response", self._look_at)
+        self.page.unroute_all(behavior="ignoreErrors")
+        self.page.evaluate(FORGET)
+        self.page.goto("about:blank")
+
+    def _note(self, error: Error) -> None:
+        self.errors.append(str(error))
 
     def _listen(self, message: ConsoleMessage) -> None:
         if message.type == "error" and not any(word in message.text for word in HARMLESS):
@@ -270,11 +282,14 @@ class Dashboard:
         return [(frame["x"] + x, frame["y"] + y) for x, y in found]
 
 
-def _leave_empty(route: Route) -> None:
+def leave_empty(route: Route) -> None:
     route.fulfill(body="<!doctype html><title>3D scene</title>", content_type="text/html")
 
 
 NEXT_FRAME = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+
+# Not on the page of an error, which has no storage.
+FORGET = "() => { try { localStorage.clear(); } catch { /* nothing is stored */ } }"
 
 # The scene is drawn ten times a second instead of sixty: it shows the same, and leaves the core to the tests.
 FEW_FRAMES = """if (location.pathname.startsWith('/viser/')) {

@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Browser, Position, expect
 
 from pipeline.io.readers import open_source
-from tests.browser.conftest import opened
+from tests.browser.conftest import opened, opened_by_another
 from tests.browser.dashboard import COMPILING_S, Dashboard
 from tests.browser.serving import Server
 
@@ -313,7 +313,7 @@ def test_two_users_see_the_same_annotations_and_a_stale_edit_is_refused(
         {"name": "plot.csv", "mimeType": "text/csv", "buffer": b"X,Y,dbh_cm\n1.5,30.5,22\n-4.0,31.0,\n"}
     )
     expect(page.locator("#annotate-hint")).to_contain_text("2 trees imported from plot.csv")
-    with opened(chromium, server.link) as other:
+    with opened_by_another(chromium, server.link) as other:
         other.tab("Annotate")
         theirs = other.page.locator("#annotations tbody tr")
         expect(theirs).to_have_count(2)

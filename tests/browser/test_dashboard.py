@@ -24,11 +24,11 @@ def test_play_pause_step_and_seek(dashboard: Dashboard):
     expect(page.locator("#state b")).to_have_text("Playing")
     page.get_by_role("button", name="Pause").click()
     dashboard.until_server("/api/status", "it.state === 'paused'")
-    trees = int(page.locator("[data-figure=trees] dd").inner_text())
+    driven = dashboard.ask("/api/status")["distance_m"]
     dashboard.seek(0.05)
-    dashboard.until_server("/api/status", f"it.time_s < 0.1 * it.end_s && it.trees < {trees}")
+    dashboard.until_server("/api/status", f"it.time_s < 0.1 * it.end_s && it.distance_m < {driven}")
     dashboard.until(
-        "most => Number(document.querySelector('[data-figure=trees] dd').textContent) < most", trees
+        "most => parseFloat(document.querySelector('[data-figure=driven] dd').textContent) < most", driven
     )
 
 
@@ -123,10 +123,10 @@ def test_the_columns_name_the_directions_of_the_axes(dashboard: Dashboard):
 
 @pytest.mark.parametrize("choice", ["distance", "error", "time", "n_eff", "sigma"])
 def test_the_plots_are_drawn(dashboard: Dashboard, choice: str):
-    dashboard.tab("Plots")
-    dashboard.page.locator("#plot-choice").select_option(choice)
-    expect(dashboard.page.locator("#plot .main-svg").first).to_be_visible()
-    drawn = dashboard.page.locator("#plot .hm, #plot .scatterlayer .trace")
+    dashboard.tab("Charts")
+    dashboard.page.locator("#chart-choice").select_option(choice)
+    expect(dashboard.page.locator("#chart .main-svg").first).to_be_visible()
+    drawn = dashboard.page.locator("#chart .hm, #chart .scatterlayer .trace")
     expect(drawn.first).to_be_attached()
 
 

@@ -27,7 +27,7 @@ def fleet() -> Iterator[Server]:
 
 MEMBER = {
     "source": "zenoh:tcp/h:7447",
-    "remote": True,
+    "answers": True,
     "state": "playing",
     "detail": "",
     "live": True,

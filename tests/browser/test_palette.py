@@ -16,7 +16,7 @@ FOUND = {
     "learn train": "Learn: train",
     "score against": "Score against",
     "topics": "Topics and mounting",
-    "plot time": "Plot: Time per stage",
+    "chart time": "Chart: Time per stage",
     "label dbh": "Label the scene with DBH",
     "upload rec": "Upload a recording",
 }

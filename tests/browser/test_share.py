@@ -6,7 +6,7 @@ import re
 
 from playwright.sync_api import Browser, expect
 
-from tests.browser.conftest import opened
+from tests.browser.conftest import opened, opened_by_another
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
 
@@ -22,7 +22,7 @@ def test_a_link_restores_a_moment_and_a_view_only_link_changes_nothing(chromium:
         page = dashboard.page
         dashboard.reset()
         dashboard.command({"type": "seek", "time_s": 4.05})
-        dashboard.until("() => document.querySelector('#time-now').textContent === '0:04.0'")
+        dashboard.until("() => document.querySelector('#time-now').value === '0:04.0'")
         dashboard.scene.wait_for_function(POINTS)
         dashboard.scene.evaluate(
             "() => window.__viserMutable.cameraControl.setLookAt(1, 12, 3, 0, 0, 0, false)"
@@ -35,10 +35,10 @@ def test_a_link_restores_a_moment_and_a_view_only_link_changes_nothing(chromium:
         assert 0.0 <= float(moment.split("t=")[1].split("&")[0]) - stands_s < 0.002
         page.get_by_role("button", name="Close").click()
         dashboard.command({"type": "seek", "time_s": 9.05})
-        dashboard.until("() => document.querySelector('#time-now').textContent === '0:09.0'")
+        dashboard.until("() => document.querySelector('#time-now').value === '0:09.0'")
 
         page.goto(f"{moment}&fixedDpr=0.3")
-        dashboard.until("() => document.querySelector('#time-now').textContent === '0:04.0'")
+        dashboard.until("() => document.querySelector('#time-now').value === '0:04.0'")
         dashboard.scene.wait_for_function(f"() => Math.abs(({AT})()[1] - 12) < 0.02")
         assert "run=" not in page.url
         assert dashboard.errors == []
@@ -47,7 +47,7 @@ def test_a_link_restores_a_moment_and_a_view_only_link_changes_nothing(chromium:
 
 
 def looks(chromium: Browser, link: str, scan: int) -> None:
-    with opened(chromium, link) as viewer:
+    with opened_by_another(chromium, link) as viewer:
         page = viewer.page
         expect(page.locator("#looks-only")).to_be_visible()
         expect(page.locator("#trees tbody tr").first).to_be_visible()
@@ -99,5 +99,6 @@ def nothing_that_changes_is_offered(viewer: Dashboard) -> None:
         expect(panel.locator("> *").first).to_be_attached()
         assert panel.locator("> *").evaluate_all("nodes => nodes.every(node => node.inert)")
     map_.press("n")
+    expect(page.locator("#trees-export option[value=laz]")).to_have_css("display", "none")
     viewer.tab("Clusters").locator("#cluster-table tbody tr").first.click()
     expect(page.locator("#panel-story")).to_have_attribute("data-story", re.compile("^cluster "))

@@ -107,3 +107,38 @@ SQUARES = """() => {
   }
   return places;
 }"""
+
+
+def test_an_object_without_a_cluster_says_why_and_when_the_robot_was_nearest(dashboard: Dashboard):
+    page = dashboard.page
+    at = page.evaluate(FAR_OBJECT)
+    page.locator("#map").click(position={"x": at[0], "y": at[1]})
+    panel = page.locator("#panel-story")
+    expect(panel).to_have_attribute("data-story", "truth")
+    expect(panel).to_contain_text("No cluster of this scan and no tree of the map is at this place")
+    page.locator("#map").press("Escape")
+    expect(panel.locator(".empty")).to_contain_text("Nothing selected")
+
+
+def test_a_typed_time_is_gone_to(dashboard: Dashboard):
+    field = dashboard.page.locator("#time-now")
+    field.fill("0:10")
+    field.press("Enter")
+    dashboard.until_server("/api/status", "Math.abs(it.time_s - 10) < 0.06")
+    field.fill("ten")
+    field.press("Enter")
+    assert field.evaluate("node => node.validationMessage").startswith("Enter seconds")
+    field.press("Escape")
+    expect(field).to_have_value("0:10.0")
+
+
+# Where an object of the ground truth that is no tree is drawn, far from trees and clusters.
+FAR_OBJECT = """async () => {
+  const { state } = await import('/static/js/core/store.js');
+  const { screenOf } = await import('/static/js/map/map.js');
+  const { x, y } = state.map.clusters;
+  const others = [...state.map.trees, ...x.map((px, k) => ({ x: px, y: y[k] }))];
+  const gap = (each) => Math.min(...others.map((other) => Math.hypot(each.x - other.x, each.y - other.y)));
+  const [found] = state.truth.filter(({ kind }) => kind !== 'tree').sort((a, b) => gap(b) - gap(a));
+  return screenOf(found.x, found.y);
+}"""

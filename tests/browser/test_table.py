@@ -155,14 +155,14 @@ def test_pairs_are_saved_as_a_picture_and_as_a_table(
     dashboard: Dashboard, tmp_path: Path, kind: str, held: str
 ):
     page = dashboard.page
-    dashboard.tab("Plots")
-    page.locator("#plot-choice").select_option(kind)
-    expect(page.locator("#plot .hm").first).to_be_attached()
-    page.wait_for_function("kind => document.querySelector('#plot').dataset.kind === kind", arg=kind)
-    picture = saved(page, page.locator("#plot-png"), tmp_path)
+    dashboard.tab("Charts")
+    page.locator("#chart-choice").select_option(kind)
+    expect(page.locator("#chart .hm").first).to_be_attached()
+    page.wait_for_function("kind => document.querySelector('#chart').dataset.kind === kind", arg=kind)
+    picture = saved(page, page.locator("#chart-png"), tmp_path)
     assert picture.name == f"{kind}.png"
     assert painted(picture) > 20
-    head, *rows = table(saved(page, page.locator("#plot-csv"), tmp_path))
+    head, *rows = table(saved(page, page.locator("#chart-csv"), tmp_path))
     pairs = dashboard.ask("/api/pairs")
     assert head == ["tree", *map(str, pairs["numbers"])]
     values = [[float(cell) if cell else None for cell in row[1:]] for row in rows]

@@ -92,7 +92,7 @@ def detections(centre, *, sigma=0.03, radius=0.15, arc=1.0):
     )
 
 
-def track(tracker, stamp_ns, pose, covariance, found, *, births=None, gone=(), heights=None):
+def track(tracker, stamp_ns, pose, covariance, found, *, births=None, gone=(), heights=None, score=None):
     """Update a tracker with a scan, as SLAM would associate it.
 
     Args:
@@ -103,17 +103,19 @@ def track(tracker, stamp_ns, pose, covariance, found, *, births=None, gone=(), h
         births: Landmark of each detection; by default the row.
         gone: Landmarks of trees that the map of SLAM no longer holds.
         heights: See `Tracker.process`.
+        score: Score of landmarks by birth; 1 for others.
     """
     births = np.arange(len(found.cluster)) if births is None else np.asarray(births, np.int64)
     old = tracker.tracks.landmark
     old = np.flatnonzero((old >= 0) & ~np.isin(old, births) & ~np.isin(old, gone))
     mine = births >= 0
     position = np.concatenate([pose.apply(found.centre[mine]), tracker.tracks.x[old, :2]])
+    birth = np.concatenate([births[mine], tracker.tracks.landmark[old]])
     landmarks = Landmarks(
-        np.concatenate([births[mine], tracker.tracks.landmark[old]]),
+        birth,
         position,
         np.tile([1e-4, 0.0, 1e-4], (len(position), 1)),
-        np.ones(len(position)),
+        np.array([(score or {}).get(int(b), 1.0) for b in birth]),
         gate=3.5,
         distance_max=1.0,
     )

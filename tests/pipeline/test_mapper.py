@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pipeline.classification.voxel_map import FIRST_SCANS
 from pipeline.config import PRESETS, preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers import open_source
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.types.records import Frame, Scan, Sensor, Step, Verdict
+from pipeline.types.records import Frame, Scan, Sensor, Stems, Step, Verdict
 from tests.pipeline.strategies import SENSOR, arc, scan
 
 URI = "sim:paper?duration=3"
@@ -221,3 +222,14 @@ def test_a_level_plane_alone_has_no_tree():
     level = POOR["a level plane"].astype(np.float32)
     told = [m.process(Step(k, Scan(1 + k, level), None)) for k in range(6)]
     assert len(told[-1].trees.number) == 0
+
+
+def test_a_robot_that_stands_uses_its_first_scans_and_then_one_of_each_interval():
+    tree, upright = np.array([[5.0, 1.0, 0.0]], np.float32), np.array([[0.0, 0.0, 1.0]])
+    stems = Stems(upright, np.array([0.3]))
+    for interval, used in ((1.0, FIRST_SCANS + 2), (0.0, 1)):
+        parameters = preset("stems").replace({"slam.update_interval": interval})
+        m = Mapper(parameters, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
+        for k in range(30):
+            m.process(Step(k, Scan(k * 100_000_000, tree, stems=stems), Pose2()))
+        assert m.snapshot().slam.detections == used

@@ -26,7 +26,6 @@ from pipeline.io.atomic_files import write_beside
 from pipeline.stand.figures import FIGURES, Estimate
 from pipeline.stand.plots import SamplePlot
 
-LANGUAGES = ("en", "de")
 SUFFIXES = (".html", ".pdf")
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 _PDF_SECONDS = 120.0
@@ -72,7 +71,7 @@ def report_page(
 
     Args:
         folder: Folder of the run.
-        language: One of LANGUAGES.
+        language: A language of texts.toml: "en" or "de".
         plots: Plots in the frame of the map; without any, only the whole observed area is reported.
         parameters: Parameters of the stand figures; None for the defaults.
 
@@ -110,7 +109,8 @@ def report_page(
         of_plots=of_plots,
         map=stand_map(run, whole, plots, texts, number),
         histogram=histogram(whole, texts, number),
-        trees=tree_rows(run, number),
+        trees=tree_rows(run, texts, number),
+        with_heights=bool(np.isfinite(run.columns["height_m"]).any()),
         warnings=warnings,
         verdicts={k: v for k, v in record.get("verdicts", {}).items() if k != "tree"},
         parameters=parameters.model_dump(),
@@ -124,15 +124,18 @@ def _digits(estimate: Estimate) -> int:
     return 0 if not math.isfinite(size) or size >= 100 else 1 if size >= 10 else 2
 
 
-def tree_rows(run: ExportedRun, number: Numbers) -> list[list[str]]:
-    """Return the trees as cells: number, two coordinates [m], diameter and its sigma [cm], observations,
-    coverage [deg]; a dash for unknown values.
+def tree_rows(run: ExportedRun, texts: dict[str, str], number: Numbers) -> list[list[str]]:
+    """Return the trees as cells: number, two coordinates [m], diameter and its sigma [cm], height and its
+    sigma [m] if any height is known, observations, coverage [deg], state of the review; a dash for unknown
+    values.
 
     Args:
         run: The run, in the coordinates of its files.
+        texts: Texts of the language.
         number: Format of the language.
     """
     c = run.columns
+    heights = ("height_m", "sigma_height_m") if np.isfinite(c["height_m"]).any() else ()
     return [
         [
             str(c["tree"][k]),
@@ -140,8 +143,10 @@ def tree_rows(run: ExportedRun, number: Numbers) -> list[list[str]]:
             number(float(run.place[k, 1]), 2),
             number(float(c["dbh_cm"][k]), 1),
             number(float(c["sigma_dbh_cm"][k]), 1),
+            *(number(float(c[name][k]), 1) for name in heights),
             str(c["observations"][k]),
             number(float(c["coverage_deg"][k]), 0),
+            texts[str(c["review"][k])],
         ]
         for k in range(len(run.place))
     ]

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import Counter
 from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager, nullcontext
-from typing import Annotated, Any
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    asynccontextmanager,
+    contextmanager,
+    nullcontext,
+)
+from typing import Annotated, Any, TypeVar
 
-from fastapi import Depends
+from fastapi import Depends, Query
+from pydantic import ValidationError
 from starlette.requests import HTTPConnection
 
 from app.common.request_queue import RequestQueue
@@ -15,8 +23,13 @@ from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.web.auth import Role, is_local, role_of
+from app.web.responses import BadRequestError
+from pipeline.config.stages import Stand
+from pipeline.stand.volume import LONGEST
 
+#: Largest number of connections of one kind.
 MOST: dict[Role, int] = {"owner": 50, "viewer": 50}
+T = TypeVar("T")
 
 
 class ConnectionLimit:
@@ -25,13 +38,10 @@ class ConnectionLimit:
     def __init__(self) -> None:
         self._taken: Counter[Role] = Counter()
 
-    def __len__(self) -> int:
-        """Return the number of connected browsers of all roles."""
-        return self._taken.total()
-
     @contextmanager
     def place(self, role: Role) -> Iterator[bool]:
-        """Take a place inside the context; yields False, and takes none, where none is left for this role."""
+        """Take a place inside the context and yield True; if none is left for this role, take none and yield
+        False."""
         free = self._taken[role] < MOST[role]
         self._taken[role] += free
         try:
@@ -87,6 +97,32 @@ async def _viewer_turn(connection: HTTPConnection) -> AsyncIterator[None]:
         yield
 
 
+def _figure_parameters(
+    dbh_min: Annotated[float, Query(ge=0.0, le=1.0)] = 0.07,
+    volume: Annotated[str, Query(max_length=LONGEST)] = "",
+) -> Stand:
+    """Return the parameters of stand figures that a request gives; BadRequestError for another formula.
+
+    Args:
+        dbh_min: Minimum diameter [m].
+        volume: Volume formula; empty for none.
+    """
+    try:
+        return Stand(dbh_min=dbh_min, volume=volume.strip())
+    except ValidationError as error:
+        what = error.errors()[0]["msg"].removeprefix("Value error, ")
+        raise BadRequestError(what, remedy='As in "0.00007 * dbh_cm^1.8 * height_m^0.95"') from None
+
+
+@asynccontextmanager
+async def in_thread(context: AbstractContextManager[T]) -> AsyncIterator[T]:
+    """Yield the value of a context that is entered in a thread, because entering it writes files; it is left
+    on the event loop."""
+    with ExitStack() as stack:
+        yield await asyncio.to_thread(stack.enter_context, context)
+
+
+FigureParameters = Annotated[Stand, Depends(_figure_parameters)]
 CallerRole = Annotated[Role, Depends(_role)]
 AnyFile = Annotated[bool, Depends(_may_open_any_file)]
 #: For routes that cost the mapping process or this one more than some milliseconds.

@@ -15,7 +15,7 @@ from starlette.responses import Response
 from app.dashboard.annotations import Against, row_payload
 from app.dashboard.dashboard import Dashboard
 from app.store.records import MOST_ANNOTATIONS, Author, Content, contents_of, moment
-from app.web.responses import BadRequestError, Body, Id, Number, UserName, file_reply, json_reply
+from app.web.responses import BadRequestError, Body, Number, UserName, json_reply, text_reply
 from app.web.routes.access import Dash
 from pipeline.errors import SourceError
 
@@ -26,14 +26,14 @@ _FARTHEST_M = 1e7
 _LARGEST_DBH_M = 10.0
 _BROWSER = r"^[0-9a-f]{16,40}$"
 
-_Metres = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
+Metres = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited")
 
 
-class _Edit(Body):
+class Edit(Body):
     """The fields of every edit: the run, the browser, and the person."""
 
-    run: Id
+    run: Number
     browser: Annotated[str, Field(pattern=_BROWSER)]
     who: UserName
 
@@ -43,9 +43,9 @@ class _Edit(Body):
         return Author(self.browser, self.who)
 
 
-class _Add(_Edit):
-    x: _Metres
-    y: _Metres
+class _Add(Edit):
+    x: Metres
+    y: Metres
     kind: Literal["tree", "pole", "person", "bush", "other", "skipped"] = "tree"
     dbh_cm: Annotated[float, Field(gt=0.0, le=100.0 * _LARGEST_DBH_M)] | None = None
 
@@ -56,14 +56,14 @@ class _Add(_Edit):
 
 
 class _Change(_Add):
-    version: Id
+    version: Number
 
 
-class _Delete(_Edit):
-    version: Id
+class _Delete(Edit):
+    version: Number
 
 
-class _Import(_Edit):
+class _Import(Edit):
     """A table of trees as text; `dbh_unit` is the unit of a column `dbh` whose header does not name it."""
 
     table: Annotated[str, Field(max_length=1_000_000)]
@@ -95,7 +95,7 @@ async def add(body: _Add, dashboard: Dash) -> Response:
     (added,) = await dashboard.annotation_editor.edit(
         body.run, lambda store: store.add(body.run, body.author, [body.content])
     )
-    return await _done(dashboard, body, {"id": added}, 201)
+    return await edited(dashboard, body, {"id": added}, 201)
 
 
 @router.patch("/annotations/{number}")
@@ -105,7 +105,7 @@ async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
     await dashboard.annotation_editor.edit(
         body.run, lambda store: store.change(body.run, body.author, number, body.version, body.content)
     )
-    return await _done(dashboard, body, {"id": number})
+    return await edited(dashboard, body, {"id": number})
 
 
 @router.delete("/annotations/{number}")
@@ -113,25 +113,25 @@ async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
     """Delete an annotation; 409 if it does not have this version any more or another run was opened, 404 for
     an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
     await dashboard.annotation_editor.edit(
-        body.run, lambda store: store.delete(body.run, body.author, number, body.version)
+        body.run, lambda store: store.change(body.run, body.author, number, body.version, None)
     )
-    return await _done(dashboard, body, {"id": number})
+    return await edited(dashboard, body, {"id": number})
 
 
 @router.post("/annotations/undo")
-async def undo(body: _Edit, dashboard: Dash) -> Response:
+async def undo(body: Edit, dashboard: Dash) -> Response:
     """Undo the last edit of the browser; return the numbers of edits that can be undone and repeated. 409 if
     there is none, or if another person has changed the annotation since."""
     await dashboard.annotation_editor.edit(body.run, lambda store: store.undo(body.run, body.author))
-    return await _done(dashboard, body, {})
+    return await edited(dashboard, body, {})
 
 
 @router.post("/annotations/redo")
-async def redo(body: _Edit, dashboard: Dash) -> Response:
+async def redo(body: Edit, dashboard: Dash) -> Response:
     """Repeat the edit that the browser undid last; return the numbers of edits that can be undone and
     repeated. 409 if there is none, or if another person has changed the annotation since."""
     await dashboard.annotation_editor.edit(body.run, lambda store: store.redo(body.run, body.author))
-    return await _done(dashboard, body, {})
+    return await edited(dashboard, body, {})
 
 
 @router.post("/annotations/import")
@@ -144,7 +144,7 @@ async def import_table(body: _Import, dashboard: Dash) -> Response:
     new = [content for content in contents if _key(content) not in existing]
     if new:
         await dashboard.annotation_editor.edit(body.run, lambda store: store.add(body.run, body.author, new))
-    return await _done(dashboard, body, {"added": len(new), "left_out": len(contents) - len(new)})
+    return await edited(dashboard, body, {"added": len(new), "left_out": len(contents) - len(new)})
 
 
 @router.put("/annotations/against")
@@ -161,7 +161,7 @@ async def export_table(dashboard: Dash) -> Response:
     without annotations."""
     from pipeline.io.result_files import csv_text
 
-    return file_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
+    return text_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
 
 
 @router.get("/annotations.geojson")
@@ -177,10 +177,10 @@ async def export_geojson(dashboard: Dash) -> Response:
         "coordinateFrame": {**ROBOTS_FRAME, "origin": "that of the cloud"} if cloud else dict(ROBOTS_FRAME),
         "features": features,
     }
-    return file_reply(json.dumps(collection, indent=1) + "\n", "truth.geojson", "application/geo+json")
+    return text_reply(json.dumps(collection, indent=1) + "\n", "truth.geojson", "application/geo+json")
 
 
-async def _done(dashboard: Dashboard, edit: _Edit, payload: dict[str, Any], status: int = 200) -> Response:
+async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], status: int = 200) -> Response:
     """Return a response with further values, the number of edits so far (`serial`), and how many edits of
     this browser can be undone and redone.
 
@@ -197,15 +197,16 @@ async def _done(dashboard: Dashboard, edit: _Edit, payload: dict[str, Any], stat
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
-    """Return the annotations of the open run as JSON values, those of a whole cloud in the coordinates of its
-    file."""
+    """Return the annotations of the open run, see `row_payload`, those of a whole cloud in the coordinates of
+    its file."""
     x, y = dashboard.offset
     rows = [row_payload(row) for row in dashboard.annotation_editor.rows]
     return [{**row, "x": row["x"] + x, "y": row["y"] + y} for row in rows]
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
-    """Return an annotation as a GeoJSON feature; x and y [m] in the frame of the map."""
+    """Return an annotation, see `_rows`, as a GeoJSON point at its x and y, with class, DBH [cm], author and
+    time."""
     properties = {"class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"], "edited": _when(row)}
     geometry = {"type": "Point", "coordinates": [row["x"], row["y"]]}
     return {"type": "Feature", "id": row["id"], "geometry": geometry, "properties": properties}

@@ -11,7 +11,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from app.dashboard.parameters import file_of, read_file
-from app.web.responses import Body, UserName, Value, Word, file_reply, json_reply
+from app.web.responses import Body, UserName, Value, Word, json_reply, text_reply
 from app.web.routes.access import Dash
 
 router = APIRouter(prefix="/api")
@@ -131,7 +131,7 @@ async def choose_view(body: _ViewChoice, dashboard: Dash) -> Response:
 async def download(dashboard: Dash) -> Response:
     """Return all values as a file for `--config`."""
     text = file_of(dashboard.parameters.preset, dashboard.parameters.parameters)
-    return file_reply(text, "parameters.toml", _TOML)
+    return text_reply(text, "parameters.toml", _TOML)
 
 
 @router.get("/sets")
@@ -180,4 +180,4 @@ async def upload_set(body: _ParameterFile, dashboard: Dash) -> Response:
 async def download_set(name: str, dashboard: Dash) -> Response:
     """GET /api/sets/{name}.toml: return a saved set as a file for `--config`; 404 if there is none of this
     name."""
-    return file_reply(dashboard.sets.text(name), "parameters.toml", _TOML)
+    return text_reply(dashboard.sets.text(name), "parameters.toml", _TOML)

@@ -3,37 +3,42 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Iterator
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
+from typing import Annotated, Literal
 
-import numpy as np
 from fastapi import APIRouter, Depends, Path, Query
-from starlette.responses import Response
+from starlette.responses import FileResponse, Response
 
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.payload import comparison_payload, doubts_of, packed, stages_payload, trees_payload
 from app.dashboard.scores import pairs_payload
 from app.dashboard.selection import NothingMappedError
+from app.dashboard.shown_run import ShownRun
+from app.sources import inspection
 from app.web.responses import (
     LARGEST_NUMBER,
     Body,
     Number,
     Word,
-    block_reply,
+    bytes_reply,
     error_reply,
     failure_reply,
-    file_reply,
     json_reply,
+    text_reply,
 )
-from app.web.routes.access import Bounds, Dash, ViewerTurn
-from app.worker.protocol import CloudFrame, Shown
+from app.web.routes.access import Bounds, Dash, FigureParameters, ViewerTurn, in_thread
+from app.worker.protocol import Shown
 from pipeline.config import Parameters
+from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
-from pipeline.types.records import Frame, Trees
-from pipeline.types.records import Path as RobotPath
+from pipeline.io.block_file import LARGE
 
 router = APIRouter(prefix="/api")
 
+# Reading a long recording again.
+_CLOUD_S = 600.0
 _Scan = Annotated[int | None, Query(ge=0, le=LARGEST_NUMBER)]
 _Stamp = Annotated[int, Path(ge=-(2**63), le=2**63 - 1)]
 
@@ -69,17 +74,14 @@ async def trees(dashboard: Dash) -> Response:
 
 @router.get("/trees.csv")
 def trees_table(dashboard: Dash) -> Response:
-    """Return the confirmed trees as a CSV table, those of a whole cloud in its coordinates, with only its
-    header before the first map."""
-    from pipeline.io.result_files import TREE_COLUMNS, csv_text, tree_rows
+    """Return the confirmed trees with their reviews as a CSV table, those of a whole cloud in its
+    coordinates; only the header before the first map."""
+    from pipeline.io.result_files import TREE_COLUMNS, csv_text
 
-    shown = dashboard.shown
-    rows = (
-        []
-        if shown is None
-        else tree_rows(_in_file(shown.frame.trees, dashboard.status.cloud), dashboard.start_ns)
+    is_mapped = dashboard.shown is not None
+    return text_reply(
+        ShownRun.of(dashboard).trees_text() if is_mapped else csv_text(TREE_COLUMNS, []), "trees.csv"
     )
-    return file_reply(csv_text(TREE_COLUMNS, rows), "trees.csv")
 
 
 @router.get("/path.csv")
@@ -89,70 +91,60 @@ def path_table(dashboard: Dash) -> Response:
 
     path = dashboard.path
     rows = [] if path is None else path_rows(path, dashboard.start_ns)
-    return file_reply(csv_text(PATH_COLUMNS, rows), "path.csv")
+    return text_reply(csv_text(PATH_COLUMNS, rows), "path.csv")
+
+
+def _folder_for_large_files() -> Iterator[FilePath]:
+    """Yield a temporary folder, which is removed after the response is sent."""
+    with TemporaryDirectory(prefix="stemmap-cloud-", dir=LARGE) as name:
+        yield FilePath(name)
+
+
+@router.get("/export/laz")
+async def export_cloud(
+    dashboard: Dash, there: Annotated[FilePath, Depends(_folder_for_large_files)]
+) -> Response:
+    """Return the cloud of the run as LAZ, see `app.batch.mapped_cloud.write_cloud`; a child process reads the
+    source again. Only for owners. 409 before the first map; 422 if the source cannot be read."""
+    run, file = ShownRun.of(dashboard), there / "cloud.laz"
+    try:
+        async with in_thread(run.folder()) as folder:
+            question = {"ask": "cloud", "path": str(folder), "file": str(file)}
+            await inspection.ask(question, patience_s=_CLOUD_S)
+    except StemmapError as error:
+        return failure_reply(422, error)
+    return FileResponse(
+        file, 200, {"Cache-Control": "no-store"}, "application/octet-stream", filename=file.name
+    )
 
 
 @router.get("/export/{suffix}", dependencies=[ViewerTurn])
 async def export(
-    suffix: Literal["gpkg", "shp", "geojson", "dxf", "xlsx", "tif"], dashboard: Dash, shown: NewestScan
+    suffix: Literal["gpkg", "shp", "geojson", "dxf", "xlsx", "tif"],
+    dashboard: Dash,
+    parameters: FigureParameters,
 ) -> Response:
-    """Return the map as a file for GIS, CAD or spreadsheets, in local coordinates or those of a whole cloud;
-    a Shapefile as zip archive. For a run of scans, the bytes are those of `stemmap export` for a run with the
-    same map. 409 before the first map; 422 if a package is missing or the map lacks what the format shows."""
-    if dashboard.path is None:
-        raise NothingMappedError
-    # All parts are of one run: another source may be opened while the file is written.
-    run = _MappedRun(
-        dashboard.source.uri, shown.frame, dashboard.path, dashboard.start_ns, dashboard.status.cloud
-    )
+    """Return the map with the plots of the run as a file for GIS, CAD or spreadsheets, in the reference
+    system of the map; a Shapefile as zip archive. For a run of scans, the bytes are those of `stemmap export`
+    for a run with the same map and plots. 409 before the first map; 422 if a package is missing, the map
+    lacks what the format shows, or all plots are outside of what was observed."""
+    run = ShownRun.of(dashboard)
     try:
-        content, name = await asyncio.to_thread(_exported, run, f".{suffix}")
+        content, name = await asyncio.to_thread(_exported, run, f".{suffix}", parameters)
     except StemmapError as error:
         return failure_reply(422, error)
-    headers = {"Content-Disposition": f'attachment; filename="{name}"', "Cache-Control": "no-store"}
-    return Response(content, 200, headers, media_type="application/octet-stream")
+    return bytes_reply(content, filename=name)
 
 
-def _in_file(trees: Trees, cloud: CloudFrame | None) -> Trees:
-    """Return trees in the coordinates of the file of a whole cloud; those of a run of scans (None) as they
-    are."""
-    return trees if cloud is None else replace(trees, position=trees.position + cloud.offset[:2])
-
-
-class _MappedRun(NamedTuple):
-    """Parts of the newest map that an export contains.
-
-    Attributes:
-        uri: URI of the source.
-        frame: Newest results.
-        path: The estimated path.
-        start_ns: Time of the first scan [ns].
-        cloud: Frame of a whole cloud; None for a run of scans.
-    """
-
-    uri: str
-    frame: Frame
-    path: RobotPath
-    start_ns: int
-    cloud: CloudFrame | None
-
-
-def _exported(run: _MappedRun, suffix: str) -> tuple[bytes, str]:
+def _exported(run: ShownRun, suffix: str, parameters: Stand) -> tuple[bytes, str]:
     """Return the bytes and the name of the exported file, see `export`."""
-    from app.batch.export import export_bytes, for_export
-    from app.batch.georeference import MapFrame
-    from app.batch.run_folder import as_written
-    from pipeline.io.result_files import terrain_rows
+    from app.batch.export import export_bytes, read_for_export
+    from app.batch.stand import stand_of
 
-    ground, cloud = run.frame.ground, run.cloud
-    cells = [] if ground is None else [[float(cell) for cell in row[:3]] for row in terrain_rows(ground)]
-    terrain = np.array(cells, np.float64).reshape(-1, 3)
-    frame = MapFrame()
-    if cloud is not None:
-        terrain += cloud.offset
-        frame = MapFrame(cloud.crs, how="the cloud's own" if cloud.crs else "")
-    written = as_written(_in_file(run.frame.trees, cloud), run.path, run.start_ns)
-    return export_bytes(for_export(run.uri, *written, terrain, frame), suffix)
+    plots = run.sample_plots()
+    with run.folder() as folder:
+        of_plots = stand_of(folder, parameters, plots) if plots else None
+        return export_bytes(read_for_export(folder, of_plots), suffix)
 
 
 @router.get("/evaluation")
@@ -219,7 +211,7 @@ async def camera_picture(stamp_ns: _Stamp, dashboard: Dash) -> Response:
     content = dashboard.camera.jpeg(stamp_ns)
     if content is None:
         return error_reply(404, "this picture is not kept any more", remedy="Ask for the newest one")
-    return Response(content, 200, {"Cache-Control": "no-store"}, media_type="image/jpeg")
+    return bytes_reply(content, "image/jpeg")
 
 
 @router.get("/camera/tree/{number}.jpg", dependencies=[ViewerTurn])
@@ -227,7 +219,7 @@ async def tree_picture(number: Number, dashboard: Dash, shown: NewestScan) -> Re
     """Return the part of the camera picture that shows a tree best, as JPEG; 404 if no picture shows it, 409
     before the first map, 503 if the worker is busy."""
     content = await dashboard.camera.tree(number, shown.frame.trees, dashboard.path)
-    return Response(content, 200, {"Cache-Control": "no-store"}, media_type="image/jpeg")
+    return bytes_reply(content, "image/jpeg")
 
 
 @router.get("/section", dependencies=[ViewerTurn, Depends(newest_scan)])
@@ -236,14 +228,14 @@ async def section(dashboard: Dash) -> Response:
     lower left corner of cell (0, 0) [m], and the occupied cells along x and y; 409 before the first map, 503
     if the worker is busy."""
     found = await dashboard.worker_client.section()
-    return block_reply(packed({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
+    return bytes_reply(packed({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
 
 
 @router.get("/stages", dependencies=[ViewerTurn])
 async def stages(shown: NewestScan) -> Response:
     """Return the points of the current scan, stage by stage (Fig. 3), as a binary block; 409 before the first
     map."""
-    return block_reply(await asyncio.to_thread(stages_payload, shown.frame))
+    return bytes_reply(await asyncio.to_thread(stages_payload, shown.frame))
 
 
 @router.post("/compare", dependencies=[ViewerTurn])
@@ -258,7 +250,7 @@ async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
     differences = [[name, value, second[name]] for name, value in first.items() if second[name] != value]
     distance = dashboard.parameters.parameters.evaluation.match_distance
     header = {"a": body.a, "b": body.b, "differences": differences}
-    return block_reply(await asyncio.to_thread(comparison_payload, frames, header, dashboard.truth, distance))
+    return bytes_reply(await asyncio.to_thread(comparison_payload, frames, header, dashboard.truth, distance))
 
 
 def _parameters_of(dashboard: Dashboard, name: str) -> Parameters:

@@ -153,8 +153,8 @@ async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_
 @router.post("/inside")
 async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) -> Response:
     """POST /api/inside: return the topics of a recording or a robot and the mounting of its LiDAR, read by a
-    child process (see `app.sources.inspection.inside`); 403 if the address is not permitted on this server,
-    409 if it cannot be read."""
+    child process (see `app.sources.inspection_process.inside`); 403 if the address is not permitted on this
+    server, 409 if it cannot be read."""
     uri = permitted_uri(body.uri, settings, any_file)
     if uri is None:
         raise not_permitted(body.uri)

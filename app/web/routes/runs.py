@@ -3,28 +3,55 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+import io
+import math
+import zipfile
+from collections.abc import AsyncIterator, Callable
+from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path as FilePath
-from typing import Annotated, Any
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Literal
 
+import numpy as np
 from fastapi import APIRouter, Path, Query, Request
 from pydantic import Field
+from shapely.geometry import mapping
 from starlette.responses import Response
 
-from app.batch.compare import compare
-from app.batch.run_folder import delete_partial_output, finished_folders, partial_outputs, read_folder
+from app.batch.georeference import write_map_frame
+from app.batch.plot_files import stored_frame, stored_plots
+from app.batch.reviews import reviewed_run, stored_reviews
+from app.batch.run_folder import read_run_record
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
+from app.dashboard.shown_run import ShownRun
+from app.sources import inspection
 from app.sources.request import request_of_kept
-from app.store.records import UnknownError
+from app.store.records import NoFilesError, UnknownError
 from app.store.store import RunRecords
-from app.web.responses import LARGEST_NUMBER, BadRequestError, Body, Number, error_reply, json_reply
-from app.web.routes.access import AnyFile, Dash, Deployment, ViewerTurn
+from app.web.responses import (
+    LARGEST_NUMBER,
+    BadRequestError,
+    Body,
+    Number,
+    bytes_reply,
+    error_reply,
+    json_reply,
+)
+from app.web.routes.access import AnyFile, Dash, Deployment, FigureParameters, ViewerTurn, in_thread
 from app.web.routes.run import permitted_request
+from pipeline.config import PRESETS, preset
+from pipeline.geometry.poses import Pose2
+from pipeline.io.atomic_files import write_texts
+from pipeline.io.result_files import csv_text
+from pipeline.stand.plots import SamplePlot
 
 router = APIRouter(prefix="/api/runs")
 
-_FOLDER = "folder:"
+_OPEN, _FOLDER = "open", "folder:"
+_MOST_FOLDERS = 500
+# A PDF of a large stand on a busy machine.
+_REPORT_S = 240.0
 # The number of a record, or the name of a finished folder.
 _Key = Annotated[str, Path(min_length=1, max_length=300)]
 _KeyInQuery = Annotated[str, Query(min_length=1, max_length=300)]
@@ -37,16 +64,17 @@ class _Name(Body):
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
     """GET /api/runs: return at most 500 runs without their maps (`runs`), the newest first, finished folders
-    (`folders`), partial outputs (`unfinished`), and the number of the open run (`open`)."""
+    (`folders`), and the number of the open run (`open`)."""
+    await dashboard.run_recorder.write_now()
     rows = await dashboard.store.ask(lambda store: store.book.listed())
-    folders, changed, remains = await asyncio.to_thread(_folders, settings)
+    folders = await asyncio.to_thread(_folders, settings)
     return json_reply(
         {
             "runs": [_row(row) for row in rows],
             "folders": [
-                {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed[name]} for name in folders
+                {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed_s}
+                for name, changed_s in folders.items()
             ],
-            "unfinished": remains,
             "open": dashboard.run_recorder.record,
         }
     )
@@ -54,12 +82,36 @@ async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
 
 @router.get("/compare", dependencies=[ViewerTurn])
 async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b: _KeyInQuery) -> Response:
-    """Return two runs as JSON, "a" and "b", with the map of b in the frame of a and the tables of
-    `app.batch.compare.compare`; 404 if one does not exist, 409 if a folder cannot be read. The keys name runs
-    of the store or output folders ("folder:NAME")."""
+    """Compare two runs as `stemmap compare` does, in a child process. The keys name runs of the store or
+    output folders ("folder:NAME"). Maps of the same recording share a frame; others are aligned by the
+    distances between their stems or, if that fails, compared without alignment, and `how` has the reason.
+
+    Return both runs, `a` (the earlier visit) and `b`; the tables of `app.sources.inspection_process.visits`;
+    `b_path`, the path of b in the frame of a as [x, y]; and `parameters`, `name`, `a` and `b` of each
+    parameter that differs. 404 if a run does not exist, 409 if its files cannot be read."""
     first, second = await _whole(a, settings, dashboard), await _whole(b, settings, dashboard)
-    same = first["source"] == second["source"] and bool(first["source"])
-    return json_reply({"a": first, "b": second, **await compare(first, second, same_source=same)})
+    async with AsyncExitStack() as stack:
+        paths = (
+            await _visit_path(a, first, stack, settings, dashboard),
+            await _visit_path(b, second, stack, settings, dashboard),
+        )
+        question = {
+            "ask": "visits",
+            "paths": [str(path) for path in paths],
+            "names": [first["name"], second["name"]],
+            "same_frame": bool(first["source"]) and first["source"] == second["source"],
+        }
+        found = await inspection.ask(question)
+    path = np.array(second["map"]["path"], np.float64).reshape(-1, 2)
+    return json_reply(
+        {
+            "a": first,
+            "b": second,
+            **found,
+            "b_path": np.round(Pose2(*found["pose"]).apply(path), 3).tolist(),
+            "parameters": _changed_parameters(first["parameters"], second["parameters"]),
+        }
+    )
 
 
 @router.get("/{key}", dependencies=[ViewerTurn])
@@ -67,6 +119,33 @@ async def read_run(key: _Key, dashboard: Dash, settings: Deployment) -> Response
     """Return a run of the store or an output folder ("folder:NAME") with its map, its parameters and their
     history (empty for a folder); 404 if it does not exist, 409 if the folder cannot be read."""
     return json_reply(await _whole(key, settings, dashboard))
+
+
+@router.get("/{key}/report/{suffix}", dependencies=[ViewerTurn])
+async def report(
+    key: _Key,
+    suffix: Literal["html", "pdf"],
+    dashboard: Dash,
+    settings: Deployment,
+    parameters: FigureParameters,
+    language: Literal["en", "de"] = "en",
+) -> Response:
+    """Return the report of `stemmap report` for a run with its plots; a child process writes it. The key is
+    the number of a record, "folder:NAME", or "open" for the open run. 404 for an unknown run, 409 if there is
+    no report of it, as no PDF without Chromium."""
+    async with _run_folder(key, settings, dashboard) as (folder, plots):
+        with TemporaryDirectory(prefix="stemmap-report-") as there:
+            file = FilePath(there) / f"report.{suffix}"
+            question = {
+                "ask": "report",
+                "path": str(folder),
+                "file": str(file),
+                "language": language,
+                "plots": [(plot.name, mapping(plot.shape)) for plot in plots],
+                "parameters": parameters.model_dump(),
+            }
+            await inspection.ask(question, patience_s=_REPORT_S)
+            return bytes_reply(await asyncio.to_thread(file.read_bytes), filename=file.name)
 
 
 @router.patch("/{number}")
@@ -77,14 +156,6 @@ async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
     if not name or not name.isprintable():
         raise BadRequestError("the name is empty or has characters that cannot be shown", where="name")
     return await _done(dashboard, number, lambda book: book.rename(number, name))
-
-
-@router.delete("/unfinished")
-async def delete_remains(name: _KeyInQuery, settings: Deployment) -> Response:
-    """Delete the partial output of an ended run in the data folder, which cannot be undone; return its name.
-    404 for an unknown one, 409 if a process may still write to it."""
-    await asyncio.to_thread(delete_partial_output, name, settings)
-    return json_reply({"name": name})
 
 
 @router.delete("/{number}")
@@ -125,6 +196,84 @@ async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: Any
     return json_reply({}, 202)
 
 
+@asynccontextmanager
+async def _run_folder(
+    key: str, settings: Settings, dashboard: Dashboard
+) -> AsyncIterator[tuple[FilePath, list[SamplePlot]]]:
+    """Yield the folder with the result files of a run and its plots; a temporary folder is removed
+    afterwards.
+
+    Args:
+        key: "open" for the open run, number of a record, or "folder:" and the name of a finished folder.
+        settings: Settings with the data folders.
+        dashboard: The dashboard with its store.
+
+    Raises:
+        UnknownError: There is no such run.
+        StemmapError: It has no result files, they are damaged, or nothing is mapped yet.
+    """
+    if key in (_OPEN, str(dashboard.run_recorder.record)):
+        run = ShownRun.of(dashboard)
+        async with in_thread(run.folder()) as folder:
+            yield folder, run.sample_plots()
+    elif key.startswith(_FOLDER):
+        folder = await asyncio.to_thread(_finished_folder, key.removeprefix(_FOLDER), settings)
+        async with _with_edits(folder, dashboard) as found:
+            yield found
+    else:
+        number = _number(key)
+        packed = await dashboard.store.ask(lambda store: store.book.files(number))
+        with TemporaryDirectory(prefix="stemmap-run-") as there:
+            folder = FilePath(there)
+            await asyncio.to_thread(zipfile.ZipFile(io.BytesIO(packed)).extractall, folder)
+            source = read_run_record(folder)["source"]
+            frame = await dashboard.store.ask(lambda store: stored_frame(store, source))
+            if frame is not None:
+                await asyncio.to_thread(write_map_frame, folder, frame)
+            async with _with_edits(folder, dashboard) as found:
+                yield found
+
+
+@asynccontextmanager
+async def _with_edits(
+    folder: FilePath, dashboard: Dashboard
+) -> AsyncIterator[tuple[FilePath, list[SamplePlot]]]:
+    """Yield a run with the reviews of its recording, see `reviewed_run`, and the plots of the recording."""
+    source = (await asyncio.to_thread(read_run_record, folder))["source"]
+    contents = await dashboard.store.ask(lambda store: stored_reviews(store, source))
+    plots = await dashboard.store.ask(lambda store: stored_plots(store, source))
+    async with in_thread(reviewed_run(folder, contents)) as reviewed:
+        yield reviewed, plots
+
+
+async def _visit_path(
+    key: str, run: dict[str, Any], stack: AsyncExitStack, settings: Settings, dashboard: Dashboard
+) -> FilePath:
+    """Return the folder of a run, or a table of its trees if it has no result files; errors as in
+    `_run_folder`.
+
+    Args:
+        key, settings, dashboard: See `_run_folder`.
+        run: The run with its map.
+        stack: Removes temporary files.
+    """
+    try:
+        return (await stack.enter_async_context(_run_folder(key, settings, dashboard)))[0]
+    except NoFilesError:
+        folder = FilePath(stack.enter_context(TemporaryDirectory(prefix="stemmap-run-")))
+        names = ("number", "x", "y", "dbh_cm")
+        cells = [[str(tree[n]) if tree[n] is not None else "" for n in names] for tree in run["map"]["trees"]]
+        write_texts(folder, {"trees.csv": csv_text(("tree", "x_m", "y_m", "dbh_cm"), cells)})
+        return folder / "trees.csv"
+
+
+def _number(key: str) -> int:
+    """Return the number of a record; raises UnknownError for another key."""
+    if not key.isdecimal() or int(key) > LARGEST_NUMBER:
+        raise UnknownError("there is no such run", where=key[:100])
+    return int(key)
+
+
 async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], None]) -> Response:
     """Run an action on the records, and return the number of the run."""
     await dashboard.store.ask(lambda store: work(store.book))
@@ -132,7 +281,9 @@ async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], 
 
 
 async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
-    """Return a run with its map and parameter history as the page receives it.
+    """Return a run as the page receives it: the columns of its record (see `_row`) or the values of its
+    folder (see `app.sources.inspection_process.finished`), with `key`, `map`, `revisions` (see `_revision`;
+    [] for a folder) and `differences` from the preset.
 
     Args:
         key: Number of a record, or "folder:" and the name of a finished folder.
@@ -145,15 +296,43 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
     """
     if key.startswith(_FOLDER):
         name = key.removeprefix(_FOLDER)
-        return {"key": key, "revisions": [], **await read_folder(name, settings)}
-    if not key.isdecimal() or int(key) > LARGEST_NUMBER:
-        raise UnknownError("there is no such run", where=key[:100])
-    row = await dashboard.store.ask(lambda store: store.book.whole(int(key)))
-    return {**_row(row), "map": row["map"], "revisions": [_revision(each) for each in row["revisions"]]}
+        folder = await asyncio.to_thread(_finished_folder, name, settings)
+        found = await inspection.ask({"ask": "finished", "path": str(folder)})
+        run = {"key": key, "name": name, "revisions": [], **found}
+    else:
+        number = _number(key)
+        row = await dashboard.store.ask(lambda store: store.book.whole(number))
+        run = {**_row(row), "map": row["map"], "revisions": [_revision(each) for each in row["revisions"]]}
+    return {**run, "differences": _differences(run["preset"], run["parameters"])}
+
+
+def _changed_parameters(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
+    """Return `name` and both values, `a` and `b`, of each parameter that differs; None for one that a run
+    does not have."""
+    names = dict.fromkeys([*a, *b])
+    return [
+        {"name": name, "a": _plain(a.get(name)), "b": _plain(b.get(name))}
+        for name in names
+        if a.get(name) != b.get(name)
+    ]
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401 - whatever a parameter is
+    """Return a value for JSON: None for NaN and infinity, all else unchanged."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _differences(name: str, parameters: dict[str, Any]) -> dict[str, Any]:
+    """Return the values by dotted name that differ from those of a preset; empty for an unknown preset."""
+    if name not in PRESETS:
+        return {}
+    usual = dict(preset(name).flat())
+    return {key: value for key, value in parameters.items() if key in usual and usual[key] != value}
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a record without its map for the page, with times in seconds since 1970."""
+    """Return a record for the page: its columns without the map and internal ones, and `key`, its number as
+    text. Its times are `begun_s` and `changed_s`, whole seconds since 1970."""
     kept = {
         name: value for name, value in row.items() if name not in ("map", "revisions", "run", "deleted_ns")
     }
@@ -162,7 +341,8 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _revision(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a change of parameters for the page, with its time in seconds since 1970."""
+    """Return a change of parameters for the page: `revision`, `time_s` in the run, `who`, `preset`, `changes`
+    and its time `at_s`, whole seconds since 1970."""
     names = ("revision", "time_s", "who", "preset", "changes")
     return {**{name: row[name] for name in names}, "at_s": row["at_ns"] // 10**9}
 
@@ -175,11 +355,45 @@ def _changed_s(folder: FilePath) -> int | None:
         return None
 
 
-def _folders(settings: Settings) -> tuple[dict[str, FilePath], dict[str, int | None], list[Any]]:
-    """Return the finished folders and the times of their last change by name, and the partial outputs."""
-    folders = finished_folders(settings)
-    return (
-        folders,
-        {name: _changed_s(path) for name, path in folders.items()},
-        list(partial_outputs(settings)),
-    )
+def _folders(settings: Settings) -> dict[str, int | None]:
+    """Return the time of the last change of each finished folder, see `_changed_s`, by name."""
+    return {name: _changed_s(path) for name, path in _finished_folders(settings).items()}
+
+
+def _finished_folders(settings: Settings) -> dict[str, FilePath]:
+    """Return the folders of finished runs in the data folders by name, at most 500; of two with the same name
+    the first. Links that point outside of the data folders, and data folders that cannot be read, are left
+    out."""
+    found: dict[str, FilePath] = {}
+    for folder in settings.data_folders:
+        try:
+            paths = sorted(path for path in folder.iterdir() if _is_finished(path, folder))
+        except OSError:
+            continue
+        for path in paths:
+            found.setdefault(path.name, path)
+    return dict(list(found.items())[:_MOST_FOLDERS])
+
+
+def _finished_folder(name: str, settings: Settings) -> FilePath:
+    """Return the folder of a finished run by its name in `_finished_folders`; raises UnknownError if it is
+    not among them."""
+    path = _finished_folders(settings).get(name)
+    if path is None:
+        raise UnknownError("there is no such run in the data folders", where=name[:200])
+    return path
+
+
+def _is_finished(path: FilePath, folder: FilePath) -> bool:
+    """Return whether a path is the folder of a finished run inside of a data folder.
+
+    Args:
+        path: The path.
+        folder: The data folder.
+    """
+    try:
+        if path.name.startswith(".") or not path.resolve().is_relative_to(folder.resolve()):
+            return False
+        return (path / "run.json").is_file() and (path / "trees.csv").is_file()
+    except OSError:
+        return False

@@ -89,7 +89,14 @@ async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: Calle
         if not free:
             await browser.close(_TRY_AGAIN_LATER)
             return
-        await bridge(browser, dashboard.scene, user=current_user.get(), looks_only=role != "owner")
+        scene = dashboard.scene
+        await bridge(
+            browser,
+            port=scene.port,
+            secret=scene.secret,
+            user=current_user.get(),
+            looks_only=role != "owner",
+        )
 
 
 @contextlib.asynccontextmanager

@@ -66,13 +66,13 @@ async def stop_search(dashboard: Dash) -> Response:
 
 @router.post("/search/go-on")
 async def continue_search(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """POST /api/search/go-on: continue the search that was stopped, with the same choices; return its state.
-    409 if no search was stopped, or if parameters or true trees have changed since."""
-    search = dashboard.search
-    if search.request is None:
+    """POST /api/search/go-on: continue the search that was stopped: start it with the same choices; returns
+    and fails as `start_search`, and 409 if no search was stopped. The results of its trials are stored,
+    unless parameters or true trees have changed since."""
+    request = dashboard.search.request
+    if request is None or not dashboard.search.can_go_on:
         raise StemmapError("there is no stopped search", remedy="Start a search")
-    await search.go_on(await _plan(dashboard, settings, any_file, search.request))
-    return json_reply(search.as_plain(), 202)
+    return await start_search(request, dashboard, settings, any_file)
 
 
 @router.post("/search/use")
@@ -86,8 +86,8 @@ async def use_found(dashboard: Dash) -> Response:
 
 @router.post("/search/save")
 async def save_found(body: SaveSet, dashboard: Dash) -> Response:
-    """Save the best set under a name, with its provenance; return all saved sets. 409 if no better set was
-    found, 422 for the name of a preset."""
+    """Save the best set under a name, with its provenance, in place of one of this name; return all saved
+    sets, with 201. 409 if no better set was found, 422 for the name of a preset."""
     preset_name, values, text = dashboard.search.found()
     await dashboard.sets.save(body.name, preset_name, values, body.who, text)
     return json_reply(dashboard.sets.as_plain(), 201)
@@ -157,7 +157,7 @@ async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted
     others = await _others(dashboard, settings, any_file) if wanted.also or wanted.held_out else []
     state = dashboard.parameters
     source, digest, truth = dashboard.source, dashboard.digest, dashboard.file_truth
-    return plan_of(wanted, source, digest, truth, state.parameters, state.preset, others)
+    return plan_of(wanted, source, digest, truth, state.parameters, state.preset, others, dashboard.results)
 
 
 async def _others(dashboard: Dashboard, settings: Settings, any_file: bool) -> list[OtherRun]:

@@ -47,7 +47,8 @@ class _Blob:
     """Bytes of arrays, each at a multiple of eight bytes; see `encode` for `planes`."""
 
     def __init__(self, planes: bool) -> None:
-        """Begin an empty block; see `encode` for `planes`."""
+        """Begin an empty block; with `planes` the first bytes of all numbers of an array come first, then the
+        second ones, and so on."""
         self.parts: list[bytes] = []
         self.length = 0
         self._planes = planes
@@ -85,8 +86,13 @@ def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: 
 
 
 def record_bytes(record: Any) -> bytes:  # noqa: ANN401 - any record
-    """Return a record as bytes that compress well, see `encode`: the length of the JSON text (4 bytes,
-    little-endian), the text, and the arrays in planes."""
+    """Return a record as bytes that compress well: the length of the JSON text (4 bytes, little-endian), the
+    text, and the arrays in planes. Numbers that are not finite become texts; fields with NOT_SAVED are
+    omitted.
+
+    Raises:
+        TypeError: A value has a type that `encode` does not know.
+    """
     tree, arrays = encode(record, planes=True)
     text = msgspec.json.encode(tree)
     return len(text).to_bytes(_LENGTH, "little") + text + arrays
@@ -105,7 +111,12 @@ def record_of(kind: type[R], data: bytes) -> R:
 
 
 def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
-    """Return a value as JSON values, with its arrays added to `blob`; see `encode`."""
+    """Return a value as JSON values, with its arrays added to `blob`: a dataclass as a table of its saved
+    fields, a tuple as a list, an array as its description, a number that is not finite as text.
+
+    Raises:
+        TypeError: A value has another type.
+    """
     if isinstance(value, np.ndarray):
         return blob.add(value)
     if is_dataclass(value) and not isinstance(value, type):
@@ -189,7 +200,8 @@ def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN
 
 
 def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
-    """Return a dataclass of type `kind` from a table of its saved fields; see `decode` for missing fields.
+    """Return a dataclass of type `kind` from a table of its saved fields. A missing field with ADDED gets the
+    value of its function of the other fields, or its default.
 
     Raises:
         ValueError: `tree` is not a table, or has other fields.
@@ -229,11 +241,11 @@ def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any
 
 
 def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
-    """Return a number, truth value or text of type `kind`. An integer is accepted as float if it has fewer
-    than 64 bits, and "nan", "inf" and "-inf" are.
+    """Return a number, truth value or text of type `kind`. An integer is also accepted as float, and so are
+    the texts "nan", "inf" and "-inf".
 
     Raises:
-        ValueError: The value has another type.
+        ValueError: The value has another type, or is an integer of 64 bits or more.
     """
     if kind is float and isinstance(tree, str) and tree in ("nan", "inf", "-inf"):
         return float(tree)
@@ -247,7 +259,8 @@ def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
 
 
 def _array(scalar: Any, tree: Any, blob: _Block, name: str) -> np.ndarray[Any, Any]:  # noqa: ANN401
-    """Return a copy of an array with elements of type `scalar` by its description, see `_Blob.add`.
+    """Return a copy of an array with elements of type `scalar` by its description: a table of "dtype"
+    (little-endian), "shape" and "at", its position in the block [bytes].
 
     Raises:
         ValueError: It has another type, no valid shape (1 to 8 dimensions), or is not inside of the block.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pipeline.classification import PackedVoxelMap
+from pipeline.classification.column_classifier import SAME
 from pipeline.classification.voxel_map import TILE
 from pipeline.config import Parameters
 from pipeline.geometry.gaussian import spread_by_pose
@@ -24,7 +25,6 @@ from pipeline.tracking.track_table import NO_LANDMARK, TrackTable, join
 from pipeline.types.records import Bool, Columns, Int, Verdict
 
 GATE = 5.0  # sigma; largest distance of observations of one tree
-SAME_COLUMN = 0.35  # m
 MOST_RETURNS = 20  # of a voxel of the second map
 
 
@@ -49,7 +49,7 @@ def merge_maps(
 ) -> MergedMap:
     """Merge map b into map a; both are unchanged. Trees of both at one place (`associate`) become one with
     the number in a; other trees of b get new numbers. The run continues at the end of b, in the frame of a,
-    without graph and places.
+    without graph and places. The height map is that of a.
 
     Args:
         a, b: The maps.
@@ -228,7 +228,7 @@ def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int
 
 
 def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
-    """Return the columns of a, and those of b that are more than SAME_COLUMN from all of a, moved into the
+    """Return the columns of a, and those of b that are more than SAME from all of a, moved into the
     frame of a; T is the pose of the frame of b in the frame of a."""
     axis = b.axis.copy()
     axis[:, :2] = T.apply(b.axis[:, :2])
@@ -241,12 +241,12 @@ def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
 
 
 def _apart(place: Float, other: Float) -> Bool:
-    """Return which positions, shape (N, 2) [m], are more than SAME_COLUMN from all other ones, shape (M, 2);
+    """Return which positions, shape (N, 2) [m], are more than SAME from all other ones, shape (M, 2) [m];
     all if either is empty."""
     from scipy.spatial import cKDTree
 
     if not len(place) or not len(other):
         return np.ones(len(place), np.bool_)
     distance, _ = cKDTree(other).query(place)
-    apart: Bool = distance > SAME_COLUMN
+    apart: Bool = distance > SAME
     return apart

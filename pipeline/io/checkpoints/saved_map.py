@@ -58,7 +58,8 @@ class SavedMap:
 
     @classmethod
     def of(cls, mapper: Mapper) -> SavedMap:
-        """Return the state of a mapper as a copy, without the states to which a lost robot could return."""
+        """Return the state of a mapper, which later scans do not change, without the states to which a lost
+        robot could return."""
         state, path = mapper.snapshot(), mapper.path
         slam, lost = state.slam, state.recovery
         return cls(

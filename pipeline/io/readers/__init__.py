@@ -27,8 +27,8 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         options: Choices of the user; None for the defaults.
 
     Raises:
-        SourceError: It does not exist, has an unknown format, or is damaged.
-        UsageError: The scheme of the URI is unknown.
+        SourceError: It does not exist, has an unknown format, is damaged, or is a live robot.
+        UsageError: The scheme of the URI is unknown, or its scenario or options are not valid.
     """
     chosen = options or SourceOptions()
     scheme = _SCHEME.match(uri)
@@ -47,10 +47,10 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
 
 
 def check_existence(uri: str) -> None:
-    """Check that a URI without a scheme names a file or a folder.
+    """Check that a URI without a scheme names a file or a folder; a URI with a scheme is not checked.
 
     Raises:
-        SourceError: There is none.
+        SourceError: There is none, or the path is not valid.
     """
     try:
         if _SCHEME.match(uri) is None and not Path(uri).expanduser().exists():
@@ -132,7 +132,8 @@ def _opener(module: str, function: str) -> Opener:
     so that formats which are not used are not imported."""
 
     def opened(uri: str, path: Path, options: SourceOptions) -> Source:
-        """Open a source, see `Opener`."""
+        """Import the module, and return the source that its function opens; errors are those of this
+        function."""
         found: Opener = getattr(import_module(f"pipeline.io.readers.{module}"), function)
         return found(uri, path, options)
 
@@ -216,9 +217,22 @@ def expected_format(path: Path) -> Format | None:
     return next((kind for kind in FILES if path.suffix.lower() in kind.suffixes), None)
 
 
+def is_cloud(uri: str) -> bool:
+    """Return whether a file is a whole cloud by its first bytes or its name; a .pcd file is a scan. False for
+    a file that cannot be read."""
+    try:
+        path = Path(uri).expanduser()
+        with path.open("rb") as file:
+            head = file.read(16)
+    except (OSError, ValueError, RuntimeError):
+        return False
+    kind = file_format(path, head) or expected_format(path)
+    return kind is not None and kind.is_cloud
+
+
 def recordings_in(folder: Path) -> list[str]:
     """Return the sorted names of the files in a folder (not in folders in it) that are runs or clouds by
-    their suffixes."""
+    their suffixes; OSError if it cannot be read."""
     return sorted(path.name for path in folder.iterdir() if path.is_file() and expected_format(path))
 
 
@@ -230,7 +244,8 @@ def named(names: list[str]) -> str:
 
 def folder_opener(folder: Path) -> Opener | None:
     """Return the opener of a folder by the names of the files in it, and of `velodyne/*.bin`; None if nothing
-    in it can be read. Where several formats fit, the order is TreeManager, ROS recording, scans."""
+    in it can be read. Where several formats fit, the order is TreeManager, ROS recording, scans. OSError if
+    the folder cannot be read."""
     names = {path.name for path in folder.iterdir() if path.is_file()}
     if any(name.startswith("TreeManagerState_") for name in names):
         return _tree_manager

@@ -26,8 +26,9 @@ class RecordedTopic:
     Attributes:
         name, type: e.g. "/velodyne_points" and "sensor_msgs/msg/PointCloud2".
         messages: Number of messages.
-        read_as: Role in which it is read ("scan", "odometry", "imu", "gnss", "pose", "transforms"), or "".
-        fits: Role that `--topic` can give it, "" when there is none.
+        read_as: Role in which it is read ("scan", "odometry", "imu", "gnss", "pose", "camera",
+            "transforms"), or "".
+        fits: First role that `--topic` can give it, "" when there is none.
         why_not: Why it is not read, "" when it is.
     """
 
@@ -100,7 +101,8 @@ class SourceOptions:
     """Choices of the user for a source.
 
     Attributes:
-        topics: Topic by role ("scan", "odometry", "imu", "gnss", "pose"); other roles are found by type.
+        topics: Topic by role ("scan", "odometry", "imu", "gnss", "pose", "camera"); other roles are found by
+            type.
         T_base_lidar: Extrinsics of the LiDAR; None means those of the source, else identity.
         seed: Random seed of simulated runs.
         as_live: Of the recording of a live run: read only the messages that the live run mapped.

@@ -226,7 +226,8 @@ class MessageSource(FileSource):
         self._camera: tuple[Camera | None, str] | None = None
 
     def camera(self) -> tuple[Camera | None, str]:
-        """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
+        """Return the camera, or None and the reason why it is unknown, "" when there is no camera. It is
+        searched for once."""
         if self._camera is None and self._picture_channels:  # needed for each picture
             topic = next(channel.topic for channel in self._picture_channels.values())
             self._camera = find_camera(self._container, self._fixed_transforms(), self.base, topic)
@@ -252,7 +253,7 @@ class MessageSource(FileSource):
         for stamp_ns, message in self._taken(None) if left else ():
             if stamp_ns in left:
                 left.discard(stamp_ns)
-                picture = self._picture(message, stamp_ns)
+                picture = picture_of(message, self._picture_channels, stamp_ns)
                 if picture is not None:
                     yield picture
 
@@ -261,15 +262,11 @@ class MessageSource(FileSource):
         decoded."""
         # First only a short interval is read: pictures of a fast camera can be a megabyte each.
         best = self._nearest(stamp_ns, min(within_ns, SAME_TIME_NS)) or self._nearest(stamp_ns, within_ns)
-        return None if best is None else self._picture(best[1], best[0])
+        return None if best is None else picture_of(best[1], self._picture_channels, best[0])
 
     def close(self) -> None:
         """Close the recording."""
         self._container.close()
-
-    def _picture(self, message: Message, stamp_ns: int) -> Picture | None:
-        """Return the picture in a message with this time [ns]; None if it cannot be decoded."""
-        return picture_of(message, self._picture_channels, stamp_ns)
 
     def _nearest(self, stamp_ns: int, within_ns: int) -> tuple[int, Message] | None:
         """Return the time [ns] and message of the picture nearest to a time; None if none is within

@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.errors import SourceError
-from pipeline.inventory.cloud import CloudDescription, WholeCloud
-from pipeline.io.readers import expected_format, file_format
 from pipeline.io.readers.base import COORDINATE_LIMIT, count_loss, digest_of
 from pipeline.io.readers.point_files import (
     MISSING,
@@ -22,25 +20,13 @@ from pipeline.io.readers.point_files import (
     ScanFileError,
     open_table,
 )
+from pipeline.types.clouds import CloudDescription, WholeCloud
 from pipeline.types.records import Float, Float32
 
 if TYPE_CHECKING:
     import laspy
 
 _REMEDY = "Copy the file again, or export it again"
-
-
-def is_cloud(uri: str) -> bool:
-    """Return whether a file is a whole cloud by its first bytes or its name; a .pcd file is a scan. False for
-    a file that cannot be read."""
-    try:
-        path = Path(uri).expanduser()
-        with path.open("rb") as file:
-            head = file.read(16)
-    except (OSError, ValueError, RuntimeError):
-        return False
-    kind = file_format(path, head) or expected_format(path)
-    return kind is not None and kind.is_cloud
 
 
 def open_cloud(uri: str) -> WholeCloud:
@@ -99,7 +85,12 @@ class CloudFile:
     description: CloudDescription
 
     def __init__(self, uri: str, path: Path) -> None:
-        """Open the file and read its description and its first points."""
+        """Open the file and read its description and its first points.
+
+        Raises:
+            SourceError: It has another format, is damaged, or has no valid point.
+            OSError: It cannot be read.
+        """
         self._uri, self._path = uri, path
         self.losses: dict[str, int] = {}
         with self._one_error():
@@ -150,6 +141,7 @@ class CloudFile:
 
         Raises:
             SourceError: No point has valid coordinates.
+            OSError: The file cannot be read.
         """
         for _, xyz in self._read():
             first = xyz[is_place(xyz)][:1000]
@@ -183,13 +175,20 @@ class TableCloud(CloudFile):
     name = "point"
 
     def _describe(self) -> CloudDescription:
-        """Return the description by the header of the table, which is kept open for reading."""
+        """Return the description by the header of the table, which is stored for reading.
+
+        Raises:
+            ScanFileError: It is no such table, or its data is damaged.
+            SourceError: No point has valid coordinates.
+            OSError: It cannot be read.
+        """
         self._table = table = open_table(self._path)
         attributes = tuple(name for name in table.names if name not in ("x", "y", "z"))
         return self._described(table.kind, table.points, crs="", attributes=attributes)
 
     def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the coordinates of all rows, valid or not."""
+        """Yield the coordinates of all rows, valid or not, shape (N, 3) [m], each part with its number of
+        points."""
         for columns in self._table.parts():
             with np.errstate(over="ignore", invalid="ignore"):
                 xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], axis=1)
@@ -209,13 +208,24 @@ _LASZIP, _ITEMS, _ITEM = 22204, 34, struct.Struct("<HHH")
 _LAYERS, _BYTES_14 = {10: 9, 11: 1, 12: 2, 13: 1}, 14
 
 
+#: System identifier of the LAS files that `stemmap export` writes of a drive.
+SYSTEM_OF_DRIVE = "stemmap drive"
+
+
 class LasCloud(CloudFile):
     """A .las or .laz file as a cloud."""
 
     name = "LAS"
 
     def _describe(self) -> CloudDescription:
-        """Return the description by the header, which is checked before laspy reads it."""
+        """Return the description by the header, which is checked before laspy reads it. An error of laspy is
+        not caught.
+
+        Raises:
+            SourceError: The header contradicts itself or the file, names too many points, or no point has
+                valid coordinates.
+            OSError: The file cannot be read.
+        """
         points, self._there, compressed, version = _check_las(self._path, self._uri)
         with _open_las(self._path) as reader:
             header = reader.header
@@ -226,11 +236,12 @@ class LasCloud(CloudFile):
             low=np.array(header.mins, np.float64),
             high=np.array(header.maxs, np.float64),
             attributes=tuple(n for n in header.point_format.dimension_names if n not in ("X", "Y", "Z")),
+            cut_above=str(header.system_identifier).rstrip("\0") == SYSTEM_OF_DRIVE,
         )
 
     def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the coordinates of the points before any damage. Withheld points are omitted and counted in
-        `losses`."""
+        """Yield the coordinates of the points before any damage, shape (N, 3) [m], each part with the number
+        of points read. Withheld points are omitted and counted in `losses`."""
         read = 0
         with _open_las(self._path) as reader:
             scales, offsets = reader.header.scales.copy(), reader.header.offsets.copy()
@@ -261,7 +272,9 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
         and the version.
 
     Raises:
-        SourceError: They contradict each other.
+        SourceError: It is no LAS file, the sizes contradict each other, there are no or too many points, or
+            none before the first damage.
+        OSError: It cannot be read.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -423,7 +436,13 @@ class E57Cloud(CloudFile):
     name = "E57"
 
     def _describe(self) -> CloudDescription:
-        """Return the description by the headers of the stations."""
+        """Return the description by the headers of the stations. An error of pye57 is not caught.
+
+        Raises:
+            SourceError: pye57 is not installed, there are too many stations or points, or no point has valid
+                coordinates.
+            OSError: The file cannot be read.
+        """
         with closing(self._open()) as file:
             stations = int(file.scan_count)
             if stations > MOST_STATIONS:
@@ -435,7 +454,12 @@ class E57Cloud(CloudFile):
         return self._described(kind, sum(points), crs="")
 
     def _read(self) -> Iterator[tuple[int, Float]]:
-        """Yield the points of all stations in the frame of the file."""
+        """Yield the positions of the points of all stations in the frame of the file, shape (N, 3) [m], NaN
+        for invalid ones, each part with its number of points. Errors of pye57 are not caught.
+
+        Raises:
+            SourceError: pye57 is not installed, or points have no coordinates.
+        """
         with closing(self._open()) as file:
             for station in range(int(file.scan_count)):
                 for xyz in self._station(file, station):

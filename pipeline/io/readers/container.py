@@ -132,7 +132,9 @@ class IndexedContainer(Container):
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield messages, see `Container.messages`."""
+        """Yield the messages of some channels in the order of their times of recording, from `start_ns` [ns]
+        on (None: all). Those that cannot be read are counted in `losses` as `unreadable`; a payload that
+        cannot be unpacked is b""."""
         first = 0 if start_ns is None else int(np.searchsorted(self.index[:, 1], start_ns))
         for row in first + np.flatnonzero(np.isin(self.index[first:, 0], list(numbers))):
             number, log_ns, place = self.index[row].tolist()
@@ -236,8 +238,8 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
 
 
 def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
-    """Return the first `limit` + 1 unpacked bytes of a block, or all if there are fewer; arguments as in
-    `unpack`.
+    """Return the first `limit` + 1 unpacked bytes of a block, or all if there are fewer or the block is not
+    compressed; arguments as in `unpack`.
 
     Raises:
         BrokenChunkError: The block is damaged, or the compression is unknown.
@@ -310,7 +312,11 @@ class ChunkedFile(IndexedContainer):
     unreadable = "messages in damaged chunks of the recording"
 
     def __init__(self, path: Path) -> None:
-        """Open the file and read its index; chunks without a valid index are unpacked."""
+        """Open the file and read its index; chunks without a valid index are unpacked.
+
+        Raises:
+            SourceError: The file cannot be opened, has another format, or holds no messages that can be read.
+        """
         self.damage = {}
         self._path = path
         self._known: dict[int, Channel] = {}
@@ -401,7 +407,7 @@ class ChunkedFile(IndexedContainer):
         return raw
 
     def _unpacked_size(self) -> int:
-        """Return the size of the chunks in memory [bytes]."""
+        """Return the size of the unpacked chunks that are kept in memory [bytes]."""
         return sum(len(raw or b"") for raw in self._unpacked.values())
 
     def _unpack(self, chunk: Chunk) -> bytes | None:
@@ -414,8 +420,9 @@ class ChunkedFile(IndexedContainer):
         return raw if not chunk.crc or zlib.crc32(raw) == chunk.crc else None
 
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
-        """Return a message, see `IndexedContainer._message`; None also if there is no message of this
-        channel. Its time is that of its own record, because the time in the index may be damaged."""
+        """Return the message at a place, with its payload as it is stored; None if it cannot be read or is
+        not of the channel `number`. Its time is that of its own record, shifted behind steps of the clock,
+        because the time in the index may be damaged."""
         del log_ns
         try:
             message, _ = self._record(self._bytes_of(self._chunks[place >> 32]), place & 0xFFFFFFFF)
@@ -427,8 +434,9 @@ class ChunkedFile(IndexedContainer):
         return replace(message, log_ns=message.log_ns + shift_ns)
 
     def _rows_of(self, chunk: Chunk) -> Int:
-        """Return the index of a chunk in the order of the file, int64, shape (N, 3); it is made anew if the
-        file has no whole one, or an impossible one."""
+        """Return the index of a chunk in the order of the file, int64, shape (N, 3); it is built from the
+        messages of the chunk if the file has no complete one, or an impossible one. Then it ends at the first
+        damaged record, which is counted in `damage`."""
         if chunk.index and chunk.index_is_whole:
             rows = np.concatenate(chunk.index)
             rows = rows[np.argsort(rows[:, 2], kind="stable")]

@@ -71,7 +71,8 @@ class MessageList(Container):
     def messages(
         self, numbers: Collection[int], start_ns: int | None, losses: dict[str, int]
     ) -> Iterator[Message]:
-        """Yield the messages, see `Container.messages`."""
+        """Yield the messages of some channels in their order, without those recorded before `start_ns` [ns]
+        (None: all). `losses` is unchanged."""
         del losses
         for message in self._messages:
             if message.channel in numbers and (start_ns is None or message.log_ns >= start_ns):
@@ -281,7 +282,8 @@ class LiveCamera:
 
 
 def fixed_transforms(container: Container) -> TransformTree:
-    """Return the fixed transforms in the messages of a container."""
+    """Return the fixed transforms in the first FIXED_MESSAGES messages of the topics "tf_static" of a
+    container; without any, an empty tree."""
     mounting = Extrinsics(container)
     mounting.read(frozenset(c.number for c in container.channels if is_fixed(c.topic)), frozenset())
     return mounting.tree
@@ -326,7 +328,7 @@ def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
         where: Its name in errors.
 
     Raises:
-        SourceError: They are of a newer version.
+        SourceError: They are of another version, or name no topic or more than _MOST_TOPICS.
     """
     try:
         content = container.attachment(NAME, _LIMIT)
@@ -358,7 +360,12 @@ class LiveRecording(MessageSource):
     def __init__(
         self, uri: str, container: Container, run: LiveRunHeader, paths: list[Path], options: SourceOptions
     ) -> None:
-        """Read the recording up to its description, and the notes of the recorder."""
+        """Read the recording up to its description, and the notes of the recorder.
+
+        Raises:
+            SourceError: A topic is missing, or there is no scan that can be read.
+            OSError: A file cannot be read.
+        """
         super().__init__(container)
         self._uri, self._run = uri, run
         self._options = replace(options, topics={"scan": run.topics[0], **options.topics})
@@ -375,7 +382,8 @@ class LiveRecording(MessageSource):
         self._description = self._describe(reader.description, paths)
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int:
-        """Return the time of a picture [ns], see `time_beside`; never None."""
+        """Return the time of a picture [ns], never None: its stamp, or its arrival plus the offset of the
+        clocks if the stamp is missing, 0 or of another clock."""
         return time_beside(stamp_ns, message.log_ns, self._offset_ns)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
@@ -398,7 +406,11 @@ class LiveRecording(MessageSource):
         return ArrivalReader(self._uri, KIND, self._channels, self._options)
 
     def _opened_reader(self) -> ArrivalReader:
-        """Return a reader that has read up to its description, or to the end."""
+        """Return a reader that has read up to its description, or to the end; without a scan it has none.
+
+        Raises:
+            SourceError: None of the scans can be read.
+        """
         reader = self._reader()
         for message in self._messages(self._numbers, {}):
             reader.add(message)
@@ -415,6 +427,9 @@ class LiveRecording(MessageSource):
         Args:
             known: Description of its first messages as a live run.
             paths: Files of the recording.
+
+        Raises:
+            OSError: A file cannot be read.
         """
         scans = {c.number: c.count for c in self._container.channels if c.topic == self._run.topics[0]}
         recorded, skipped = sum(scans.values()), sum(len(self._skipped.get(c, ())) for c in scans)
@@ -424,7 +439,7 @@ class LiveRecording(MessageSource):
         warnings = list(known.warnings)
         if self._container.damage:
             warnings.append("the recording is cut or damaged: only whole messages are read")
-        revisions = tuple(self._revisions())
+        revisions = tuple(self._notes(PARAMETERS, Revision))
         if skipped and not self._options.as_live:
             # Scans are counted among those that were mapped live, so the numbers do not fit here.
             revisions = tuple(replace(last, from_scan=0) for last in revisions[-1:])
@@ -450,10 +465,6 @@ class LiveRecording(MessageSource):
             skipped = self._skipped.get(message.channel) if self._options.as_live else None
             if skipped is None or message.log_ns not in skipped:
                 yield message
-
-    def _revisions(self) -> Iterator[Revision]:
-        """Return the parameters of the live run, in order."""
-        return self._notes(PARAMETERS, Revision)
 
     def _read_skipped(self) -> dict[int, set[int]]:
         """Return the log times [ns] of the messages that the live run did not map, by channel; at most
@@ -488,7 +499,7 @@ class LiveRecording(MessageSource):
 
 
 def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
-    """Return the description of the topics of the camera of a live run."""
+    """Return a description with the role "camera" for each channel of the camera of a live run."""
     return tuple(RecordedTopic(c.topic, c.msgtype, c.count, "camera", "") for c in channels)
 
 
@@ -523,7 +534,8 @@ def open_recording(uri: str, path: Path, options: SourceOptions) -> Source:
         options: Choices of the user.
 
     Raises:
-        SourceError: It cannot be read, or has no scans.
+        SourceError: It is no recording that can be read, or has no scans.
+        OSError: A file or folder cannot be read.
     """
     paths = bag_files(path) if path.is_dir() else [path]
     container = BagFolder(paths) if path.is_dir() else open_bag(path)

@@ -50,7 +50,11 @@ class McapFile(ChunkedFile):
     kind = "ROS 2 MCAP"
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """Return the bytes of an attachment, see `Container.attachment`. None if there is none."""
+        """Return the bytes of the first attachment of a name, None if there is none.
+
+        Raises:
+            SourceError: It is longer than `limit` bytes, is damaged, or has a wrong checksum.
+        """
         for opcode, offset, length in self._further:
             if opcode != Opcode.ATTACHMENT or _attachment_name(self._read(offset, 4096)) != name:
                 continue
@@ -72,7 +76,8 @@ class McapFile(ChunkedFile):
     def whole_records(self) -> Iterator[records.McapRecord]:
         """Yield all definitions, attachments, metadata and messages that can be read; other chunks and
         records are counted in `damage`. Attachments with a wrong checksum are among these. Chunks are yielded
-        in the order of the file, with the times that they have there."""
+        in the order of the file, with the times that they have there, and with their own definitions, which
+        repeat earlier ones. Of a chunk that is damaged in part the records before the damage are yielded."""
         yield from self._schemas.values()
         yield from self._definitions.values()
         for opcode, offset, length in self._further:
@@ -158,8 +163,8 @@ class McapFile(ChunkedFile):
         return behind[0][0] if behind else 0
 
     def _take_or_count(self, opcode: int, body: int, length: int) -> bool:
-        """Store the contents of a record, see `_take`. Return whether it could be read; a damaged record is
-        counted, and may be a part of the index of the last chunk.
+        """Store the contents of a record, see `_take`, and return True. For a damaged record return False: it
+        is counted, and the index of the last chunk, of which it may be a part, counts as incomplete.
 
         Args:
             opcode: Type of the record.
@@ -176,7 +181,8 @@ class McapFile(ChunkedFile):
         return True
 
     def _take(self, opcode: int, body: int, length: int) -> None:
-        """Store the contents of a record.
+        """Store the contents of a record: type, channel, chunk, its index, or message; of an attachment or
+        metadata the position. Other kinds are ignored.
 
         Args:
             opcode: Kind of the record.
@@ -245,7 +251,13 @@ class McapFile(ChunkedFile):
             self._chunks.append(Chunk(start, end - start, "", end - start))
 
     def _record(self, raw: bytes, at: int) -> tuple[Message | None, int]:
-        """Return the message of a record and its end, see `ChunkedFile._record`."""
+        """Return the message of the record at an offset in an unpacked chunk, None for another record, and
+        the offset of its end. A type or channel is added to those of the file.
+
+        Raises:
+            BrokenChunkError: The record is longer than the chunk, or its time is impossible.
+            DAMAGE: It cannot be parsed.
+        """
         opcode, length = RECORD.unpack_from(raw, at)
         at += RECORD.size
         end = at + length

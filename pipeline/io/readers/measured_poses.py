@@ -700,7 +700,7 @@ class FrameAlignments:
 
     def _align_recording(self, alignment: FrameAlignment) -> tuple[Any, str]:
         """Return the frame by the first _MOST_READINGS messages of a recording and "", or None and the
-        reason."""
+        reason. Reading ends when the frame is known or refused."""
         messages = self._container.messages(alignment.readings | self._odometry, None, {})
         for message in islice(messages, _MOST_READINGS):
             for stamped in self._times_of(message, {}):

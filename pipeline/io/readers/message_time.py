@@ -106,7 +106,7 @@ class ClockStepFilter(Clock):
     """
 
     def __init__(self, offsets_ns: list[int | None], notices: list[str] | None = None) -> None:
-        """Choose the clock as `Clock` does."""
+        """Choose the clock as `Clock` does; messages about steps are appended to `notices`."""
         super().__init__(offsets_ns)
         self.notices: list[str] = [] if notices is None else notices
         self._channels: dict[int, _ChannelClock] = {}
@@ -114,8 +114,9 @@ class ClockStepFilter(Clock):
 
     def time_of(self, stamp_ns: int | None, message: Message) -> int | None:
         """Return the time of a message [ns], with the steps of the clock removed; call it in the order of
-        arrival. A stamp that is missing or zero is replaced by the time of arrival plus the known offset.
-        None if such a message, or one with another clock, is the first of its channel. A step adds a notice.
+        arrival. If stamps are not used it is the time of arrival. A stamp that is missing or zero is replaced
+        by the time of arrival plus the known offset. None if such a message, or one with another clock, is
+        the first of its channel. A step adds a notice.
         """
         if not self.by_stamp:
             return message.log_ns

@@ -123,7 +123,7 @@ def _column_names(fields: list[str]) -> list[str]:
 
 
 def _usable(names: list[str]) -> tuple[str, ...]:
-    """Return the names of the columns that can be used.
+    """Return the names of the columns that can be used, in their order: those that do not begin with "*".
 
     Raises:
         ScanFileError: x, y or z is missing.
@@ -209,7 +209,12 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
             raise ScanFileError("it ends before its first point")
 
     def parts() -> Iterator[Columns]:
-        """Yield the points in parts, see PointTable."""
+        """Yield the points in parts, see PointTable; damage ends them.
+
+        Raises:
+            ScanFileError: The data is damaged before its first point.
+            OSError: It cannot be read.
+        """
         read = 0
         try:
             with ExitStack() as stack:
@@ -251,7 +256,12 @@ def _text_table(
         raise ScanFileError("it ends before its first point")
 
     def parts() -> Iterator[Columns]:
-        """Yield the points in parts, see PointTable."""
+        """Yield the points in parts, see PointTable; damaged lines are left out.
+
+        Raises:
+            ScanFileError: There should be points, and no line is valid.
+            OSError: It cannot be read.
+        """
         with path.open("rb") as file:
             file.seek(start)
             for _ in range(skipped):
@@ -301,7 +311,12 @@ def _open_pcd(path: Path, head: bytes) -> PointTable:
         raise ScanFileError("its packed data is too large; write it as binary")
 
     def parts() -> Iterator[Columns]:
-        """Yield the points as one part. The data has one field after the other, each with all points."""
+        """Yield the points as one part. The data has one field after the other, each with all points.
+
+        Raises:
+            ScanFileError: The packed data is missing, cut, or of another size than in the header.
+            OSError: It cannot be read.
+        """
         with path.open("rb") as file:
             file.seek(start)
             body = file.read(WHOLE_LIMIT)
@@ -571,6 +586,7 @@ def _open_npz(path: Path) -> PointTable:
 
     Raises:
         ScanFileError: The file is damaged or has no such array.
+        OSError: It cannot be read.
     """
     arrays: dict[str, _NumpyArray] = {}
     reason = "it holds no arrays"

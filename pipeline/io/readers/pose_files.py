@@ -143,7 +143,12 @@ def _text(path: Path) -> str:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    """Return the words of each line that is not empty and does not begin with #."""
+    """Return the words of each line that is not empty and does not begin with #.
+
+    Raises:
+        TextError: It is longer than TEXT_LIMIT, or is not UTF-8.
+        OSError: It cannot be read.
+    """
     return [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
 
 
@@ -201,7 +206,12 @@ def _calibration(path: Path) -> Pose3 | None:
 
 
 def _moves_along_z(R: Float, t: Float) -> bool:
-    """Return whether the steps, in the frame of each pose, are along z more than along x."""
+    """Return whether the steps between poses, in the frame of the pose before, sum up to more along z than
+    along x, and to more than _STILL; False for a single pose.
+
+    Args:
+        R, t: Rotations, shape (N, 3, 3), and positions, shape (N, 3) [m].
+    """
     steps = np.einsum("nji,nj->ni", R[:-1], np.diff(t, axis=0))
     x, _, z = np.abs(steps).sum(axis=0)
     return bool(z > x and z > _STILL)
@@ -240,10 +250,10 @@ def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
 
 
 def between(first: Pose3, second: Pose3, fraction: float) -> Pose3:
-    """Return the pose between two poses: the position on a line, the attitude by slerp.
+    """Return the pose between two poses: the position on a line, the attitude by slerp the shorter way.
 
     Args:
-        first, second: The poses.
+        first, second: The poses, finite.
         fraction: Position between them, from 0 (first) to 1 (second).
     """
     q, p = first.quaternion(), second.quaternion()

@@ -57,7 +57,13 @@ class RosSource(MessageSource):
         self, uri: str, container: Container, paths: list[Path], options: SourceOptions, *, live: bool = False
     ) -> None:
         """Open the source: choose topics and clock, read transforms and the first scan, and align measured
-        poses."""
+        poses.
+
+        Raises:
+            SourceError: It has no scans, none of the first ones can be read, or a topic chosen by the user
+                does not fit.
+            OSError: A file cannot be read.
+        """
         super().__init__(container)
         self._uri = uri
         self._channels = {channel.number: channel for channel in container.channels}
@@ -209,8 +215,8 @@ class RosSource(MessageSource):
     # --- opening ---------------------------------------------------------------------------------
 
     def _clock_offset(self, numbers: frozenset[int]) -> int | None:
-        """Return stamp minus time of recording of the first message of some channels [ns], None without a
-        stamp."""
+        """Return stamp minus time of recording of the first message of some channels [ns]; None without a
+        message, without a stamp, and for a stamp of 0."""
         for message in islice(self._container.messages(numbers, None, {}), 1):
             stamp_ns = header_stamp(self._channels[message.channel], message.payload)
             return stamp_ns - message.log_ns if stamp_ns else None

@@ -47,7 +47,11 @@ class Db3File(IndexedContainer):
     unreadable = "messages that the database cannot give"
 
     def __init__(self, path: Path) -> None:
-        """Open the database and read the index of all messages."""
+        """Open the database and read the index of all messages.
+
+        Raises:
+            SourceError: It is not a bag, or its tables cannot be read.
+        """
         self._path = path
         self.damage = {}
         # `immutable` keeps SQLite from writing a journal, which fails on a read-only disk.
@@ -74,7 +78,8 @@ class Db3File(IndexedContainer):
         self._database.close()
 
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
-        """Return the message in a row of the table, see `IndexedContainer._message`."""
+        """Return the message in row `place` of the table, with the channel and time [ns] of the index; None
+        if the database cannot give it."""
         try:
             found = self._database.execute("SELECT data FROM messages WHERE rowid = ?", (place,)).fetchone()
         except (sqlite3.Error, MemoryError):
@@ -130,6 +135,7 @@ def bag_files(folder: Path) -> list[Path]:
 
     Raises:
         SourceError: The files themselves are compressed, or there are several without metadata.yaml.
+        OSError: The folder cannot be read.
     """
     files = sorted((path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")), key=_natural)
     packed = sorted(path for path in folder.iterdir() if path.suffixes[-1:] == [".zstd"])
@@ -169,7 +175,11 @@ class BagFolder(IndexedContainer):
 
     def __init__(self, files: list[Path]) -> None:
         """Open all files; one that cannot be read is counted in `damage`. Channels of the n-th file (from 0)
-        are numbered from n times _STRIDE."""
+        are numbered from n times _STRIDE.
+
+        Raises:
+            SourceError: None of the files can be read.
+        """
         self.damage = {}
         self._parts: list[IndexedContainer] = []
         for path in files:
@@ -192,8 +202,11 @@ class BagFolder(IndexedContainer):
         self._set_index(channels, np.concatenate(index))
 
     def attachment(self, name: str, limit: int) -> bytes | None:
-        """Return the bytes of an attachment of any file, see `Container.attachment`. None if no file has
-        it."""
+        """Return the bytes of an attachment of the first file that has one of this name; None if none has.
+
+        Raises:
+            SourceError: It is longer than `limit` bytes or damaged.
+        """
         found = (part.attachment(name, limit) for part in self._parts)
         return next((content for content in found if content is not None), None)
 
@@ -203,7 +216,8 @@ class BagFolder(IndexedContainer):
             part.close()
 
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
-        """Return a message of the file to which its channel belongs, see `IndexedContainer._message`."""
+        """Return the message at a place of the file to which the channel belongs; None if it cannot be
+        read."""
         part, own = divmod(number, _STRIDE)
         message = self._parts[part]._message(own, log_ns, place)
         return None if message is None else replace(message, channel=number)
@@ -299,7 +313,13 @@ class BagFile(ChunkedFile):
         self._known[number] = Channel(number, topic, msgtype, "ros1")
 
     def _record(self, raw: bytes, at: int) -> tuple[Message | None, int]:
-        """Return the message of a record and its end, see `ChunkedFile._record`."""
+        """Return the message of the record at an offset in an unpacked chunk, None for another record, and
+        the offset of its end. A connection is added to the channels of the file.
+
+        Raises:
+            BrokenChunkError: The record is longer than the chunk, or has no header.
+            DAMAGE: It cannot be parsed.
+        """
         (header_size,) = LENGTH.unpack_from(raw, at)
         (length,) = LENGTH.unpack_from(raw, at + 4 + header_size)
         body = at + 8 + header_size

@@ -47,7 +47,7 @@ class LayoutError(Exception):
 
 
 def decode_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2, stamp_ns: int) -> Scan:
-    """Decode a PointCloud2 message of any layout.
+    """Decode a PointCloud2 message of any layout; `stamp_ns` is the time of the scan [ns].
 
     The time of a point is read from a field named t, time, timestamp, time_offset or offset_time: integers
     are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit inferred from
@@ -114,9 +114,10 @@ def _dtype(cloud: ros2.sensor_msgs__msg__PointCloud2, step: int) -> np.dtype[np.
 
 
 def decode_laser_scan(laser: ros2.sensor_msgs__msg__LaserScan, stamp_ns: int) -> Scan:
-    """Decode a LaserScan into a planar scan (z = 0, ring 0); the stamp is the time of its first beam.
+    """Decode a LaserScan into a planar scan (z = 0, ring 0); `stamp_ns` is the time of its first beam [ns].
 
-    Beams outside of range_min and range_max of the message are no returns.
+    Beams outside of range_min and range_max of the message are no returns; they count in `dropped`.
+    Intensities of another number than ranges, and beam times of a sweep of 2 s or more, are not used.
 
     Raises:
         LayoutError: Its angles or ranges are impossible.
@@ -307,6 +308,7 @@ class RecordDecoder:
 
         Raises:
             ValueError: The pose is not finite or its quaternion is zero.
+            Exception: Of many kinds, when the message is damaged.
         """
         pose = self.message(message).pose.pose
         return Odometry(stamp_ns, pose_of(pose.position, pose.orientation))
@@ -316,7 +318,8 @@ class RecordDecoder:
         is None if the message has none.
 
         Raises:
-            ValueError: A rate or an acceleration is not finite.
+            ValueError: A number is not finite, or a rate or an acceleration is 1e6 or more.
+            Exception: Of many kinds, when the message is damaged.
         """
         decoded: ros2.sensor_msgs__msg__Imu = self.message(message)
         linked = self._tree.find(self.base, frame_name(decoded.header.frame_id))

@@ -32,7 +32,7 @@ def clean_scan(
     Args:
         stamp_ns: Time of the scan [ns].
         points: Points in the sensor frame, shape (N, 3) [m].
-        reflectance: Reflectances, shape (N,), or None; numbers that are not finite are replaced.
+        reflectance: Reflectances, shape (N,), or None; NaN becomes 0, and infinite numbers are limited.
         ring: Ring numbers, shape (N,), or None.
         offset_ns: Times of the points after the stamp [ns], shape (N,), or None.
         dropped: Number of returns that were left out before; the rows left out here are added.
@@ -167,10 +167,11 @@ VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.
 
 
 def sensor_of(scan: Scan) -> Sensor:
-    """Infer the sensor from a scan: number of rings, their step in elevation, and the step in azimuth.
+    """Infer the sensor from a scan: number of rings, their step in elevation, and the step in azimuth; the
+    range sigma is 0.03 m.
 
     Without a ring column only a VLP-16 is recognised, by its elevations; else `rings` is 0, as it is with
-    fewer than 100 points.
+    fewer than 100 points. Steps that are unknown are those of `Sensor`.
     """
     if len(scan.points) < 100:
         return Sensor(range_sigma=0.03)
@@ -194,7 +195,8 @@ def sensor_of(scan: Scan) -> Sensor:
 
 
 def _in_steps_of_vlp_16(scan: Scan) -> bool:
-    """Return whether nearly all returns have odd degrees of elevation, -15 to 15, in four rings or more."""
+    """Return whether nearly all returns beyond 3 m have odd degrees of elevation, -15 to 15, in four rings or
+    more; False for fewer than 100."""
     points = scan.points.astype(np.float64)
     reach = np.hypot(points[:, 0], points[:, 1])
     # The lasers are up to 11 mm above and below the centre, which blurs the angles of near returns.
@@ -215,7 +217,8 @@ def rings_descend(scan: Scan) -> bool:
 
 
 def _elevations(scan: Scan) -> Float:
-    """Return the median elevation [rad] of each ring, NaN for rings with few points, shape (rings,)."""
+    """Return the median elevation [rad] of each ring, NaN for one with fewer than _RING_POINTS points, shape
+    (rings,). The scan has points and ring numbers."""
     ring = np.asarray(scan.ring, dtype=np.int64)
     points = scan.points.astype(np.float64)
     angle = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
@@ -228,8 +231,8 @@ def _elevations(scan: Scan) -> Float:
 
 
 def _azimuth_step(scan: Scan) -> float:
-    """Return the median angle between neighbouring returns of a ring [rad], 0 if it is unknown. The scan has
-    ring numbers."""
+    """Return the median angle between neighbouring returns of a ring [rad], without equal azimuths and holes;
+    0 for fewer than _RING_POINTS such angles. The scan has ring numbers."""
     steps = []
     ring = np.asarray(scan.ring)
     azimuth = np.arctan2(scan.points[:, 1].astype(np.float64), scan.points[:, 0].astype(np.float64))

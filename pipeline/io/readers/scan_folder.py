@@ -53,8 +53,12 @@ class ScanFolder(FileSource):
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
-        """Find the scan files, read the files of times and poses, and load the first scan that can be
-        read."""
+        """Find the scan files, read the files of times and poses, and load the first scan that can be read.
+
+        Raises:
+            SourceError: There are no files, or none of the first ones holds a scan.
+            OSError: The folder cannot be read.
+        """
         super().__init__()
         self._suffix, self._files = _scan_files(path)
         self._kind, self._load, sensor_of_first = FORMATS[self._suffix]
@@ -222,7 +226,8 @@ class ScanFolder(FileSource):
 
 def _scan_files(path: Path) -> tuple[str, list[Path]]:
     """Return the suffix of the scans in a folder, or in its folder `velodyne` if it has no .bin file itself,
-    and the files with this suffix by number or time; only `path` if that is a file."""
+    and the files with this suffix by number or time; only `path` if that is a file. Without .bin files it is
+    .pcd, or else the most frequent suffix of a scan; there may be no files. OSError if it cannot be read."""
     if path.is_file():
         return path.suffix.lower() if path.suffix.lower() == ".bin" else ".pcd", [path]
     inside = path / "velodyne"
@@ -297,18 +302,19 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 
 def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a PCD, PLY or NumPy file as a scan; arguments as in `load_bin`. Rows of NaN in organised clouds
-    are no returns.
+    """Read a PCD, PLY or NumPy file as a scan at a time [ns]. Rows of NaN in organised clouds are no returns;
+    points that the file promises but does not hold are counted in `losses`, in place.
 
     Raises:
-        ScanFileError: See `read_columns`.
+        ScanFileError: It is damaged, has no x, y and z, or promises more than POINT_LIMIT points.
         OSError: It cannot be read.
     """
     return scan_of(stamp_ns, read_columns(path, losses))
 
 
 def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a LAS or LAZ file as a scan; arguments as in `load_bin`. Its coordinates are in the sensor frame.
+    """Read a LAS or LAZ file as a scan of positions only at a time [ns]. Its coordinates are in the sensor
+    frame; points that are missing, withheld or without coordinates are counted in `losses`, in place.
 
     Raises:
         ScanFileError: It is damaged or too large.

@@ -122,6 +122,11 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
 def open_cloud_drive(uri: str, file: Path, options: SourceOptions) -> SimulatedSource:
     """Open a whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
 
+    Args:
+        uri: As the user wrote it.
+        file: The cloud.
+        options: Choices of the user, of which seed and extrinsics count.
+
     Raises:
         SourceError: It cannot be read, or has no path for a robot.
     """

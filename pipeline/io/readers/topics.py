@@ -114,9 +114,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())
     if unknown:
         raise SourceError(f"there is no role {unknown[0]!r} for a topic", where=where, remedy=f"Use {ROLES}.")
-    chosen = {
-        role: _choose(_free(topics, role, wanted), role, wanted.get(role), where) for role in TYPES_BY_ROLE
-    }
+    chosen = {role: _choose(topics, role, wanted, where) for role in TYPES_BY_ROLE}
     if chosen["scan"] is None:
         types = " or ".join(TYPES_BY_ROLE["scan"])
         raise SourceError(
@@ -130,19 +128,6 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
 def _role_of(topic: Topic) -> str:
     """Return the first role that the type of a topic fits, "" without one."""
     return next((role for role, types in TYPES_BY_ROLE.items() if topic.msgtype in types), "")
-
-
-def _free(topics: list[Topic], role: str, wanted: Mapping[str, str]) -> list[Topic]:
-    """Return the topics that may have a role: all, but for the role "odometry" not the topic that the user
-    chose as pose of another SLAM.
-
-    Args:
-        topics: Topics of the recording.
-        role: The role.
-        wanted: Topic by role where the user named it.
-    """
-    taken = wanted.get("pose") if role == "odometry" else None
-    return [topic for topic in topics if topic.name != taken]
 
 
 def _why_not(topic: Topic, chosen: Topic | None) -> str:
@@ -181,21 +166,23 @@ def _group(channels: Iterable[Channel]) -> list[Topic]:
     ]
 
 
-def _choose(topics: list[Topic], role: str, name: str | None, where: str) -> Topic | None:
+def _choose(topics: list[Topic], role: str, wanted: Mapping[str, str], where: str) -> Topic | None:
     """Return the topic of a role; None if there is none with messages. A planar laser is chosen only without
-    another scan topic.
+    another scan topic, and the pose of another SLAM is not odometry.
 
     Args:
-        topics: Topics that may have the role.
+        topics: Topics of the recording.
         role: The role.
-        name: Topic chosen by the user, which may have no messages; None for none. Without one the role "pose"
+        wanted: Topic by role chosen by the user, which may have no messages. Without a choice the role "pose"
             has no topic.
         where: Name of the recording in errors.
 
     Raises:
         SourceError: The topic chosen by the user does not exist or has another type.
     """
-    types = TYPES_BY_ROLE[role]
+    types, name = TYPES_BY_ROLE[role], wanted.get(role)
+    taken = wanted.get("pose") if role == "odometry" else None
+    topics = [topic for topic in topics if topic.name != taken]
     fitting = [topic for topic in topics if topic.msgtype in types and (name is None or topic.name == name)]
     if name is not None and not fitting:
         there = any(topic.name == name for topic in topics)

@@ -99,8 +99,9 @@ def write_tree_manager(folder: Path, path: MapPath, trees: Trees, reach: float) 
 
 
 def _write(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
-    """Write the files of a mapped run into an existing folder; return the number of confirmed trees that are
-    in no frame. Arguments as in `write_tree_manager`.
+    """Write the files of a mapped run into an existing folder: the trajectory, and for each pose a frame with
+    the confirmed trees that were seen until then within `reach` [m]. Return the number of confirmed trees
+    that are in no frame.
 
     Raises:
         OSError: The disk refuses.
@@ -160,7 +161,13 @@ class TreeManagerSource(FileSource):
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
-        """Read the trajectory and the first frame, and check the sizes of all files."""
+        """Read the trajectory and the first frame, and check the sizes of all files.
+
+        Raises:
+            SourceError: There is no TreeManagerState file, the trajectory is missing, damaged or too short,
+                the first file lacks a column of positions, or a file is too large.
+            OSError: The folder cannot be read.
+        """
         super().__init__()
         numbered = sorted(
             (int(match.group(1)), file) for file in path.iterdir() if (match := NAME.fullmatch(file.name))
@@ -232,7 +239,8 @@ class TreeManagerSource(FileSource):
 
 
 def _read_frame(file: Path, uri: str) -> tuple[Float, dict[str, int], int]:
-    """Read the table of a file: its rows, the index of each column, and the number of damaged rows.
+    """Read the table of a file: its rows, shape (N, columns), with NaN for empty fields; the index of each
+    column by name; and the number of damaged rows.
 
     Raises:
         SourceError: It is too large, or its header lacks a column.
@@ -263,7 +271,8 @@ def _too_large(file: Path, uri: str) -> SourceError:
 
 
 def _axes(table: Float, at: dict[str, int]) -> Float:
-    """Return unit vectors along the stems, upwards, shape (N, 3); NaN for invalid ones.
+    """Return unit vectors along the stems, upwards, shape (N, 3); NaN for a length that differs from 1 by 0.1
+    or more, and for all if a column is missing.
 
     Args:
         table: Rows of the file, shape (N, columns).
@@ -279,7 +288,8 @@ def _axes(table: Float, at: dict[str, int]) -> Float:
 
 
 def _dbh(table: Float, at: dict[str, int]) -> Float:
-    """Return diameters [m], shape (N,); NaN for missing or impossible ones. Arguments as in `_axes`."""
+    """Return the diameters in a table [m], shape (N,); NaN for missing ones and those that are not between 0
+    and DBH_LIMIT. `at` is the index of each column by name."""
     if DBH not in at:
         return np.full(len(table), np.nan)
     dbh = table[:, at[DBH]]

@@ -75,7 +75,8 @@ class Rotation:
         self._stamp_ns = self._turned = 0
 
     def begins(self, azimuth: int, stamp_ns: int) -> bool:
-        """Process the next packet; return whether a sweep begins with it, which the first one does not do.
+        """Process the next packet; return whether a sweep begins with it: after a full turn, or a pause of
+        more than GAP_NS; the first packet begins none.
 
         Args:
             azimuth: Azimuth of its first block [0.01 degrees].
@@ -182,7 +183,12 @@ class PcapSource(FileSource):
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
         """Index the packets of the file and group them to sweeps. Only packets of the sender and model with
-        the most packets are used; the others are counted in `losses`. The file stays open until `close`."""
+        the most packets are used; the others are counted in `losses`. The file stays open until `close`.
+
+        Raises:
+            SourceError: It is not a capture, or has no packets of a known sensor.
+            OSError: It cannot be read.
+        """
         super().__init__()
         self._path = path
         packets, self._damage = find_packets(path)
@@ -330,7 +336,8 @@ def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]
         buffer: Bytes of the file.
         at, end: Position of the captured bytes.
         link: Bytes before the IP header.
-        losses: Counts other packets to the LiDAR's port.
+        losses: Counts other packets to the LiDAR's port, and data packets that the capture has cut; changed
+            in place.
     """
     ip = at + link
     if link == _ETHERNET and buffer[at + 12 : at + 14] == b"\x81\x00":

@@ -99,7 +99,12 @@ class VictoriaParkSource(FileSource):
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
-        """Read the whole zip; scans are made in `records`."""
+        """Read the whole zip; scans are made in `records`.
+
+        Raises:
+            SourceError: It is a different zip, damaged, or too large when unpacked.
+            OSError: The file becomes unreadable after it was unpacked.
+        """
         super().__init__()
         members = _unpack(path, uri)
         self._scan_ns, self._ranges = self._read_laser(members["laser.txt"], uri)
@@ -223,10 +228,11 @@ class VictoriaParkSource(FileSource):
         return table
 
     def _ascending(self, table: Float, reason: str) -> Float:
-        """Return the rows with finite numbers whose times are in [0, _LONGEST_S) and do not go back.
+        """Return the rows with finite numbers whose times are in [0, _LONGEST_S) and do not go back; there
+        may be none.
 
         Args:
-            table: Rows with the time in the first column.
+            table: Rows, shape (N, columns), with the time in the first column [s].
             reason: Reason under which the other rows are counted as losses.
         """
         time = table[:, 0]

@@ -237,7 +237,12 @@ class LiveWriter(_RosWriter):
     def __init__(
         self, stream: Stream, channels: Sequence[Channel], header: Mapping[str, Any], robot: str
     ) -> None:
-        """Write the head of the file and define the channels of robot and outputs."""
+        """Write the head of the file and define the channels of robot and outputs, whose topics begin with
+        /ROBOT/stemmap/, or /stemmap/ without a name.
+
+        Raises:
+            OSError: The disk refuses.
+        """
         content = json.dumps({"version": VERSION, **header}).encode()
         super().__init__(stream, LIVE_CHUNK_SIZE, NAME, content)
         self._numbers = {c.number: self._channel(c.topic, c.msgtype) for c in channels}
@@ -286,7 +291,8 @@ class LiveWriter(_RosWriter):
         self._write(self._parameters, self._last_ns, messages.text(text))
 
     def add_skipped(self, times_by_topic: Mapping[str, Sequence[int]]) -> None:
-        """Write which messages the mapping did not use: log times [ns] by topic.
+        """Write which messages the mapping did not use: log times [ns] by topic. The log time of this note,
+        as of parameters and outputs, is that of the last message of the robot.
 
         Raises:
             OSError: The disk refuses.

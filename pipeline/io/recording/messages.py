@@ -1,5 +1,5 @@
 """Records as standard ROS 2 messages in CDR, as Foxglove and ROS 2 read them, and the parts of such
-messages."""
+messages. A time that ROS cannot represent raises the error of `header`."""
 
 from __future__ import annotations
 
@@ -102,6 +102,9 @@ def point_cloud(scan: Scan) -> Message:
 
     `time` [s after the stamp] is a float32, as in the driver, and too coarse for nanoseconds; so `t` (int32)
     follows it, which is `offset_ns`. Columns that the scan does not have are left out. The frame is LIDAR.
+
+    Raises:
+        StemmapError: ROS cannot represent the time.
     """
     columns: list[tuple[str, str, int, NDArray[Any]]] = [
         (name, "<f4", _FLOAT32, scan.points[:, axis]) for axis, name in enumerate("xyz")
@@ -136,14 +139,22 @@ def point_cloud(scan: Scan) -> Message:
 
 
 def odometry(record: Odometry) -> Message:
-    """Return a nav_msgs/Odometry: the pose of base_link in odom. Covariances and twist are zero."""
+    """Return a nav_msgs/Odometry: the pose of base_link in odom. Covariances and twist are zero.
+
+    Raises:
+        StemmapError: ROS cannot represent the time.
+    """
     T = record.T_odom_base
     return odometry_of(header(record.stamp_ns, ODOM), BASE, pose(T.t, T.quaternion()), np.zeros(36))
 
 
 def imu(record: Imu) -> Message:
     """Return a sensor_msgs/Imu in base_link; without an orientation its covariance begins with -1 and the
-    orientation is the identity. Other covariances are zero."""
+    orientation is the identity. Other covariances are zero.
+
+    Raises:
+        StemmapError: ROS cannot represent the time.
+    """
     unknown = np.zeros(9)
     if record.orientation is None:
         unknown[0] = -1.0
@@ -161,18 +172,25 @@ def imu(record: Imu) -> Message:
 
 
 def compressed_image(stamp_ns: int, data: bytes) -> Message:
-    """Return a sensor_msgs/CompressedImage of a JPEG."""
+    """Return a sensor_msgs/CompressedImage of the bytes of a JPEG, frame CAMERA.
+
+    Raises:
+        StemmapError: ROS cannot represent the time.
+    """
     pixels = np.frombuffer(data, np.uint8)
     return make("sensor_msgs/CompressedImage", header=header(stamp_ns, CAMERA), format="jpeg", data=pixels)
 
 
 def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) -> Message:
-    """Return a sensor_msgs/CameraInfo of a pinhole camera without distortion.
+    """Return a sensor_msgs/CameraInfo of a pinhole camera without distortion, frame CAMERA.
 
     Args:
         stamp_ns: Time [ns].
         width, height: Size of its pictures [pixels].
         K: Camera matrix, shape (3, 3) [pixels].
+
+    Raises:
+        StemmapError: ROS cannot represent the time.
     """
     return make(
         "sensor_msgs/CameraInfo",
@@ -196,7 +214,11 @@ def text(content: str) -> bytes:
 
 
 def transform(stamp_ns: int, parent: str, child: str, T_parent_child: Pose3) -> Message:
-    """Return a tf2_msgs/TFMessage with one transform, that of the frame `child` in the frame `parent`."""
+    """Return a tf2_msgs/TFMessage with one transform, that of the frame `child` in the frame `parent`.
+
+    Raises:
+        StemmapError: ROS cannot represent the time.
+    """
     moved = make(
         "geometry_msgs/Transform",
         translation=vector(*T_parent_child.t),

@@ -12,8 +12,7 @@ import numpy as np
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers.ros_messages import standard_types
 from pipeline.io.recording.messages import BASE, encode, header, make, odometry_of, pose, vector
-from pipeline.types.clearance import Clearance, Zone
-from pipeline.types.records import Frame, Path, Trees
+from pipeline.types.records import Clearance, Frame, Path, Trees, Zone
 
 MAP = "map"
 #: A longer path is thinned evenly, because it is published every second.
@@ -47,12 +46,13 @@ def type_hash(topic: str) -> str:
 
 
 def scan_messages(frame: Frame) -> dict[str, bytes]:
-    """Return the messages of a scan by topic, in CDR: pose and clearance."""
-    return pose_messages(frame) | way_messages(frame.clearance, frame.stamp_ns)
+    """Return the messages of a scan by topic, in CDR: those of `pose_messages` and `clearance_messages`."""
+    return pose_messages(frame) | clearance_messages(frame.clearance, frame.stamp_ns)
 
 
-def way_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]:
-    """Return the clearance and its zone by topic, in CDR; empty for None, when obstacles are not detected.
+def clearance_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]:
+    """Return the messages of a clearance by topic, in CDR: CLEARANCE (the distance ahead) and ZONE; empty for
+    None, when obstacles are not detected.
 
     By REP 117 a range is infinite without an obstacle; it is NaN where the sensor has no view. A time [ns]
     that ROS cannot represent is limited.
@@ -60,7 +60,7 @@ def way_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]
     if clearance is None:
         return {}
     seen = clearance.zone is not Zone.UNKNOWN
-    way = make(
+    distance = make(
         "sensor_msgs/Range",
         header=_header(stamp_ns, BASE),
         radiation_type=_INFRARED,
@@ -70,11 +70,12 @@ def way_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]
         range=clearance.ahead if seen else float("nan"),
         variance=0.0,
     )
-    return {CLEARANCE: encode(way), ZONE: encode(make("std_msgs/UInt8", data=int(clearance.zone)))}
+    return {CLEARANCE: encode(distance), ZONE: encode(make("std_msgs/UInt8", data=int(clearance.zone)))}
 
 
 def pose_messages(frame: Frame) -> dict[str, bytes]:
-    """Return the pose at a scan by topic, in CDR: with and without its covariance."""
+    """Return the pose at a scan by topic, in CDR: POSE, and ODOMETRY with its covariance. A time [ns] that
+    ROS cannot represent is limited."""
     T, covariance = frame.estimate.T_map_base, np.zeros((6, 6))
     rows = np.array([0, 1, 5])  # x, y and yaw of x, y, z, roll, pitch, yaw
     covariance[np.ix_(rows, rows)] = frame.estimate.covariance
@@ -84,14 +85,15 @@ def pose_messages(frame: Frame) -> dict[str, bytes]:
 
 
 def map_messages(frame: Frame, path: Path) -> dict[str, bytes]:
-    """Return path (at most MOST_POSES poses) and confirmed trees at a scan by topic, in CDR."""
+    """Return the map at a scan by topic, in CDR: PATH (at most MOST_POSES poses), and the confirmed trees as
+    TREES and DETECTIONS."""
     head = _header(frame.stamp_ns)
     return {PATH: encode(_path(path, head)), **tree_messages(frame.trees, head)}
 
 
 def tree_messages(trees: Trees, head: Any) -> dict[str, bytes]:  # noqa: ANN401
-    """Return the confirmed trees by topic, in CDR: markers, of which the first deletes all earlier ones, and
-    detections.
+    """Return the confirmed trees by topic, in CDR: TREES, markers of which the first deletes all earlier
+    ones, and DETECTIONS.
 
     Args:
         trees: The map.
@@ -189,7 +191,8 @@ def _marker(
 
 
 def _detection(trees: Trees, row: int, head: Any) -> Any:  # noqa: ANN401
-    """Return a vision_msgs/Detection3D of the tree in a row; an unknown diameter has the width 0."""
+    """Return a vision_msgs/Detection3D of the tree in a row, with the fixed height STEM_HEIGHT; an unknown
+    diameter has the width 0."""
     x, y = (float(value) for value in trees.position[row])
     covariance = np.zeros((6, 6))
     covariance[:2, :2] = trees.covariance[row]

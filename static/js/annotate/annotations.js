@@ -59,11 +59,13 @@ export function callMe(name) {
   signAs(myName());
 }
 
-const call = (method, where, fields = {}) => request(`/api/annotations${where}`, { method, headers: { "Content-Type": "application/json" },
+// Requests an edit of this browser.
+export const send = (method, path, fields = {}) => request(path, { method, headers: { "Content-Type": "application/json" },
   body: JSON.stringify({ run: state.annotations?.run, browser: me, who: myName(), ...fields }) });
+const call = (method, where, fields) => send(method, `/api/annotations${where}`, fields);
 
 // Edits are sent one at a time; each has come back before the next one is sent.
-function edit(work) {
+export function edit(work) {
   last = last.then(async () => {
     try {
       const done = await work();
@@ -173,6 +175,12 @@ export const unreviewed = () => trees().filter((tree) => !isReviewed(tree)).sort
 
 export const isReviewed = (tree) => (annotationOf(tree)?.kind ?? SKIPPED) !== SKIPPED;
 
+// "3 of 52 trees reviewed" where trees without annotation would count as wrong although nobody has looked at them; else "".
+export function reviewProgress() {
+  const left = state.annotations?.used === "annotations" ? unreviewed().length : 0;
+  return left ? `${trees().length - left} of ${count(trees().length, "tree")} reviewed` : "";
+}
+
 export function votesText({ number }) {
   const of = votes.of.get(number);
   if (!of || of.votes === null) return "";
@@ -259,7 +267,7 @@ export function truthText() {
   const number = rows().length;
   return {
     source: `Scored against the ground truth of this run${number ? "; annotations do not count" : ""}.`,
-    annotations: "Scored against the annotations. A found tree without annotation counts as wrong.",
+    annotations: reviewProgress() ? `Scored against the annotations; ${reviewProgress()}. The other figures follow when all are.` : "Scored against the annotations.",
     both: `Scored against the ground truth of this run, corrected by ${count(number, "annotation")}.`,
   }[state.annotations?.used] ?? "";
 }

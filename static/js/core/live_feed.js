@@ -35,6 +35,10 @@ function receiveMap({ path, ...map }) {
   if (path.start === 0) state.odometry.length = 0; // another run
   state.map = map.index < 0 ? null : map; // -1: another run is opening and nothing of it is mapped yet
   if (map.odom) state.odometry[map.index] = map.odom;
+  if (!state.map && state.selectedTruth) {
+    state.selectedTruth = null; // an object of the former run
+    changed("selection");
+  }
 }
 
 // An answer to an earlier click must not undo a later one.
@@ -70,7 +74,7 @@ export function select(tree) {
   if (!sendMessage({ type: "select", tree })) return;
   // A tree that is selected already gets no answer; waiting for one would hide the next selection made elsewhere.
   if (state.selected !== tree || state.selectedCluster) chosen = { tree, until: performance.now() + ANSWER_WAIT };
-  Object.assign(state, { selected: tree, selectedCluster: null, place: null });
+  Object.assign(state, { selected: tree, selectedCluster: null, selectedTruth: null, place: null });
   changed("selection");
 }
 

@@ -5,7 +5,7 @@ import { byId, el } from "./dom.js";
 import { showProblem } from "./problem.js";
 
 // Controls that change something for everybody or give the server work. Of the panels only the contents, so that they scroll.
-const CONTROLS = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open"];
+const CONTROLS = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open", "#plots-edit"];
 const PANELS = ["panel-annotate", "panel-tune"];
 
 export let access = { role: "owner", viewer_link: null, robots: null };
@@ -39,5 +39,5 @@ export async function startAccess() {
   end.prepend(el("span", { id: "looks-only", class: "looks-only", text: "View only", title: "This is a view-only link. Ask the owner of this dashboard for a link with write access" }));
   // The panel of sliders in the scene belongs to viser; a veil over it shows that it is disabled.
   document.querySelector(".scene")?.append(el("div", { class: "veil", title: "View only: parameters cannot be changed" }));
-  for (const id of ["welcome-open", "welcome-robot"]) if (byId(id)) byId(id).hidden = true;
+  for (const id of ["welcome-open", "welcome-robot", "welcome-sliders"]) if (byId(id)) byId(id).hidden = true;
 }

@@ -8,7 +8,7 @@ export const state = {
   odometry: [],      // [x, y] by scan index; holes where the page was not connected
   truth: null,       // ground truth trees
   evaluation: null,  // the map scored against the ground truth
-  annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}], skipped: likewise}
+  annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}], skipped: likewise, plots, georeference}
   learning: null,    // {state, words, learned}: decision trees being trained from annotations
   parameters: null,  // {preset, set, revision, undo, redo, values, changed}
   sets: null,        // {sets: [{name, who, at_s}]}: saved sets of parameters
@@ -16,6 +16,7 @@ export const state = {
   selected: null,    // number of the selected tree
   place: null,       // [x, y, z] of the selection on the ground, once the server has answered
   selectedCluster: null, // {scan, cluster, verdict, x, y} as it was when selected
+  selectedTruth: null, // object of the ground truth without a tree or a cluster of this scan, when clicked
   view: null,        // layers and choices of the 3D scene
   ghost: null,       // `remapped` or `rough` while the previous map is drawn as an overlay
   compare: null,     // clusters of the current scan by set A and by set B, while they are compared
@@ -34,7 +35,7 @@ export const state = {
 // --- selectors ---------------------------------------------------------------------------------
 
 export const trees = () => state.map?.trees ?? [];
-const treeOf = (number) => trees().find((tree) => tree.number === number) ?? null;
+export const treeOf = (number) => trees().find((tree) => tree.number === number) ?? null;
 export const selectedTree = () => treeOf(state.selected);
 export const isCloud = () => Boolean(state.status?.cloud);
 export const isPlaying = () => state.status?.state === "playing";

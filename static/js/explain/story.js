@@ -11,6 +11,7 @@ import { onSceneLoad } from "../scene/scene.js";
 import { openTab, visible } from "../shell/tabs.js";
 import { clusterStory, clusterTitle } from "./cluster.js";
 import { treeStory } from "./tree.js";
+import { truthStory } from "./truth.js";
 
 const EVERY = 1000; // [ms] between two updates of a tree while the run plays
 const RETRY = 3000; // [ms] after a failed request
@@ -34,7 +35,7 @@ async function show() {
   if (!visible("story")) return;
   const subject = wanted();
   showHead(subject?.kind);
-  if (!subject) return showEmpty();
+  if (!subject) return state.selectedTruth ? showTruth(state.selectedTruth) : showEmpty();
   markOld(subject);
   if (`${subject.name} ${subject.version}` === shown) return;
   if (busy) { again = true; return; }
@@ -87,6 +88,17 @@ function showEmpty() {
     : nothingYet() }));
 }
 
+// An object of the ground truth without a cluster: there is no verdict in this scan, but other scans may have one.
+function showTruth(truth) {
+  const name = `truth ${truth.x} ${truth.y} ${state.map?.index}`;
+  if (shown === name) return;
+  shown = name;
+  panel().dataset.story = "truth";
+  body().classList.remove("old");
+  panel().querySelector(".story-wait").hidden = true;
+  body().replaceChildren(...truthStory(truth));
+}
+
 function chooseCluster(scan, cluster) {
   prefers = "cluster";
   selectCluster(scan, cluster);
@@ -129,7 +141,11 @@ export function startStory() {
   panel().append(el("div", { class: "story-head" }), el("p", { class: "story-wait note dim", role: "status", hidden: true }), el("div", { class: "story-body" }));
   on("selection", onSelection);
   on("map", update);
-  on("status", () => { if (state.status?.state !== "playing") update(); });
+  on("status", () => {
+    if (state.status?.state === "playing") return;
+    update();
+    if (state.selectedTruth) show();
+  });
   on("tab", () => show());
   on("missing", onMissing);
   onSceneLoad((inner) => inner.addEventListener("pointerdown", () => { clickedAt = performance.now(); }, { capture: true }));

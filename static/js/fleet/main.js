@@ -30,7 +30,7 @@ function showMembers(message) {
   }
   for (const member of members) {
     if (!cards.has(member.name)) {
-      cards.set(member.name, card(member.name, placeOf(member.name), member.remote));
+      cards.set(member.name, card(member.name, placeOf(member.name)));
       byId("cards").append(cards.get(member.name).node);
     }
     fillCard(cards.get(member.name), member);
@@ -75,7 +75,7 @@ const FIGURES = {
 };
 const NO_FIGURES = ["starting", "failed"];
 
-function card(name, place, remote) {
+function card(name, place) {
   const cells = {};
   const list = el("dl", {}, ...Object.entries(FIGURES).map(([key, [title]]) => {
     cells[key] = { value: el("dd", { text: NONE }) };
@@ -86,8 +86,7 @@ function card(name, place, remote) {
   const canvas = el("canvas", { role: "img", "aria-label": `Map of ${name}` });
   const words = el("p", { class: "words" });
   const foot = el("span", {});
-  const link = remote ? el("span", { class: "dim", text: "Mapped on the robot" })
-    : el("a", { class: "small", href: `/robots/${encodeURIComponent(name)}`, text: "Open its dashboard", hidden: true });
+  const link = el("a", { class: "small", href: `/robots/${encodeURIComponent(name)}`, text: "Open its dashboard", hidden: true });
   const node = el("article", { class: "card", "data-robot": name, "aria-label": name },
     el("h2", {}, el("i", { "aria-hidden": "true", text: letterOf(place) }), name), canvas, state, el("small", { class: "source" }), list, words,
     el("div", { class: "foot" }, foot, link));
@@ -104,7 +103,7 @@ function fillCard(made, member) {
     setText(made.cells[key].value, text);
     made.cells[key].cell.className = meaning ?? "";
   }
-  made.link.hidden = !member.remote && !member.answers; // the dashboard of a robot that does not answer yet cannot be opened
+  made.link.hidden = !member.answers; // the dashboard of a robot that does not answer yet cannot be opened
   setText(made.words, wordsOf(member));
   made.words.classList.toggle("bad", member.state === "failed");
   const lost = member.recording.startsWith("not");

@@ -1,6 +1,6 @@
 // The 2D map of the dashboard: hover, select, measure and annotate.
 
-import { draft } from "../annotate/annotations.js";
+import { annotating, draft, rows as annotations } from "../annotate/annotations.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "../annotate/pointer.js";
 import { drawSection } from "../annotate/section.js";
 import { byId } from "../core/dom.js";
@@ -9,12 +9,16 @@ import { dbhText, heightText, NONE, seenText } from "../core/format.js";
 import { select, selectCluster } from "../core/live_feed.js";
 import { nearest } from "../core/nearest.js";
 import { clusters, isCloud, on, state, trees } from "../core/store.js";
+import { throttled } from "../core/timing.js";
 import { openStory } from "../explain/story.js";
+import { drawPlots } from "../plots/draw.js";
+import { clickOn, dragTo, drawing, hoverTo, plots, pressAt, release } from "../plots/plots.js";
 import { drawMap, treeAt } from "./draw.js";
 import { boundsOf, MapCanvas } from "./map_canvas.js";
 import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
 
 const BUTTONS_HEIGHT = 54; // [px] at the upper edge
+const LEGEND_EVERY = 500; // [ms] between two updates
 const POINT_REACH = 9; // [px] around clusters and ground truth
 const canvas = byId("map");
 
@@ -26,16 +30,18 @@ const map = new MapCanvas(canvas, {
   paint(pen, view) {
     drawSection(pen, view);
     drawMap(pen, view, state);
+    drawPlots(pen, view);
     drawAnnotations(pen, view);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
     canvas.setAttribute("aria-label", `Map: ${trees().length} trees${isCloud() ? "" : " and the robot's path"}. The table below lists the trees.${measured}`);
   },
   gestures: {
-    press: (at) => measuring() || grab(at, map.view),
-    drag: (at, travelled) => drag(at, map.view, travelled),
-    release: drop,
-    hover: (at) => (measuring() ? measureTowards(snapped(at)) : hoverAt(at, map.view)),
+    press: (at) => pressAt(at, map.view) || measuring() || grab(at, map.view),
+    drag: (at, travelled) => dragTo(at, map.view, travelled) || drag(at, map.view, travelled),
+    release: () => release() || drop(),
+    hover: (at) => hoverTo(at, map.view) || (measuring() ? measureTowards(snapped(at)) : hoverAt(at, map.view)),
     click: (at) => {
+      if (clickOn(at, map.view)) return;
       if (measuring()) measureAt(snapped(at));
       else if (!clickAt(at, map.view, treeAt(trees(), at, map.view))) choose(at);
     },
@@ -51,8 +57,8 @@ const truthAt = (at) => nearest(state.truth ?? [], gapTo(at), POINT_REACH);
 
 function describe(at) {
   const [tree, truth, cluster] = [treeAt(trees(), at, map.view), truthAt(at), clusterAt(at)];
-  canvas.classList.toggle("hits", Boolean(tree ?? cluster));
-  if (draft.adding || !(tree ?? truth ?? cluster)) return "";
+  canvas.classList.toggle("hits", Boolean(tree ?? cluster ?? truth));
+  if (draft.adding || drawing() || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isCloud() ? `height ${heightText(tree)}` : seenText(tree));
   else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
@@ -74,6 +80,14 @@ function snapped(at) {
   return { x, y };
 }
 
+// The legend names what the map shows.
+function showLegend() {
+  const kinds = (state.truth ?? []).map(({ kind }) => kind);
+  const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"), plot: plots().length,
+    hollow: trees().some((tree) => tree.dbh_cm === null), annotation: annotating() && annotations().length };
+  for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
+}
+
 function choose(at) {
   const cluster = clusterAt(at);
   let tree = treeAt(trees(), at, map.view);
@@ -85,7 +99,11 @@ function choose(at) {
   } else if (!tree && cluster) {
     openStory("cluster");
     selectCluster(state.map.index, cluster.row);
-  } else select(null);
+  } else {
+    select(null);
+    state.selectedTruth = truthAt(at);
+    if (state.selectedTruth) openStory("truth");
+  }
 }
 
 // Position on the canvas [px] of a place in the map [m].
@@ -103,5 +121,6 @@ export function startMap() {
   byId("map-csv").addEventListener("click", () => saveCsv("map.csv", tableOfMap()));
   byId("map-fit").addEventListener("click", () => map.fit());
   on("annotating", showNextToReview);
-  on("map truth filter selection measure tab annotations annotating section compare ghost theme", map.redraw);
+  on("map truth annotations tab", throttled(showLegend, LEGEND_EVERY));
+  on("map truth filter selection measure tab annotations annotating sketch section compare ghost theme", map.redraw);
 }

@@ -4,6 +4,7 @@ import { get, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital } from "../core/format.js";
 import { on, state } from "../core/store.js";
+import { parametersText } from "../playback/timeline.js";
 import { chosenFor, startInside } from "./source_options.js";
 import { startUpload } from "./upload.js";
 
@@ -19,6 +20,9 @@ export async function openSources(begin = "") {
   const address = byId("source-uri");
   if (typeof begin === "string" && begin) address.value = begin;
   showChoice();
+  const { changed: values = [] } = state.parameters ?? {};
+  byId("source-parameters").hidden = !values.length;
+  setText(byId("source-parameters"), values.length ? `The run opens with the parameters in force: ${parametersText()}. Reset all in Tune returns to the preset.` : "");
   address.focus();
   try {
     list(await get("/api/sources"));
@@ -28,18 +32,27 @@ export async function openSources(begin = "") {
 }
 
 function list({ scenarios = [], recordings = [] }) {
-  const simulated = scenarios.map(({ uri, doc }) => entry(uri, uri, doc));
+  const simulated = scenarios.map(({ uri, doc }) => entry(uri, uri, doc, () => withOptions(uri)));
   const recorded = recordings.map((each) => {
     const uri = each.uri ?? each;
     return entry(uri, each.name ?? uri.split("/").pop(), each.doc ?? "");
   });
   byId("source-list").replaceChildren(
     ...(recorded.length ? [el("h3", { text: "Recordings in the data folder" }), ...recorded] : []),
-    ...(simulated.length ? [el("h3", { text: "Simulated, with ground truth" }), ...simulated] : []));
+    ...(simulated.length ? [el("h3", { text: "Simulated, with ground truth" }),
+      el("p", { class: "source-options" }, option("seed", "Seed", "0", "1"), option("duration", "Duration s", "1", "0.1", "3600")), ...simulated] : []));
 }
 
-const entry = (uri, title, doc) =>
-  el("button", { type: "button", onclick: () => (isWholeCloud(uri) ? offerChoice(uri) : ask(uri)) }, el("b", { text: title }), el("span", { text: doc }));
+const option = (name, title, min, step, max) => el("label", {}, `${title} `, el("input", { id: `source-${name}`, type: "number", min, step, max, placeholder: "standard" }));
+
+// The address of a scenario with the typed seed and duration.
+function withOptions(uri) {
+  const typed = ["seed", "duration"].map((name) => [name, byId(`source-${name}`).value]).filter(([, value]) => value);
+  return typed.length ? `${uri}?${new URLSearchParams(typed)}` : uri;
+}
+
+const entry = (uri, title, doc, address = () => uri) =>
+  el("button", { type: "button", onclick: () => (isWholeCloud(uri) ? offerChoice(uri) : ask(address())) }, el("b", { text: title }), el("span", { text: doc }));
 
 // --- whole clouds: mapped as a whole, or driven through by a simulated robot ---------------------------
 

@@ -42,7 +42,7 @@ function show() {
     line.max = String(end);
     line.step = String(end / Math.max(1000, Math.ceil(10 * end))); // so that the last step is the end of the run
     line.value = String(status.going_to_s ?? status.time_s); // the thumb stays where it was put while the run seeks
-    setText(byId("time-now"), clock(status.time_s));
+    showTime(status.time_s);
   }
   line.setAttribute("aria-valuetext", clock(Number(line.value)));
   setText(byId("time-end"), status.live ? "live" : status.end_s === null && status.scan_index >= 0 ? "open end" : clock(status.end_s));
@@ -50,6 +50,27 @@ function show() {
   const speed = byId("speed");
   if (document.activeElement !== speed) speed.value = String(status.speed);
   showWarnings(status.warnings ?? []);
+}
+
+function showTime(seconds) {
+  const field = byId("time-now");
+  if (document.activeElement !== field) field.value = clock(seconds);
+  field.disabled = byId("timeline").disabled;
+}
+
+// Seconds of "10", "10.5" or "0:10"; NaN for other texts.
+function secondsOf(text) {
+  const [, minutes = "0", seconds] = /^(?:(\d+):)?(\d+(?:\.\d*)?)$/.exec(text.trim().replace(",", ".")) ?? [];
+  return 60 * Number(minutes) + Number(seconds);
+}
+
+// The scan at the typed time is the last one that is not after it; half a tenth keeps a rounded time from being the one before.
+function seekTyped(field) {
+  const seconds = secondsOf(field.value);
+  field.setCustomValidity(Number.isFinite(seconds) ? "" : "Enter seconds or minutes:seconds, for example 10 or 0:10");
+  if (!field.reportValidity()) return;
+  field.blur();
+  seek(Math.min(seconds + 0.05, Number(byId("timeline").max)));
 }
 
 // How far the scans up to a distant target are mapped.
@@ -75,9 +96,14 @@ function showWarnings(warnings) {
   list.replaceChildren(...warnings.map((text) => el("li", { text })));
 }
 
+// The saved set in force, or the preset with the number of changed values.
+export function parametersText() {
+  const { preset, set, changed } = state.parameters;
+  return set || (changed.length ? `● ${preset}, ${changed.length} changed` : preset);
+}
+
 function showPreset() {
-  const { preset, changed } = state.parameters;
-  setText(byId("preset"), changed.length ? `● ${preset}, ${changed.length} changed` : preset);
+  setText(byId("preset"), parametersText());
 }
 
 export function startTimeline() {
@@ -88,10 +114,14 @@ export function startTimeline() {
   const line = byId("timeline");
   line.addEventListener("input", () => {
     dragging = true;
-    setText(byId("time-now"), clock(Number(line.value)));
+    showTime(Number(line.value));
     seek(Number(line.value));
   });
   line.addEventListener("change", () => { dragging = false; });
+  const field = byId("time-now");
+  field.addEventListener("focus", () => field.select());
+  field.addEventListener("keydown", (event) => { if (event.key === "Enter") seekTyped(field); else if (event.key === "Escape") field.blur(); });
+  field.addEventListener("blur", () => { field.setCustomValidity(""); if (state.status) showTime(state.status.time_s); });
   byId("speed").addEventListener("change", (event) => {
     send("set_speed", { factor: Number(event.target.value) });
     event.target.blur();

@@ -1,153 +1,127 @@
-// The tab Plots: figures 6 and 7 of the paper, and the course of the run. Plotly is loaded when it is first needed.
+// Plots for stand figures: their edits, which are sent and undone like annotations, and drawing them on the map.
 
-import { get } from "../core/api.js";
-import { byId, el, setText } from "../core/dom.js";
-import { saveCsv } from "../core/download.js";
-import { select } from "../core/live_feed.js";
-import { on, state } from "../core/store.js";
-import { colour } from "../core/theme.js";
+import { edit, send } from "../annotate/annotations.js";
+import { changed, state, trees } from "../core/store.js";
+import { treeAt } from "../map/draw.js";
 import { visible } from "../shell/tabs.js";
 
-const EVERY = 2000; // [ms] between two updates
-const LONGEST = 1200; // samples kept of each curve
-const none = () => ({ time: [], n_eff: [], sigma: [], yaw: [], stages: {}, stageTime: [] });
-const history = none();
-let plotly = null, busy = false;
+export const SHAPES = { circle: "Circle", rectangle: "Rectangle", polygon: "Polygon" };
+const CLOSING = 10; // [px] around the first corner, where a click closes a polygon
 
-function load() {
-  plotly ??= new Promise((resolve, reject) => {
-    document.head.append(el("script", { src: "/static/plotly.min.js", onload: () => resolve(window.Plotly),
-      onerror: () => reject(new Error("The plotting library could not be loaded. Reload the page.")) }));
-  });
-  return plotly;
+export const plots = () => state.annotations?.plots ?? [];
+export const plotting = () => visible("plots");
+
+export const sketch = {
+  kind: null, // shape that is drawn now
+  corners: [], // [x, y] of the places that were clicked [m]
+  end: null, // [x, y] of the pointer [m]
+  begun: false, // whether a click has set the first end
+  dragged: false, // whether the pointer is dragged now
+  pick: null, // called with each place that is clicked, {x, y} or the number of a `tree`, where the kind is "point"
+};
+const NOTHING = { corners: [], end: null, begun: false, dragged: false };
+const news = () => changed("sketch");
+
+export const addPlots = (list) => edit(() => send("POST", "/api/plots", { plots: list }));
+export const addAlong = (every, radius) => edit(() => send("POST", "/api/plots/along", { every, radius }));
+export const importPlots = (files, crs) => edit(() => send("POST", "/api/plots/import", { files, crs }));
+export const changePlot = ({ id, version }, fields) => edit(() => send("PATCH", `/api/plots/${id}`, { version, ...fields }));
+
+// --- drawing by pointer ---------------------------------------------------------------------------------------
+
+export const drawing = () => sketch.kind !== null;
+
+export function draw(kind, pick = null) {
+  Object.assign(sketch, NOTHING, { kind: sketch.kind === kind ? null : kind, corners: [], pick });
+  news();
 }
 
-function layout(extra = {}) {
-  const axis = { gridcolor: colour("line"), zerolinecolor: colour("line"), linecolor: colour("line"), ticks: "" };
-  return {
-    paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", font: { color: colour("text"), size: 11, family: colour("font") },
-    margin: { l: 46, r: 14, t: 8, b: 40 }, uirevision: "keep", xaxis: { ...axis }, yaxis: { ...axis }, ...extra,
-  };
+export const stopDrawing = () => drawing() && draw(sketch.kind);
+
+const to3 = (value) => Math.round(1000 * value) / 1000;
+
+// The shape between the first place and the pointer, as it is sent to the server; null while it is no area.
+export function shapeOf({ kind, corners: [first, ...others], end }) {
+  if (!first) return null;
+  if (kind === "polygon") {
+    const ring = [first, ...others].map((corner) => corner.map(to3));
+    return ring.length > 2 ? { kind, polygons: [[ring]] } : null;
+  }
+  if (!end) return null;
+  const [dx, dy] = [Math.abs(end[0] - first[0]), Math.abs(end[1] - first[1])];
+  if (kind === "circle") return dx + dy > 0 ? { kind, x: to3(first[0]), y: to3(first[1]), radius: to3(Math.hypot(dx, dy)) } : null;
+  return dx > 0 && dy > 0 ? { kind, x: to3((first[0] + end[0]) / 2), y: to3((first[1] + end[1]) / 2), length: to3(dx), width: to3(dy), turn_deg: 0 } : null;
 }
 
-const SCALES = {
-  distance: { colorscale: "Viridis", unit: "m" },
-  error: { colorscale: "Cividis", unit: "%" },
+export function finish() {
+  const shape = shapeOf(sketch);
+  Object.assign(sketch, NOTHING, { kind: null, corners: [] });
+  news();
+  return shape && addPlots([{ name: "", shape }]);
+}
+
+// The functions return true where the event belonged to a drawing. Circles and rectangles are drawn by dragging or by two
+// clicks, polygons by a click for each corner and one on the first corner. Points are picked by clicks.
+
+const byClicks = ({ kind }) => kind === "polygon" || kind === "point";
+
+export function pressAt(at, view) {
+  if (!drawing()) return false;
+  if (!byClicks(sketch) && !sketch.corners.length) sketch.corners = [view.toMap(...at)];
+  return true;
+}
+
+export function dragTo(at, view, travelled) {
+  if (!drawing() || byClicks(sketch)) return false;
+  sketch.dragged = travelled > 4;
+  sketch.end = view.toMap(...at);
+  news();
+  return true;
+}
+
+export function release() {
+  if (!drawing() || !sketch.dragged) return false;
+  sketch.dragged = false;
+  finish();
+  return true;
+}
+
+export function hoverTo(at, view) {
+  if (!drawing()) return false;
+  sketch.end = view.toMap(...at);
+  news();
+  return true;
+}
+
+export function clickOn(at, view) {
+  if (!drawing()) return false;
+  const place = view.toMap(...at);
+  if (sketch.kind === "point") {
+    const tree = treeAt(trees(), at, view);
+    sketch.pick(tree ? { tree: tree.number } : { x: to3(place[0]), y: to3(place[1]) });
+  } else if (sketch.kind === "polygon") {
+    const [px, py] = sketch.corners.length ? view.toScreen(...sketch.corners[0]) : [Infinity, Infinity];
+    if (sketch.corners.length > 2 && Math.hypot(at[0] - px, at[1] - py) < CLOSING) finish();
+    else sketch.corners.push(place);
+  } else if (sketch.begun) {
+    sketch.end = place;
+    finish();
+    return true;
+  } else sketch.begun = true;
+  news();
+  return true;
+}
+
+// --- the picture ------------------------------------------------------------------------------------------------
+
+const corner = ({ x, y, length, width, turn_deg: turn }) => {
+  const [c, s] = [Math.cos((turn * Math.PI) / 180), Math.sin((turn * Math.PI) / 180)];
+  return ([u, v]) => [x + 0.5 * (u * length * c - v * width * s), y + 0.5 * (u * length * s + v * width * c)];
 };
 
-async function matrix(kind) {
-  const pairs = await get("/api/pairs");
-  const z = kind === "distance" ? pairs?.distance_m : pairs?.error_percent;
-  if (!z || z.length < 2) {
-    return kind === "distance" ? "Distances need at least two trees. Let the run play on."
-      : "The error needs at least two trees that match the ground truth. Simulated runs have ground truth.";
-  }
-  const labels = pairs.numbers.map(String);
-  const { colorscale, unit } = SCALES[kind];
-  const figure = layout();
-  Object.assign(figure.xaxis, { type: "category", title: { text: "tree" } });
-  Object.assign(figure.yaxis, { type: "category", title: { text: "tree" }, autorange: "reversed" });
-  return [[{ type: "heatmap", x: labels, y: labels, z, colorscale, colorbar: { title: { text: unit }, thickness: 12 }, xgap: 1, ygap: 1,
-    hovertemplate: `tree %{y} to tree %{x}<br>%{z:.3~r} ${unit}<extra></extra>` }], figure];
-}
-
-function curve(kind) {
-  if (history.time.length < 2) return "Nothing to plot yet. Press play.";
-  const figure = layout({ showlegend: kind !== "n_eff", legend: { orientation: "h", y: 1.02, yanchor: "bottom" } });
-  if (kind === "time") figure.margin.t = 74;
-  if (kind === "sigma") return pose(figure);
-  figure.xaxis.title = { text: "time in the run, s" };
-  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms per scan" : "effective particles" } });
-  if (kind === "n_eff") return [[line(history.time, history.n_eff, "N_eff")], figure];
-  return [Object.entries(history.stages).map(([name, values]) => ({ ...line(history.stageTime, values, name), stackgroup: "one" })), figure];
-}
-
-// Position on the left axis, heading on the right one.
-function pose(figure) {
-  const right = { ...figure.yaxis, overlaying: "y", side: "right", rangemode: "tozero", showgrid: false, title: { text: "heading, °" } };
-  Object.assign(figure, { yaxis2: right });
-  Object.assign(figure.margin, { t: 30, r: 46 });
-  Object.assign(figure.xaxis, { title: { text: "time in the run, s" } });
-  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "position, cm" } });
-  return [[line(history.time, history.sigma, "position, cm"), { ...line(history.time, history.yaw, "heading, °"), yaxis: "y2" }], figure];
-}
-
-const line = (x, y, name) => ({ type: "scatter", mode: "lines", x, y, name, line: { width: 1.5 }, hovertemplate: `%{y:.3~r}<extra>${name}</extra>` });
-
-async function draw() {
-  if (!visible("plots") || busy) return;
-  busy = true;
-  try {
-    const kind = byId("plot-choice").value;
-    const [Plotly, drawing] = await Promise.all([load(), kind in SCALES ? matrix(kind) : curve(kind)]);
-    const isText = typeof drawing === "string"; // why there is no plot
-    byId("plot").hidden = isText;
-    byId("plot-empty").hidden = !isText;
-    setText(byId("plot-empty"), isText ? drawing : "");
-    if (!isText) await show(Plotly, kind, ...drawing);
-  } catch (error) {
-    byId("plot-empty").hidden = false;
-    setText(byId("plot-empty"), error.message);
-  } finally {
-    busy = false;
-  }
-}
-
-async function show(Plotly, kind, traces, figure) {
-  const plot = byId("plot");
-  if (plot.data && plot.dataset.kind !== kind) Plotly.purge(plot); // axes of another figure must not be reused
-  plot.dataset.kind = kind;
-  const fresh = !plot.data;
-  await Plotly.react(plot, traces, figure, { displayModeBar: false, responsive: true });
-  if (fresh) plot.on("plotly_click", ({ points }) => points[0].data.type === "heatmap" && select(Number(points[0].y)));
-}
-
-function push(list, value) {
-  list.push(value);
-  if (list.length > LONGEST) list.shift();
-}
-
-function recordMap({ map }) {
-  if (!map) return clearHistory();
-  if (history.time.length && map.time_s < history.time.at(-1)) clearHistory();
-  push(history.time, map.time_s);
-  push(history.n_eff, map.n_eff);
-  push(history.sigma, 100 * (map.health?.sigma_xy_m ?? map.sigma_xy));
-  push(history.yaw, map.health?.sigma_yaw_deg ?? null);
-}
-
-function recordStatus({ status }) {
-  if (status.scan_index < 0 || status.time_s === history.stageTime.at(-1)) return;
-  push(history.stageTime, status.time_s);
-  for (const [name, milliseconds] of Object.entries(status.stage_ms ?? {})) push((history.stages[name] ??= []), milliseconds);
-}
-
-function clearHistory() {
-  Object.assign(history, none());
-}
-
-async function savePng() {
-  const plot = byId("plot");
-  if (plot.hidden || !plot.data) return;
-  await (await load()).downloadImage(plot, { format: "png", scale: 2, width: 900, height: 700, filename: plot.dataset.kind });
-}
-
-// A matrix as a table with tree numbers in the first row and column; curves as rows of time, curve and value.
-function saveTable() {
-  const plot = byId("plot");
-  if (plot.hidden || !plot.data) return;
-  const [first] = plot.data;
-  const rows = first.type === "heatmap" ? [["tree", ...first.x], ...first.z.map((row, k) => [first.y[k], ...row])]
-    : [["time_s", "curve", "value"], ...plot.data.flatMap(({ x, y, name }) => x.map((time, k) => [time, name, y[k]]))];
-  saveCsv(`${plot.dataset.kind}.csv`, rows);
-}
-
-export function startPlots() {
-  byId("plot-png").addEventListener("click", savePng);
-  byId("plot-csv").addEventListener("click", saveTable);
-  on("map", recordMap);
-  on("status", recordStatus);
-  on("tab theme", draw);
-  byId("plot-choice").addEventListener("change", draw);
-  setInterval(() => state.status?.state !== "failed" && draw(), EVERY);
+// The rings of a shape as [[x, y], ...] [m]; a circle has 72 corners.
+export function ringsOf(shape) {
+  if (shape.kind === "polygon") return shape.polygons.flat();
+  if (shape.kind === "rectangle") return [[[-1, -1], [1, -1], [1, 1], [-1, 1]].map(corner(shape))];
+  return [Array.from({ length: 72 }, (_, k) => [shape.x + shape.radius * Math.cos((k * Math.PI) / 36), shape.y + shape.radius * Math.sin((k * Math.PI) / 36)])];
 }

@@ -1,17 +1,20 @@
-// Two runs compared: overlaid maps, trees that appeared, vanished or moved, scores and parameters.
+// Two visits compared: overlaid maps, growth, new, missing and moved trees, scores and parameters.
 
 import { get } from "../core/api.js";
 import { el } from "../core/dom.js";
-import { saveCanvas, saveCsv } from "../core/download.js";
-import { count, figure, NONE } from "../core/format.js";
+import { saveBytes, saveCanvas } from "../core/download.js";
+import { count, figure, fixed, NONE } from "../core/format.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";
 import { put, say, table } from "./detail.js";
-import { mapPicture, paintTwo, treeText } from "./draw.js";
+import { mapPicture, paintTwo } from "./draw.js";
 import { FIGURES, SCORES, when } from "./figures.js";
 
+const ORDER = ["moved", "missing", "new", "same", "not seen in a", "not seen in b"];
+const WORDS = { same: "same", moved: "moved", missing: "missing", new: "new", "not seen in a": "not seen in A", "not seen in b": "not seen in B" };
+
 export async function showTwo(a, b) {
-  say("Comparing the two runs …");
+  say("Comparing the two visits …");
   let both;
   try {
     both = await get(`/api/runs/compare?a=${encodeURIComponent(a)}&b=${encodeURIComponent(b)}`);
@@ -19,55 +22,70 @@ export async function showTwo(a, b) {
     say(error.message);
     return;
   }
-  const trees = [...both.a.map.trees, ...both.b_trees];
+  both.trees = both.rows.map((row) => ({ ...row, x: row.x_m, y: row.y_m, number: row.tree_a ?? row.tree_b, dbh_cm: row.dbh_a_cm ?? row.dbh_b_cm, ellipse: [0, 0, 0] }));
+  const { counts } = both.record;
   const map = mapPicture({
     label: `Maps of ${both.a.name} and ${both.b.name}, overlaid`,
-    legend: [["tree", "in both"], ["only-a", `only in A (${both.only_a.length})`], ["only-b", `only in B (${both.only_b.length})`], ["moved", `moved (${both.moved})`], ["path", "path A"], ["path-b", "path B"]],
+    legend: [["tree", "in both"], ["only-a", `missing in B (${counts.missing})`], ["only-b", `new in B (${counts.new})`], ["moved", `moved (${counts.moved})`],
+      ["grown", `significant growth (${both.record.significant})`], ["outside", `not seen in A or B (${counts["not seen in a"] + counts["not seen in b"]})`], ["path", "path A"], ["path-b", "path B"]],
     paint: (pen, view) => paintTwo(pen, view, both),
-    bounds: () => boundsOf(trees, both.a.map.path, both.b_path),
-    describe: (at, view) => describe(both, at, view),
+    bounds: () => boundsOf(both.trees, both.a.map.path, both.b_path),
+    describe: (at, view) => describe(treeAt(both.trees, at, view)),
   });
   put(map, head(both), figures(both), map.box, more(both, map));
 }
 
-function head({ a, b, how }) {
+// Without an alignment, pairs of trees are only near each other by chance.
+const UNALIGNED = "The stems of the two visits do not agree: these are different places, or too few stems are in both. Pairs and growth mean nothing.";
+
+function head({ a, b, how, aligned }) {
   return el("div", { class: "run-head" },
     el("h2", {}, el("span", { text: `A: ${a.name}` }), el("span", { text: `B: ${b.name}` })),
-    el("p", { class: "dim", text: `A ${when(a.begun_s ?? a.changed_s)} · B ${when(b.begun_s ?? b.changed_s)} · frames: ${how}` }));
+    el("p", { class: "dim", text: `A ${when(a.begun_s ?? a.changed_s)} · B ${when(b.begun_s ?? b.changed_s)} · frames: ${how}` }),
+    ...(aligned ? [] : [el("p", { class: "error", role: "alert", text: UNALIGNED })]));
 }
 
-function figures(both) {
-  const boxes = [["in both", both.pairs.length], ["only in A (vanished)", both.only_a.length], ["only in B (appeared)", both.only_b.length],
-    [`moved more than ${100 * both.moved_m} cm`, both.moved], ["RMS of the shifts", both.shift_rms_m === null ? NONE : `${figure(100 * both.shift_rms_m)} cm`]];
+const signed = (value, digits = 2) => (value === null ? NONE : `${value > 0 ? "+" : ""}${fixed(value, digits)}`);
+
+function figures({ record, aligned }) {
+  const { counts } = record;
+  if (!aligned) return figureBoxes([["trees of A", record.trees_a], ["trees of B", record.trees_b]]);
+  const growth = record.growth_mean_cm === null ? NONE : `${signed(record.growth_mean_cm)}${record.growth_se_cm === null ? "" : ` ± ${figure(record.growth_se_cm, 2)}`} cm`;
+  return figureBoxes([["in both", record.pairs], ["mean growth of DBH", growth], ["significant growth", record.significant], ["new in B", counts.new], ["missing in B", counts.missing],
+    ["moved", counts.moved], ["RMS of the shifts", record.shift_rms_m === null ? NONE : `${figure(100 * record.shift_rms_m)} cm`]]);
+}
+
+function figureBoxes(boxes) {
   return el("dl", { class: "run-figures", id: "compare-figures" }, ...boxes.map(([name, text]) => el("div", {}, el("dt", { text: name }), el("dd", { text: String(text) }))));
 }
 
-function describe(both, at, view) {
-  const a = treeAt(both.a.map.trees, at, view), b = treeAt(both.b_trees, at, view);
-  if (!a && !b) return "";
-  const pair = both.pairs.find((each) => each.a === a?.number || (!a && each.b === b.number));
-  if (!pair) return a ? `Only in A. ${treeText(a)}` : `Only in B. ${treeText(b)}`;
-  return `A ${pair.a}, B ${pair.b}: ${figure(100 * pair.shift_m)} cm apart${pair.dbh_cm === null ? "" : `, DBH ${pair.dbh_cm > 0 ? "+" : ""}${figure(pair.dbh_cm)} cm`}`;
+const growthText = (row) => (row.growth_cm === null ? NONE : `${signed(row.growth_cm)} ± ${fixed(row.sigma_growth_cm, 2)}`);
+
+function describe(row) {
+  if (!row) return "";
+  const numbers = [["A", row.tree_a], ["B", row.tree_b]].filter(([, number]) => number !== null).map(([name, number]) => `${name} ${number}`).join(", ");
+  const growth = row.growth_cm === null ? "" : `\nDBH ${growthText(row)} cm${row.significant ? ", significant" : ""}`;
+  return `${numbers}: ${WORDS[row.status]}${row.shift_m === null ? "" : `, ${figure(100 * row.shift_m)} cm apart`}${growth}`;
 }
+
+const COLUMNS = [["A", (row) => String(row.tree_a ?? NONE)], ["B", (row) => String(row.tree_b ?? NONE)], ["status", (row) => WORDS[row.status]],
+  ["shift cm", (row) => (row.shift_m === null ? NONE : figure(100 * row.shift_m))], ["DBH A cm", (row) => fixed(row.dbh_a_cm, 1)], ["DBH B cm", (row) => fixed(row.dbh_b_cm, 1)],
+  ["growth cm", growthText], ["", (row) => (row.significant ? "significant" : "")]];
 
 function more(both, map) {
   const { a, b } = both;
   const scores = [...FIGURES.slice(0, 3).map(([name, text]) => [name, text(a), text(b)]),
     ...SCORES.map(([name, text]) => [name, a.scores ? text(a.scores) : NONE, b.scores ? text(b.scores) : NONE])];
-  const rows = pairRows(both);
+  const rows = [...both.rows].sort((one, other) => ORDER.indexOf(one.status) - ORDER.indexOf(other.status) || (other.growth_cm ?? -Infinity) - (one.growth_cm ?? -Infinity));
   return el("div", { class: "run-more" },
     el("div", { class: "row" },
-      el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas("compared.png", map.canvas) }),
-      el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv("compared.csv", [["tree_a", "tree_b", "shift_m", "dbh_change_cm", "is"], ...rows]) })),
+      el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas("comparison.png", map.canvas) }),
+      el("button", { class: "small", text: "Trees as CSV", onclick: () => saveBytes("comparison.csv", both.csv) })),
+    el("details", { open: true }, el("summary", { text: `${count(rows.length, "tree")}: growth with its standard deviation, new, missing and moved trees` }),
+      table(COLUMNS.map(([name]) => name), rows.map((row) => COLUMNS.map(([, text]) => text(row))), [0, 1, 3, 4, 5, 6])),
+    el("p", { class: "note", text: "A tree is new or missing only where the other visit looked. Growth is marked so that at most 5 % of the marks are expected to be false." }),
     el("div", {}, el("h3", { text: "Scores side by side" }), table(["", "A", "B"], scores, [1, 2])),
     el("div", {}, el("h3", { text: "Parameters that differ" }), both.parameters.length
       ? table(["parameter", "A", "B"], both.parameters.map(({ name, a: before, b: after }) => [name, String(before ?? NONE), String(after ?? NONE)]))
-      : el("p", { class: "note", text: "None." })),
-    el("details", { open: rows.length < 40 }, el("summary", { text: count(rows.length, "tree") }),
-      table(["A", "B", "shift cm", "DBH change cm", ""], rows.map(([x, y, shift, dbh, is]) => [x ?? NONE, y ?? NONE, shift === null ? NONE : figure(100 * shift), dbh === null ? NONE : figure(dbh), is]), [0, 1, 2, 3])));
-}
-
-function pairRows({ pairs, only_a: gone, only_b: come }) {
-  return [...gone.map((number) => [number, null, null, null, "vanished"]), ...come.map((number) => [null, number, null, null, "appeared"]),
-    ...pairs.map((pair) => [pair.a, pair.b, pair.shift_m, pair.dbh_cm, pair.moved ? "moved" : "same"])];
+      : el("p", { class: "note", text: "None." })));
 }

@@ -4,6 +4,7 @@ import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
 import { clock, count, fixed, NONE } from "../core/format.js";
+import { reportMenu } from "../core/report.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";
 import { mapPicture, paintRun, treeText } from "./draw.js";
@@ -89,9 +90,13 @@ function more(run, map) {
   return el("div", { class: "run-more" },
     el("div", { class: "row" },
       el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(`${file}.png`, map.canvas) }),
+      reportMenu("run-report", run.key),
       el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(`${file}_trees.csv`, treeRows(run.map.trees)) })),
     ...(run.scores ? [el("div", {}, el("h3", { text: "Against the ground truth" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
-    el("div", {}, el("h3", { text: "Changes of parameters" }), ...changes(run)),
+    el("div", {}, el("h3", { text: "Differences from the preset" }), Object.keys(run.differences).length
+      ? table(["parameter", "value"], Object.entries(run.differences).map(([name, value]) => [name, String(value)]))
+      : el("p", { class: "note", text: `None: all parameters are those of the preset ${run.preset}.` })),
+    el("div", {}, el("h3", { text: "Changes of parameters during the run" }), ...changes(run)),
     el("details", {}, el("summary", { text: `All ${Object.keys(run.parameters).length} parameters` }),
       table(["parameter", "value"], Object.entries(run.parameters).map(([name, value]) => [name, String(value)]))));
 }

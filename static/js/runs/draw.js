@@ -3,7 +3,7 @@
 import { el } from "../core/dom.js";
 import { dbhText, seenText } from "../core/format.js";
 import { colours } from "../core/theme.js";
-import { drawFrame, drawLine, drawNumbers, drawTree, drawTruth, symbolRadius } from "../map/draw.js";
+import { drawCircle, drawFrame, drawLine, drawNumbers, drawTree, drawTruth, symbolRadius } from "../map/draw.js";
 import { MapCanvas } from "../map/map_canvas.js";
 
 // A map with its legend: {box, canvas, redraw}. `legend` is [[class, text]]; `paint`, `bounds` and `describe` are those of MapCanvas.
@@ -24,22 +24,36 @@ export function paintRun(pen, view, { path, truth, trees }) {
   drawNumbers(pen, view, trees, null);
 }
 
-export function paintTwo(pen, view, { a, b_trees: trees, b_path: path, pairs, only_a: onlyA, only_b: onlyB }) {
+export function paintTwo(pen, view, { a, b_path: path, places_b: places, trees }) {
   drawLine(pen, view, a.map.path, colours.path, 2);
   pen.setLineDash([6, 5]);
   drawLine(pen, view, path, colours.selection, 1.4);
   pen.setLineDash([]);
-  const [ofA, ofB] = [byNumber(a.map.trees), byNumber(trees)];
-  for (const pair of pairs) {
-    drawTree(pen, view, ofA.get(pair.a), false);
-    if (pair.moved) drawArrow(pen, view, ofA.get(pair.a), ofB.get(pair.b));
+  for (const tree of trees) {
+    if (tree.status === "missing") drawSign(pen, view, tree, [[-1, -1, 1, 1], [-1, 1, 1, -1]], colours.pole); // ×
+    else if (tree.status === "new") drawSign(pen, view, tree, [[-1, 0, 1, 0], [0, -1, 0, 1]], colours.selection); // +
+    else if (tree.status.startsWith("not seen")) drawUnseen(pen, view, tree);
+    else drawTree(pen, view, tree, false);
+    if (tree.status === "moved") drawArrow(pen, view, tree, places[tree.tree_b]);
+    if (tree.significant) drawGrowth(pen, view, tree);
   }
-  for (const number of onlyA) drawSign(pen, view, ofA.get(number), [[-1, -1, 1, 1], [-1, 1, 1, -1]], colours.pole); // ×
-  for (const number of onlyB) drawSign(pen, view, ofB.get(number), [[-1, 0, 1, 0], [0, -1, 0, 1]], colours.selection); // +
-  drawNumbers(pen, view, a.map.trees, null);
+  drawNumbers(pen, view, trees, null);
 }
 
-const byNumber = (trees) => new Map(trees.map((tree) => [tree.number, tree]));
+function drawUnseen(pen, view, tree) {
+  Object.assign(pen, { strokeStyle: colours.other, lineWidth: 1.5 });
+  pen.setLineDash([3, 3]);
+  drawCircle(pen, ...view.toScreen(tree.x, tree.y), symbolRadius(tree, view.scale));
+  pen.stroke();
+  pen.setLineDash([]);
+}
+
+// A ring around a tree whose growth is significant.
+function drawGrowth(pen, view, tree) {
+  Object.assign(pen, { strokeStyle: colours.plot, lineWidth: 2 });
+  drawCircle(pen, ...view.toScreen(tree.x, tree.y), symbolRadius(tree, view.scale) + 4);
+  pen.stroke();
+}
 
 function drawSign(pen, view, tree, strokes, colour) {
   const [px, py] = view.toScreen(tree.x, tree.y);
@@ -59,7 +73,7 @@ function drawSign(pen, view, tree, strokes, colour) {
 // An arrow from a tree's former place to its present one, at least 16 pixels long so that it is visible.
 function drawArrow(pen, view, from, to) {
   const [x0, y0] = view.toScreen(from.x, from.y);
-  const [x1, y1] = view.toScreen(to.x, to.y);
+  const [x1, y1] = view.toScreen(...to);
   const length = Math.hypot(x1 - x0, y1 - y0) || 1;
   const drawn = Math.max(length, 16);
   const [dx, dy] = [(x1 - x0) / length, (y1 - y0) / length];

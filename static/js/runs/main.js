@@ -12,7 +12,7 @@ import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
 const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor"], ["trees", ""], ["F1", ""], ["preset", "minor"]];
-let known = { runs: [], folders: [], unfinished: [], open: null };
+let known = { runs: [], folders: [], open: null };
 const ticked = new Set();
 let deleted = null; // the run that Undo brings back
 
@@ -31,7 +31,7 @@ function fill() {
   const wanted = byId("runs-find").value.trim().toLowerCase();
   const fits = ({ name, uri = "" }) => `${name} ${uri}`.toLowerCase().includes(wanted);
   const [runs, folders] = [known.runs.filter(fits), known.folders.filter(fits)];
-  byId("runs").tBodies[0].replaceChildren(...runs.map(row), ...(folders.length ? [group("Finished maps in the data folder (stemmap map --out)"), ...folders.map(row)] : []), ...unfinishedGroup(wanted));
+  byId("runs").tBodies[0].replaceChildren(...runs.map(row), ...(folders.length ? [group("Finished maps in the data folder (stemmap map --out)"), ...folders.map(row)] : []));
   const all = known.runs.length + known.folders.length;
   setText(byId("runs-count"), count(all, "run"));
   byId("runs").hidden = !byId("runs").tBodies[0].rows.length;
@@ -44,15 +44,6 @@ function fill() {
 // Names of folders may hold any character.
 const addressOf = ({ key }) => `run=${encodeURIComponent(key)}`;
 const group = (text) => el("tr", { class: "group" }, el("td", { colspan: HEADS.length, text }));
-
-function unfinishedGroup(wanted) {
-  const left = known.unfinished.filter(({ name }) => name.toLowerCase().includes(wanted));
-  const reload = async (problem) => {
-    await load();
-    if (problem) showError(problem);
-  };
-  return left.length ? [group("Incomplete maps"), ...unfinishedRows(left, HEADS.length, reload)] : [];
-}
 
 function showError(words) {
   setText(byId("runs-error"), words);
@@ -100,7 +91,7 @@ function follow() {
   markTicked();
   if (compare.length === 2) showTwo(...compare);
   else if (run) showRun(run, { replay, rename, remove });
-  else say("Choose a run to see its map, or tick two runs to compare them.");
+  else say("Choose a run to see its map, or tick two runs to compare them: growth, new, missing and moved trees.");
 }
 
 async function replay(run) {
@@ -140,7 +131,12 @@ async function undo() {
 
 byId("runs").tHead.replaceChildren(el("tr", {}, ...HEADS.map(([text, cls]) => (text ? el("th", { scope: "col", class: cls, text }) : el("td", { class: cls })))));
 byId("runs-find").addEventListener("input", fill);
-byId("runs-compare").addEventListener("click", () => go([...ticked].map((key) => `compare=${encodeURIComponent(key)}`).join("&")));
+// The earlier run is A.
+const begun = (key) => {
+  const run = [...known.runs, ...known.folders].find((each) => each.key === key);
+  return run?.begun_s ?? run?.changed_s ?? 0;
+};
+byId("runs-compare").addEventListener("click", () => go([...ticked].sort((a, b) => begun(a) - begun(b)).map((key) => `compare=${encodeURIComponent(key)}`).join("&")));
 byId("toast-undo").addEventListener("click", undo);
 addEventListener("hashchange", follow);
 addEventListener("focus", load);
@@ -153,25 +149,3 @@ startTheme();
 startAccess();
 load();
 follow();
-
-// --- incomplete outputs of runs that were killed ---------------------------------------------------------
-
-const size = (bytes) => (bytes < 1e6 ? `${Math.ceil(bytes / 1000)} kB` : `${Math.round(bytes / 1e6)} MB`);
-const folderOf = (name) => name.split("/").slice(0, -1).join("/") || "the data folder";
-
-// Rows of the list; `done` is called with the message of an error, or with "" after a deletion.
-function unfinishedRows(left, columns, done) {
-  const remove = async (name) => {
-    try {
-      await removeAt(`/api/runs/unfinished?name=${encodeURIComponent(name)}`);
-      done("");
-    } catch (error) {
-      done(error.message);
-    }
-  };
-  return left.map(({ name, size: bytes, changed_s: changed, quiet }) => el("tr", { class: "unfinished", "data-unfinished": name },
-    el("td"), el("td", { colspan: columns - 2 }, el("b", { text: `Incomplete map in ${folderOf(name)}` }),
-      el("small", { text: `${size(bytes)}, last written ${when(changed)}. The run ended before its map was written: map its recording again.` })),
-    el("td", {}, el("button", { class: "small", "data-edit": true, text: "Delete", "aria-label": `Delete ${name}`, disabled: !quiet,
-      title: quiet ? "Delete the incomplete map only" : "Written to within the last ten minutes, so the run may still be active", onclick: () => remove(name) }))));
-}

@@ -1,12 +1,15 @@
 // The tab Scores: the map against the ground truth. Each rate is shown with its counts.
 
-import { contradictionText, scoreAgainst, truthText } from "../annotate/annotations.js";
+import { contradictionText, reviewProgress, scoreAgainst, truthText } from "../annotate/annotations.js";
 import { byId, definitions, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { capital, figure, NONE, percent } from "../core/format.js";
 import { on, state } from "../core/store.js";
 import { openSources } from "../open/dialog.js";
+import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
+
+const EVERY = 300; // [ms] between two updates
 
 const RATES = {
   TA: ["TA  trees found", "True acceptance: trees of the ground truth that are in the map"],
@@ -18,6 +21,7 @@ const centimetres = (value) => (value === null ? NONE : `${figure(value)} cm`);
 const inCentimetres = (metres) => (metres === null ? NONE : centimetres(100 * metres));
 const percentOf = (value) => (value === null ? NONE : `${figure(value)} %`);
 
+const BY_REVIEW = ["completeness", "correctness", "F1", "trees without counterpart"]; // of a complete review only
 const LINES = [
   ["completeness", (s) => percent(s.completeness)],
   ["correctness", (s) => percent(s.correctness)],
@@ -51,7 +55,8 @@ function rates(score) {
 }
 
 function lines(score) {
-  return definitions(LINES.map(([title, text]) => [title, text(score)]));
+  const progress = reviewProgress();
+  return definitions(LINES.map(([title, text]) => [title, progress && BY_REVIEW.includes(title) ? progress : text(score)]));
 }
 
 function nothing() {
@@ -65,5 +70,5 @@ function nothing() {
 }
 
 export function startScores() {
-  on("evaluation truth annotations tab phase", show);
+  on("evaluation truth annotations tab phase map", throttled(show, EVERY));
 }

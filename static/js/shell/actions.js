@@ -11,6 +11,7 @@ import { advance, togglePlay } from "../playback/timeline.js";
 import { toggleFocus } from "../scene/focus.js";
 import { toggleFollow } from "../scene/layers.js";
 import { closeOver, openOver } from "../scene/overlay.js";
+import { draw } from "../plots/plots.js";
 import { pressInScene } from "../scene/scene.js";
 import { openSearch } from "../tune/panel.js";
 import { redo, reset, undo } from "../tune/parameters.js";
@@ -73,7 +74,10 @@ export const ACTIONS = [
   ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
   ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv"), null, "export table spreadsheet"],
   ["Export the map: GeoPackage, Shapefile, DXF, XLSX …", "", "", () => { toTab("trees")(); byId("trees-export").focus(); }, null, "save download gis qgis cad excel geojson"],
+  ["Report of the run as HTML or PDF: figures, map, plots, trees", "", "", () => { toTab("plots")(); byId("plots-report").focus(); }, null, "print page bericht stand inventory"],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],
+  ...["circle", "rectangle", "polygon"].map((kind) => [`Plots: draw a ${kind} on the map`, "", "", edits(() => { toTab("plots")(); draw(kind); }), null, "stand inventory sample area hectare basal"]),
+  ["Plots: import a file", "", "", edits(() => { toTab("plots")(); byId("plot-import").click(); }), null, "geopackage shapefile geojson gis"],
   ["Annotate: add trees by clicks on the map", "", "", inAnnotate(() => toggleAdding(true))],
   ["Annotate: skip to the next tree to review", "", "", inAnnotate(skip)],
   ["Annotate: the selected tree is a tree", "", "", inAnnotate(() => review("tree"))],

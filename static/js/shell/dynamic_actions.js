@@ -66,10 +66,10 @@ const panels = () => [
   ...(byId("warnings-button").hidden ? [] : [["Show the warnings", "", () => byId("warnings-button").click()]]),
 ];
 
-const plots = () => [...byId("plot-choice").options].map(({ value, text }) => [`Plot: ${text}`, "", () => {
-  toTab("plots")();
-  byId("plot-choice").value = value;
-  byId("plot-choice").dispatchEvent(new Event("change"));
+const charts = () => [...byId("chart-choice").options].map(({ value, text }) => [`Chart: ${text}`, "", () => {
+  toTab("charts")();
+  byId("chart-choice").value = value;
+  byId("chart-choice").dispatchEvent(new Event("change"));
 }]);
 
 const views = () => Object.entries(CHOICES).flatMap(([name, words]) => (state.view?.[name]?.of ?? []).map((value) => [`${words} ${value}`, "", edits(() => chooseView(name, value))]));
@@ -86,5 +86,5 @@ export function presentActions() {
   const sensitivities = tuning.specs.filter(({ kind }) => kind !== "name").map((spec) =>
     [`Sensitivity of ${spec.title} (${spec.stage})`, "", edits(() => { openParameter(spec.name); requestSensitivity(spec); }), `${spec.name} how much does it matter ∿`]);
   const found = trees().map(({ number }) => [`Tree ${number}`, "", () => { openDrawer(); openStory("tree"); select(number); }]);
-  return [...tabs, ...panels(), ...plots(), ...layers, ...views(), ...sets, ...speeds, ...parameters, ...found, ...sensitivities];
+  return [...tabs, ...panels(), ...charts(), ...layers, ...views(), ...sets, ...speeds, ...parameters, ...found, ...sensitivities];
 }

@@ -7,6 +7,7 @@ import { edits, looksOnly } from "../core/permissions.js";
 import { advance } from "../playback/timeline.js";
 import { toggleLayer } from "../scene/layers.js";
 import { onSceneLoad, pressInScene } from "../scene/scene.js";
+import { plotKey } from "../plots/panel.js";
 import { tuneKey } from "../tune/parameters.js";
 import { ACTIONS, showSheet } from "./actions.js";
 import { openPalette } from "./palette.js";
@@ -37,7 +38,7 @@ function act(event, inScene) {
     if (inScene && ["f", "t", "b"].includes(event.key)) take(); // keys of viser
     return;
   }
-  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || tuneKey(event))) {
+  if (!looksOnly() && !target.matches?.(TYPES) && (annotateKey(event) || plotKey(event) || tuneKey(event))) {
     take();
     return;
   }

@@ -14,7 +14,8 @@ import { startSources } from "../open/dialog.js";
 import { startWelcome } from "../open/welcome.js";
 import { startMarks } from "../playback/event_marks.js";
 import { startTimeline } from "../playback/timeline.js";
-import { startPlots } from "../plots/plots.js";
+import { startCharts } from "../charts/charts.js";
+import { startPlotsPanel } from "../plots/panel.js";
 import { startCamera } from "../scene/camera.js";
 import { startFocus } from "../scene/focus.js";
 import { startLayers } from "../scene/layers.js";
@@ -34,7 +35,7 @@ import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
-for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startPlots, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
+for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startPlotsPanel, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
   startTimeline, startMarks, startSources, startScene, startScenePanel, startLayers, startFocus, startKeys, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

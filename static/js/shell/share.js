@@ -63,11 +63,18 @@ function row(id, label, hint, value) {
   return el("div", {}, el("label", { for: id, text: label }), el("div", { class: "row" }, box, copy), el("p", { class: "dim", text: hint }));
 }
 
+const LOOPBACK = ["localhost", "127.0.0.1", "[::1]"];
+
+function reach() {
+  return LOOPBACK.includes(location.hostname) ? [el("p", { class: "note", text: "The links work on this computer only. Start stemmap with --host to open the dashboard to other computers." })] : [];
+}
+
 function show() {
   const dialog = byId("share-dialog");
   dialog.replaceChildren(el("h2", { id: "share-title", text: "Share" }),
     row("share-here", "This run at this time with this camera", `${state.status?.source ?? ""} at ${clock(state.status?.time_s)}. Opening it needs access to this dashboard.`, hereLink()),
     ...(access.viewer_link ? [row("share-viewer", "View-only link", "It shows everything and changes nothing. In one browser the last opened link applies: try it in another browser or a private window.", `${location.origin}${access.viewer_link}`)] : []),
+    ...reach(),
     el("form", { method: "dialog", class: "row end" }, el("button", { text: "Close" })));
   dialog.showModal();
 }

@@ -1,8 +1,9 @@
 // The status strip and the notice below it.
 
+import { reviewOf, reviewProgress } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital, figure, NONE } from "../core/format.js";
-import { changed, isCloud, on, state } from "../core/store.js";
+import { changed, isCloud, on, state, trees } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 import { isGoing } from "../playback/timeline.js";
 
@@ -15,7 +16,7 @@ const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans ta
 
 // title, unit, function of the status that returns [text, class, title], and "minor" if it is hidden first in a narrow strip
 const FIGURES = {
-  trees: ["trees", "", (s) => [String(s.trees), ...remapping(s)]],
+  trees: ["trees", "", (s) => [String(s.trees - rejected()), ...labelOfTrees(s)]],
   points: ["points", "", (s) => [s.cloud ? s.cloud.points.toLocaleString("en") : NONE]],
   health: ["SLAM", "", (s) => [s.health, { good: "good", weak: "warn", lost: "bad" }[s.health] ?? "soon", reason(s)]],
   rate: ["scan rate", "Hz", (s) => [s.state === "playing" ? figure(s.scan_rate_hz) : NONE], "minor"],
@@ -23,14 +24,17 @@ const FIGURES = {
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
   sigma: ["pose sigma", "cm", (s) => [state.map && s.health !== "static" ? figure(100 * state.map.sigma_xy) : NONE], "minor"], // a pose that was never tested has none
-  f1: ["F1 to truth", "", () => [state.evaluation ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
+  f1: ["F1 to truth", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
 const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
 const cells = {};
 
+const rejected = () => trees().filter((tree) => reviewOf(tree) === "rejected").length;
+
 // During a re-mapping the shown map is the one before.
-function remapping({ remapped }) {
-  return remapped === null || remapped === undefined ? [] : ["remapping", `trees; re-mapping, ${Math.floor(100 * remapped)} %`];
+function labelOfTrees({ remapped }) {
+  if (remapped !== null && remapped !== undefined) return ["remapping", `trees; re-mapping, ${Math.floor(100 * remapped)} %`];
+  return rejected() ? ["", `trees, ${rejected()} rejected`] : [];
 }
 
 // Time between two scans [ms]; slower mapping falls behind.
@@ -40,6 +44,7 @@ function budget({ scans, end_s: end }) {
 
 // F1 of the map, and how many trees of the current scan are right: they follow a slider before the map does.
 function ofScan() {
+  if (reviewProgress()) return `F1: ${reviewProgress()}`;
   if (state.evaluation?.warning) return "F1 doubtful, see Scores";
   const { right, wrong } = state.map ?? {};
   return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
@@ -205,7 +210,7 @@ const seconds = (since) => Math.floor((performance.now() - since) / 1000);
 
 export function startStatus() {
   build();
-  on("status map evaluation", show);
+  on("status map evaluation annotations", show);
   on("status map", showWay);
   on("status connection", showState);
   setInterval(showState, 1000);

@@ -3,7 +3,7 @@
 import { byId, recall, remember } from "../core/dom.js";
 import { changed } from "../core/store.js";
 
-export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "scores", "plots"];
+export const NAMES = ["trees", "clusters", "story", "tune", "annotate", "scores", "plots", "charts"];
 let current = NAMES[0];
 
 export const visible = (name) => name === current;

@@ -1,18 +1,19 @@
 // The table of trees (Table 2 of the paper): sorted by any column, filtered by the text above it.
 
 import { reviewOf } from "../annotate/annotations.js";
-import { block } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { saveBytes, saveCanvas } from "../core/download.js";
+import { saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
+import { isReport, reportOptions, saveReport, saveWritten } from "../core/report.js";
 import { roving } from "../core/roving.js";
 import { changed, isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
 import { openStory } from "../explain/story.js";
+import { settings } from "../plots/panel.js";
 import { openTab, visible } from "../shell/tabs.js";
 import { filterOf, HELP, sigma } from "./filter.js";
 
@@ -141,7 +142,9 @@ function offerCsv(any) {
 
 // The server writes the file, so that it is the same as that of `stemmap export`. A Shapefile comes as a zip archive.
 function exportAs(format) {
-  return attempted(async () => saveBytes(`trees${format === "shp" ? "_shp.zip" : `.${format}`}`, await block(`/api/export/${format}`)));
+  if (isReport(format)) return saveReport("open", format, settings());
+  const name = { shp: "trees_shp.zip", laz: "cloud.laz" }[format] ?? `trees.${format}`;
+  return saveWritten("Writing the file …", name, `/api/export/${format}?${settings()}`);
 }
 
 function emptyText(all, wanted, refused) {
@@ -165,6 +168,7 @@ export function startTable() {
   byId("find").addEventListener("input", fill);
   byId("find").title = HELP;
   const menu = byId("trees-export");
+  menu.append(...reportOptions());
   menu.addEventListener("change", () => { exportAs(menu.value); menu.value = ""; });
   byId("trees-png").addEventListener("click", () => saveCanvas("trees.png", pictureOf(byId("trees"))));
   on("map truth annotations phase", throttled(fill, EVERY));

@@ -34,25 +34,26 @@ function build() {
   const main = tuning.specs.filter((spec) => spec.main).sort((a, b) => FIRST_STAGES.indexOf(b.stage) - FIRST_STAGES.indexOf(a.stage));
   const others = tuning.specs.filter((spec) => !spec.main);
   const parts = [groupOf(MAIN, main), ...[...new Set(others.map((spec) => spec.stage))].map((stage) => groupOf(stage, others.filter((spec) => spec.stage === stage)))];
+  const sets = el("details", { class: "tune-part" }, el("summary", { text: "Sets and files" }),
+    el("p", { id: "tune-summary", class: "note dim" }),
+    el("div", { class: "tune-files" },
+      button("tune-save", "Save as …", "Save these values on the server under a name", askName), button("tune-delete", "Delete", "Delete the saved set", dropSet),
+      el("a", { class: "small", id: "tune-download", href: "/api/parameters.toml", download: "parameters.toml", text: "Download", title: "These values as a TOML file, for --config of the command line" }),
+      button("tune-upload", "Upload", "Use the values of a TOML file", () => file.click()), file),
+    el("form", { id: "tune-name-form", class: "tune-files", hidden: true, onsubmit: saveSet },
+      el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
+      el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName })));
   byId("panel-tune").replaceChildren(
     el("div", { class: "tune-head" },
       el("select", { id: "tune-set", "aria-label": "Preset or saved set", onchange: (event) => use(event.target.value) }),
       button("tune-undo", "Undo", "Undo the last parameter change (Ctrl+Z in this tab)", undo), button("tune-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo),
       button("tune-reset", "Reset all", "Reset all values to the preset", () => reset([]))),
+    sets,
     el("p", { id: "tune-error", class: "error", role: "alert", hidden: true }),
     el("div", { class: "tune-effect" }, counts, wholeRun),
     el("div", { class: "tune-files" }, find, el("label", { class: "tune-only" }, only, " changed only")),
     el("div", { id: "tune-rows" }, ...parts),
     el("p", { id: "tune-none", class: "empty", hidden: true }),
-    el("details", { class: "tune-part" }, el("summary", { text: "Sets and files" }),
-      el("p", { id: "tune-summary", class: "note dim" }),
-      el("div", { class: "tune-files" },
-        button("tune-save", "Save as …", "Save these values on the server under a name", askName), button("tune-delete", "Delete", "Delete the saved set", dropSet),
-        el("a", { class: "small", id: "tune-download", href: "/api/parameters.toml", download: "parameters.toml", text: "Download", title: "These values as a TOML file, for --config of the command line" }),
-        button("tune-upload", "Upload", "Use the values of a TOML file", () => file.click()), file),
-      el("form", { id: "tune-name-form", class: "tune-files", hidden: true, onsubmit: saveSet },
-        el("input", { id: "tune-name", type: "text", maxlength: "40", placeholder: "Name of the set", "aria-label": "Name of the set", autocomplete: "off", onkeydown: (event) => event.key === "Escape" && closeName() }),
-        el("button", { class: "small primary", text: "Save" }), el("button", { class: "small", type: "button", text: "Cancel", onclick: closeName }))),
     el("details", { class: "tune-part" }, el("summary", { text: "Search for better values" }), searchPart));
   show();
 }

@@ -10,8 +10,7 @@ import pytest
 
 from app.batch.summary import JUST_BEGUN, MOST_SPANS, RunHealth, health_word
 from app.dashboard.payload import health_payload
-from pipeline.types.pose_health import Health, HealthState
-from pipeline.types.records import Frame
+from pipeline.types.records import Frame, Health, HealthState
 from tests.app import fakes
 from tests.app.scene.frames import make_frame
 

@@ -12,19 +12,20 @@ import msgspec
 import numpy as np
 import pytest
 
-from app.batch.compare import compare
 from app.common.settings import Settings
 from app.dashboard import run_recorder
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
+from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.sources.request import SourceRequest, request_of_kept, request_of_options
 from app.store.records import Author, Content
 from app.training.annotated_runs import annotated_run
-from app.worker.protocol import Begin, Open, Shown
+from app.worker.protocol import Begin, Open, Shown, View
 from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import TruthTrees
+from tests.app.batch.finished_runs import write_run
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
 
@@ -252,44 +253,64 @@ async def test_two_runs_of_one_recording_are_compared(both: Running) -> None:
     new, old = (row["key"] for row in await runs(client))
     told = (await client.get("/api/runs/compare", params={"a": old, "b": new})).json()
     assert told["how"] == "same recording"
-    assert (told["only_a"], told["only_b"], told["moved"]) == ([], [4], 0)
-    assert [(pair["a"], pair["b"], pair["shift_m"]) for pair in told["pairs"]] == [
+    assert [(row["tree_a"], row["tree_b"], row["shift_m"]) for row in told["rows"]] == [
         (1, 1, 0),
         (2, 2, 0),
         (3, 3, 0),
+        (None, 4, None),
     ]
+    assert told["record"]["counts"]["same"] == 3
     assert told["parameters"] == [{"name": "clustering.eps", "a": 0.15, "b": 0.4}]
 
 
-def a_run(places: list[tuple[float, float]]) -> dict[str, Any]:
-    trees = [
-        {
-            "number": k + 1,
-            "x": x,
-            "y": y,
-            "ellipse": [0.02, 0.02, 0.0],
-            "dbh_cm": 20.0 + k,
-            "sigma_dbh_cm": 1.0,
-        }
-        for k, (x, y) in enumerate(places)
-    ]
-    return {"map": {"trees": trees, "path": [[0.0, 0.0]]}, "parameters": {"a": 1}}
+async def test_two_visits_are_those_of_the_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two folders in frames of their own: a tree has grown, one is gone, one is new."""
+    from app.cli import main
 
-
-async def test_runs_of_two_recordings_are_laid_upon_one_another() -> None:
     rng = np.random.default_rng(3)
-    there = rng.uniform(-15, 15, (24, 2))
+    there = rng.uniform(1, 19, (24, 2))
     c, s = np.cos(0.7), np.sin(0.7)
     here = (there - [3.0, -2.0]) @ np.array([[c, -s], [s, c]])
-    told = await compare(a_run(list(map(tuple, there))), a_run(list(map(tuple, here))), same_source=False)
-    assert told["how"] == "aligned by 24 stems"
-    assert (told["only_a"], told["only_b"], len(told["pairs"])) == ([], [], 24)
+    dbh = rng.uniform(0.15, 0.45, 24)
+    grown = dbh.copy()
+    grown[5] += 0.05
+    folder = tmp_path / "recordings"
+    write_run(folder / "first", there[1:], dbh[1:], dbh_sigma=0.004, numbers=range(2, 25))
+    write_run(folder / "second", here[:-1], grown[:-1], dbh_sigma=0.004, side=20.0)
+    paths = [str(folder / name) for name in ("first", "second")]
+    assert await asyncio.to_thread(main, ["compare", *paths, "--out", str(tmp_path / "out")]) == 0
+    async with running(Settings(folder=tmp_path)) as (client, _):
+        client.headers.update(BEARER)
+        query = {"a": "folder:first", "b": "folder:second"}
+        run = folder / "second" / "run.json"
+        run.write_text(run.read_text().replace('"sha256": "00"', '"sha256": "01"'))
+        told = (await client.get("/api/runs/compare", params=query)).json()
+    assert told["how"] == "aligned by 22 stems"
     np.testing.assert_allclose(told["pose"], [3.0, -2.0, 0.7], atol=0.02)
-    few = await compare(a_run([(0, 0)]), a_run([(0.3, 0), (9, 9)]), same_source=False)
-    assert few["how"].startswith("not aligned")
-    assert (few["only_b"], few["moved"], few["pairs"][0]["shift_m"]) == ([2], 1, 0.3)
-    empty = await compare(a_run([]), a_run([(1, 1)]), same_source=True)
-    assert (empty["only_b"], empty["shift_rms_m"]) == ([1], None)
+    assert told["csv"] == (tmp_path / "out" / "comparison.csv").read_text()
+    assert [row["tree_a"] for row in told["rows"] if row["significant"]] == [6]
+    assert (told["record"]["pairs"], told["record"]["significant"]) == (22, 1)
+    np.testing.assert_allclose(told["places_b"]["6"], there[5], atol=0.02)
+
+
+async def test_maps_that_do_not_fit_are_compared_without_alignment(tmp_path: Path) -> None:
+    folder = tmp_path / "recordings"
+    write_run(folder / "few", [[1.0, 1.0]], [0.2])
+    write_run(folder / "none", np.zeros((0, 2)), [])
+    write_run(folder / "other", [[1.3, 1.0], [9.0, 9.0]], [0.2, 0.3])
+    for k, name in enumerate(("few", "none", "other")):
+        run = folder / name / "run.json"
+        run.write_text(run.read_text().replace('"sha256": "00"', f'"sha256": "{k}"'))
+    async with running(Settings(folder=tmp_path)) as (client, _):
+        client.headers.update(BEARER)
+        for a, b, statuses in (("few", "other", ["same", "new"]), ("none", "few", ["new"])):
+            query = {"a": f"folder:{a}", "b": f"folder:{b}"}
+            told = (await client.get("/api/runs/compare", params=query)).json()
+            assert told["how"].startswith("not aligned: the stems of the two visits do not agree")
+            assert not told["aligned"]
+            assert [row["status"] for row in told["rows"]] == statuses
 
 
 async def test_a_finished_folder_in_the_data_folder_is_listed_and_read(tmp_path: Path) -> None:
@@ -297,7 +318,8 @@ async def test_a_finished_folder_in_the_data_folder_is_listed_and_read(tmp_path:
 
     folder = tmp_path / "recordings"
     folder.mkdir()
-    assert main(["map", "sim:stand?duration=3", "--out", str(folder / "north")]) == 0
+    changed = ("--set", "clustering.min_points=9")
+    assert main(["map", "sim:stand?duration=3", "--out", str(folder / "north"), *changed]) == 0
     (folder / "broken").mkdir()
     (folder / "broken" / "run.json").write_text("{")
     (folder / "broken" / "trees.csv").write_text("")
@@ -309,6 +331,7 @@ async def test_a_finished_folder_in_the_data_folder_is_listed_and_read(tmp_path:
         assert [each["name"] for each in listed] == ["broken", "north"]
         whole = (await client.get("/api/runs/folder:north")).json()
         assert (whole["uri"], whole["scans"], whole["preset"]) == ("sim:stand?duration=3", 30, "forest")
+        assert whole["differences"] == {"clustering.min_points": 9}
         assert len(whole["map"]["trees"]) == whole["trees"] > 0
         assert whole["scores"]["TA"]["of"] > 0
         refused = await client.get("/api/runs/folder:broken")
@@ -336,3 +359,44 @@ def test_a_long_path_is_thinned_and_keeps_its_ends() -> None:
     assert len(thin) == MOST_PATH_POINTS
     assert (thin[0], thin[-1]) == ([0.0, 0.0], [9999.0, 0.0])
     assert thinned(xy[:0]) == []
+
+
+async def test_the_report_of_a_run_is_that_of_the_command_line(both: Running, tmp_path: Path) -> None:
+    """Of the open run, and of a run in the list, which keeps its result files."""
+    from app.batch.report import report_page
+
+    client, dashboard = both
+    assert (await client.get("/api/runs/open/report/html")).status_code == 409
+    await play(dashboard)
+    assert dashboard.path is not None
+    for stamp in dashboard.path.stamp_ns.tolist():
+        await dashboard.receive(View(1, stamp, np.full(360, 8.0)))
+    await show(dashboard, 3, 4)
+    shape = {"kind": "circle", "x": 1.0, "y": 1.0, "radius": 3.0}
+    run = (await client.get("/api/annotations")).json()["run"]
+    body = {"run": run, "browser": "a" * 16, "who": "Ann", "plots": [{"name": "north", "shape": shape}]}
+    assert (await client.post("/api/plots", json=body)).status_code == 201
+
+    reply = await client.get("/api/runs/open/report/html?language=de&volume=0.001*dbh_cm^2")
+    assert reply.status_code == 200, reply.text
+    assert reply.headers["content-disposition"] == 'attachment; filename="report.html"'
+    page = reply.text
+    assert "Bestandesbericht" in page
+    assert "north" in page
+    assert "Stammvolumen je Hektar" in page
+    english = (await client.get("/api/runs/open/report/html")).text
+    assert "What was left out" not in english  # only `stemmap map` counts it
+    with ShownRun.of(dashboard).folder() as folder:
+        assert english == report_page(folder, plots=ShownRun.of(dashboard).sample_plots())
+
+    key = next(row["key"] for row in await runs(client))
+    assert (await client.get(f"/api/runs/{key}/report/html")).text == english
+    await play(dashboard, "other:", run=2)
+    async with asyncio.timeout(20):  # the files are written in the background
+        while (stored := await client.get(f"/api/runs/{key}/report/html")).status_code == 409:
+            assert "without its result files" in stored.text
+            await asyncio.sleep(0.05)
+    assert (stored.status_code, stored.text == english) == (200, True)
+    assert (await client.get("/api/runs/999/report/html")).status_code == 404
+    assert (await client.get("/api/runs/folder:none/report/html")).status_code == 404
+    assert (await client.get(f"/api/runs/{key}/report/html?language=xx")).status_code == 422

@@ -10,6 +10,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
+from app.batch.revisit import read_visit
 from app.batch.run_folder import read_run
 from pipeline.geometry.poses import Pose2
 from pipeline.stand.revisit import VisitTrees, compare_visits
@@ -99,6 +100,15 @@ def test_the_same_run_twice_has_no_change(visits, tmp_path, capsys):
     assert "60 same" in result.out
     assert "significant for 0" in result.out
     assert {row["significant"] for row in rows(tmp_path / "out")} == {"false"}
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+@pytest.mark.parametrize(("trees", "numbers"), [((7, 12), [7, 12]), ((7, 7), [1, 2]), ((7, 10**30), [1, 2])])
+def test_trees_of_a_table_keep_their_numbers_if_these_are_unique(tmp_path, delimiter, trees, numbers):
+    table = tmp_path / "trees.csv"
+    text = f"Tree,x_m,y_m\n{trees[0]},1.0,2.0\n\n{trees[1]},3.0,4.0\n"
+    table.write_text(text.replace(",", delimiter))
+    assert read_visit(table).trees.number.tolist() == numbers
 
 
 def test_only_what_the_other_visit_looked_at_is_missing(visits, tmp_path, capsys):

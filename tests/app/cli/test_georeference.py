@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import re
 from types import SimpleNamespace
 
@@ -18,7 +19,7 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers.measured_poses import Fix
 from pipeline.io.readers.ros import RosSource
-from tests.app.batch.finished_runs import grid_run
+from tests.app.batch.finished_runs import grid_run, write_run
 from tests.app.cli.test_commands import stemmap
 
 TRUE = Pose2(500000.0, 5300000.0, 0.5)  # UTM zone 32
@@ -95,6 +96,7 @@ def test_plots_of_the_country_are_moved_into_the_map(run, tmp_path, capsys):
         ("tree,easting,northing\n1,500000,5300000\n2,500009,5300000\n", "contradict|times"),
         ("tree,easting,northing\n1,5300000,500000\n2,5300002,500000\n", "no place|longitude"),
         ("tree,easting,northing\n1,nan,5300000\n", "not a number"),
+        (f"name,tree,easting,northing\n{'n' * 61},1,500000,5300000\n", "more than 60 characters"),
     ],
 )
 def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, message):
@@ -111,6 +113,7 @@ def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, mes
     [
         (["--by-hand", "500000,5300000,0"], 2, "--crs is missing"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:1"], 1, "not a coordinate reference system"),
+        (["--by-hand", "500000,5300000,0", "--crs", "²"], 1, "not a coordinate reference system"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4326"], 1, "degrees"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:2263"], 1, "foot"),
         (["--by-hand", "50,5,0", "--crs", "EPSG:25832"], 1, "do not fit"),
@@ -121,6 +124,39 @@ def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, mes
 def test_what_does_not_fit_is_refused_in_one_line(run, capsys, words, code, message):
     result = stemmap(capsys, "georeference", run, *words)
     result.refused(code, message)
+
+
+def test_a_map_that_is_already_in_the_country_gets_its_system_in_one_step(tmp_path, capsys):
+    run = write_run(
+        tmp_path / "run", np.array([[470628.0, 3650000.0], [470640.0, 3650010.0]]), np.full(2, 0.2)
+    )
+    zeros = stemmap(capsys, "georeference", run, "--by-hand", "0,0,0", "--crs", "EPSG:26912")
+    assert zeros.code == 0, zeros.err
+    again = stemmap(capsys, "georeference", run, "--in-file", "--crs", "EPSG:26912")
+    assert again.out == zeros.out
+    frame = read_map_frame(run)
+    assert (frame.crs, frame.pose, frame.z) == ("EPSG:26912", Pose2(0.0, 0.0, 0.0), 0.0)
+    stemmap(capsys, "georeference", run, "--in-file").refused(2, "--crs is missing")
+
+
+def test_coordinates_of_a_local_map_are_in_no_system(run, capsys):
+    stemmap(capsys, "georeference", run, "--in-file", "--crs", "EPSG:26912").refused(1, "do not fit")
+
+
+def test_the_confirmation_shows_where_the_map_is(run, capsys):
+    words = ("georeference", run, "--by-hand", "391000,5819000,0", "--crs")
+    for code, place in ((25833, "33N: 13.39° E, 52.51° N"), (25830, "30N: 4.61° W")):
+        told = stemmap(capsys, *words, f"EPSG:{code}").out
+        assert f"EPSG:{code}, " in told
+        assert place in told
+        assert "area of use: Europe between" in told
+        assert ", by hand" in told
+    # A file of an earlier version has no place, and "by hand" with its preposition.
+    file = run / "georeference.json"
+    record = json.loads(file.read_text()) | {"how": "by hand"}
+    del record["place"]
+    file.write_text(json.dumps(record))
+    assert stemmap(capsys, "georeference", run).out.endswith("to north, by hand\n")
 
 
 def test_removing_makes_the_map_local(run, capsys):
@@ -152,7 +188,7 @@ def test_fixes_of_the_recording_place_the_map_in_spite_of_outliers(run, capsys, 
     monkeypatch.setattr(RosSource, "fixes", lambda _source: fixes)
     monkeypatch.setattr(RosSource, "close", lambda _source: None)
     monkeypatch.setattr("app.sources.opening.open_source", lambda _uri: source)
-    saved = SimpleNamespace(map=SimpleNamespace(stamp_ns=path.stamp_ns + start_ns))
+    saved = SimpleNamespace(start_ns=start_ns)
     monkeypatch.setattr("app.batch.continue_map.read_saved_run", lambda _folder: saved)
     result = stemmap(capsys, "georeference", run, "--gnss", "--crs", "EPSG:25832")
     assert result.code == 0, result.err

@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 
 from app.batch.run_folder import read_run
+from app.sources.inspection_process import cloud
+from app.sources.opening import open_cloud
+from pipeline.errors import StemmapError
 from tests.app.cli.test_commands import stemmap
 
 
@@ -35,10 +38,14 @@ def test_the_cloud_of_a_drive_has_its_trees_and_its_ground(tmp_path, capsys):
     np.testing.assert_array_equal(kinds == 5, np.asarray(cloud.tree) > 0)
     ground = np.asarray(cloud.z)[kinds == 2]
     assert np.abs(np.median(ground) - 400.0) < 1.5
+    assert open_cloud(str(tmp_path / "cloud.laz")).description.cut_above
     again = tmp_path / "again.laz"
     assert stemmap(capsys, "export", run, "--to", again).code == 0
     assert again.read_bytes() == (tmp_path / "cloud.laz").read_bytes()
     assert sorted(file.name for file in tmp_path.iterdir()) == ["again.laz", "cloud.laz", "run"]
+    assert stemmap(capsys, "map", again, "--out", tmp_path / "whole").code == 3  # the cut is a warning
+    assert stemmap(capsys, "export", tmp_path / "whole", "--to", tmp_path / "whole.laz").code == 0
+    assert open_cloud(str(tmp_path / "whole.laz")).description.cut_above
 
 
 def test_a_whole_cloud_keeps_its_points(tmp_path, capsys):
@@ -57,6 +64,7 @@ def test_a_whole_cloud_keeps_its_points(tmp_path, capsys):
     of_tree = np.asarray(cloud.tree) > 0
     assert of_tree[20000:].mean() > 0.95
     assert of_tree[:20000].sum() == 0
+    assert not open_cloud(str(tmp_path / "cloud.las")).description.cut_above
     assert cloud.header.parse_crs() is None
 
 
@@ -70,3 +78,15 @@ def test_a_source_that_is_gone_or_a_folder_that_is_not_there_is_one_line(tmp_pat
     result = stemmap(capsys, "export", run, "--to", tmp_path / name)
     result.refused(1)
     assert not (tmp_path / "cloud.laz").exists()
+
+
+def test_the_page_writes_the_same_bytes_and_refuses_a_live_run(tmp_path, capsys):
+    run = tmp_path / "run"
+    assert stemmap(capsys, "map", "sim:stand?duration=2", "--out", run).code == 0
+    assert stemmap(capsys, "export", run, "--to", tmp_path / "line.laz").code == 0
+    assert cloud({"path": str(run), "file": str(tmp_path / "page.laz")}) == {}
+    assert (tmp_path / "page.laz").read_bytes() == (tmp_path / "line.laz").read_bytes()
+    record = run / "run.json"
+    record.write_text(record.read_text().replace("sim:stand?duration=2", "zenoh:tcp/127.0.0.1:7447"))
+    with pytest.raises(StemmapError, match="a live run has no recording"):
+        cloud({"path": str(run), "file": str(tmp_path / "live.laz")})

@@ -9,6 +9,7 @@ import warnings
 
 import geopandas
 import numpy as np
+import pyproj
 import pytest
 import shapely
 
@@ -89,13 +90,36 @@ def test_points_with_a_radius_are_circles(run, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
+    ("point", "radius", "message"),
+    [
+        (shapely.Point(10, 10), "5 m", "plot a: the radius '5 m' is not a number"),
+        (shapely.Point(10, 10), math.nan, "plot a: the radius 'nan' is not a number"),
+        (shapely.Point(), 5.0, "plot a is not an area"),
+    ],
+)
+def test_points_without_a_place_or_a_radius_are_refused(run, tmp_path, capsys, point, radius, message):
+    file = written(tmp_path, "p.gpkg", [point], columns={"radius_m": [radius]})
+    stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local").refused(1, message)
+
+
+def test_a_file_of_features_that_is_not_one_json_value_is_refused(run, tmp_path, capsys):
+    feature = {
+        "type": "Feature",
+        "properties": {},
+        "geometry": shapely.geometry.mapping(shapely.box(0, 0, 9, 9)),
+    }
+    (file := tmp_path / "p.geojson").write_text(2 * (json.dumps(feature) + "\n"))
+    stemmap(capsys, "stand", run, "--plots", file, "--plots-crs", "local").refused(1, "not JSON in UTF-8")
+
+
+@pytest.mark.parametrize(
     ("words", "message"),
     [
         (["--circle", "500,500,5"], "outside of what the run observed"),
         (["--circle", "10,10,0"], "area of 0"),
         (["--along", "200"], "no plots every 200 m"),
         (["--plots", "missing.gpkg"], "cannot read the plots"),
-        (["--plots", "plots.txt"], ".gpkg, .shp or .geojson"),
+        (["--plots", "plots.txt"], "or .geojson files"),
     ],
 )
 def test_plots_that_cannot_be_used_are_refused(run, capsys, words, message):
@@ -182,3 +206,43 @@ def test_trees_far_from_every_view_are_corrected_for_detection(tmp_path, capsys)
     assert none.code == 0
     row = table(tmp_path / "none" / "stand.csv")["all"]
     assert row["n_ha"] == row["n_ha_corrected"]
+
+
+def test_a_formula_of_the_user_gives_volumes(run, tmp_path, capsys):
+    result = stemmap(capsys, "stand", run, "--volume", "0.001 * dbh_cm^2", "--out", tmp_path / "out")
+    assert (result.code, result.err) == (0, "")
+    assert "Stem volume: 1,000" in result.out
+    row = table(tmp_path / "out" / "stand.csv")["all"]
+    assert float(row["v_ha"]) == pytest.approx(1000.0)
+    assert row["trees_with_volume"] == "100"
+    # A drive sees no tree tops: without heights there is no volume, and the warning says so.
+    result = stemmap(capsys, "stand", run, "--volume", "0.001 * dbh_cm^2 * height_m")
+    assert result.code == 3
+    assert "volume of 0 of 100 trees" in result.err
+    result = stemmap(capsys, "stand", run, "--volume", "dbh + 1")
+    assert (result.code, "--volume" in result.err, "'dbh'" in result.err) == (2, True, True)
+
+
+def test_a_reference_system_in_wkt_is_reported_by_its_name(tmp_path, capsys):
+    wkt = pyproj.CRS("EPSG:25832").to_wkt()
+    run = grid_run(tmp_path / "run", seen=False, cloud_crs=wkt)
+    result = stemmap(capsys, "stand", run)
+    assert "coordinates ETRS89 / UTM zone 32N\n" in result.out
+
+
+def test_coordinates_may_be_negative(run, capsys):
+    alone = stemmap(capsys, "stand", run, "--circle", "-1,2,6").out
+    assert "1 plot" in alone
+    assert alone == stemmap(capsys, "stand", run, "--circle=-1,2,6").out
+    stemmap(capsys, "stand", "--", "-5,3.run").refused(1, "-5,3.run")
+
+
+def test_a_plot_may_be_called_all(run, tmp_path, capsys):
+    file = tmp_path / "plots.geojson"
+    ring = [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]
+    shape = {"type": "Polygon", "coordinates": [ring]}
+    feature = {"type": "Feature", "properties": {"name": "all"}, "geometry": shape}
+    file.write_text(json.dumps({"type": "FeatureCollection", "coordinateFrame": {}, "features": [feature]}))
+    result = stemmap(capsys, "stand", run, "--plots", file)
+    assert result.out.startswith("1 plot: ")
+    assert "plot all: " in result.err

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import time
-from pathlib import Path
 
 from app.common.child_process import ParentConnection, run_child
 
@@ -36,12 +34,4 @@ def serve(parent: ParentConnection) -> None:
 
 
 if __name__ == "__main__":
-    mark = Path(sys.argv[1]) if len(sys.argv) > 1 else None
-
-    def close() -> None:
-        """Write the mark before the process ends."""
-        if mark is not None:
-            mark.touch()
-        os._exit(0)
-
-    run_child(serve, memory_limit=512 << 20, on_close=close)
+    run_child(serve, memory_limit=512 << 20)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from app.common.arrays import first_difference
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.payload import clearance_payload, ellipses
-from pipeline.types.clearance import Clearance, Zone
+from pipeline.types.records import Clearance, Zone
 
 
 async def following(stream: Any, n: int) -> list[dict[str, Any]]:
@@ -71,7 +71,7 @@ async def test_maps_wait_for_their_round_and_states_do_not() -> None:
         live.publish("status", {"state": "paused"})
         kinds = [message["type"] for message in await following(stream, 2)]
     assert kinds == ["status", "map"]
-    assert live.listeners == 0
+    assert not live._listeners
 
 
 @given(st.lists(st.integers(0, 2), max_size=6), st.lists(st.integers(0, 2), max_size=6))

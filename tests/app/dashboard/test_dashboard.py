@@ -34,15 +34,16 @@ from pipeline.config import preset
 from pipeline.errors import ParameterError, SourceError
 from pipeline.ground.terrain_map import no_height_map
 from tests.app.explain.stories import cluster_story
-from tests.app.fakes import FakeScene, FakeWorker, frame, opened, path, truth_trees
+from tests.app.fake_scene import FakeScene
+from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 
 
 @pytest_asyncio.fixture
 async def dashboard() -> AsyncIterator[Dashboard]:
     made = Dashboard(ParameterState(), Broadcast())
-    made.worker, made.scene = FakeWorker(), FakeScene()
+    made.worker = FakeWorker()
     made.check_source = AsyncMock()
-    await made.start(Open("fake:"))
+    await made.start(Open("fake:"), FakeScene)
     yield made
     await made.close()
 

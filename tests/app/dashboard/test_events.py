@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.dashboard.events import Events
-from pipeline.types.pose_health import Health
+from pipeline.types.records import Health
 from tests.app.fakes import frame
 
 

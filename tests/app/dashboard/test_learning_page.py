@@ -16,10 +16,9 @@ import pytest
 
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.learning import LEAST_OTHERS, LEAST_TREES, Learning
+from app.dashboard.learning import Learning
 from app.dashboard.payload import doubts_of
 from app.store.forests import Forests
-from app.training import learning as training
 from app.web.auth import viewer_token
 from pipeline.classification import no_columns
 from pipeline.classification.forest import ALL_AROUND, CLASSES, ONE_WAY
@@ -145,10 +144,6 @@ async def test_who_may_only_look_starts_nothing(tmp_path: Path) -> None:
         for method, where in (("POST", ""), ("DELETE", ""), ("POST", "/use")):
             assert (await client.request(method, f"/api/learning{where}")).status_code == 403
         assert (await client.get("/api/learning")).status_code == 200
-
-
-def test_the_page_asks_for_as_many_as_learning_does() -> None:
-    assert (LEAST_TREES, LEAST_OTHERS) == (training.LEAST_TREES, training.LEAST_OTHERS)
 
 
 def test_the_tree_whose_votes_are_nearest_to_the_limit_comes_first() -> None:

@@ -29,6 +29,9 @@ class RefusingStore:
     def update(self, _record: int, _figures: Any) -> None:
         pass
 
+    def put_files(self, _record: int, _files: bytes) -> None:
+        pass
+
     def revise_all(self, _record: int, changes: list[Any]) -> None:
         self.written += changes
 
@@ -37,7 +40,7 @@ def recorder_of(store: RefusingStore) -> RunRecorder:
     """A recorder of an open run that has a record and has shown a scan."""
     recorder = RunRecorder(cast(Any, store))
     page = run_recorder._Page(cast(Any, None), None, record=1)
-    page.best = page.newest = cast(Any, SimpleNamespace(shown=SimpleNamespace(time_s=2.0)))
+    page.best = page.newest = cast(Any, SimpleNamespace(shown=SimpleNamespace(time_s=2.0), files=dict))
     recorder._page = page
     return recorder
 

@@ -11,10 +11,9 @@ from app.explain import build
 from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import CLASSES, FREE_END, ONE_WAY, Forest, forest_of, vote
 from pipeline.config import preset
-from pipeline.types.records import Columns, Sensor, Verdict
+from pipeline.types.records import Columns, Verdict
 from tests.app.scene.frames import make_frame
 
-SENSOR = Sensor("one way", rings=0, ring_step=0.0, azimuth_step=0.003, range_sigma=0.02)
 TREE, POLE = {"share": [1.0, 0, 0, 0, 0, 0]}, {"share": [0, 1.0, 0, 0, 0, 0]}
 THICK = NAMES.index("thick")
 
@@ -55,7 +54,7 @@ def test_a_pole_in_free_air_is_told_by_the_trees_that_took_it_for_one(
     forest = asked()
     monkeypatch.setattr(build, "kept_forests", lambda: lambda _name, _all_around: forest)
     frame = replace(make_frame(), columns=column(forest, top, thick))
-    story = build.column_story(frame, np.zeros(2), preset("forest"), SENSOR)
+    story = build.column_story(frame, np.zeros(2), preset("forest"), False)
     assert story is not None
     assert (story.tree_in_free_air, story.verdict) == (share, verdict)
     assert [figure.figure for figure in story.effects] == told

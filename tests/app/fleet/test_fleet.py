@@ -25,7 +25,8 @@ from app.store.records import NewRun
 from app.web.auth import viewer_token
 from app.web.serving import bind
 from app.worker.protocol import Open
-from tests.app.fakes import FakeScene, FakeWorker
+from tests.app.fake_scene import FakeScene
+from tests.app.fakes import FakeWorker
 from tests.app.server_for_tests import TOKEN
 
 SETTINGS = Settings(port=0)
@@ -37,7 +38,7 @@ def make(port: int, settings: Settings = SETTINGS) -> Fleet:
         port,
         TOKEN,
         make_scene=lambda _dashboard, _loop: FakeScene(),
-        make_worker=lambda _dashboard: FakeWorker(),
+        make_worker=FakeWorker,
     )
 
 
@@ -173,7 +174,7 @@ async def test_robots_begin_when_what_they_need_is_compiled():
         40000,
         TOKEN,
         make_scene=lambda _dashboard, _loop: FakeScene(),
-        make_worker=lambda _dashboard: FakeWorker(),
+        make_worker=FakeWorker,
         warm=warm,
     )
     assert fleet.add("red", Open("fake:red"))

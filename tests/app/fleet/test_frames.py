@@ -43,10 +43,10 @@ async def test_a_try_waits_for_more_trees(monkeypatch: pytest.MonkeyPatch):
     asked: list[int] = []
 
     async def refused(_a: dict[str, Any], b: dict[str, Any]) -> tuple[None, str]:
-        asked.append(len(b["map"]["trees"]))
+        asked.append(len(b["trees"]))
         return None, "too few stems"
 
-    monkeypatch.setattr(module, "align", refused)
+    monkeypatch.setattr(module, "_aligned", refused)
     frames = Frames()
     for count in range(1, 20):
         await frames.try_one({"a": ("one", shown(STEMS)), "b": ("two", shown(STEMS[:count]))})
@@ -71,7 +71,7 @@ async def test_the_same_recording_is_left_when_another_source_is_opened(
     async def refused(_a: dict[str, Any], _b: dict[str, Any]) -> tuple[None, str]:
         return None, "other stems"
 
-    monkeypatch.setattr(module, "align", refused)
+    monkeypatch.setattr(module, "_aligned", refused)
     maps = {"a": ("one", shown(STEMS)), "b": ("one", shown(STEMS))}
     frames = Frames()
     await frames.try_one(maps)

@@ -21,7 +21,7 @@ from app.robot.link import (
     Inbox,
 )
 from app.robot.recorder import Recorder
-from app.robot.source import FULL, REFUSED, SPARED, LiveSource, PictureStore
+from app.robot.source import LiveSource, PictureStore
 from app.robot.topics import PICTURE_TYPES, Publisher, choose
 from app.worker.session import camera_picture, has_camera
 from pipeline.errors import StemmapError
@@ -159,7 +159,7 @@ def test_each_tree_gets_a_picture_of_those_that_were_put_aside(run: Path, tmp_pa
         assert isinstance(plain, RosSource)
         stamps = plain.picture_stamps()
         assert keep_pictures(live, trees_at((5.0, 0.0)), way(stamps), tmp_path) == (0, "")
-        live.keep_pictures(tmp_path / "not" / "there" / "yet")
+        live.keep_pictures()
         for k in range(1, len(stamps) + 1):
             frame: Any = RunFigures(stamps[k - 1])
             live.mapped(frame, way(stamps[:k]))
@@ -169,38 +169,38 @@ def test_each_tree_gets_a_picture_of_those_that_were_put_aside(run: Path, tmp_pa
         assert (tmp_path / "pictures" / "tree_0001.jpg").read_bytes().startswith(b"\xff\xd8")
 
 
-def test_what_is_put_aside_is_bounded_and_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("app.robot.source.MOST_BYTES", 25)
-    with closing(PictureStore(tmp_path)) as kept:
+def test_what_is_put_aside_is_bounded_and_counted(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("app.robot.source.MOST_BYTES", 2500)
+    data = [np.random.default_rng(k).bytes(1000) for k in range(5)]
+    with closing(PictureStore()) as kept:
         for k in range(1, 5):
             assert kept.is_due(way(list(range(1, 3 * k))))
-            kept.add(Picture(k, "", 0, 0, 0, bytes([k]) * 10), way(list(range(1, 3 * k))))
+            kept.add(Picture(k, "", 0, 0, 0, data[k]), way(list(range(1, 3 * k))))
         assert kept.stamps() == [1, 2]
-        assert kept.losses == {FULL: 2}
-        assert [picture.data for picture in kept.at({2, 3})] == [bytes([2]) * 10]
-    assert list(tmp_path.iterdir()) == []
+        ((reason, number),) = kept.losses.items()
+        assert ("the limit of" in reason, number) == (True, 2)
+        assert [picture.data for picture in kept.at({2, 3})] == [data[2]]
 
 
-def test_the_disk_keeps_its_reserve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    free = [SPARE_BYTES + 10, SPARE_BYTES + 9]
-    monkeypatch.setattr("app.robot.source.free_space", lambda _: free.pop(0))
-    with closing(PictureStore(tmp_path)) as kept:
-        for stamp_ns in (1, 2):
-            kept.add(Picture(stamp_ns, "", 0, 0, 0, bytes(10)), way([1]))
-        assert kept.stamps() == [1]
-        assert kept.losses == {SPARED: 1}
+def test_the_disk_keeps_its_reserve(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("pipeline.io.block_file.free_space", lambda _: SPARE_BYTES - 1)
+    with closing(PictureStore()) as kept:
+        kept.add(Picture(1, "", 0, 0, 0, bytes(10)), way([1]))
+        assert kept.stamps() == []
+        assert list(kept.losses) == [
+            "pictures not stored for trees: less than 2 GB of the disk would be left"
+        ]
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no disk here that is always full")
-def test_a_full_disk_costs_pictures_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def full(dir: Path, **how: Any) -> Any:
-        del dir
-        return Path("/dev/full").open("w+b", **how)
+def test_a_full_disk_costs_pictures_and_nothing_else(monkeypatch: pytest.MonkeyPatch):
+    def full(**_how: Any) -> Any:
+        return Path("/dev/full").open("w+b", buffering=0)
 
-    monkeypatch.setattr("app.robot.source.tempfile.TemporaryFile", full)
-    with closing(PictureStore(tmp_path)) as kept:
+    monkeypatch.setattr("pipeline.io.block_file.TemporaryFile", full)
+    with closing(PictureStore()) as kept:
         kept.add(Picture(1, "", 0, 0, 0, bytes(10)), way([1]))
-        assert kept.losses == {REFUSED: 1}
+        assert list(kept.losses) == ["pictures not stored for trees: No space left on device"]
         assert list(kept.at(kept.stamps())) == []
 
 

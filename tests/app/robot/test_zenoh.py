@@ -9,14 +9,15 @@ from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from app.robot.link import LOST_SCANS
 from app.robot.source import LiveSource, open_live
+from pipeline.errors import SourceError
 from pipeline.io.recording import outputs
-from pipeline.types.clearance import Clearance, Zone
-from pipeline.types.records import Odometry, Record, Scan
+from pipeline.types.records import Clearance, Odometry, Record, Scan, Zone
 from tests.app.fakes import START_NS, frame, path, trees
-from tests.app.robot.conftest import POINTS, SCANS, Child, Robot, listening, until
+from tests.app.robot.conftest import POINTS, SCANS, Child, Robot, free_port, listening, until
 
 
 def taken(source: LiveSource, records: list[Record], scans: int) -> None:
@@ -106,3 +107,22 @@ def test_others_hear_the_pose_and_the_trees(router: int, robots: Callable[[str],
         robot.send()
         until(source.listen)
         assert not any("stemmap" in topic.name for topic in source.description.topics)
+
+
+def test_all_robots_at_once_and_unknown_options_are_refused():
+    for options, reason in (("robot=*", "only one robot"), ("mapped=robot", "no option 'mapped'")):
+        with pytest.raises(SourceError, match=reason):
+            open_live(f"zenoh:tcp/127.0.0.1:9?{options}")
+
+
+def test_routers_that_are_connected_pass_a_robot_on(router: int, robots: Callable[[str], Robot]):
+    far = free_port()
+    other = Child("-m", "tests.app.robot.router", str(far), str(router))
+    assert other.hear() == "ready"
+    with closing(listening(f"zenoh:tcp/127.0.0.1:{far}?robot=red")) as source:
+        robot = robots("red")
+        until(lambda: source.listen() or "announced and silent" in source.waiting_for(), source.waiting_for)
+        robot.send()
+        until(source.listen, source.waiting_for)
+        assert source.robots == ["red"]
+    other.kill()

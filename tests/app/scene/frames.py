@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from app.scene.labels import LabelNodes
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Clusters, Detections, Frame, PoseEstimate, Trees, Verdict
 
@@ -90,3 +91,8 @@ def make_frame(index: int = 0, *, trees: int = 25, clusters: int = 8, pose: Pose
         trees=make_trees(trees),
         counts={"raw": len(members) + 430, "filtered": len(members) + 30},
     )
+
+
+def texts_of(labels: LabelNodes) -> list[str]:
+    """The visible texts."""
+    return [label.text for label in labels._shown.values()]

@@ -11,19 +11,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.scene import Scene
-from app.scene.labels import BEHIND, MOST_LABELS, Label, LabelNodes, apart, cluster_labels, short
-from tests.app.scene.frames import make_frame, make_trees
+from app.scene.labels import (
+    BEHIND,
+    MOST_LABELS,
+    TEXT_HEIGHT,
+    Label,
+    LabelNodes,
+    apart,
+    cluster_labels,
+    short,
+)
+from tests.app.scene.frames import make_frame, make_trees, texts_of
 
 PATH = np.zeros((1, 2))
 
 
 def test_clusters_are_labelled_by_the_ratio_of_eigenvalues_and_trees_by_dbh(scene: Scene):
-    frame = make_frame(0)
-    scene.show(frame, PATH)
-    assert {"λ1/λ2 5.0", "λ1/λ2 ∞"} <= set(scene._scan.texts)
-    assert any(re.fullmatch(r"\d+: \d+ cm", text) for text in scene._map.texts)
+    frame = make_frame(0, trees=4, clusters=3)
+    far = replace(frame.clusters, centroid=frame.clusters.centroid * np.array([4.0, 4.0, 1.0]))
+    scene.show(replace(frame, clusters=far), PATH)
+    assert {"λ1/λ2 5.0", "λ1/λ2 ∞"} <= set(texts_of(scene._scan._labels))
+    assert any(re.fullmatch(r"\d+: \d+ cm", text) for text in texts_of(scene._map._labels))
     scene.choose("labels", False)
-    assert scene._scan.texts == scene._map.texts == []
+    assert texts_of(scene._scan._labels) == texts_of(scene._map._labels) == []
 
 
 def test_a_cluster_at_a_labelled_tree_has_no_label_of_its_own(scene: Scene):
@@ -32,8 +42,8 @@ def test_a_cluster_at_a_labelled_tree_has_no_label_of_its_own(scene: Scene):
     at = frame.estimate.T_map_base.apply(frame.clusters.centroid[:, :2] + offset)
     trees = make_trees(len(at))
     scene.show(replace(frame, trees=replace(trees, position=at + 0.05)), PATH)
-    assert len(scene._map.texts) == len(at)
-    assert scene._scan.texts == []
+    assert len(texts_of(scene._map._labels)) == len(at)
+    assert texts_of(scene._scan._labels) == []
 
 
 @pytest.mark.parametrize(
@@ -42,7 +52,8 @@ def test_a_cluster_at_a_labelled_tree_has_no_label_of_its_own(scene: Scene):
 def test_labels_say_what_was_chosen(scene: Scene, label_by: str, expected: str | None):
     scene.show(make_frame(0), PATH)
     scene.choose("label_by", label_by)
-    assert scene._scan.texts == [] if expected is None else expected in scene._scan.texts
+    shown = texts_of(scene._scan._labels)
+    assert shown == [] if expected is None else expected in shown
 
 
 def test_trees_come_first_when_there_are_too_many():
@@ -51,22 +62,32 @@ def test_trees_come_first_when_there_are_too_many():
     centroid = frame.clusters.centroid * np.column_stack([wide, wide, np.ones(200)])
     frame = replace(frame, clusters=replace(frame.clusters, centroid=centroid))
     labels = cluster_labels(frame, np.arange(200), "verdict")
-    assert len(labels) == MOST_LABELS
+    assert 20 < len(labels) <= MOST_LABELS
     assert {label.text for label in labels} == {"tree"}
 
 
-@given(st.lists(st.tuples(st.floats(-40, 40), st.floats(-40, 40)), min_size=1, max_size=40), st.randoms())
-def test_no_label_lies_upon_another_and_none_is_left_out_without_one_that_covers_it(at, rng):
-    places, robot, width = np.array(at), np.array([1.0, 2.0]), 0.1
+@given(
+    st.lists(st.tuples(st.floats(-40, 40), st.floats(-40, 40), st.floats(0, 4)), min_size=1, max_size=40),
+    st.randoms(),
+)
+def test_no_label_covers_another_and_none_is_left_out_without_one_that_covers_it(at, rng):
+    places, robot, width = np.array(at), np.array([1.0, 2.0, 0.5]), 0.1
     order = np.array(rng.sample(range(len(at)), len(at)))
     kept = apart(places, order, robot, width, 100)
     assert kept[0] == order[0]
+    x, y, z = (places - robot - BEHIND).T
+    azimuth, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
     for k, row in enumerate(order.tolist()):
-        room = width * (BEHIND + np.linalg.norm(places[row] - robot))
         before = [other for other in kept if other in order[:k]]
-        is_free = all(np.linalg.norm(places[row] - places[other]) >= room for other in before)
-        assert (row in kept) == is_free
+        turn = np.abs(np.angle(np.exp(1j * (azimuth[row] - azimuth[before])))) * np.cos(elevation[row])
+        covered = (turn < width) & (np.abs(elevation[row] - elevation[before]) < TEXT_HEIGHT)
+        assert (row in kept) == (not covered.any())
     assert apart(places, order, robot, width, 3) == kept[:3]
+
+
+def test_distant_trees_behind_one_another_have_one_label():
+    trees = np.array([BEHIND + k * np.array([8.0, 4.5, -4.0]) for k in (3.0, 3.3, 1.0)])
+    assert apart(trees, np.array([2, 1, 0]), np.zeros(3), 0.09, 9) == [2]
 
 
 async def test_a_label_that_says_the_same_costs_nothing(scene: Scene):
@@ -76,7 +97,7 @@ async def test_a_label_that_says_the_same_costs_nothing(scene: Scene):
     labels.show([Label(2, "b", (1.05, 0.0, 0.0)), Label(1, "a", (0.0, 0.05, 0.0))])
     assert scene.messages == before
     labels.show([Label(3, "c", (9.0, 0.0, 0.0))])
-    assert labels.texts == ["c"]
+    assert texts_of(labels) == ["c"]
 
 
 @pytest.mark.parametrize(("value", "text"), [(3.2189, "3.2"), (16.457, "16"), (123.4, "100"), (np.inf, "∞")])
@@ -90,7 +111,7 @@ def test_a_stem_of_another_program_is_labelled_and_drawn_without_eccentricity_an
     extent = np.column_stack([frame.clusters.extent[:, :2], unknown])
     ready = replace(frame.clusters, eccentricity=unknown, extent=extent)
     scene.show(replace(frame, clusters=ready), PATH)
-    assert set(scene._scan.texts) == {"tree", "too long"}
+    assert set(texts_of(scene._scan._labels)) == {"tree", "too long"}
     scene.choose("colour_by", "eccentricity")
     fits = scene._server.scene.get_handle_by_name("/world/robot/scan/fits")
     assert fits is not None

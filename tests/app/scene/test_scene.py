@@ -12,7 +12,7 @@ from app.scene import Scene
 from app.scene import scene as scene_module
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import TruthTrees
-from tests.app.scene.frames import make_frame, make_trees
+from tests.app.scene.frames import make_frame, make_trees, texts_of
 from tests.app.scene.recorder import buffered
 
 PATH = np.column_stack([0.05 * np.arange(1000), np.zeros(1000)])
@@ -166,10 +166,10 @@ def test_selection_is_marked_and_named(scene: Scene):
     assert scene.select(7, (1.0, 2.0, 0.3)) == pytest.approx((1.0, 2.0, 0.0))
     scene.select(7)
     assert node(scene, "/world/selection").visible
-    assert any(text.startswith("tree 7, DBH") for text in scene._map.texts)
+    assert any(text.startswith("tree 7, DBH") for text in texts_of(scene._map._labels))
     scene.select(None)
     assert not node(scene, "/world/selection").visible
-    assert not any(text.startswith("tree") for text in scene._map.texts)
+    assert not any(text.startswith("tree") for text in texts_of(scene._map._labels))
 
 
 def test_a_click_or_a_look_around_sends_no_points(scene: Scene, monkeypatch: pytest.MonkeyPatch):

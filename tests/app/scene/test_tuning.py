@@ -31,7 +31,7 @@ async def moved(scene: Scene, name: str, value: float | int | bool | str) -> Per
     person = Person()
     server = scene._server
     server._connected_clients[0] = person  # type: ignore[assignment]
-    message = _messages.GuiUpdateMessage(scene._tune.widget(name)._impl.uuid, {"value": value})
+    message = _messages.GuiUpdateMessage(scene._tune._widgets[name]._impl.uuid, {"value": value})
     handlers = server._websock_server._incoming_handlers[_messages.GuiUpdateMessage]
     for handler in handlers:
         future = asyncio.run_coroutine_threadsafe(handler(0, message), server._event_loop)  # type: ignore[arg-type]
@@ -51,14 +51,14 @@ async def test_there_is_a_slider_for_each_main_parameter(scene: Scene):
     assert len(specs) == 12
     assert len({(spec.title, spec.unit) for spec in specs}) == 12  # the page finds them by their labels
     for spec in specs:
-        widget: Any = scene._tune.widget(spec.name)
+        widget: Any = scene._tune._widgets[spec.name]
         assert spec.title in widget.label
         assert spec.unit in widget.label
         assert (widget.min, widget.max) == spec.shown
 
 
 async def test_a_slider_reaches_a_value_beyond_its_range(scene: Scene):
-    slider: Any = scene._tune.widget("clustering.eps")
+    slider: Any = scene._tune._widgets["clustering.eps"]
     scene.show_parameters(preset("forest").replace({"clustering.eps": 4.0}), "forest")
     assert (slider.min, slider.max, slider.value) == (0.05, 4.0, 4.0)
     scene.show_parameters(preset("forest"), "forest")
@@ -74,7 +74,7 @@ async def test_a_person_changes_a_parameter(scene: Scene, recorder: Recorder):
 
 async def test_a_value_set_from_code_does_not_come_back(scene: Scene, recorder: Recorder):
     scene.show_parameters(preset("paper"), "paper")
-    assert scene._tune.widget("clustering.eps").value == 0.25
+    assert scene._tune._widgets["clustering.eps"].value == 0.25
     await asyncio.sleep(0)
     await until(lambda: not scene._tuning._tasks)
     assert recorder.asked == []
@@ -83,11 +83,11 @@ async def test_a_value_set_from_code_does_not_come_back(scene: Scene, recorder: 
 async def test_what_differs_from_the_preset_is_marked(scene: Scene):
     changed = preset("forest").replace({"clustering.eps": 0.3})
     scene.show_parameters(changed, "forest")
-    assert scene._tune.widget("clustering.eps").label.startswith("● ")
-    assert not scene._tune.widget("clustering.min_points").label.startswith("● ")
+    assert scene._tune._widgets["clustering.eps"].label.startswith("● ")
+    assert not scene._tune._widgets["clustering.min_points"].label.startswith("● ")
     assert "**1** value differs" in scene._tune._summary.content
     scene.show_parameters(preset("forest"), "forest")
-    assert not scene._tune.widget("clustering.eps").label.startswith("● ")
+    assert not scene._tune._widgets["clustering.eps"].label.startswith("● ")
 
 
 async def test_a_refused_value_goes_back_and_the_person_is_told():
@@ -96,7 +96,7 @@ async def test_a_refused_value_goes_back_and_the_person_is_told():
     try:
         person = await moved(scene, "filters.x_min", 90.0)
         assert person.told == ["refused for the test"]
-        assert scene._tune.widget("filters.x_min").value == Parameters().filters.x_min
+        assert scene._tune._widgets["filters.x_min"].value == Parameters().filters.x_min
     finally:
         scene.close()
 
@@ -114,9 +114,9 @@ async def test_while_one_change_is_under_way_only_the_newest_waits(scene: Scene,
         scene._tuning.change("clustering.eps", eps, None)
         await asyncio.sleep(0)
     # What the server says about the first change does not pull the slider away from the hand.
-    set_value(scene._tune.widget("clustering.eps"), 0.5)
+    set_value(scene._tune._widgets["clustering.eps"], 0.5)
     scene.show_parameters(preset("forest").replace({"clustering.eps": 0.2}), "forest")
-    assert scene._tune.widget("clustering.eps").value == 0.5
+    assert scene._tune._widgets["clustering.eps"].value == 0.5
     go.set()
     await until(lambda: not scene._tuning._busy)
     assert recorder.asked == [("change", {"clustering.eps": 0.2}), ("change", {"clustering.eps": 0.5})]
@@ -126,7 +126,7 @@ async def test_while_one_change_is_under_way_only_the_newest_waits(scene: Scene,
 async def test_a_value_of_another_kind_is_dropped(scene: Scene, recorder: Recorder, value: object):
     await moved(scene, "clustering.eps", value)  # type: ignore[arg-type]
     assert recorder.asked == []
-    assert scene._tune.widget("clustering.eps").value == 0.15
+    assert scene._tune._widgets["clustering.eps"].value == 0.15
 
 
 async def test_presets_and_resets_are_asked_for(scene: Scene, recorder: Recorder):

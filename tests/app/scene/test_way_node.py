@@ -13,7 +13,7 @@ from app.scene.robot import OF_ZONE, way_lines
 from pipeline.config.stages import Obstacles
 from pipeline.detection.obstacles import find_clearance
 from pipeline.geometry.poses import Pose2
-from pipeline.types.clearance import Clearance, Zone
+from pipeline.types.records import Clearance, Zone
 from tests.app.scene.frames import make_frame
 
 P = Obstacles()

@@ -15,7 +15,7 @@ from app.common.settings import Settings
 from app.robot.link import Inbox
 from app.robot.source import open_any
 from app.robot.topics import Publisher
-from app.sources import inspection
+from app.sources import inspection, inspection_process
 from app.sources.inspection import ask, check_source
 from app.sources.request import SourceRequest
 from app.worker.protocol import Open
@@ -71,7 +71,7 @@ async def test_a_path_that_does_not_exist_is_refused_without_a_process(
 
 
 def test_what_has_no_topics_says_so():
-    told = inspection.recorded("sim:paper?duration=1")
+    told = inspection_process.recorded("sim:paper?duration=1")
     assert (told["topics"], told["mount"]) == ([], None)
 
 
@@ -102,10 +102,10 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
     names = [("points", POINT_CLOUD), ("fix", NAV_SAT_FIX), ("image", IMAGE), ("depth", "a/msg/Large")]
     topics = [Publisher("red", f"/red/{name}", kind) for name, kind in names]
     link = lambda _, inbox: Announced(inbox, *topics)  # noqa: E731
-    monkeypatch.setattr(inspection, "link_for", lambda _address: link)
-    monkeypatch.setattr(inspection, "SETTLE_S", 0.3)
-    monkeypatch.setattr(inspection, "COUNT_S", 0.01)
-    told = inspection.heard("zenoh:tcp/127.0.0.1:7447")
+    monkeypatch.setattr(inspection_process, "link_for", lambda _address: link)
+    monkeypatch.setattr(inspection_process, "SETTLE_S", 0.3)
+    monkeypatch.setattr(inspection_process, "COUNT_S", 0.01)
+    told = inspection_process.heard("zenoh:tcp/127.0.0.1:7447")
     found = {name: (t["fits"], t["messages"], t["rate_hz"]) for name, t in by_name(told).items()}
     assert found == {
         "/red/points": ("scan", 21, 10.0),
@@ -115,9 +115,9 @@ def test_a_robot_tells_what_it_announces_and_how_often(monkeypatch: pytest.Monke
     }
     assert "silent" in by_name(told)["/red/fix"]["why_not"]
     assert (told["mount"], told["warnings"]) == (None, [])
-    monkeypatch.setattr(inspection, "link_for", lambda _address: lambda _, inbox: Announced(inbox))
-    monkeypatch.setattr(inspection, "LISTEN_S", 0.1)
-    assert "no topic was announced" in inspection.heard("velodyne:127.0.0.1:2368")["warnings"][0]
+    monkeypatch.setattr(inspection_process, "link_for", lambda _address: lambda _, inbox: Announced(inbox))
+    monkeypatch.setattr(inspection_process, "LISTEN_S", 0.1)
+    assert "no topic was announced" in inspection_process.heard("velodyne:127.0.0.1:2368")["warnings"][0]
 
 
 async def test_a_source_is_checked_up_to_its_first_scan(tmp_path: Path, run: Path) -> None:

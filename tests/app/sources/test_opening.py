@@ -23,14 +23,12 @@ _DEFINITIONS = (
 )
 
 
-def bag(path: Path, *, stamp: str = "timestamp INTEGER", messages: int = 300) -> None:
+def bag(path: Path, *, stamp: str = ", timestamp INTEGER", messages: int = 300) -> None:
     """Write a bag with a topic of clouds and messages of one byte."""
     with sqlite3.connect(path) as database:
         database.execute(f"PRAGMA page_size = {_PAGE}")
         database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
-        database.execute(
-            f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, data BLOB, {stamp})"
-        )
+        database.execute(f"CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, data BLOB{stamp})")
         database.execute("INSERT INTO topics VALUES (1, '/points', 'sensor_msgs/msg/PointCloud2', 'cdr')")
         rows = [(k,) for k in range(messages)]
         database.executemany("INSERT INTO messages(id, topic_id, data) VALUES (?, 1, x'00')", rows)
@@ -47,7 +45,11 @@ def endless_definitions(path: Path) -> None:
 
 def computed_column(path: Path) -> None:
     """The time of a message takes long to compute, and SQL allows to leave out the word GENERATED."""
-    bag(path, stamp="timestamp INTEGER AS (id + 0 * length(hex(zeroblob(20000000))))")
+    bag(path, stamp="")
+    with sqlite3.connect(path) as database:  # only now: each row that is inserted computes it
+        computed = "timestamp INTEGER AS (id + 0 * length(hex(zeroblob(20000000))))"
+        database.execute(f"ALTER TABLE messages ADD COLUMN {computed}")
+    database.close()
 
 
 def pages_that_name_one_child(path: Path) -> None:

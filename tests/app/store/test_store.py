@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from app.store.database import FILE_NAME
-from app.store.records import Author, Content, StaleError, UnknownError
+from app.store.records import FRAME, Author, Content, StaleError, UnknownError
 from app.store.store import Store
 from pipeline.errors import StemmapError
 
@@ -79,7 +79,7 @@ class Edits(RuleBasedStateMachine):
         chosen = data.draw(st.sampled_from(sorted(self.board)))
         before = self.board[chosen]
         if content is None:
-            self.store.delete(self.run, who, chosen, self.versions[chosen])
+            self.store.change(self.run, who, chosen, self.versions[chosen], None)
             del self.board[chosen]
             self._did(who, {chosen: before}, {})
         else:
@@ -146,7 +146,7 @@ def test_all_is_undone_and_done_again_in_order():
     for k in range(20):
         store.change(run, ANN, a, k + 1, Content(1.0, 2.0 + 0.01 * (k + 1)))
         seen.append(store.annotations(run))
-    store.delete(run, ANN, a, 21)
+    store.change(run, ANN, a, 21, None)
     contents_of = [[row.content for row in rows] for rows in seen]
     for expected in reversed(contents_of):
         store.undo(run, ANN)
@@ -164,9 +164,31 @@ def test_runs_are_known_by_what_was_recorded_and_do_not_mix():
     (id_,) = store.add(one, ANN, [Content(0.0, 0.0)])
     assert store.annotations(other) == []
     with pytest.raises(UnknownError):
-        store.delete(other, ANN, id_, 1)
+        store.change(other, ANN, id_, 1, None)
     with pytest.raises(StemmapError, match="nothing to undo"):
         store.undo(other, ANN)
+
+
+@pytest.mark.parametrize("back", ["redo of an addition", "undo of a deletion"])
+def test_a_run_has_at_most_one_reference_system(back: str):
+    store = ticking()
+    run = store.open_run("d", "u", "n")
+    frames = [Content(0.0, 0.0, FRAME, None, {"crs": crs}) for crs in ("EPSG:25832", "EPSG:25833")]
+    (id_,) = store.add(run, ANN, frames[:1])
+    with pytest.raises(StaleError, match="by Ann"):
+        store.add(run, BOB, frames[1:])
+    with pytest.raises(UnknownError):
+        store.change(run, BOB, id_, 1, Content(1.0, 2.0))
+    turn = store.redo
+    if back == "redo of an addition":
+        store.undo(run, ANN)
+    else:
+        store.change(run, ANN, id_, 1, None)
+        turn = store.undo
+    store.add(run, BOB, frames[1:])
+    with pytest.raises(StaleError, match="by Bob"):
+        turn(run, ANN)
+    assert [row.content for row in store.annotations(run)] == frames[1:]
 
 
 def test_a_run_has_a_largest_number_of_annotations(monkeypatch: pytest.MonkeyPatch):

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 
 from app.cli import main
 from app.dashboard.parameters import ParameterState
-from app.store.forests import FOLDER, Forests, name_of
+from app.store.forests import FOLDER, LEAST_OTHERS, LEAST_TREES, Forests, name_of
 from app.store.records import Author, Content
 from app.store.store import Store
 from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector
 from app.training.examples import TREE, Examples, object_numbers
 from app.training.fit_forest import PRIOR, SETTINGS, all_expanded, expanded
-from app.training.learning import LEAST_OTHERS, LEAST_TREES, seen_by, what_lacks
+from app.training.learning import seen_by, what_lacks
 from app.training.validation import SAME_PLACE, Rates, fold_of, groups_of, validate
 from pipeline.classification import no_columns
 from pipeline.classification.features import COUNT, NAMES
@@ -28,6 +28,7 @@ from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, FREE_END, 
 from pipeline.config import Parameters, assign, preset
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.types.records import Columns
+from tests.benchmarks.package_forest.fit import FITS
 
 POLE = CLASS_OF_KIND["pole"]
 LEAF = {"share": [0.9, 0.1, 0, 0, 0, 0]}
@@ -281,7 +282,7 @@ def test_a_run_that_was_annotated_is_learned_from(tmp_path, monkeypatch, capsys)
     assert main(["train", "--annotations", "sim:slope"]) == 2
     assert "there is no annotated run 'sim:slope'" in capsys.readouterr().err
     for row in store.annotations(run):
-        store.delete(run, ANN, row.id, row.version)
+        store.change(run, ANN, row.id, row.version, None)
     store.add(run, ANN, truth)
     store.close()
     assert main(["train", "--annotations", uri]) == 0
@@ -317,4 +318,4 @@ def true_things(uri: str) -> tuple[str, list[Content]]:
 def test_the_package_forest_is_one_that_can_be_kept(tmp_path):
     package = json.loads(FILE.read_text())
     forests = Forests(tmp_path)
-    assert len(forests(forests.keep(package), False).trees.root) == SETTINGS[ONE_WAY].trees
+    assert len(forests(forests.keep(package), False).trees.root) == FITS[ONE_WAY].trees

@@ -8,7 +8,7 @@ from typing import Any
 
 from app.tuning.jobs import Job, JobResult
 from app.tuning.scoring import Scorer
-from app.tuning.workers import ScoringProcesses
+from app.tuning.workers import ResultStore, ScoringProcesses
 
 
 class InlineProcesses(ScoringProcesses[Any]):
@@ -19,17 +19,25 @@ class InlineProcesses(ScoringProcesses[Any]):
         done: Workers and their jobs.
     """
 
-    def __init__(self, does: Callable[[int, Job], JobResult] | None = None, count: int = 1) -> None:
-        super().__init__(count, ("false",))
+    def __init__(
+        self,
+        does: Callable[[int, Job], JobResult] | None = None,
+        count: int = 1,
+        kept: ResultStore | None = None,
+    ) -> None:
+        super().__init__(count, ("false",), kept)
         self._scorer = Scorer(runs=8)
         self._does = does or (lambda _worker, job: self._scorer.score(job))
         self.done: list[tuple[int, Job]] = []
 
     def submit(self, job: Job, worker: int = 0) -> Future[JobResult]:
-        self.done.append((worker, job))
         future: Future[JobResult] = Future()
-        future.set_result(self._does(worker, job))
+        future.set_result(self._known_or_computed(worker, job))
         return future
+
+    def _compute(self, worker: int, job: Job) -> JobResult:
+        self.done.append((worker, job))
+        return self._does(worker, job)
 
     def close(self) -> None:
         super().close()

@@ -23,3 +23,14 @@ def job(eps: float, *, seed: int = 0, digest: str = "d", particles: int = 100) -
     parameters = preset("forest").replace({"clustering.eps": eps, "slam.particles": particles})
     run = RunWithTruth(SourceRequest("sim:nothing", seed=seed), digest, truth)
     return Job(run, parameters.model_dump())
+
+
+def counted(
+    ta: int, fr: int, fa: int, tr: int, spurious: int, rmse: float | None, pair: float | None
+) -> MapScores:
+    """Return scores with these counts, position RMSE [m] and pair error [%]."""
+    trees, others = ta + fr, fa + tr
+    rates = {"TA": (ta, trees), "FR": (fr, trees), "FA": (fa, others), "TR": (tr, others)}
+    plain = plain_scores(None) | {name: {"count": n, "of": of} for name, (n, of) in rates.items()}
+    plain |= {"spurious": spurious, "position_rmse": rmse, "mean_pair_error_percent": pair}
+    return msgspec.convert(plain, MapScores)

@@ -15,7 +15,6 @@ from app.tuning.plan import (
     Goal,
     Plan,
     PlannedRun,
-    RunScore,
     SearchAxis,
     Trial,
     axes_of,
@@ -26,17 +25,18 @@ from app.tuning.plan import (
 from app.tuning.result import Result, best_parameters, toml_of, warning_of
 from pipeline.config import field_specs, preset
 from pipeline.errors import ParameterError
+from tests.app.tuning.jobs import counted
 from tests.app.tuning.provenance import provenance_in
 
 FOREST = preset("forest")
 # Eight of ten trees and one of two poles; two of four trees and three where nothing stands.
-ONE = RunScore(TA=8, FR=2, FA=1, TR=1, spurious=0, position_rmse=0.1, pair_error=1.0)
-OTHER = RunScore(TA=2, FR=2, FA=0, TR=0, spurious=3, position_rmse=0.2, pair_error=5.0)
-NOTHING = RunScore(TA=0, FR=4, FA=0, TR=2, spurious=0, position_rmse=None, pair_error=None)
+ONE = counted(8, 2, 1, 1, 0, 0.1, 1.0)
+OTHER = counted(2, 2, 0, 0, 3, 0.2, 5.0)
+NOTHING = counted(0, 4, 0, 2, 0, None, None)
 
 counts = st.integers(0, 50)
 scores = st.builds(
-    lambda ta, fr, fa, tr, spurious, rmse, pair: RunScore(
+    lambda ta, fr, fa, tr, spurious, rmse, pair: counted(
         ta, fr, fa, tr, spurious, rmse if ta else None, pair if ta > 1 else None
     ),
     counts, counts, counts, counts, counts, st.floats(0, 0.5), st.floats(0, 100),
@@ -62,8 +62,8 @@ def test_an_empty_map_has_no_errors_and_the_worst_f1():
 @given(scores)
 def test_f1_of_one_run_is_the_harmonic_mean(score):
     pooled = pool([score])
-    if score.TA:
-        correct = score.TA / (score.TA + score.FA + score.spurious)
+    if score.TA.count:
+        correct = score.TA.count / (score.TA.count + score.FA.count + score.spurious)
         assert pooled.f1 == pytest.approx(2 * pooled.ta * correct / (pooled.ta + correct))
         assert pooled.false_share == pytest.approx(1 - correct)
 
@@ -177,7 +177,6 @@ PLAN = Plan(
     ),
     axes=AXES,
     start=FOREST.model_dump(),
-    journal="unused",
 )
 START = Trial(-1, {"detection.e_max": 60.0, "shape.centre": "circle"}, 0.3, (ONE,), (OTHER,))
 BEST = Trial(7, {"detection.e_max": 41.5, "shape.centre": "centroid"}, 0.2, (ONE,), (NOTHING,))

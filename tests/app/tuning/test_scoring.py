@@ -55,14 +55,14 @@ def test_scans_are_looked_at_once_for_like_sets_and_the_scores_are_those_of_look
     one.close()
 
 
-def test_what_was_kept_and_is_damaged_is_looked_at_again(monkeypatch):
+def test_a_cached_scan_that_is_damaged_is_reported(monkeypatch):
     run, scorer = ready(RUN), Scorer()
     job = Job(run.run, preset("forest").model_dump())
-    first = scorer.score(job)
-    monkeypatch.setattr("pipeline.remapping.scan_cache.ScanCache.read", lambda *_: None)
+    assert scorer.score(job).scores is not None
+    monkeypatch.setattr("pipeline.io.block_file.zstandard.frame_content_size", lambda _block: -1)
     second = scorer.score(job)
     scorer.close()
-    assert (second.scores, second.looked) == (first.scores, True)
+    assert "is damaged" in second.error
 
 
 def test_a_recording_that_is_gone_or_was_replaced_is_reported():

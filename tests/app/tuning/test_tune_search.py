@@ -14,28 +14,25 @@ import pytest
 import pytest_asyncio
 
 from app.sources.request import SourceRequest
-from app.store.records import contents_of
 from app.tuning.job import TuneSearch
-from app.tuning.plan import Plan, PlannedRun, RunScore, Trial, axes_of
-from app.tuning.result import Result, SearchMessage, SearchStart
+from app.tuning.plan import Plan, PlannedRun, Trial, axes_of
+from app.tuning.result import Result, SearchMessage
 from app.worker.protocol import Open
 from pipeline.config import preset
 from pipeline.errors import StemmapError
 from tests.app.batch.test_runs import play
 from tests.app.fakes import opened, truth_trees
 from tests.app.server_for_tests import BEARER, Running, running
+from tests.app.tuning.jobs import counted
 from tests.app.tuning.provenance import provenance_in
 
 PLAN = Plan(
     runs=(PlannedRun(SourceRequest("sim:stand?duration=1")),),
     axes=axes_of(["classification.tree_share=0.1..0.9"]),
     start=preset("forest").model_dump(),
-    journal="",
     trials=3,
 )
-POOR, GOOD = (
-    RunScore(TA=ta, FR=10 - ta, FA=0, TR=0, spurious=0, position_rmse=0.1, pair_error=1.0) for ta in (5, 9)
-)
+POOR, GOOD = (counted(ta, 10 - ta, 0, 0, 0, 0.1, 1.0) for ta in (5, 9))
 START = Trial(-1, {"classification.tree_share": 0.4}, 1 / 3, (POOR,))
 BEST = Trial(1, {"classification.tree_share": 0.7}, 1 / 19, (GOOD,))
 RESULT = Result(
@@ -155,40 +152,18 @@ async def test_a_run_that_is_left_while_its_search_is_being_started_has_none(mad
     assert [process.returncode is None for process in made] == [False]
 
 
-async def test_a_stopped_search_goes_on_with_its_trials_and_only_with_what_it_began_with(tmp_path):
-    pages: list[dict[str, Any]] = []
-    search = TuneSearch(pages.append)
-    first = SearchMessage(trials=(msgspec.structs.replace(START, number=0),))
+async def test_a_stopped_search_can_go_on_and_its_process_is_told_its_plan(tmp_path):
+    heard = tmp_path / "heard"
     ended = SearchMessage(result=msgspec.structs.replace(RESULT, better=False, best=START, made=1))
-    search._command = says(SAID[0], first, then=f"sys.stdin.readline()\nprint({_line(ended)!r}, flush=True)")
+    then = f"sys.stdin.readline()\nprint({_line(ended)!r}, flush=True)"
+    search = TuneSearch(lambda _told: None, says(*SAID[:2], then=then, hears=heard))
     await search.start(PLAN)
-    with pytest.raises(StemmapError, match="under way"):
-        await search.go_on(PLAN)
-    await until(lambda: search.as_plain()["made"] == 1)
+    await until(lambda: search.as_plain()["made"] == 2)
+    assert not search.can_go_on
     await search.stop()
     await until(lambda: not search.is_under_way)
-    await until(lambda: pages[-1] == search.as_plain())
-    assert (pages[-1]["state"], pages[-1]["go_on"]) == ("done", True)
-    edited = msgspec.structs.replace(PLAN.runs[0], truth=tuple(contents_of(truth_trees())))
-    for changed, words in (
-        ({"start": preset("paper").model_dump()}, r"parameters were changed since .*\(.* and \d+ more"),
-        ({"runs": (edited,)}, "true trees were edited"),
-        ({"seed": 1}, "opened in another way"),
-    ):
-        with pytest.raises(StemmapError, match=words):
-            await search.go_on(msgspec.structs.replace(PLAN, **changed))
-    # The process is told the first trial, and repeats it.
-    news = SearchMessage(trials=(BEST, msgspec.structs.replace(START, number=2)))
-    heard = tmp_path / "heard"
-    search._command = says(msgspec.structs.replace(SAID[0], trials=first.trials), news, SAID[2], hears=heard)
-    await search.go_on(PLAN)
-    await until(lambda: not search.is_under_way)
-    told = search.as_plain()
-    assert (told["state"], told["made"], told["better"], told["go_on"]) == ("done", 3, True, False)
-    assert [number for number, _ in told["points"]] == [0, 1, 2]
-    with pytest.raises(StemmapError, match="no stopped search"):
-        await search.go_on(PLAN)
-    assert msgspec.json.decode(heard.read_bytes(), type=SearchStart) == SearchStart(PLAN, first.trials)
+    assert (search.as_plain()["state"], search.can_go_on) == ("done", True)
+    assert msgspec.json.decode(heard.read_bytes(), type=Plan) == PLAN
 
 
 async def test_a_real_search_is_stopped_and_keeps_what_it_found():
@@ -313,7 +288,6 @@ async def test_runs_of_the_list_are_searched_over_or_held_out_where_they_can_be_
     assert [(row["held_out"], row["runs"]) for row in told["scores"]] == [(False, 2), (True, 1)]
     assert told["held_out"] == [(1, pytest.approx(2 / 3))]
     assert "on held-out runs F1 fell" in told["warning"]
-    await client.post("/api/parameters/undo", json={})
-    await dashboard.change_parameters({"classification.tree_share": 0.5})
-    answer = await client.post("/api/search/go-on", json={})
-    assert (answer.status_code, answer.json()["error"]["where"]) == (409, "classification.tree_share")
+    assert (await client.post("/api/search/go-on", json={})).status_code == 202
+    await until(lambda: not dashboard.search.is_under_way)
+    assert len(dashboard.search.plan.runs) == 3

@@ -34,8 +34,8 @@ def test_places_are_given_by_role_and_given_back() -> None:
             assert free
             with room.place("owner") as none:
                 assert not none
-        assert len(room) == 2
-    assert len(room) == 0
+        assert room._taken.total() == 2
+    assert room._taken.total() == 0
 
 
 @pytest.mark.usefixtures("few")

@@ -387,6 +387,23 @@ async def test_an_export_that_the_map_lacks_or_nobody_knows_is_refused(both: Run
     assert (await client.get("/api/export/exe")).status_code == 422
 
 
+async def test_the_cloud_is_sent_from_a_file_that_is_removed(both: Running, monkeypatch, tmp_path) -> None:
+    client, dashboard = both
+    assert (await client.get("/api/export/laz")).status_code == 409
+    await show(dashboard)
+
+    async def ask(question: dict[str, str], patience_s: float) -> None:
+        assert Path(question["file"]).is_relative_to(tmp_path)
+        Path(question["file"]).write_bytes(b"LASF")
+
+    monkeypatch.setattr("app.web.routes.results.LARGE", tmp_path)
+    monkeypatch.setattr("app.sources.inspection.ask", ask)
+    reply = await client.get("/api/export/laz")
+    assert reply.content == b"LASF"
+    assert reply.headers["content-disposition"] == 'attachment; filename="cloud.laz"'
+    assert list(tmp_path.iterdir()) == []
+
+
 async def test_pairs_have_distances_and_errors_of_matched_trees(both: Running) -> None:
     client, dashboard = both
     await show(dashboard)

@@ -17,6 +17,7 @@ from typing import Any
 
 import httpx
 import pytest
+import viser
 from websockets.asyncio.client import ClientConnection, connect
 
 from app.cli import main
@@ -156,6 +157,30 @@ async def test_a_signal_ends_server_and_worker_without_output(number: signal.Sig
         assert errors.decode() == ""
         assert len(workers) == 1
         assert not runs(workers[0])
+
+
+async def test_a_browser_that_never_reads_leaves_no_traceback_at_the_end() -> None:
+    async with serving("sim:stand?duration=20") as server, server.browser() as (_, page):
+        address = httpx.URL(server.url)
+        _, writer = await asyncio.open_connection(address.host, address.port, limit=1)
+        headers = {
+            "Host": f"{address.host}:{address.port}",
+            "Authorization": f"Bearer {server.token}",
+            "Upgrade": "websocket",
+            "Connection": "Upgrade",
+            "Sec-WebSocket-Version": "13",
+            "Sec-WebSocket-Key": "MDEyMzQ1Njc4OWFiY2RlZg==",
+            "Sec-WebSocket-Protocol": f"viser-v{viser.__version__}",
+        }
+        lines = ["GET /viser/ HTTP/1.1", *(f"{name}: {value}" for name, value in headers.items())]
+        writer.write("\r\n".join([*lines, "", ""]).encode())
+        await page.passed(30)
+        server.process.send_signal(signal.SIGTERM)
+        async with asyncio.timeout(20):
+            _, errors = await server.process.communicate()
+        writer.close()
+        assert server.process.returncode == 0
+        assert errors.decode() == ""
 
 
 def runs(pid: int) -> bool:

@@ -19,7 +19,7 @@ from websockets.typing import Subprotocol
 
 from app.web.auth import viewer_token
 from app.web.viser_proxy import LARGEST, is_allowed
-from tests.app.fakes import FakeScene
+from tests.app.fake_scene import FakeScene
 from tests.app.server_for_tests import BEARER, TOKEN, served
 
 VERSION = Subprotocol("viser-v1.1.1")

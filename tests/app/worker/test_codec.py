@@ -147,7 +147,7 @@ def test_a_damaged_picture_is_a_picture_or_a_wire_error(data: st.DataObject) -> 
         ("<f8", [2], b"\0" * 8, "no array"),
         ("<f4", [1], b"\0" * 4, "agreed"),
         ("|O", [1], b"\0" * 8, "agreed"),
-        ("<f8", [1, 1, 1, 1], b"\0" * 8, "shape"),
+        ("<f8", [1, 1, 1, 1, 1], b"\0" * 8, "shape"),
     ],
 )
 def test_an_array_that_contradicts_itself_is_refused(

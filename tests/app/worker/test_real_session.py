@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
 
+from app.cli import main
 from app.worker.process import new_session
 from app.worker.session import Session
 from pipeline.config import Parameters
+from pipeline.io.result_files import seen_text
+from pipeline.stand.seen_area import SeenRecorder
 from pipeline.types.records import Float, Frame, Path
 
 URI = "sim:stand?duration=7"
@@ -52,6 +56,22 @@ def test_the_real_mapper_comes_back_to_the_same_bytes(session: Session) -> None:
     assert path is not None
     assert session.path is not None
     np.testing.assert_array_equal(session.path.x, path.x)
+
+
+def test_the_observed_area_is_that_of_the_command(session: Session, tmp_path: FilePath) -> None:
+    """Also after steps back and forth."""
+    for index in (40, 10, 69):
+        stand_at(session, index)
+    assert session.run is not None
+    assert session.path is not None
+    recorder = SeenRecorder()
+    for stamp_ns, free in session.run.take_views():
+        recorder.add(stamp_ns, free)
+    stand_at(session, 20)
+    assert session.run.take_views() == []
+    stand_at(session, 69)
+    assert main(["map", URI, "--seed", "3", "--out", str(tmp_path / "out")]) == 0
+    assert seen_text(recorder.area(session.path)) == (tmp_path / "out" / "seen.csv").read_text()
 
 
 def test_a_slider_on_the_standing_scan_and_back_leaves_no_trace(session: Session) -> None:

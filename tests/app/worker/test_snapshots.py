@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from contextlib import closing
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.worker import remap
-from app.worker.remap import ParameterHistory, Snapshots, nbytes
+from app.worker.remap import ParameterHistory, Snapshots
 from pipeline.config import Parameters
-from pipeline.geometry.poses import Pose3
-from pipeline.mapper import Mapper
-from pipeline.slam import SlamState
-from pipeline.types.records import Sensor
+from pipeline.io.block_file import BlockFile
 
 SETS = [Parameters().replace({"clustering.eps": eps}) for eps in (0.1, 0.2, 0.3)]
 
@@ -24,54 +19,50 @@ def test_states_stay_few_and_evenly_spread_however_long_the_run() -> None:
     kept: Snapshots[int] = Snapshots(0)
     for scans in range(20_001):
         kept.offer(scans, scans)
-    held = {kept.newest(scans)[0] for scans in range(20_001)}
-    assert len(held) <= 40
+    held = {0, *kept._files}
+    assert len(held) <= 21
     gaps = {b - a for a, b in zip(sorted(held), sorted(held)[1:], strict=False)}
     assert len(gaps) == 1
-    assert gaps.pop() <= 20_000 / 15
+    assert gaps.pop() <= 20_000 / 10
 
 
-def test_large_states_are_fewer_and_the_first_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    megabyte = 1 << 20
-    # It grows: 1 MB every 50 scans.
-    monkeypatch.setattr(remap, "nbytes", lambda scans: scans * megabyte // 50)
-    kept: Snapshots[int] = Snapshots(0)
-    held: set[int] = set()
-    for scans in range(10_001):
-        kept.offer(scans, scans)
-        held = {kept.newest(n)[0] for n in range(0, scans + 1, 50)}
-        assert sum(n // 50 for n in held) <= 256
-        assert 0 in held
-    assert len(held) > 1
+def test_states_that_the_disk_refuses_are_not_kept_and_harm_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(BlockFile, "put_block", lambda *_: False)
+    with closing(Snapshots(0)) as kept:
+        for scans in range(2001):
+            kept.offer(scans, scans)
+        assert kept.newest(2000) == (0, 0)
 
 
-def test_a_state_beyond_all_bounds_is_not_kept_and_harms_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(remap, "nbytes", lambda scans: scans << 40)
-    kept: Snapshots[int] = Snapshots(0)
-    for scans in range(2001):
-        kept.offer(scans, scans)
-    assert kept.newest(2000) == (0, 0)
+def test_a_damaged_state_is_passed_over() -> None:
+    with closing(Snapshots(0)) as kept:
+        for scans in range(101):
+            kept.offer(scans, scans)
+        file = kept._files[100]
+        assert file._file is not None
+        file._file.seek(0)
+        file._file.write(b"damaged")
+        assert kept.newest(100) == (50, 50)
 
 
-@dataclass
-class Inner:
-    a: object
-    b: float = 0.5
+def test_a_state_of_other_contents_is_passed_over() -> None:
+    with closing(Snapshots(0)) as kept:
+        for scans in range(101):
+            kept.offer(scans, scans)
+        kept._files[100].close()
+        kept._files[100] = other = BlockFile()
+        assert other.put_block(0, b"no state")
+        assert kept.newest(100) == (50, 50)
 
 
-def test_the_bytes_of_a_state_are_those_of_all_its_arrays() -> None:
-    assert nbytes(Inner(Inner(np.zeros((3, 2))), b=2.0)) == 48
-    assert nbytes(Inner((np.zeros(2), None))) == 16
-    assert nbytes(7) == 0
-    state = Mapper(Parameters(), sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0).snapshot()
-    slam = state.slam
-    assert isinstance(slam, SlamState)
-    assert nbytes(state) >= slam.pose.nbytes + slam.maps.block.nbytes + slam.maps.mean.nbytes
+def test_a_run_that_cannot_go_back_stores_no_state() -> None:
+    kept: Snapshots[int] = Snapshots(0, 0)
+    assert not any(kept.is_due(scans) for scans in range(1000))
 
 
 @given(st.integers(0, 500), st.integers(0, 500))
 def test_the_newest_state_is_not_newer_than_asked_for(scans: int, forgotten: int) -> None:
-    kept: Snapshots[int] = Snapshots(0)
+    kept = Snapshots(0)
     for n in range(401):
         kept.offer(n, n)
     kept.forget_after(forgotten)

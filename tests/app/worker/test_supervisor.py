@@ -6,6 +6,7 @@ import asyncio
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
@@ -68,10 +69,32 @@ class Said:
 @pytest_asyncio.fixture
 async def both() -> AsyncIterator[tuple[WorkerProcess, Said]]:
     said = Said()
-    worker = WorkerProcess(said, FAKE)
-    await worker.start()
+    worker = WorkerProcess(FAKE)
+    await worker.start(said)
     yield worker, said
     await worker.close()
+
+
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def started() -> AsyncIterator[tuple[WorkerProcess, Said]]:
+    said = Said()
+    worker = WorkerProcess(FAKE)
+    await worker.start(said)
+    await said.wait(lambda m: isinstance(m, Report))
+    yield worker, said
+    await worker.close()
+
+
+@pytest.fixture
+def shared(started: tuple[WorkerProcess, Said]) -> tuple[WorkerProcess, Said]:
+    """A worker that other tests used before, and will use; the test leaves it running."""
+    worker, said = started
+    said.messages.clear()
+    worker.restarts = 0
+    return worker, said
+
+
+in_one_loop = pytest.mark.asyncio(loop_scope="module")
 
 
 def is_running(pid: int) -> bool:
@@ -82,8 +105,9 @@ def is_running(pid: int) -> bool:
     return True
 
 
-async def test_it_opens_and_maps(both: tuple[WorkerProcess, Said]) -> None:
-    worker, said = both
+@in_one_loop
+async def test_it_opens_and_maps(shared: tuple[WorkerProcess, Said]) -> None:
+    worker, said = shared
     await worker.send(SetSpeed(0.0))
     await worker.send(Open("fake:30"))
     assert (await said.opened()).kind == "fake run"
@@ -94,11 +118,12 @@ async def test_it_opens_and_maps(both: tuple[WorkerProcess, Said]) -> None:
     assert (await said.state("finished")).scan_index == 29
 
 
+@in_one_loop
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
 async def test_killed_it_is_started_again_with_all_it_must_know(
-    both: tuple[WorkerProcess, Said], number: signal.Signals
+    shared: tuple[WorkerProcess, Said], number: signal.Signals
 ) -> None:
-    worker, said = both
+    worker, said = shared
     await worker.send(SetParameters(FINE, 9))
     await worker.send(Open("fake:30"))
     await said.opened()
@@ -114,8 +139,9 @@ async def test_killed_it_is_started_again_with_all_it_must_know(
     await said.scan(1)
 
 
-async def test_a_print_of_a_library_disturbs_nothing(both: tuple[WorkerProcess, Said]) -> None:
-    worker, said = both
+@in_one_loop
+async def test_a_print_of_a_library_disturbs_nothing(shared: tuple[WorkerProcess, Said]) -> None:
+    worker, said = shared
     await worker.send(Open("prints:5"))
     await said.opened()
     await worker.send(Advance(1))
@@ -123,8 +149,9 @@ async def test_a_print_of_a_library_disturbs_nothing(both: tuple[WorkerProcess, 
     assert worker.restarts == 0
 
 
-async def test_a_failed_source_is_a_state_and_not_a_death(both: tuple[WorkerProcess, Said]) -> None:
-    worker, said = both
+@in_one_loop
+async def test_a_failed_source_is_a_state_and_not_a_death(shared: tuple[WorkerProcess, Said]) -> None:
+    worker, said = shared
     await worker.send(Open("missing:"))
     assert "no such file" in (await said.state("failed")).detail
     await worker.send(Open("fake:5"))
@@ -134,9 +161,9 @@ async def test_a_failed_source_is_a_state_and_not_a_death(both: tuple[WorkerProc
 
 async def test_dying_again_and_again_it_waits_for_a_person() -> None:
     said = Said()
-    worker = WorkerProcess(said, (sys.executable, "-c", "raise SystemExit(7)"), clock=lambda: 0.0)
+    worker = WorkerProcess((sys.executable, "-c", "raise SystemExit(7)"), clock=lambda: 0.0)
     worker_pauses_shortened(worker)
-    await worker.start()
+    await worker.start(said)
     try:
         status = await said.wait(lambda m: isinstance(m, Report) and "5 times" in m.status.detail)
         assert "exit code 7" in status.status.detail
@@ -156,8 +183,8 @@ def worker_pauses_shortened(worker: WorkerProcess) -> None:
 
 async def test_a_protocol_error_ends_it() -> None:
     said = Said()
-    worker = WorkerProcess(said, (sys.executable, "-c", "print('hello ' * 5, flush=True)"))
-    await worker.start()
+    worker = WorkerProcess((sys.executable, "-c", "print('hello ' * 5, flush=True)"))
+    await worker.start(said)
     try:
         assert "protocol error" in (await said.state("failed")).detail
     finally:
@@ -172,8 +199,8 @@ async def test_a_fault_of_the_listener_does_not_end_the_watch(caplog: pytest.Log
         if isinstance(message, Opened):
             raise KeyError("a fault on purpose")
 
-    worker = WorkerProcess(listener, FAKE)
-    await worker.start()
+    worker = WorkerProcess(FAKE)
+    await worker.start(listener)
     try:
         await worker.send(Open("fake:5"))
         await said.opened()
@@ -202,8 +229,8 @@ async def test_a_live_run_has_time_to_finish_its_recording(
 ) -> None:
     monkeypatch.setattr("app.worker.supervisor._GRACE_S", 0.1)
     slow = "import sys, time, pathlib; sys.stdin.read(); time.sleep(1); pathlib.Path(sys.argv[1]).touch()"
-    worker = WorkerProcess(Said(), (sys.executable, "-c", slow, str(tmp_path / "finished")))
-    await worker.start()
+    worker = WorkerProcess((sys.executable, "-c", slow, str(tmp_path / "finished")))
+    await worker.start(Said())
     await worker.send(Open("zenoh:tcp/127.0.0.1:1"))
     await worker.close()
     assert (tmp_path / "finished").exists()
@@ -223,12 +250,12 @@ async def test_a_source_that_never_finishes_opening_is_ended_and_reported(
     assert worker.restarts == 0
 
 
+@in_one_loop
 async def test_a_refused_source_is_no_longer_being_opened(
-    both: tuple[WorkerProcess, Said], monkeypatch: pytest.MonkeyPatch
+    shared: tuple[WorkerProcess, Said], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its refusal follows its first status at once, and neither may be lost on the way."""
-    worker, said = both
-    await said.wait(lambda m: isinstance(m, Report))
+    worker, said = shared
     pid = worker.pid
     monkeypatch.setattr(worker, "_opening_limit_s", 0.5)
     for _ in range(5):
@@ -252,10 +279,11 @@ async def test_another_source_replaces_one_that_does_not_finish_opening(
     assert worker.restarts == 0
 
 
+@in_one_loop
 async def test_a_command_while_the_worker_restarts_is_refused_and_not_lost(
-    both: tuple[WorkerProcess, Said],
+    shared: tuple[WorkerProcess, Said],
 ) -> None:
-    worker, said = both
+    worker, said = shared
     await worker.send(Open("fake:5"))
     await said.opened()
     assert worker.pid is not None
@@ -271,10 +299,10 @@ async def test_a_command_while_the_worker_restarts_is_refused_and_not_lost(
 
 async def test_a_speed_that_ends_the_worker_is_dropped() -> None:
     said = Said()
-    worker = WorkerProcess(said, (sys.executable, "-c", "raise SystemExit(7)"))
+    worker = WorkerProcess((sys.executable, "-c", "raise SystemExit(7)"))
     worker_pauses_shortened(worker)
     await worker.send(SetSpeed(1.0))
-    await worker.start()
+    await worker.start(said)
     try:
         await said.wait(lambda m: isinstance(m, Report) and "speed was reset" in m.status.detail)
     finally:
@@ -293,8 +321,8 @@ async def test_it_does_not_outlive_the_web_process() -> None:
 
 async def test_a_run_that_stops_answering_is_reported_and_replaced() -> None:
     said = Said()
-    worker = WorkerProcess(said, FAKE, silence_limit_s=3.0)
-    await worker.start()
+    worker = WorkerProcess(FAKE, silence_limit_s=2.0)
+    await worker.start(said)
     try:
         await worker.send(Open("fake:100000"))
         await said.opened()
@@ -312,10 +340,33 @@ async def test_a_run_that_stops_answering_is_reported_and_replaced() -> None:
         await worker.close()
 
 
+async def test_a_worker_that_gets_no_processor_is_reported_and_not_replaced(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    said = Said()
+    worker = WorkerProcess(FAKE, silence_limit_s=2.0)
+    await worker.start(said)
+    try:
+        await worker.send(Open("fake:100000"))
+        await said.opened()
+        await worker.send(Play())
+        await said.state("playing")
+        assert worker.pid is not None
+        monkeypatch.setattr("app.worker.supervisor.starved_s", lambda _pid: 0.9 * time.monotonic())
+        os.kill(worker.pid, signal.SIGSTOP)
+        assert "has not answered" in (await said.state("waiting")).detail
+        await asyncio.sleep(3.0)
+        assert worker.restarts == 0
+        os.kill(worker.pid, signal.SIGCONT)
+        await said.state("playing")
+    finally:
+        await worker.close()
+
+
 async def test_a_command_that_is_not_answered_while_paused_replaces_the_worker() -> None:
     said = Said()
-    worker = WorkerProcess(said, FAKE, silence_limit_s=3.0)
-    await worker.start()
+    worker = WorkerProcess(FAKE, silence_limit_s=2.0)
+    await worker.start(said)
     try:
         await worker.send(Open("fake:30"))
         await said.opened()
@@ -323,7 +374,7 @@ async def test_a_command_that_is_not_answered_while_paused_replaces_the_worker()
         first = worker.pid
         assert first is not None
         os.kill(first, signal.SIGSTOP)
-        await asyncio.sleep(4.0)
+        await asyncio.sleep(3.0)
         assert worker.restarts == 0  # no message is due
         await worker.send(Advance(1))
         assert "did not answer" in (await said.state("failed")).detail
@@ -334,15 +385,15 @@ async def test_a_command_that_is_not_answered_while_paused_replaces_the_worker()
 
 async def test_a_run_that_is_paused_or_plays_slowly_is_not_replaced() -> None:
     said = Said()
-    worker = WorkerProcess(said, FAKE, silence_limit_s=3.0)
-    await worker.start()
+    worker = WorkerProcess(FAKE, silence_limit_s=2.0)
+    await worker.start(said)
     try:
         await worker.send(SetSpeed(0.01))
         await worker.send(Open("fake:30"))
         await said.opened()
         await worker.send(Play())
         await said.state("playing")
-        await asyncio.sleep(5.0)
+        await asyncio.sleep(3.0)
         assert worker.restarts == 0
     finally:
         await worker.close()

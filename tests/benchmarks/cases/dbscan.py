@@ -10,8 +10,7 @@ from tests.benchmarks.table import Cell, Table, ratio
 from tests.benchmarks.timing import in_turns, middle
 
 if TYPE_CHECKING:
-    from pipeline.detection.clustering import Dbscan
-    from pipeline.types.records import Float32
+    from pipeline.types.records import Float32, Int32
 
 NAME = "dbscan"
 LINE = "DBSCAN by our grid, scikit-learn and Open3D on the same points"
@@ -49,10 +48,10 @@ def row(size: int, rounds: int, dimensions: int, eps: float, min_points: int) ->
     from pipeline.detection.clustering import ENGINES
 
     points = np.ascontiguousarray(scene(size)[:, :dimensions])
-    sides: dict[str, Callable[[], Dbscan]] = {
+    sides: dict[str, Callable[[], Int32]] = {
         name: partial(engine, points, eps, min_points) for name, engine in ENGINES.items()
     }
-    labels = [work().label for work in sides.values()]
+    labels = [work() for work in sides.values()]
     first = labels[0]
     agree = all(bool(((a < 0) == (first < 0)).all()) and a.max() == first.max() for a in labels)
     times = {name: middle(ms) for name, ms in in_turns(sides, rounds, warm=False).items()}

@@ -79,10 +79,11 @@ def run() -> list[Table]:
     ]
 
 
-def attack(kind: str, copies: int) -> MappingResult:
-    """Read damaged copies in a child, and in another from the next on when that one dies or hangs."""
-    outcome, first = MappingResult(), 0
-    while first < copies and outcome.used_s < BUDGET_S:
+def attack(kind: str, copies: int, first: int = 0, budget_s: float = BUDGET_S) -> MappingResult:
+    """Read damaged copies from a first number on in a child, and in another from the next on when that one
+    dies or hangs; for at most so many seconds of a core."""
+    outcome = MappingResult()
+    while first < copies and outcome.used_s < budget_s:
         with tempfile.TemporaryDirectory() as folder:
             words = [sys.executable, "-m", "tests.benchmarks.fuzzing", kind, str(DATA), folder]
             child = subprocess.Popen(
@@ -92,7 +93,7 @@ def attack(kind: str, copies: int) -> MappingResult:
                 stdout=subprocess.PIPE,
                 text=True,
             )
-            first = _follow(child, outcome, first)
+            first = _follow(child, outcome, first, budget_s)
             if first < copies:  # it died, or was ended, while it read this one
                 first += 1
     return outcome
@@ -104,12 +105,12 @@ def _processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def _follow(child: subprocess.Popen[str], outcome: MappingResult, first: int) -> int:
+def _follow(child: subprocess.Popen[str], outcome: MappingResult, first: int, budget_s: float) -> int:
     """Count what a child tells until it ends; the copy that it would read next."""
     assert child.stdout is not None
     before, used_s, before_s = first, 0.0, outcome.used_s
     while True:
-        if outcome.used_s > BUDGET_S:
+        if outcome.used_s > budget_s:
             child.kill()
             child.wait()
             return first

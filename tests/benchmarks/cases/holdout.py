@@ -7,13 +7,13 @@ many as of a mirrored scene. So they are one place.
 
 from __future__ import annotations
 
-import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from tests.benchmarks.package_forest import DATA, REACH, STREET, training_examples
 from tests.benchmarks.table import Cell, Table
 
 if TYPE_CHECKING:
@@ -24,13 +24,8 @@ if TYPE_CHECKING:
 NAME = "holdout"
 LINE = "Trees in places left out of training, whole clouds, diameters by tape (needs STEMMAP_DATA)"
 
-DATA = Path(os.environ.get("STEMMAP_DATA", "../shared/data"))
 PARKS = (("00",), ("02",), ("03",), ("04", "07"), ("06",))
-STREET = DATA / "semantickitti" / "000000.bin"
 TRAINING_SEEDS = range(3)
-STAND_SEEDS, STREET_SEEDS, WILD_SEEDS, EVERY = range(11, 17), range(200, 240), range(200, 224), 4
-REACH = 25.0  # m
-COPIES = 8  # of each park scene with pasted things; `stemmap train` makes 48
 RESAMPLES = 10_000
 SPREAD = 4.0  # cm; the reference DBH of a stem counts where the tools agree to this
 MATCH = 0.5  # m
@@ -62,7 +57,7 @@ def run() -> list[Table]:
 
 
 def _detection() -> Table:
-    examples, pasted = _training_examples()
+    examples, pasted = training_examples()
     rows, parks = list[tuple[Cell, ...]](), list[list[MappingResult]]()
     groups = [[DATA / "park_trunks" / name for name in names] for names in PARKS]
     for group in [*groups, [STREET]]:
@@ -127,9 +122,9 @@ def _outcome(scene: Path, forest: Forest) -> MappingResult:
     """One scene mapped by the whole mapper."""
     import numpy as np
 
-    from app.training.labelled_scenes import labelled_points, trunks
     from pipeline.evaluation.matching import match
     from tests.benchmarks.classes import ByClass
+    from tests.benchmarks.package_forest.labelled_scenes import labelled_points, trunks
     from tests.benchmarks.trunks import mapped
 
     frame, _, _ = mapped(str(scene), odometry="static", forest=forest)
@@ -146,62 +141,13 @@ def _outcome(scene: Path, forest: Forest) -> MappingResult:
     return MappingResult(found, int(false.sum()), by_class.taken)
 
 
-def _training_examples() -> tuple[list[Examples], list[Examples]]:
-    """Examples of all simulated and labelled scenes, and of the copies with pasted things; kept in the data
-    folder, or in the folder STEMMAP_EXAMPLES."""
-    from functools import partial
-
-    from app.training.augmentation import FOLDER, copies
-    from app.training.examples import stored_or_computed
-    from app.training.labelled_scenes import labelled_examples, stand_examples, stand_name, street_examples
-    from pipeline.config import preset
-
-    kept = examples_folder()
-    p, found = preset("forest"), list["Examples"]()
-    for uri, furnished in _stands():
-        make = partial(stand_examples, uri, p, EVERY, furnished=furnished)
-        found += stored_or_computed(kept, stand_name(uri, furnished), make)
-    for seed in WILD_SEEDS:
-        uri = f"sim:wild?seed={seed}&odometry=exact"
-        found += stored_or_computed(kept, uri, partial(stand_examples, uri, p, EVERY))
-    for seed in STREET_SEEDS:
-        for one_way in (False, True):
-            make = partial(street_examples, seed, one_way, p, REACH)
-            found += stored_or_computed(kept, f"{'park' if one_way else 'street'} {seed}", make)
-    parks = [DATA / "park_trunks" / name for names in PARKS for name in names]
-    for scene in (*parks, STREET):
-        found += stored_or_computed(kept, str(scene), partial(labelled_examples, scene, p, REACH))
-    return found, [e for scene in parks for e in copies(scene, kept / FOLDER, p, REACH, COPIES)]
-
-
-def examples_folder() -> Path:
-    """Where the examples of training scenes are kept."""
-    from app.common.settings import data_folder
-    from pipeline.errors import StemmapError
-
-    if named := os.environ.get("STEMMAP_EXAMPLES"):
-        return Path(named)
-    folder = data_folder(os.environ)
-    if folder is None:
-        raise StemmapError("there is no data folder", remedy="Set STEMMAP_EXAMPLES to a folder")
-    return folder / "training"
-
-
-def _stands() -> Iterator[tuple[str, bool]]:
-    """The simulated stands, as `stemmap train` makes them."""
-    sigma = ("0.02", "0.03", "0.01")
-    for name in ("stand", "slope", "dense"):
-        for n, seed in enumerate(STAND_SEEDS):
-            yield f"sim:{name}?seed={seed}&odometry=exact&sigma={sigma[n % 3]}", n % 2 == 1
-
-
 def _fitted_without(
     scenes: Sequence[Path], examples: list[Examples], pasted: list[Examples], seed: int
 ) -> Forest:
     """The classifier fitted to all scenes but these."""
-    from app.training.augmentation import is_of
-    from app.training.fit_forest import as_json, fit_all
     from pipeline.classification.forest import ALL_AROUND, ONE_WAY, forest_of
+    from tests.benchmarks.package_forest.augmentation import is_of
+    from tests.benchmarks.package_forest.fit import as_json, fit_all
 
     left_out = {str(scene) for scene in scenes}
     others = [e for e in examples if e.scene not in left_out]

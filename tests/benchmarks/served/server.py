@@ -1,6 +1,7 @@
 """The dashboard's server as `stemmap serve` runs it, which tells when it heard of each scan.
 
-`python -m tests.benchmarks.served.server SOURCE FOLDER`: a line of JSON goes in, one comes out.
+`python -m tests.benchmarks.served.server SOURCE FOLDER [WORKER]`: a line of JSON goes in, one comes out.
+WORKER is the module of the mapping process.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any
 
 import uvicorn
 
+from app.common.child_process import python_module
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
@@ -23,7 +25,7 @@ from app.web.app import build
 from app.web.auth import new_token
 from app.web.serving import bind, uvicorn_config
 from app.worker.protocol import FromWorker, Open, Shown
-from app.worker.supervisor import WorkerProcess
+from app.worker.supervisor import OnMessage, WorkerProcess
 from tests.benchmarks.child import answers
 
 # Of the messages that are still missing so many are sent before others get a turn.
@@ -35,7 +37,8 @@ _TICKS = os.sysconf("SC_CLK_TCK")
 class Served:
     """A server in this process, and what is asked of it."""
 
-    def __init__(self, source: str, folder: Path) -> None:
+    def __init__(self, source: str, folder: Path, worker: str = "app.worker.process") -> None:
+        self._worker_command = python_module(worker)
         self._heard: list[tuple[int, float, float]] = []
         settings = Settings(port=0, folder=folder)
         self._listening = bind(settings)
@@ -62,13 +65,19 @@ class Served:
         self._server.should_exit = True
         await serving
 
-    def _worker(self, dashboard: Dashboard) -> WorkerProcess:
-        async def receive(message: FromWorker) -> None:
-            if isinstance(message, Shown):
-                self._heard.append((message.frame.index, time.monotonic(), time.time()))
-            await dashboard.receive(message)
+    def _worker(self) -> WorkerProcess:
+        heard = self._heard
 
-        return WorkerProcess(receive)
+        class ObservedWorker(WorkerProcess):
+            async def start(self, on_message: OnMessage) -> None:
+                async def receive(message: FromWorker) -> None:
+                    if isinstance(message, Shown):
+                        heard.append((message.frame.index, time.monotonic(), time.time()))
+                    await on_message(message)
+
+                await super().start(receive)
+
+        return ObservedWorker(self._worker_command)
 
     async def _answer(self, question: dict[str, Any]) -> dict[str, Any]:
         match question["do"]:
@@ -81,6 +90,8 @@ class Served:
                 return {"heard": heard}
             case "cpu":
                 return {"web": _cpu_s(os.getpid()), "worker": _cpu_s(self._dashboard.worker.pid)}
+            case "pids":
+                return {"web": os.getpid(), "worker": self._dashboard.worker.pid}
             case "messages":
                 return {"messages": self._scene.messages}
             case "age":
@@ -115,4 +126,4 @@ def _cpu_s(pid: int | None) -> float:
 
 
 if __name__ == "__main__":
-    asyncio.run(Served(sys.argv[1], Path(sys.argv[2])).run())
+    asyncio.run(Served(sys.argv[1], Path(sys.argv[2]), *sys.argv[3:]).run())

@@ -109,6 +109,22 @@ def test_another_forest_votes_on_all_columns_from_the_next_scan_on():
     assert before.columns.verdict[tree] == Verdict.TREE, "a snapshot stays as it was"
 
 
+def test_the_forest_of_a_sensor_that_has_moved_votes_on_all_columns_from_the_next_scan_on():
+    def by_kind(_name: str, all_around: bool) -> Forest:
+        one, none = np.zeros(1, np.int32), np.full(1, -1, np.int32)
+        kind = 0 if all_around else 1
+        return Forest(DecisionTrees(one, none, np.zeros(1), one, one, np.eye(len(CLASSES))[kind : kind + 1]))
+
+    gathering = ColumnClassifier(FOREST.classification, all_around=False, forests=by_kind)
+    points = trunk(5.0, 1.0, 0.15, top=5.9)
+    gathering.add(points, points[:, 2].copy(), 0, view())
+    standing = gathering.columns
+    assert standing.share[:, 1].tolist() == [1.0] * len(standing.verdict) != []
+    gathering.all_around = True
+    gathering.add(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), 1, view())
+    assert gathering.columns.share[:, 0].tolist() == [1.0] * len(standing.verdict)
+
+
 def test_going_back_gives_the_same_again():
     clouds = [trunk(4.0 + 0.001 * k, 1.0, 0.1, points=300, seed=k) for k in range(FOLD + 20)]
     gathering = ColumnClassifier(FOREST.classification, all_around=True)

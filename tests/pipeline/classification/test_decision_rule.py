@@ -15,8 +15,11 @@ from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.types.records import Verdict
 
 
-def verdict(stopped: int, passed: int, height: float = 1.5) -> Verdict:
-    """The verdict of a column with all votes for a tree, by the rays that it stopped and let pass."""
+def verdict(
+    stopped: int, passed: int, height: float = 1.5, present: float = 0.0, absent: float = 0.0
+) -> Verdict:
+    """The verdict of a column with all votes for a tree, by the rays that it stopped and let pass, and by the
+    scans in which it was present and absent."""
     met, through = np.zeros((1, SLICES), np.int32), np.zeros((1, SLICES), np.int32)
     met[0, int(height / SLICE)], through[0, int(height / SLICE)] = stopped, passed
     none = no_columns()
@@ -24,6 +27,7 @@ def verdict(stopped: int, passed: int, height: float = 1.5) -> Verdict:
     one = replace(none, **rows)
     one.figures[0, NAMES.index("voxels to 3 m")] = 100.0
     one.share[0, CLASSES.index(Verdict.TREE)] = 1.0
+    one.present[0], one.absent[0] = present, absent
     return Verdict(int(column_votes(replace(one, met=met, passed=through)).verdict(0.4)[0]))
 
 
@@ -40,3 +44,12 @@ def test_what_stops_rays_or_was_hardly_seen_is_left_to_the_votes(stopped: int, p
 def test_rays_below_and_above_breast_height_do_not_matter():
     assert verdict(0, 40, BREAST_HEIGHT.start * SLICE - 0.1) is Verdict.TREE
     assert verdict(0, 40, BREAST_HEIGHT.stop * SLICE + 0.1) is Verdict.TREE
+
+
+@pytest.mark.parametrize(
+    ("present", "absent", "gone"),
+    [(0, 5, True), (0, 4, False), (5, 6, True), (6, 6, False), (9, 6, False), (4, 20, True)],
+)
+def test_a_column_that_is_absent_in_most_scans_is_gone(present: int, absent: int, gone: bool):
+    found = verdict(40, 0, present=present, absent=absent)
+    assert found is (Verdict.MOVING if gone else Verdict.TREE)

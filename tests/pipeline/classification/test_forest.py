@@ -10,22 +10,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.training.examples import UNKNOWN, Examples
-from app.training.fit_forest import SETTINGS, FittedForest, as_json, fit, fit_free_end
+from app.training.fit_forest import SETTINGS
 from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import (
     ALL_AROUND,
     CLASSES,
     FILE,
     FREE_END,
+    MOVED,
     ONE_WAY,
     feature_effects,
     forest_of,
+    is_seen_all_around,
     read_forest,
     standard_forest,
     vote,
 )
 from pipeline.errors import StemmapError
 from pipeline.types.records import Verdict
+from tests.benchmarks.package_forest.fit import FittedForest, as_json, fit, fit_free_end
 
 LEAF = {"share": [1.0, 0, 0, 0, 0, 0]}
 OTHER = {"share": [0, 0, 0, 0, 0, 1.0]}
@@ -37,6 +40,19 @@ def written(tmp_path, **changes: object):
     file = tmp_path / "forest.json"
     file.write_text(json.dumps(data))
     return file
+
+
+@given(turn=st.floats(0.0, 6.3), length=st.floats(0.0, 50.0))
+def test_a_sensor_that_looks_one_way_has_seen_all_around_once_it_has_moved(
+    turn: float, length: float
+) -> None:
+    path = np.linspace(0.0, length, 9)[:, None] * np.array([np.cos(turn), np.sin(turn)])
+    assert is_seen_all_around(16, path[:1])
+    assert not is_seen_all_around(0, path[:1])
+    assert not is_seen_all_around(0, np.zeros((0, 2)))
+    if length <= MOVED or length > 1.5 * MOVED:  # between them it depends on the direction
+        assert is_seen_all_around(0, path) == (length > MOVED)
+    assert not is_seen_all_around(0, path) or is_seen_all_around(0, np.vstack([path, path[:1]]))
 
 
 def test_a_figure_decides_at_its_threshold(tmp_path):

@@ -8,8 +8,11 @@ import pytest
 
 from pipeline.classification.column_extraction import PROFILE
 from pipeline.classification.features import COUNT, NAMES, UNSEEN, features
-from pipeline.classification.ray_statistics import count_rays, depth_image
+from pipeline.classification.ray_statistics import NEAR, count_rays, depth_image, update_visibility
 from pipeline.classification.voxel_map import SLICE, SLICES
+from pipeline.detection.free_space import BEHIND, BINS
+from pipeline.geometry.azimuth_bins import direction_bin
+from pipeline.geometry.poses import Pose2
 from pipeline.ground.terrain import SECTORS
 
 FLAT = np.full((SECTORS, 200), -1.0)  # the ground 1 m below the sensor
@@ -40,6 +43,36 @@ def test_what_ends_at_the_column_met_it_and_what_ends_behind_passed_it(height):
     assert passed.sum() == 1
     assert abs((passed.argmax() + 0.5) * SLICE - height) <= SLICE
     assert met.sum() == 0
+
+
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+@pytest.mark.parametrize(
+    ("free", "present", "absent"),
+    [
+        (-NEAR - 0.01, 0, 0),
+        (-NEAR + 0.01, 1, 0),
+        (NEAR - 0.01, 1, 0),
+        (BEHIND - 0.01, int(BEHIND < NEAR), 0),
+        (BEHIND + 0.01, 0, 1),
+        (20.0, 0, 1),
+    ],
+)
+def test_a_column_is_absent_where_the_free_range_ends_behind_it(free, present, absent, yaw):
+    """`free` is the range beyond the axis at which the free range in its direction ends [m]."""
+    pose = np.array([1.0, -2.0, yaw])
+    dx, dy = AXIS[0, :2] - pose[:2]
+    reach = np.hypot(dx, dy)
+    clear, steepest = np.zeros(BINS), np.full(BINS, -1.0)
+    x, y = Pose2(0.0, 0.0, -yaw).apply(np.array([dx, dy]))
+    there = direction_bin(x, y, BINS)
+    clear[there], steepest[there] = reach + free, 0.2
+    for range_max, seen in ((reach + 0.1, True), (reach - 0.1, False)):
+        viewed, was, was_not = np.full(1, -1.0), np.zeros(1), np.zeros(1)
+        update_visibility(
+            AXIS, viewed, was, was_not, pose, clear, steepest, np.array([0.0, 0.0, 1.0]), FLAT, range_max
+        )
+        assert (was[0], was_not[0]) == ((present, absent) if seen else (0, 0))
+        assert viewed[0] == pytest.approx(0.2 * reach + 1.0 if seen else -1.0)
 
 
 def test_a_ray_that_is_stopped_before_or_goes_elsewhere_tells_nothing():

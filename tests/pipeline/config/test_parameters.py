@@ -25,7 +25,7 @@ from pipeline.errors import ParameterError
 
 SPECS = field_specs()
 NUMBERS = [spec for spec in SPECS if spec.kind in ("float", "int")]
-UNITS = {"", "m", "m/m", "m/s", "m/s²", "m/√m", "deg", "deg/√m", "deg/√rad", "sigma", "m²"}
+UNITS = {"", "m", "s", "m/m", "m/s", "m/s²", "m/√m", "deg", "deg/√m", "deg/√rad", "sigma", "m²"}
 
 
 def replaced(name: str, value: object) -> Parameters | str:
@@ -326,18 +326,18 @@ def test_a_removed_choice_is_replaced_with_one_warning():
 
 
 def test_names_of_earlier_versions_are_accepted_with_one_warning_each():
-    with pytest.warns(RenamedParameterWarning, match=r"slam.looks is now called slam.independent_views_max"):
-        by_name = Parameters().replace({"slam.looks": 50.0})
+    with pytest.warns(RenamedParameterWarning, match=r"gathering.range_max is now called classification"):
+        by_name = Parameters().replace({"gathering.range_max": 12.0})
     with pytest.warns(RenamedParameterWarning, match=r"gathering.every is now called classification.every"):
         from_file = from_toml("[gathering]\nevery = 2\n", Parameters(), "old.toml")
     with pytest.warns(RenamedParameterWarning, match=r"shape.slices"):
         assigned = assign(Parameters(), ["shape.slices=6"])
-    assert by_name.slam.independent_views_max == 50.0
+    assert by_name.classification.range_max == 12.0
     assert from_file.classification.every == 2
     assert assigned.shape.split_slices == 6
 
 
 def test_a_current_name_takes_precedence_over_an_earlier_name():
     with pytest.warns(RenamedParameterWarning):
-        p = from_toml("[slam]\nlooks = 50.0\nindependent_views_max = 20.0\n", Parameters(), "both.toml")
-    assert p.slam.independent_views_max == 20.0
+        p = from_toml("[shape]\nslices = 6\nsplit_slices = 8\n", Parameters(), "both.toml")
+    assert p.shape.split_slices == 8

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
-from pipeline.detection.cluster_shape import describe, eccentricity, moments
+from pipeline.detection.cluster_shape import describe, eccentricity, moments, spread_about
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.types.records import Labels
 from tests.pipeline.strategies import SENSOR, arc, one_cluster
@@ -146,3 +146,9 @@ def test_columns_are_contiguous_like_those_of_a_cached_scan(shape):
     clusters = describe(np.ones((9, 3), np.float32), labels, SENSOR, shape)
     for column in fields(clusters):
         assert getattr(clusters, column.name).flags.c_contiguous, column.name
+
+
+def test_the_spread_about_a_centre_is_that_of_each_cluster():
+    points = np.array([[1.0, 0.0], [3.0, 0.0], [0.0, 6.0], [0.0, 7.0], [0.0, 11.0]])
+    spread = spread_about(points, np.array([0, 2, 5]), np.zeros((2, 2)))
+    np.testing.assert_allclose(spread, np.array([1.0, np.std([6.0, 7.0, 11.0])]))

@@ -12,13 +12,12 @@ from hypothesis.extra.numpy import arrays
 
 from pipeline.config import Parameters, preset
 from pipeline.config.stages import Obstacles
-from pipeline.detection.obstacles import BESIDE, TIGHTEST, find_clearance, way_of
+from pipeline.detection.obstacles import BESIDE, TIGHTEST, find_clearance, path_curvature
 from pipeline.errors import ParameterError
 from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose3
 from pipeline.ground.terrain import RINGS, SECTORS, Terrain
-from pipeline.types.clearance import Clearance, Zone
-from pipeline.types.records import Sensor, Step
+from pipeline.types.records import Clearance, Sensor, Step, Zone
 from tests.pipeline.strategies import scan
 
 P = Obstacles()
@@ -256,12 +255,12 @@ def test_what_is_no_number_is_passed_over():
     "twist", [(math.nan, 0.0, 1.0), (1.0, 0.0, math.nan), (0.0, 0.0, 9.0), (1.0, 0.0, math.inf)]
 )
 def test_velocities_that_tell_no_way_lead_straight_on(twist: tuple[float, float, float]):
-    assert way_of(twist) == 0.0
+    assert path_curvature(twist) == 0.0
     assert clearance(post(2.0, 0.0), twist=twist).zone is Zone.SLOW
 
 
 def test_no_way_is_tighter_than_a_robot_turns():
-    assert way_of((0.1, 0.0, 9.0)) == 1.0 / TIGHTEST
+    assert path_curvature((0.1, 0.0, 9.0)) == 1.0 / TIGHTEST
 
 
 def test_it_can_be_switched_off_and_zones_are_ordered():

@@ -200,6 +200,11 @@ def test_a_map_that_is_too_large_errs_by_its_scale(scale):
     assert told.largest == pytest.approx(told.mean, abs=1e-9)
 
 
+def test_two_near_trees_are_a_pair():
+    truth = np.array([[0.0, 0.0], [0.5, 0.0]])
+    assert pair_errors(1.1 * truth, truth).percent.max() == pytest.approx(10.0)
+
+
 def test_distances_by_hand():
     told = pair_distances(np.array([[0.0, 0], [3, 4], [3, 0]]))
     np.testing.assert_allclose(told, [[0, 5, 3], [5, 0, 4], [3, 4, 0]])

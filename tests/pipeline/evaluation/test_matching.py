@@ -37,6 +37,12 @@ def test_groups_that_share_no_pair_give_what_the_whole_gives(seed: int, n: int, 
     np.testing.assert_allclose(distance.sum(), total, atol=1e-9)
 
 
+def test_two_long_pairs_are_better_than_a_short_one():
+    found, truth = np.array([[0.0, 0.0], [3.0, 0.0]]), np.array([[0.1, 0.0], [-2.9, 0.0]])
+    assert match(found, truth, 3.0).tolist() == [1, 0]
+    assert match(0.01 * found, 0.01 * truth, 0.03).tolist() == [1, 0]
+
+
 def test_many_trees_need_no_matrix_of_all_pairs():
     """40,000 squared distances would be 13 GB."""
     rng = np.random.default_rng(1)

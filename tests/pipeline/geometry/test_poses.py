@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from pipeline.geometry.poses import Pose2, Pose3, interpolate, wrap_angle
+from pipeline.geometry.poses import Pose2, Pose3, euler_rotation, interpolate, wrap_angle
 from tests.pipeline.strategies import angles, poses2, poses3
 
 
@@ -74,6 +75,15 @@ def test_a_rotation_comes_back_from_its_quaternion_and_its_angles(pose):
     _same3(Pose3.from_quaternion(pose.t, -7.0 * q), pose)
     _same3(Pose3.from_euler(pose.t, *pose.euler()), pose)
     np.testing.assert_allclose(pose.R @ pose.R.T, np.eye(3), atol=1e-12)
+
+
+def test_euler_angles_of_one_pose_and_of_many_are_those_of_scipy():
+    given_angles = np.random.default_rng(1).uniform(-3.0, 3.0, (20, 3))
+    expected = Rotation.from_euler("ZYX", given_angles[:, ::-1]).as_matrix()
+    many = euler_rotation(*given_angles.T)
+    np.testing.assert_allclose(many, expected, atol=1e-15)
+    for each, R in zip(given_angles, many, strict=True):
+        np.testing.assert_allclose(euler_rotation(*each), R, atol=1e-15)
 
 
 @pytest.mark.parametrize("axis", range(3))

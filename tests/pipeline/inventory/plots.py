@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.inventory.cloud import CloudDescription
+from pipeline.types.clouds import CloudDescription
 
 
 @dataclass

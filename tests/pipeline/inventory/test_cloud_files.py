@@ -14,8 +14,8 @@ import pytest
 
 from app.cli import main
 from pipeline.errors import SourceError
-from pipeline.io.readers import open_source
-from pipeline.io.readers.clouds import is_cloud, open_cloud
+from pipeline.io.readers import is_cloud, open_source
+from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
 from tests.pipeline.inventory.plots import plot
 

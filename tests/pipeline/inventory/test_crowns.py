@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -151,3 +153,20 @@ def test_a_spooled_cloud_is_read_once_and_gives_the_same_points():
     assert np.array_equal(first, second)
     assert cloud.read == 1
     spooled.close()
+
+
+class MadeOfDrive(Made):
+    """The cloud of a drive."""
+
+    @property
+    def description(self):
+        return replace(super().description, cut_above=True)
+
+
+def test_the_cloud_of_a_drive_gives_no_heights():
+    rng = np.random.default_rng(2)
+    found = map_plot(MadeOfDrive(np.concatenate([flat(8.0, rng), tree(4.0, 4.0, rng)])), FOREST)
+    assert len(found.trees.number) == 1
+    assert found.trees.height is not None
+    assert np.isnan(found.trees.height).all()
+    assert "field of view" in found.crowns.hidden[0]

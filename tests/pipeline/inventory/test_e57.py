@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SourceError
-from pipeline.io.readers.clouds import is_cloud, open_cloud
+from pipeline.io.readers import is_cloud
+from pipeline.io.readers.clouds import open_cloud
 
 pye57 = pytest.importorskip("pye57", reason="pye57 is an extra")
 

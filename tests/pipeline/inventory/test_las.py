@@ -13,7 +13,8 @@ import pytest
 
 from app.cli import main
 from pipeline.errors import SourceError
-from pipeline.io.readers.clouds import is_cloud, open_cloud
+from pipeline.io.readers import is_cloud
+from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.point_files import MISSING
 from tests.pipeline.inventory.plots import PLACES, plot, write_las
 

@@ -191,6 +191,19 @@ def test_a_lidar_is_taken_before_the_bumper_and_info_says_why(
     assert any("/points" in line and "10.0 Hz" in line and "used as scan" in line for line in lines)
 
 
+@pytest.mark.parametrize(("turn_s", "timed"), [(0.0, False), (0.05, True), (1.9, True), (2.1, False)])
+def test_beams_have_times_where_a_turn_takes_less_than_two_seconds(
+    turn_s: float, timed: bool, tmp_path: Path, opened: Opened
+):
+    def fill(author: Author, write: Write) -> None:
+        message = laser(author, START_NS, time_increment=turn_s / BEAMS)
+        write("/scan", "sensor_msgs/msg/LaserScan", START_NS, message)
+
+    source = opened(write_recording("mcap", tmp_path, fill))
+    (scan,) = [record for record in source.records() if isinstance(record, Scan)]
+    assert (scan.offset_ns is not None) == timed
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -18,8 +18,8 @@ from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.measured_poses import GATE, NoPoseError, OtherPose, align_poses
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import FastSlam, Motion
+from pipeline.slam.measured_pose import within_gate
 from pipeline.slam.motion import noise_of
-from pipeline.slam.pose_gate import within_gate
 from pipeline.types.records import PoseMeasurement
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, Write, write_recording

@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import SourceError
+from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.point_files import ScanFileError, lzf_decompress, read_columns
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened
@@ -155,6 +156,22 @@ def test_a_cut_file_gives_the_whole_points(data: str, tmp_path: Path, opened: Op
     assert isinstance(scan, Scan)
     np.testing.assert_array_equal(scan.points, [[1.0, 2.0, 3.0]])
     assert source.losses == {"points that the files promise but do not hold": 2}
+
+
+def test_a_whole_cloud_names_its_other_columns(tmp_path: Path):
+    path = tmp_path / "cloud.pcd"
+    path.write_bytes(pcd(ROWS, "binary"))
+    assert open_cloud(str(path)).description.attributes == ("ring",)
+
+
+def test_a_zip_that_is_damaged_before_its_first_point_is_refused(tmp_path: Path):
+    path = tmp_path / "cloud.npz"
+    np.savez_compressed(path, points=np.random.default_rng(1).random((200_000, 3), np.float32))
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(content)
+    with pytest.raises(ScanFileError, match="its data is damaged"):
+        read_columns(path, {})
 
 
 def test_a_cut_compressed_file_is_refused(tmp_path: Path, opened: Opened):

@@ -94,6 +94,7 @@ def test_a_tree_in_the_promised_units():
         "height_m": "",
         "sigma_height_m": "",
         "lean_deg": "",
+        "review": "open",
     }
 
 

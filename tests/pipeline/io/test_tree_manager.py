@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,17 @@ from hypothesis import strategies as st
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers import Source, tree_manager
-from pipeline.io.readers.tree_manager import COLUMNS, _numbers, state_name, state_text, trajectory_text
+from pipeline.io.readers.tree_manager import (
+    COLUMNS,
+    _numbers,
+    state_name,
+    state_text,
+    trajectory_text,
+    write_tree_manager,
+)
 from pipeline.types.records import Odometry, Record, Scan, Stems
+from pipeline.types.records import Path as MapPath
+from tests.app import fakes
 from tests.pipeline.io.conftest import Opened
 
 NAN = float("nan")
@@ -178,6 +188,19 @@ def test_what_is_written_is_read(rows: list[list[float | bool]]):
     table, damaged = _numbers(body, len(COLUMNS))
     assert damaged == 0
     np.testing.assert_allclose(table, np.array(rows, float).reshape(-1, 17), rtol=1e-8, atol=1e-12)
+
+
+def test_frames_have_the_trees_that_were_seen_until_then_and_are_within_reach(tmp_path: Path):
+    trees = replace(
+        fakes.trees(3),
+        position=np.array([[1.0, 3.0], [0.0, -3.9], [9.0, 9.0]]),
+        first_seen_ns=np.array([0, 5, 0]),
+        confirmed=np.ones(3, np.bool_),
+    )
+    path = MapPath(np.array([0, 10]), np.zeros(2), np.zeros(2), np.zeros(2), np.zeros(2))
+    assert write_tree_manager(tmp_path / "out", path, trees, 4.0) == 1
+    frames = [(tmp_path / "out" / state_name(k)).read_text().splitlines() for k in range(2)]
+    assert [len(lines) - 1 for lines in frames] == [1, 2]
 
 
 @given(st.binary(max_size=300))

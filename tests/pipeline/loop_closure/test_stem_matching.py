@@ -10,10 +10,14 @@ from scipy.stats import chi2
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.loop_closure.stem_matching import MapStems, find_constellation
-from pipeline.loop_closure.stem_matching.alignment import aligned, alignment_covariance
-from pipeline.loop_closure.stem_matching.hypotheses import pairs_within
-from pipeline.loop_closure.stem_matching.stem_constellation import worst_sigma
+from pipeline.loop_closure.pose_hypotheses import pairs_within
+from pipeline.loop_closure.stem_matching import (
+    MapStems,
+    aligned,
+    alignment_covariance,
+    find_constellation,
+    worst_sigma,
+)
 
 P = Relocalisation()
 seeds = st.integers(0, 2**32 - 1)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import pipeline.remapping.preview as preview_of
 from pipeline.remapping import ClusterTable, Rerun, ScanCaches, preview_trees, sample_scans
 from pipeline.remapping.preview import MOST_PLACES, SAMPLE_BYTES, SAMPLE_SCANS, _grouped
 from pipeline.types.records import Verdict
@@ -51,6 +52,29 @@ def test_hits_are_the_clusters_that_are_trees(known):
     assert preview is not None
     found = np.count_nonzero(before.clusters.verdicts(BASE.detection) == Verdict.TREE)
     assert int(preview.observations.sum()) == found
+
+
+def test_a_long_run_keeps_the_clusters_of_some_scans(known, monkeypatch):
+    parameters = BASE.replace({"tracking.hits_to_confirm": 1, "tracking.proximity_radius": 0.3})
+    before = replace(known[1], columns=None)
+    whole = preview_trees(before, parameters)
+    assert whole is not None
+    monkeypatch.setattr(preview_of, "MOST_ROWS", before.clusters.start[-1] // 3)
+    m, few = mapper(BASE), ClusterTable()
+    for step in run()[0]:
+        scan = m.segment(step)
+        few.put(step.index, scan.clusters, scan.sensor_offset)
+        assert few.start[-1] <= preview_of.MOST_ROWS
+    assert few.spacing == 4
+    kept = np.arange(0, len(run()[0]), 4)
+    verdicts = before.clusters.of(kept.tolist()).verdicts(BASE.detection)
+    assert few.verdicts(BASE.detection).tolist() == verdicts.tolist()
+    given = preview_trees(replace(before, clusters=few), parameters)
+    assert given is not None
+    assert share_within(given.position, whole.position, 0.3) > 0.9
+    often = whole.position[whole.observations > 20]
+    assert share_within(often, given.position, 0.3) > 0.9
+    assert given.observations.sum() == pytest.approx(whole.observations.sum(), rel=0.2)
 
 
 @pytest.mark.parametrize("lost", [True, False])

@@ -15,8 +15,7 @@ from pipeline.simulation.obstacle_aware_driver import obstacle_aware_drive
 from pipeline.simulation.robot_motion import RATE_HZ, lay_course, speed_limit
 from pipeline.simulation.run import MOUNTING, SimulatedRun, open_run
 from pipeline.simulation.scenarios import parse_uri
-from pipeline.types.clearance import Zone
-from pipeline.types.records import Step
+from pipeline.types.records import Step, Zone
 
 P = Parameters().obstacles
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.geometry.poses import Pose3
+from pipeline.geometry.poses import Pose3, euler_rotation
 from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.motion_sensors import GRAVITY, inertial_readings, wheel_odometry
 from pipeline.simulation.robot_motion import (
@@ -21,7 +21,6 @@ from pipeline.simulation.robot_motion import (
     lap_time,
     lay_course,
     lay_on_terrain,
-    rotations,
     sharp_cells,
     within_gains,
 )
@@ -96,7 +95,7 @@ def test_the_base_stands_upright_to_the_ground():
     z, gx, gy = terrain.evaluate(d.x, d.y).T
     normal = np.stack([-gx, -gy, np.ones_like(gx)], axis=1)
     normal /= np.linalg.norm(normal, axis=1)[:, None]
-    up = rotations(motion.roll, motion.pitch, d.yaw)[:, :, 2]
+    up = euler_rotation(motion.roll, motion.pitch, d.yaw)[:, :, 2]
     angle = np.degrees(np.arccos(np.clip(np.sum(up * normal, axis=1), -1.0, 1.0)))
     assert angle.max() < 0.8  # vibration
     assert angle[0] < 1e-5  # none when it stands
@@ -105,13 +104,6 @@ def test_the_base_stands_upright_to_the_ground():
     # Uphill the nose points up, which is a negative pitch.
     climbing = np.gradient(z) > 1e-3
     assert np.all(motion.pitch[climbing] < 0.0)
-
-
-def test_rotations_are_those_of_the_geometry():
-    rng = np.random.default_rng(1)
-    angles = rng.uniform(-1.0, 1.0, (20, 3))
-    for (roll, pitch, yaw), R in zip(angles, rotations(*angles.T), strict=True):
-        np.testing.assert_allclose(R, Pose3.from_euler(np.zeros(3), roll, pitch, yaw).R, atol=1e-15)
 
 
 def odometry_errors(quality: str, seeds: int) -> Float:

@@ -13,10 +13,10 @@ from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import FastSlam, Motion
 from pipeline.slam.motion import correct_by_pose
-from pipeline.types.sensor_data import Odometry, PoseMeasurement
+from pipeline.types.records import Odometry, PoseMeasurement
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, scan
 
-FOREST = preset("forest").slam
+FOREST = preset("forest").slam.model_copy(update={"update_distance": 0.0})
 STRIDE, KNOWN, AFTER = 0.1, 60, 51
 MS = 1_000_000
 

@@ -137,7 +137,13 @@ def test_many_ambiguous_detections_end_and_are_never_worse_than_no_landmark_at_a
 
 def knows_two_trees(trees, **changes: Any):
     """A filter that has seen two trees often, and then takes a step with poor odometry."""
-    slow = {"particles": 30, "view_range": 0.0, "noise_distance": 0.35, "noise_turn_distance": 0.01}
+    slow = {
+        "particles": 30,
+        "view_range": 0.0,
+        "noise_distance": 0.35,
+        "noise_turn_distance": 0.01,
+        "update_distance": 0.0,
+    }
     slam = FastSlam(preset("forest").slam.model_copy(update=slow | changes), 0)
     for k in range(8):
         slam.process(k, Pose2(), detections(trees, sigma=0.05), NOTHING_SEEN)

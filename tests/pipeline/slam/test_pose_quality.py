@@ -18,18 +18,16 @@ from pipeline.slam.pose_quality import (
     ODOMETRY_WEAK,
     SIGMA_GOOD,
     SIGMA_WEAK,
-    is_lost,
-    pose_health,
-)
-from pipeline.slam.rigid_shift_test import MANY
-from pipeline.slam.running_statistics import (
     STRANGE_LOST,
     TREE_MOTION_MAX,
     TREE_MOTION_SCANS,
     OdometryDoubt,
     RunningStatistics,
+    is_lost,
+    pose_health,
     update_statistics,
 )
+from pipeline.slam.rigid_shift_test import MANY
 from pipeline.slam.scan_statistics import (
     INNOVATION,
     RECOGNISED,
@@ -41,7 +39,7 @@ from pipeline.slam.scan_statistics import (
 )
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
-FOREST = preset("forest").slam
+FOREST = preset("forest").slam.model_copy(update={"update_distance": 0.0})
 WORLD = np.stack(np.meshgrid(np.arange(-12.0, 13.0, 4.0), [-3.0, 3.0]), axis=-1).reshape(-1, 2)
 
 

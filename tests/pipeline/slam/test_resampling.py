@@ -1,14 +1,37 @@
-"""Low-variance resampling: each particle is drawn in proportion to its weight."""
+"""Random numbers of a scan, resampling, and the choice of the best particle."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.slam.resampling import low_variance_ancestors, normalised
-from tests.pipeline.strategies import seeds
+from pipeline.config import preset
+from pipeline.geometry.poses import Pose2
+from pipeline.slam.resampling import (
+    are_apart,
+    best_after_resampling,
+    draws,
+    low_variance_ancestors,
+    normalised,
+    select_best,
+)
+from tests.pipeline.strategies import detections, seeds
+
+
+@given(st.integers(0, 2**70), st.integers(0, 2**40))
+def test_seed_and_scan_decide(seed: int, index: int) -> None:
+    noise, offset = draws(seed, index, 20)
+    again, same = draws(seed, index, 20)
+    rng = np.random.default_rng([seed, index])  # numbers of any size are taken alike
+    assert noise.tobytes() == again.tobytes() == rng.standard_normal((20, 3)).tobytes()
+    assert offset == same == rng.random()
+    others = [draws(seed + 1, index, 20), draws(seed, index + 1, 20)]
+    assert all(not np.any(np.isin(noise, other)) and offset != at for other, at in others)
+
 
 offsets = st.floats(0.0, 1.0, exclude_max=True)
 
@@ -66,3 +89,36 @@ def test_weights_sum_to_one_and_keep_their_ratios(logs):
     assert weights.sum() == pytest.approx(1.0)
     shifted = normalised(np.array(logs) + 12345.0)
     np.testing.assert_allclose(weights, shifted, rtol=1e-6, atol=1e-12)
+
+
+@given(seeds, st.floats(0.1, 3.0))
+def test_while_particles_are_apart_the_best_one_is_kept_until_it_is_not_resampled(seed, power):
+    random = np.random.default_rng(seed)
+    weights, offset = normalised(power * random.standard_normal(40)), float(random.uniform())
+    near, far = random.normal(0.0, 0.2, (40, 3)), random.normal(0.0, 8.0, (40, 3))
+    far[weights.argmax(), :2] += 1e3  # however the weights are
+    assert (are_apart(near, weights, 1.0), are_apart(far, weights, 1.0)) == (False, True)
+    assert select_best(weights, 7, near, 1.0) == weights.argmax()
+    assert select_best(weights, 7, far, 1.0) == 7
+    ancestors = low_variance_ancestors(weights, offset)
+    chosen = best_after_resampling(7, ancestors, weights)
+    assert ancestors[chosen] == chosen, "a survivor keeps its slot"
+    assert chosen == (7 if 7 in ancestors else weights.argmax())
+
+
+def test_while_particles_are_apart_the_reported_pose_is_that_of_a_particle():
+    from pipeline.slam import FastSlam
+    from tests.pipeline.strategies import NOTHING_SEEN
+
+    slam = FastSlam(preset("stems").slam.model_copy(update={"update_distance": 0.0}), 0)
+    slam.place(0, Pose2(3.0, 1.0, 0.0), np.diag([25.0, 25.0, 0.01]))
+    told = slam.process(1, Pose2(0.1, 0.0, 0.0), detections([]), NOTHING_SEEN)
+    assert told.T_map_base.as_array().tobytes() in {row.tobytes() for row in told.particles}
+    away = told.particles - told.T_map_base.as_array()
+    about_it = (told.weights[:, None] * away).T @ away
+    assert told.relative is not None
+    for covariance in (told.covariance, told.relative):
+        assert np.linalg.eigvalsh(covariance - about_it).min() > -1e-3, "of that pose, not of the mean"
+    slam.state = replace(slam.state, pose=np.tile([3.0, 1.0, 0.0], (100, 1)))
+    told = slam.process(2, Pose2(), detections([]), NOTHING_SEEN)
+    assert told.T_map_base.x == pytest.approx(3.0, abs=0.01)

@@ -69,6 +69,30 @@ def test_points_that_do_not_fit_are_refused_with_the_reason(local, known, says):
         fit_control_points(local, known, names="abcd"[: len(local)])
 
 
+@pytest.mark.parametrize(
+    ("third", "remedy"),
+    [
+        (SQUARE[2] + [0.0, 5.0], "Check point c;"),
+        # At its right distance from a, but not from b: either of b and c can be wrong.
+        (Pose2(0.0, 0.0, 0.2).apply(SQUARE[2:3])[0], "Check the points b, c: one is wrong;"),
+    ],
+)
+def test_the_point_without_which_the_others_agree_is_named_for_three_points(third, remedy):
+    local = SQUARE[:3]
+    known = np.stack([local[0], local[1] + [0.01, 0.0], third])
+    with pytest.raises(StemmapError) as refused:
+        fit_control_points(local, known, names="abc")
+    assert refused.value.remedy.startswith(remedy)
+    assert "greater error" not in refused.value.remedy
+    assert "a: 0.00 m" in refused.value.what or "a: 0.01 m" in refused.value.what
+
+
+def test_two_wrong_points_are_not_explained_by_one():
+    known = SQUARE + np.array([[0, 0], [0, 0], [3, 0], [0, 4]])
+    with pytest.raises(StemmapError, match=r"no single point explains it; residuals [a-d]: \d"):
+        fit_control_points(SQUARE, known, names="abcd")
+
+
 def test_a_greater_sigma_allows_greater_residuals():
     known = SQUARE + OFF
     assert fit_control_points(SQUARE, known, point_sigma=1.0).rms > 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -191,3 +192,22 @@ def test_plots_together_have_their_weighted_mean_and_the_error_between_them():
     unequal = combined({"a": plots["a"], "b": figures(trees_of([0.2] * 90), area=3000.0)})["n_ha"]
     assert unequal.value == pytest.approx(1e4 * 110 / 4000)
     assert math.isnan(combined({"a": plots["a"]})["n_ha"].se)
+
+
+def test_volume_counts_the_trees_that_have_one():
+    trees = trees_of([0.2] * 12)
+    volume = np.array([0.5] * 9 + [np.nan] * 3)
+    with_volume = replace(trees, volume=volume, volume_sigma=np.where(np.isfinite(volume), 0.03, np.nan))
+    f = figures(with_volume, area=1000.0)
+    assert f.with_volume == 9
+    assert f.values["v_ha"] == (pytest.approx(45.0), pytest.approx(10.0 * 0.03 * 3.0))
+    assert f.values["v_ha_corrected"].value == pytest.approx(45.0)
+    assert any("volume of 9 of 12 trees" in text for text in f.warnings)
+    half = figures(with_volume, area=1000.0, seen=500.0, detection=(0.5, 0.0))
+    assert half.values["v_ha"].value == pytest.approx(90.0)
+    assert half.values["v_ha_corrected"].value == pytest.approx(180.0)
+    empty = figures(with_volume.where(np.zeros(12, np.bool_)), area=1000.0)
+    assert empty.values["v_ha"] == (0.0, 0.0)
+    assert combined({"a": f, "b": empty})["v_ha"].value == pytest.approx(22.5)
+    assert figures(trees).with_volume is None
+    assert math.isnan(figures(trees).values["v_ha"].value)

@@ -25,7 +25,7 @@ from pipeline.stand.plots import (
     seen_plot,
     within_reach,
 )
-from pipeline.stand.seen_area import CELL, SeenArea, SeenRecorder
+from pipeline.stand.seen_area import CELL, MOST_VIEWS, SeenArea, SeenRecorder, ViewSelection
 from pipeline.types.records import Path
 
 
@@ -89,7 +89,7 @@ def test_a_scan_observes_up_to_its_free_range_and_not_behind_a_stem():
     free = np.full(BINS, 10.0)
     free[: BINS // 4] = 3.0  # a quarter of all directions is hidden
     recorder = SeenRecorder()
-    recorder.add(0, Pose2(), free)
+    recorder.add(0, free)
     seen = recorder.area(path_of([[0, 0, 0]]))
     expected = math.pi * (0.75 * 10.5**2 + 0.25 * 3.5**2)
     assert len(seen.place) * CELL**2 == pytest.approx(expected, rel=0.02)
@@ -99,18 +99,28 @@ def test_a_scan_observes_up_to_its_free_range_and_not_behind_a_stem():
 
 def test_the_observed_area_moves_with_the_final_path():
     recorder, free = SeenRecorder(), np.full(BINS, 4.0)
-    assert recorder.is_due(Pose2())
-    recorder.add(0, Pose2(), free)
-    assert not recorder.is_due(Pose2(0.3, 0.0, 0.1))
-    assert recorder.is_due(Pose2(0.6, 0.0, 0.0))
-    assert recorder.is_due(Pose2(0.0, 0.0, 0.3))
-    recorder.add(2 * 10**9, Pose2(1.0, 0.0, 0.0), free)
+    recorder.add(0, free)
+    recorder.add(2 * 10**9, free)
+    recorder.add(9 * 10**9, free)  # later than the path, as after a seek back
     seen = recorder.area(path_of([[100, 50, 1], [0, 0, 0], [101, 50, 1]]))
     np.testing.assert_allclose(seen.centres.mean(axis=0), [100.5, 50.0], atol=0.3)
     assert seen.views.max() == 2
     near = seen.rows(np.array([[100.5, 50.0]]))[0]
     assert seen.nearest[near] < 1.0
     assert len(SeenRecorder().area(path_of([[0, 0, 0]])).place) == 0
+
+
+def test_views_are_recorded_after_a_motion_and_a_few_times_at_one_place():
+    views = ViewSelection()
+    assert views.take(Pose2())
+    assert not views.take(Pose2(0.3, 0.0, 0.1))
+    assert views.take(Pose2(0.6, 0.0, 0.0))
+    assert views.take(Pose2(0.6, 0.0, 0.3))
+    laps = ViewSelection()
+    lap = [Pose2(0.6 * k + 0.25, 0.1, 0.05) for k in range(20)]
+    taken = [sum(map(laps.take, lap)) for _ in range(10)]
+    assert taken == [20] * MOST_VIEWS + [0] * (10 - MOST_VIEWS)
+    assert laps.take(Pose2(0.25, 0.1, 3.0)), "another direction is another view"
 
 
 def test_areas_of_two_drives_join():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.tracking import Tracker
-from pipeline.tracking.track_classification import REACH
+from pipeline.tracking.track_classification import REACH, _best_first
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import RING_FAR, Verdict
 from tests.pipeline.tracking.test_round_fit_override import PLACE, column
@@ -120,3 +120,11 @@ def test_hits_do_not_confirm_a_track_at_a_column_of_another_class(verdict):
 
 def test_a_new_track_next_to_a_tree_is_not_confirmed_before_classification():
     assert between(Verdict.TREE, 0.3) == (int(Verdict.OTHER), False)
+
+
+def test_of_columns_of_one_tree_the_one_with_most_votes_remains():
+    axis = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 5.0, 0.0], [5.0, 0.0, 0.0]])
+    votes = np.zeros((4, 6))
+    votes[:, 0] = 0.6, 0.9, 0.5, 0.8
+    verdict = np.array([Verdict.TREE, Verdict.TREE, Verdict.TREE, Verdict.POLE], np.int32)
+    assert _best_first(axis, votes, verdict).tolist() == [1, 2]

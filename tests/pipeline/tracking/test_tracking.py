@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
-from pipeline.tracking.kalman import ENGINES, process_noise, transition
-from pipeline.tracking.observation import SECTORS, seen_sides
+from pipeline.tracking.kalman import ENGINES, H, process_noise, transition
+from pipeline.tracking.observation import EDGE, SECTORS, UNEVEN, seen_sides
 from pipeline.tracking.track_table import fuse
 from tests.pipeline.strategies import detections, seeds, track
 
@@ -27,10 +27,10 @@ def tracker(**changes: Any):
     return Tracker(FOREST.model_copy(update=changes))
 
 
-def show(t, k, centre, *, pose=None, pose_covariance=SURE, births=None, gone=(), **rest: Any):
+def show(t, k, centre, *, pose=None, pose_covariance=SURE, births=None, gone=(), score=None, **rest: Any):
     """Give a tracker the detections of scan k, in the base frame, and return its trees; see `track`."""
     found = detections(centre, **rest)
-    track(t, k * 100_000_000, pose or Pose2(), pose_covariance, found, births=births, gone=gone)
+    track(t, k * 100_000_000, pose or Pose2(), pose_covariance, found, births=births, gone=gone, score=score)
     return t.trees()
 
 
@@ -193,6 +193,28 @@ def test_a_landmark_next_to_a_tree_is_a_part_of_its_trunk(radius, numbers):
     assert set(trees.observations.tolist()) == {4}
 
 
+@pytest.mark.parametrize(
+    ("k", "seen", "births", "score", "landmark", "observations"),
+    [
+        (50, [[5.0, 0.12]], [7], {0: 2.0, 7: 3.0}, [7], [2]),
+        (50, [[5.0, 0.12]], [7], {0: 3.0, 7: 3.0}, [0], [1]),
+        (50, [[5.0, 0.0], [5.0, 0.12]], [0, 7], {0: 2.0, 7: 3.0}, [0], [2]),
+        (50, [[5.0, 0.45]], [7], {0: 2.0, 7: 3.0}, [0, 7], [1, 1]),
+        (101, [[5.0, 0.12]], [7], {0: 2.0, 7: 3.0}, [0], [1]),
+    ],
+    ids=["better", "not better", "both detected", "another tree", "long ago"],
+)
+def test_of_two_landmarks_of_a_trunk_the_tree_takes_the_better_one(
+    k, seen, births, score, landmark, observations
+):
+    """The first views can be wrong by more than the gate of later ones, which begin a second landmark."""
+    t = tracker(proximity_radius=0.4)
+    show(t, 0, [[5.0, 0.0]], births=[0])
+    trees = show(t, k, seen, births=births, score=score)
+    assert t.tracks.landmark.tolist() == landmark
+    assert trees.observations.tolist() == observations
+
+
 def test_trees_that_come_nearer_than_the_radius_are_merged():
     t = tracker(proximity_radius=0.4)
     show(t, 0, [[5.0, 0.0], [5.0, 0.45]])
@@ -267,6 +289,10 @@ def test_diameters_refer_to_breast_height(breast_height):
     assert t.trees().dbh[0] == pytest.approx(2.0 * (0.2 + lost))
 
 
+def test_the_measurement_is_the_position_of_the_state():
+    assert (H @ np.array([1.0, 2.0, 3.0, 4.0])).tolist() == [1.0, 2.0]
+
+
 def test_a_diameter_needs_three_radii_and_weighs_them():
     t = tracker(dbh_arc_min=0.0)
     for k in range(3):
@@ -277,6 +303,12 @@ def test_a_diameter_needs_three_radii_and_weighs_them():
     assert np.isnan(trees.dbh[0])
     trees = show(t, 6, [[5.0, 0.0]], radius=0.26)
     assert trees.dbh[0] == pytest.approx(2 * (0.2 + 0.2 + 0.26) / 3)
+    tracks, p = t.tracks, t.parameters
+    weight, dbh = tracks.radius_weight[0], trees.dbh[0]
+    reach, above = tracks.radius_reach[0] / weight, tracks.radius_above[0] / weight
+    views = 1.0 / (weight * reach**2) + (EDGE * reach + UNEVEN) ** 2
+    stem = (p.out_of_round * dbh) ** 2 + (p.taper_sigma * above) ** 2
+    assert trees.dbh_sigma[0] == pytest.approx(np.sqrt(4.0 * views + stem))
     assert 0.02 < trees.dbh_sigma[0] < 0.1
     assert trees.observations.tolist() == [6]
 

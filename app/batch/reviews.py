@@ -1,0 +1,106 @@
+"""Reviews by a person: which mapped trees are trees in the figures and files that are handed in.
+
+The map is not changed. An annotation of a class other than "tree" rejects the mapped tree at its place.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from app.batch.run_folder import read_run
+from app.store.records import KINDS, Content
+from pipeline.errors import StemmapError
+from pipeline.geometry.poses import Float
+from pipeline.io.atomic_files import write_texts
+from pipeline.io.result_files import CONFIRMED, OPEN, REJECTED, TREE_COLUMNS, csv_text
+
+if TYPE_CHECKING:
+    from app.store.store import Store
+
+# Largest distance between an annotation and the same object in a map or a ground truth [m].
+SAME_THING = 0.5
+# What figures and exports of a run need, besides its trees.
+_FILES = ("path.csv", "terrain.csv", "seen.csv", "run.json", "georeference.json")
+
+
+def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> dict[int, str]:
+    """Return CONFIRMED or REJECTED for each tree that a person reviewed, by its number.
+
+    An annotation belongs to the tree that is nearest to it, within SAME_THING. Of several annotations of a
+    tree the nearest one counts. The page has the same rule (`paired` in static/js/annotate/annotations.js).
+
+    Args:
+        numbers, position: Numbers of the trees, and their positions in the map, shape (T, 2) [m].
+        contents: The annotations in the same frame; skipped trees and plots are ignored.
+    """
+    from scipy.spatial import cKDTree
+
+    stating = [content for content in contents if content.kind in KINDS]
+    if not stating or not len(numbers):
+        return {}
+    distance, row = cKDTree(position).query([(content.x, content.y) for content in stating])
+    found: dict[int, str] = {}
+    for k in np.argsort(-distance, kind="stable"):  # the nearest comes last
+        if distance[k] < SAME_THING:
+            found[numbers[row[k]]] = CONFIRMED if stating[k].kind == "tree" else REJECTED
+    return found
+
+
+def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content]:
+    """Return the annotations of a recording that state what an object is, in the frame of the map.
+
+    Args:
+        store: The store.
+        source: Member `source` of run.json.
+    """
+    contents = store.contents(str(source.get("sha256") or source.get("uri")))
+    return [content for content in contents if content.kind in KINDS]
+
+
+@contextmanager
+def reviewed_run(folder: FilePath, contents: Sequence[Content]) -> Iterator[FilePath]:
+    """Yield a folder with the run of `folder` in which trees.csv has the reviews by annotations of its
+    recording, and no others; the folder itself if there are neither annotations nor reviews. A temporary
+    folder is removed afterwards; errors name `folder` instead.
+
+    Args:
+        folder: Folder that `stemmap map` wrote.
+        contents: Annotations in the frame of the map.
+
+    Raises:
+        StemmapError: The run cannot be read.
+    """
+    run = read_run(folder)  # checks the files
+    if not (contents or run.rejected or CONFIRMED in run.reviews.values()):
+        yield folder
+        return
+    offset = run.record["source"].get("offset_m", (0.0, 0.0))
+    placed = [replace(each, x=each.x + offset[0], y=each.y + offset[1]) for each in contents]
+    with (folder / "trees.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    numbers = [int(float(row["tree"])) for row in rows]
+    position = np.array([(float(row["x_m"]), float(row["y_m"])) for row in rows]).reshape(-1, 2)
+    reviews = reviews_of(numbers, position, placed)
+    texts = [
+        [{**row, "review": reviews.get(number, OPEN)}.get(name, "") for name in TREE_COLUMNS]
+        for number, row in zip(numbers, rows, strict=True)
+    ]
+    with TemporaryDirectory(prefix="stemmap-run-") as there:
+        for name in _FILES:
+            if (folder / name).is_file():
+                shutil.copyfile(folder / name, FilePath(there) / name)
+        write_texts(FilePath(there), {"trees.csv": csv_text(TREE_COLUMNS, texts)})
+        try:
+            yield FilePath(there)
+        except StemmapError as error:
+            where = error.where.replace(there, str(folder))
+            raise type(error)(error.what, where=where, remedy=error.remedy) from error

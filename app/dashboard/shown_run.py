@@ -1,0 +1,186 @@
+"""The open run as a folder of result files, so that the functions of the command line apply to it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from app.batch.georeference import write_map_frame
+from app.batch.plot_files import placed
+from app.batch.reviews import reviews_of
+from app.batch.run_folder import as_written, score_map
+from app.common.text import changed_values, version
+from app.dashboard.selection import NothingMappedError
+from app.sources.request import SourceRequest
+from app.store.records import Annotation
+from app.worker.protocol import CloudFrame, Shown, Status
+from pipeline.config import Parameters
+from pipeline.io.atomic_files import write_texts
+from pipeline.io.result_files import (
+    PATH_COLUMNS,
+    REJECTED,
+    TERRAIN_COLUMNS,
+    TREE_COLUMNS,
+    csv_text,
+    number_text,
+    path_rows,
+    seen_text,
+    terrain_rows,
+    tree_rows,
+)
+from pipeline.stand.plots import SamplePlot
+from pipeline.stand.seen_area import SeenRecorder
+from pipeline.types.records import Path, Trees, TruthTrees
+
+if TYPE_CHECKING:
+    from app.dashboard.dashboard import Dashboard
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShownRun:
+    """The open run at one moment; its parts are of one run, also if another source is opened meanwhile.
+
+    Attributes:
+        request: Source with seed and odometry.
+        digest: Digest of the recording, or its URI.
+        status: Status of the worker.
+        shown: Newest results.
+        path: The estimated path.
+        start_ns: Time of the first scan [ns].
+        preset, parameters: In force.
+        truth: Ground truth in the coordinates of the files; None without one.
+        seen: Views of the observed area; those of later scans may be added.
+        edits: The annotations of trees and the plots.
+        frame: The reference system that the map got on the page, as annotation; None without one.
+    """
+
+    request: SourceRequest
+    digest: str
+    status: Status
+    shown: Shown
+    path: Path
+    start_ns: int
+    preset: str
+    parameters: Parameters
+    truth: TruthTrees | None
+    seen: SeenRecorder
+    edits: tuple[Annotation, ...]
+    frame: Annotation | None
+
+    @classmethod
+    def of(cls, dashboard: Dashboard) -> ShownRun:
+        """Return the present state of a dashboard; raises NothingMappedError before the first map."""
+        if dashboard.shown is None or dashboard.path is None:
+            raise NothingMappedError
+        state = dashboard.parameters
+        return cls(
+            dashboard.source,
+            dashboard.digest,
+            dashboard.status,
+            dashboard.shown,
+            dashboard.path,
+            dashboard.start_ns,
+            state.preset,
+            state.parameters,
+            dashboard.file_truth,
+            dashboard.seen,
+            (*dashboard.annotation_editor.rows, *dashboard.annotation_editor.plots),
+            dashboard.annotation_editor.frame,
+        )
+
+    @property
+    def cloud(self) -> CloudFrame | None:
+        """Frame of a whole cloud; None for a run of scans."""
+        return self.status.cloud
+
+    def sample_plots(self) -> list[SamplePlot]:
+        """Return the plots in the coordinates of the files."""
+        offset = self.cloud.offset if self.cloud else (0.0, 0.0)
+        return placed([row.content for row in self.edits], offset)
+
+    def reviews(self) -> dict[int, str]:
+        """Return the reviews of the confirmed trees, see `reviews_of`."""
+        trees = self.shown.frame.trees
+        place = trees.position[trees.confirmed]
+        return reviews_of(trees.number[trees.confirmed].tolist(), place, [row.content for row in self.edits])
+
+    def trees_text(self) -> str:
+        """Return the text of trees.csv: the confirmed trees, also rejected ones, with their reviews, in the
+        coordinates of the files."""
+        trees = in_file(self.shown.frame.trees, self.cloud)
+        return csv_text(TREE_COLUMNS, tree_rows(trees, self.start_ns, self.reviews()))
+
+    @contextmanager
+    def folder(self) -> Iterator[FilePath]:
+        """Write the run to a temporary folder, as `stemmap map` and `stemmap georeference` do, and yield it;
+        it is removed afterwards. Raises StemmapError if a file cannot be written."""
+        with TemporaryDirectory(prefix="stemmap-run-") as name:
+            write_texts(FilePath(name), self.texts())
+            if self.frame is not None and self.frame.content.plot is not None:
+                write_map_frame(FilePath(name), self.frame.content.plot["frame"])
+            yield FilePath(name)
+
+    def texts(self) -> dict[str, str]:
+        """Return the texts of trees.csv, path.csv, terrain.csv, run.json and, for a run of scans, seen.csv by
+        name."""
+        ground, offset = self.shown.frame.ground, self.cloud.offset if self.cloud else (0.0, 0.0, 0.0)
+        cells = [] if ground is None else list(terrain_rows(ground))
+        if self.cloud is not None:
+            cells = [
+                [*(number_text(float(v) + o, 3) for v, o in zip(row, offset, strict=False)), "", ""]
+                for row in cells
+            ]
+        texts = {
+            "trees.csv": self.trees_text(),
+            "path.csv": csv_text(PATH_COLUMNS, path_rows(self.path, self.start_ns)),
+            "terrain.csv": csv_text(TERRAIN_COLUMNS, cells),
+            "run.json": json.dumps(self._record(), indent=1) + "\n",
+        }
+        if self.cloud is None:
+            texts["seen.csv"] = seen_text(self.seen.area(self.path))
+        return texts
+
+    def _record(self) -> dict[str, Any]:
+        """Return the contents of run.json, without what only `stemmap map` counts, and with `rejected`, the
+        number of rejected trees, which `trees` does not count. Reviews do not change the scores, which are
+        those of the map."""
+        status, truth = self.status, self.truth
+        trees = in_file(self.shown.frame.trees, self.cloud)
+        rejected = sum(review == REJECTED for review in self.reviews().values())
+        scores = None
+        if truth is not None:
+            scores = asdict(score_map(*as_written(trees, self.path, self.start_ns), truth, self.parameters))
+        digest = "" if self.digest == self.request.uri else self.digest
+        source: dict[str, Any] = {"uri": self.request.uri, "kind": status.kind, "sha256": digest}
+        if self.cloud is not None:
+            source |= {"offset_m": list(self.cloud.offset), "crs": self.cloud.crs or None}
+        return {
+            "stemmap": version(),
+            "source": source,
+            "seed": self.request.seed,
+            "odometry": self.request.odometry,
+            **({} if (chosen := self.request.kept_choices()) is None else {"chosen": chosen}),
+            "preset": self.preset,
+            "changed": changed_values(self.preset, self.parameters),
+            "parameters": self.parameters.model_dump(),
+            "scans": 0 if self.cloud else self.shown.frame.index + 1,
+            "duration_s": round(self.shown.time_s, 6),
+            "distance_m": round(float(np.hypot(np.diff(self.path.x), np.diff(self.path.y)).sum()), 3),
+            "trees": int(np.count_nonzero(trees.confirmed)) - rejected,
+            "rejected": rejected,
+            "evaluation": scores,
+            "warnings": list(status.warnings),
+        }
+
+
+def in_file(trees: Trees, cloud: CloudFrame | None) -> Trees:
+    """Return a copy of trees in the coordinates of the file of a whole cloud; for a run of scans (None) the
+    trees themselves."""
+    return trees if cloud is None else replace(trees, position=trees.position + cloud.offset[:2])

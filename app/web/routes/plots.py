@@ -1,0 +1,283 @@
+"""Plots of the open run, drawn, typed, along the path or from GIS files, and their stand figures.
+
+A plot is an annotation of class `plot`: undo, redo and deletion are routes of `app.web.routes.annotations`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import binascii
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import count
+from pathlib import Path as FilePath
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Literal
+
+from fastapi import APIRouter
+from pydantic import Field
+from starlette.responses import Response
+
+from app.dashboard.dashboard import Dashboard
+from app.dashboard.selection import NothingMappedError
+from app.dashboard.shown_run import ShownRun
+from app.sources import inspection
+from app.store.records import PLOT, Content, UnknownError
+from app.web.responses import BadRequestError, Body, Number, json_reply
+from app.web.routes.access import Dash, FigureParameters, ViewerTurn, in_thread
+from app.web.routes.annotations import Edit, Metres, edited
+from pipeline.config.stages import Stand
+from pipeline.errors import StemmapError
+from pipeline.stand.plots import centres_along, plot_of
+
+router = APIRouter(prefix="/api")
+
+MOST_PLOTS = 500
+_MOST_CORNERS = 20_000  # of all plots, which every browser receives with each edit
+_LONGEST_NAME = 60
+_Size = Annotated[float, Field(gt=0.0, le=2000.0)]
+_Point = Annotated[list[Metres], Field(min_length=2, max_length=2)]
+_Ring = Annotated[list[_Point], Field(min_length=3, max_length=5000)]
+_Name = Annotated[str, Field(max_length=_LONGEST_NAME)]
+# Without a separator, so that it stays in its folder.
+_FileName = Annotated[str, Field(pattern=r"^[^/\\\x00]{1,100}\.[A-Za-z]{3,7}$")]
+
+
+class _Circle(Body):
+    kind: Literal["circle"]
+    x: Metres
+    y: Metres
+    radius: Annotated[float, Field(gt=0.0, le=600.0)]
+
+
+class _Rectangle(Body):
+    """A rectangle by its centre; `turn_deg` is the angle of its length from x towards y."""
+
+    kind: Literal["rectangle"]
+    x: Metres
+    y: Metres
+    length: _Size
+    width: _Size
+    turn_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+
+
+class _Polygon(Body):
+    """An area by the coordinates of a GeoJSON MultiPolygon."""
+
+    kind: Literal["polygon"]
+    polygons: Annotated[
+        list[Annotated[list[_Ring], Field(min_length=1, max_length=100)]], Field(min_length=1, max_length=100)
+    ]
+
+
+class _Plot(Body):
+    """A plot; without a name it gets the next free number."""
+
+    name: _Name = ""
+    shape: Annotated[_Circle | _Rectangle | _Polygon, Field(discriminator="kind")]
+
+
+class _AddPlot(Edit):
+    plots: Annotated[list[_Plot], Field(min_length=1, max_length=MOST_PLOTS)]
+
+
+class _Along(Edit):
+    """Circles of `radius` whose centres are `every` apart along the path [m]."""
+
+    every: Annotated[float, Field(gt=0.0, le=1e4)]
+    radius: Annotated[float, Field(gt=0.0, le=500.0)]
+
+
+class _Change(Edit):
+    """A new name, or a new radius of a circle [m]; None leaves it."""
+
+    version: Number
+    name: Annotated[str, Field(min_length=1, max_length=_LONGEST_NAME)] | None = None
+    radius: Annotated[float, Field(gt=0.0, le=600.0)] | None = None
+
+
+class _ImportPlots(Edit):
+    """Files by name, in base64: one, or the parts of a Shapefile. `crs` is the reference system of a file
+    without one, "local" or ""."""
+
+    files: Annotated[
+        dict[_FileName, Annotated[str, Field(max_length=1_000_000)]], Field(min_length=1, max_length=8)
+    ]
+    crs: Annotated[str, Field(max_length=100)] = ""
+
+
+@router.get("/plots", dependencies=[ViewerTurn])
+async def figures(dashboard: Dash, parameters: FigureParameters) -> Response:
+    """Return the stand figures of the whole observed area (`all`) and of the plots (`plots`, null without
+    plots), see `app.batch.stand.stand_record`, and the reason why a part is missing (`problem`). All are
+    empty before the first map."""
+    if dashboard.shown is None:
+        return json_reply({"all": None, "plots": None, "problem": ""})
+    return json_reply(await asyncio.to_thread(_figures, ShownRun.of(dashboard), parameters))
+
+
+@router.post("/plots")
+async def add(body: _AddPlot, dashboard: Dash) -> Response:
+    """Add plots in one edit; return their numbers and the numbers of edits that can be undone and repeated,
+    with 201. 409 if another run was opened meanwhile, 422 for a shape that is no area, a name that is
+    taken, or too many plots or corners."""
+    return await _added(dashboard, body, [(plot.name, plot.shape.model_dump()) for plot in body.plots])
+
+
+@router.post("/plots/along")
+async def add_along(body: _Along, dashboard: Dash) -> Response:
+    """Add circles along the path in one edit; responses as in `add`, and 409 before the first scan, 422 if
+    there would be too many."""
+    if dashboard.path is None:
+        raise NothingMappedError
+    with _as_bad_request():
+        centres = centres_along(dashboard.path_xy, body.every).round(3).tolist()
+    circles = [{"kind": "circle", "x": x, "y": y, "radius": body.radius} for x, y in centres]
+    return await _added(dashboard, body, [("", shape) for shape in circles])
+
+
+@router.post("/plots/import")
+async def import_file(body: _ImportPlots, dashboard: Dash) -> Response:
+    """Add the plots of a GIS file, which a child process reads, in one edit; names that are taken get a
+    number. Responses as in `add`, and 409 before the first scan, 422 if the file cannot be read."""
+    run = ShownRun.of(dashboard)
+    with TemporaryDirectory(prefix="stemmap-plots-") as folder:
+        file = await asyncio.to_thread(_written, body.files, FilePath(folder))
+        async with in_thread(run.folder()) as run_folder:
+            question = {"ask": "plots", "path": str(file), "run": str(run_folder), "crs": body.crs.strip()}
+            try:
+                read = await inspection.ask(question)
+            except StemmapError as error:
+                raise BadRequestError(error.what, where=file.name, remedy=error.remedy) from None
+    x, y = dashboard.offset
+    moved = [
+        [[[[px - x, py - y] for px, py in ring] for ring in part] for part in plot["polygons"]]
+        for plot in read["plots"]
+    ]
+    taken, named = _names(dashboard), []
+    for plot, polygons in zip(read["plots"], moved, strict=True):
+        name = _free(" ".join(plot["name"].split())[: _LONGEST_NAME - 6], taken)
+        taken.add(name)
+        named.append((name, {"kind": "polygon", "polygons": polygons}))
+    return await _added(dashboard, body, named)
+
+
+@router.patch("/plots/{number}")
+async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
+    """Rename a plot, or change the radius of a circle; return its number and the numbers of edits that can be
+    undone and repeated. 404 for an unknown plot, 409 if it does not have this version any more, 422 for a
+    name that is empty or taken, or the radius of another shape."""
+    row = next((row for row in dashboard.annotation_editor.plots if row.id == number), None)
+    if row is None or row.content.plot is None:
+        raise UnknownError("there is no such plot", where=f"plot {number}")
+    plot = dict(row.content.plot)
+    if body.name is not None:
+        plot["name"] = _checked_name(body.name, _names(dashboard) - {plot["name"]})
+    if body.radius is not None:
+        if plot["shape"]["kind"] != "circle":
+            raise BadRequestError("only a circle has a radius", where=f"plot {number}")
+        plot["shape"] = {**plot["shape"], "radius": body.radius}
+    content = replace(row.content, plot=plot)
+    await dashboard.annotation_editor.edit(
+        body.run, lambda store: store.change(body.run, body.author, number, body.version, content)
+    )
+    return await edited(dashboard, body, {"id": number})
+
+
+@contextmanager
+def _as_bad_request() -> Iterator[None]:
+    """Raise a StemmapError of the context, which is about the values of a request, as BadRequestError."""
+    try:
+        yield
+    except StemmapError as error:
+        raise BadRequestError(error.what, where=error.where, remedy=error.remedy) from None
+
+
+async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, dict[str, Any]]]) -> Response:
+    """Add plots, given by name ("" for the next free number) and shape, in one edit, and return the
+    response 201 with their `ids`; raises BadRequestError if one is not valid, a name is taken or there would
+    be too many."""
+    taken, contents = _names(dashboard), []
+    for name, shape in plots:
+        name = _checked_name(name, taken) if name else _free("", taken)
+        taken.add(name)
+        with _as_bad_request():
+            middle = plot_of(name, shape).shape.centroid
+        contents.append(Content(middle.x, middle.y, PLOT, None, {"name": name, "shape": shape}))
+    rows = dashboard.annotation_editor.plots
+    corners = sum(_corners(c.plot or {}) for c in (*(row.content for row in rows), *contents))
+    if len(rows) + len(contents) > MOST_PLOTS or corners > _MOST_CORNERS:
+        raise BadRequestError(
+            f"a run can have at most {MOST_PLOTS} plots with {_MOST_CORNERS} corners",
+            remedy="Simplify the plots, or use stemmap stand --plots FILE",
+        )
+    ids = await dashboard.annotation_editor.edit(
+        body.run, lambda store: store.add(body.run, body.author, contents)
+    )
+    return await edited(dashboard, body, {"ids": ids}, 201)
+
+
+def _names(dashboard: Dashboard) -> set[str]:
+    """Return the names of the plots of the open run."""
+    return {row.content.plot["name"] for row in dashboard.annotation_editor.plots if row.content.plot}
+
+
+def _checked_name(name: str, taken: set[str]) -> str:
+    """Return a name with its spaces merged; raises BadRequestError if it is empty, not printable or taken."""
+    merged = " ".join(name.split())
+    if not merged or not merged.isprintable():
+        raise BadRequestError("the name is empty or has characters that cannot be shown", where="name")
+    if merged in taken:
+        raise BadRequestError(f"another plot is called {merged!r}", remedy="Choose another name")
+    return merged
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """Return a name that is not in `taken`: the name itself or with a number in parentheses; without a name,
+    or for one that is not printable, the next free number as text. `taken` does not change."""
+    if name and name.isprintable() and name not in taken:
+        return name
+    names = (f"{name} ({k})" if name and name.isprintable() else str(k) for k in count(2 if name else 1))
+    return next(each for each in names if each not in taken)
+
+
+def _corners(plot: Mapping[str, Any]) -> int:
+    """Return the number of corners of the polygons of a plot; 0 for other shapes."""
+    return sum(len(ring) for part in plot["shape"].get("polygons", ()) for ring in part)
+
+
+def _written(files: Mapping[str, str], folder: FilePath) -> FilePath:
+    """Write files, given in base64 by name, to a folder; return the path of the one that is read, the first
+    with a suffix of plots. Raises BadRequestError if there is none, or for other text than base64."""
+    from app.batch.plot_files import SUFFIXES
+
+    for name, text in files.items():
+        try:
+            (folder / name).write_bytes(base64.b64decode(text, validate=True))
+        except (binascii.Error, ValueError):
+            raise BadRequestError("the file was not transferred completely", where=name) from None
+    for suffix in SUFFIXES:
+        for name in files:
+            if name.lower().endswith(suffix):
+                return folder / name
+    raise BadRequestError(
+        "there is no file of plots", remedy="Choose a .gpkg, .geojson or .zip, or all parts of a Shapefile"
+    )
+
+
+def _figures(run: ShownRun, parameters: Stand) -> dict[str, Any]:
+    """Return the figures of the route `figures`; those of the whole area are None only if nothing was
+    observed, and those of the plots also if all plots are outside."""
+    from app.batch.stand import stand_of, stand_record
+
+    found: dict[str, Any] = {"all": None, "plots": None, "problem": ""}
+    with run.folder() as folder:
+        try:
+            found["all"] = stand_record(stand_of(folder, parameters))
+            if plots := run.sample_plots():
+                found["plots"] = stand_record(stand_of(folder, parameters, plots))
+        except StemmapError as error:
+            found["problem"] = f"{error.what}. {error.remedy}".strip()
+    return found

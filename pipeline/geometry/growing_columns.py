@@ -1,0 +1,61 @@
+"""Columns that grow at the end."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Column = NDArray[Any]
+
+
+class GrowingColumns:
+    """Columns of N rows; the capacity doubles when it is full.
+
+    Columns that `shared` returned share their memory with later ones, but their values never change: where
+    one of their rows is replaced, the columns get new memory.
+
+    Args:
+        columns: The rows so far, each of shape (N, ...); copied.
+    """
+
+    def __init__(self, *columns: Column) -> None:
+        self._columns = [column.copy() for column in columns]
+        self._length, self._rows_shared = len(columns[0]), 0
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return self._length
+
+    def column(self, number: int) -> Column:
+        """Return the column with this number, from 0, of all rows; a view that later calls may change."""
+        return self._columns[number][: self._length]
+
+    def shared(self) -> list[Column]:
+        """Return all columns of all rows, whose values never change; they are not copied."""
+        self._rows_shared = max(self._rows_shared, self._length)
+        return [column[: self._length] for column in self._columns]
+
+    def write(self, start: int, *rows: Column) -> None:
+        """Replace the rows from `start`, which is at most N, onwards.
+
+        Args:
+            start: First row.
+            rows: The new rows of each column.
+        """
+        end, capacity = start + len(rows[0]), len(self._columns[0])
+        if start < self._rows_shared or end > capacity:
+            capacity = 2 * end if end > capacity else capacity
+            before, self._rows_shared = self._columns, 0
+            self._columns = [np.empty((capacity, *column.shape[1:]), column.dtype) for column in before]
+            for column, old in zip(self._columns, before, strict=True):
+                column[: len(old)] = old
+        for column, new in zip(self._columns, rows, strict=True):
+            column[start:end] = new
+        self._length = end
+
+    def return_to(self, length: int) -> None:
+        """Set the number of rows to `length`, which was reached before; rows after the present ones are those
+        that were written there last."""
+        self._length = length

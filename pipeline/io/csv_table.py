@@ -1,0 +1,105 @@
+"""Tables of numbers and words that people write: CSV with a header."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.errors import SourceError
+from pipeline.geometry.poses import Float
+from pipeline.io.readers.base import COORDINATE_LIMIT
+
+
+class CsvTable:
+    """A table with a header line; commas, semicolons or tabs, whichever is most frequent in the first line.
+
+    Args:
+        text: The text.
+        what: What the table is, for errors: "table of trees".
+        where: Name of the table in errors.
+
+    Attributes:
+        lines: Line number of each row in the file.
+        rows: Cells of each row that is not empty, without the header.
+        column: Index of each column by its name in lower case; of several with the same name the first.
+
+    Raises:
+        SourceError: The text is no CSV.
+    """
+
+    def __init__(self, text: str, what: str, where: str) -> None:
+        self.where = where
+        first = text.partition("\n")[0]
+        try:
+            reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=first.count))
+            numbered = [(reader.line_num, row) for row in reader if any(row)]
+        except csv.Error as error:
+            raise SourceError(f"the {what} is not a CSV: {error}", where=where) from None
+        header = [name.strip().lower() for name in numbered[0][1]] if numbered else []
+        self.lines, self.rows = [line for line, _ in numbered[1:]], [row for _, row in numbered[1:]]
+        self.column = {name: k for k, name in reversed(list(enumerate(header)))}
+
+    @classmethod
+    def read(cls, path: Path, what: str, largest: int) -> CsvTable:
+        """Return the table of a file, without a byte order mark; `what` names it in errors.
+
+        Raises:
+            SourceError: It cannot be read, is larger than `largest` bytes, is not UTF-8, or is no CSV.
+        """
+        try:
+            if path.stat().st_size > largest:
+                raise SourceError(f"the {what} is larger than {largest >> 20} MB", where=str(path))
+            text = path.read_text(encoding="utf-8-sig")
+        except OSError as error:
+            raise SourceError(f"cannot read the {what}: {error.strerror}", where=str(path)) from None
+        except UnicodeDecodeError:
+            raise SourceError(f"the {what} is not text", where=str(path)) from None
+        return cls(text, what, str(path))
+
+    def find(self, names: Iterable[str]) -> str | None:
+        """Return the first of some names that is a column; None if none is."""
+        return next((name for name in names if name in self.column), None)
+
+    def text(self, name: str) -> list[str]:
+        """Return the stripped cells of a column, "" where a row is too short or there is no such column."""
+        k = self.column.get(name, -1)
+        return [row[k].strip() if 0 <= k < len(row) else "" for row in self.rows]
+
+    def numbers(self, name: str, *, required: bool = True) -> Float:
+        """Return the numbers of a column, shape (N,). Without `required`, empty cells, "nan" and "na" give
+        NaN. A column that the table does not have counts as empty cells.
+
+        Raises:
+            SourceError: A cell is not a finite number, or is beyond COORDINATE_LIMIT.
+        """
+        return np.array(
+            [self._number(text, name, k, required) for k, text in enumerate(self.text(name))], np.float64
+        )
+
+    def _number(self, text: str, name: str, row: int, required: bool) -> float:
+        """Return the number of one cell, with the errors of `numbers`.
+
+        Args:
+            text: The cell.
+            name, row: Name of the column and index of the row, for errors.
+            required: Whether an unknown number is an error.
+        """
+        if text == "" and not required:
+            return math.nan
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) and (required or text.lower() not in ("nan", "na")):
+            raise SourceError(f"line {self.lines[row]}: {name} = {text!r} is not a number", where=self.where)
+        if abs(value) >= COORDINATE_LIMIT:
+            raise SourceError(
+                f"line {self.lines[row]}: {name} = {text!r} is out of range",
+                where=self.where,
+                remedy=f"Give numbers between -{COORDINATE_LIMIT:,.0f} and {COORDINATE_LIMIT:,.0f}",
+            )
+        return value

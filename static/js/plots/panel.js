@@ -1,0 +1,189 @@
+// The tab Plots: draw, type, import and list plots, with the stand figures of each plot and of all.
+
+import { draft, redo, remove, undo } from "../annotate/annotations.js";
+import { get } from "../core/api.js";
+import { button, byId, el, recall, remember, setText } from "../core/dom.js";
+import { figure, NONE, percent } from "../core/format.js";
+import { looksOnly } from "../core/permissions.js";
+import { reportMenu } from "../core/report.js";
+import { on, state } from "../core/store.js";
+import { keepFresh } from "../core/timing.js";
+import { startCoordinates } from "./coordinates.js";
+import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plots, plotting, SHAPES, sketch, stopDrawing } from "./plots.js";
+
+const EVERY = 3000; // [ms] between two requests while the run plays
+const LARGEST_FILES = 700_000; // [bytes]
+const FIELDS = { circle: [["radius", "radius m"]], rectangle: [["length", "length m"], ["width", "width m"], ["turn_deg", "turn °"]] };
+const HEADS = [["plot", ""], ["m²", "Area"], ["seen", "Observed part of the area"], ["trees", "Trees of at least the minimum diameter in the observed part"],
+  ["N/ha", "Stems per hectare"], ["G m²/ha", "Basal area per hectare"], ["Dq cm", "Quadratic mean diameter"]];
+const VOLUME = ["V m³/ha", "Stem volume per hectare"];
+let figures = { all: null, plots: null, problem: "" };
+let shown = ""; // what the figures are of
+
+// --- the settings of the figures, which this browser remembers ------------------------------------------------------
+
+const threshold = () => Number(recall("dbh-min") ?? 7);
+const formula = () => recall("volume") ?? "";
+export const settings = () => new URLSearchParams({ dbh_min: threshold() / 100, volume: formula() });
+
+const refresh = keepFresh(async () => {
+  const version = `${state.annotations?.run} ${state.annotations?.serial} ${state.map?.index} ${state.parameters?.revision} ${state.remapped?.revision} ${settings()}`;
+  if (!plotting() || !state.map || version === shown) return;
+  try {
+    figures = await get(`/api/plots?${settings()}`);
+    shown = version;
+  } catch (error) {
+    figures = { all: null, plots: null, problem: error.message };
+  }
+  fill();
+}, EVERY);
+
+// --- the controls ---------------------------------------------------------------------------------------------------
+
+const number = (name, value, title) => el("input", { type: "number", name, value, step: "any", required: true, "aria-label": title, title });
+const numberOf = (form, name) => Number(form.elements[name].value);
+
+function typed() {
+  const kind = el("select", { name: "kind", "aria-label": "Shape", onchange: () => fields.replaceChildren(...made(kind.value)) }, ...Object.keys(FIELDS).map((each) => el("option", { value: each, text: each })));
+  const made = (each) => FIELDS[each].map(([name, title]) => el("label", {}, title, number(name, name === "turn_deg" ? 0 : each === "circle" ? 5.64 : 10, title)));
+  const fields = el("span", { class: "plot-fields" }, ...made("circle"));
+  return el("form", { class: "plot-form", onsubmit: (event) => {
+    event.preventDefault();
+    const form = event.target;
+    const names = ["x", "y", ...FIELDS[kind.value].map(([name]) => name)];
+    addPlots([{ name: form.elements.name.value.trim(), shape: { kind: kind.value, ...Object.fromEntries(names.map((name) => [name, numberOf(form, name)])) } }]);
+  } }, kind, el("label", {}, "x m", number("x", 0, "x of the centre in the map, m")), el("label", {}, "y m", number("y", 0, "y of the centre in the map, m")), fields,
+  el("label", {}, "name", el("input", { type: "text", name: "name", maxlength: "60", placeholder: "next number", autocomplete: "off" })), el("button", { class: "small", text: "Add" }));
+}
+
+const alongPath = () => el("form", { class: "plot-form", onsubmit: (event) => {
+  event.preventDefault();
+  addAlong(numberOf(event.target, "every"), numberOf(event.target, "radius"));
+} }, el("label", {}, "every", number("every", 20, "Distance along the path, m"), "m"), el("label", {}, "radius", number("radius", 5.64, "Radius of the circles, m"), "m"), el("button", { class: "small", text: "Add circles" }));
+
+async function base64(file) {
+  const bytes = new Uint8Array(await file.arrayBuffer());
+  return btoa(Array.from(bytes, (byte) => String.fromCharCode(byte)).join(""));
+}
+
+function imported() {
+  const crs = el("input", { type: "text", "aria-label": "Coordinates of a file that does not state them", placeholder: "of the file", title: "Coordinates of a file that does not state them: EPSG:25832, or local for those of the map", autocomplete: "off" });
+  const file = el("input", { id: "plot-file", type: "file", multiple: true, accept: ".gpkg,.geojson,.json,.zip,.shp,.dbf,.shx,.prj,.cpg", hidden: true, "aria-label": "File of plots", onchange: async () => {
+    const files = [...file.files];
+    if (files.reduce((sum, { size }) => sum + size, 0) > LARGEST_FILES) {
+      draft.error = `The file is larger than ${LARGEST_FILES / 1e6} MB. Simplify it, or use stemmap stand --plots FILE.`;
+      fill();
+    } else if (files.length) await importPlots(Object.fromEntries(await Promise.all(files.map(async (each) => [each.name, await base64(each)]))), crs.value);
+    file.value = "";
+  } });
+  return el("div", { class: "plot-form" }, button("plot-import", "Import …", "Plots of a GeoPackage, GeoJSON or Shapefile (all its files, or a zip)", () => file.click()), el("label", {}, "coordinates", crs), file);
+}
+
+function setting(name, label, value, title, type, placeholder = "") {
+  return el("label", { title }, label, el("input", { type, value, title, placeholder, step: "any", min: "0", max: "100", onchange: (event) => { remember(name, event.target.value.trim()); refresh(); } }));
+}
+
+function build() {
+  byId("panel-plots").replaceChildren(
+    el("div", { id: "plots-edit" },
+      el("div", { class: "annotate-head" }, el("span", { class: "dim", text: "Draw" }),
+        ...Object.entries(SHAPES).map(([kind, text]) => button(`plot-${kind}`, text, `Draw a ${kind} on the map`, () => draw(kind))), el("span", { class: "grow" }),
+        button("plot-undo", "Undo", "Undo your last edit (Ctrl+Z)", undo), button("plot-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo)),
+      el("details", { class: "plot-more" }, el("summary", { text: "Type a plot, place plots along the path, or import a file" }), typed(), alongPath(), imported()),
+      el("details", { id: "coordinates", class: "plot-more" })),
+    el("p", { id: "plots-hint", class: "note dim", role: "status" }), el("p", { id: "plots-error", class: "error", role: "alert", hidden: true }),
+    el("div", { class: "plots-list" }, el("table", { id: "plots-table", class: "plain" }, el("thead"), el("tbody"))),
+    el("ul", { id: "plots-warnings", class: "plots-warnings", "aria-label": "Warnings about the figures" }),
+    el("div", { class: "plot-form" }, setting("dbh-min", "trees from DBH", threshold(), "Minimum diameter, cm", "number"), "cm",
+      setting("volume", "volume m³ =", formula(), "Volume of a stem in m³ as a formula of dbh_cm and height_m, with + - * / ^ ( ) exp log sqrt; empty: no volume", "text", "0.00007 * dbh_cm^1.8 * height_m^0.95")),
+    el("div", { class: "plot-form" }, reportMenu("plots-report", "open", settings), el("span", { text: "with map, plots, figures and list of trees" })));
+}
+
+// --- the table --------------------------------------------------------------------------------------------------------
+
+function estimate([value, se] = [null, null], digits = 3) {
+  return el("td", {}, value === null ? NONE : figure(value, digits), ...(se === null || value === null ? [] : [el("small", { text: ` ± ${figure(se, 2)}` })]));
+}
+
+function cells(of, withVolume) {
+  const names = ["n_ha", "g_ha", "dg_cm", ...(withVolume ? ["v_ha"] : [])];
+  const about = of.area_m2 === undefined ? ["", "", ""] : [figure(of.area_m2), percent(of.seen_m2 / of.area_m2), String(of.trees)];
+  return [...about.map((text) => el("td", { text })), ...names.map((name) => estimate(of[name]))];
+}
+
+function radiusOf(plot) {
+  const { kind, radius } = plot.shape;
+  if (kind !== "circle") return "";
+  if (looksOnly()) return ` r ${radius} m`;
+  return el("label", { class: "plot-radius" }, " r ", el("input", { type: "number", value: radius, min: "0.01", max: "600", step: "any", required: true, "aria-label": `Radius of plot ${plot.name}, m`, onchange: ({ target }) => target.reportValidity() && changePlot(plot, { radius: target.valueAsNumber }) }), " m");
+}
+
+function line(plot, of, withVolume) {
+  const name = looksOnly() ? plot.name : el("input", { type: "text", value: plot.name, maxlength: "60", "aria-label": `Name of plot ${plot.name}`, onchange: (event) => changePlot(plot, { name: event.target.value }) });
+  const gone = el("button", { class: "quiet small", "data-edit": true, text: "✕", title: "Delete", "aria-label": `Delete plot ${plot.name}`, onclick: () => remove(plot) });
+  return el("tr", { "data-plot": plot.id }, el("th", { scope: "row" }, name, radiusOf(plot)), ...cells(of ?? {}, withVolume), el("td", {}, gone));
+}
+
+function fillTable() {
+  const table = byId("plots-table");
+  const typing = table.contains(document.activeElement) && document.activeElement.matches("input") ? document.activeElement : null;
+  if (typing && ![...plots().map(({ name }) => name), ...plots().map(({ shape }) => String(shape.radius))].includes(typing.value)) return; // a person types
+  const edited = typing?.closest("tr").dataset.plot;
+  const found = figures.plots, withVolume = Boolean(formula());
+  const heads = [...HEADS, ...(withVolume ? [VOLUME] : [])];
+  table.tHead.replaceChildren(el("tr", {}, ...heads.map(([text, title]) => el("th", { scope: "col", text, title })), el("td")));
+  const sum = (text, of) => el("tr", { class: "sum" }, el("th", { scope: "row", text }), ...cells(of, withVolume), el("td"));
+  table.tBodies[0].replaceChildren(...plots().map((plot) => line(plot, found?.plots[plot.name], withVolume)),
+    ...(found && plots().length > 1 ? [sum("mean", found.mean)] : []),
+    ...(figures.all ? [sum("all observed", figures.all.plots.all)] : []));
+  table.hidden = !table.tBodies[0].rows.length;
+  if (typing) table.querySelector(`[data-plot="${edited}"] input[type=${typing.type}]`)?.focus();
+}
+
+function hint() {
+  if (sketch.kind === "point") return "Click a tree or a mark on the map whose coordinates are known. Esc ends.";
+  if (sketch.kind === "polygon") return "Click each corner on the map; click the first corner or press Enter to finish. Esc ends.";
+  if (drawing()) return `Drag on the map from ${sketch.kind === "circle" ? "the centre outwards" : "corner to corner"}, or click both ends. Esc ends.${sketch.kind === "circle" ? " Then its radius can be typed in the list." : ""}`;
+  if (!state.map) return "Nothing mapped yet: press play, then draw plots on the map.";
+  if (!plots().length) return "Draw plots on the map for their stems and basal area per hectare. Without plots, the figures are those of the whole observed area.";
+  const { trees_rejected: rejected } = figures.all ?? {};
+  return `Trees of the map at the shown time${rejected ? `, without ${rejected} rejected in the review` : ""}. ± is the standard error: 0 where all of a plot was observed; of the mean, by the variation between plots.`;
+}
+
+function fill() {
+  if (!plotting()) return;
+  for (const kind of Object.keys(SHAPES)) byId(`plot-${kind}`).setAttribute("aria-pressed", String(sketch.kind === kind));
+  byId("plot-undo").disabled = !draft.undo;
+  byId("plot-redo").disabled = !draft.redo;
+  setText(byId("plots-hint"), hint());
+  const problem = state.annotations?.problem || draft.error || (state.map ? figures.problem : "");
+  byId("plots-error").hidden = !problem;
+  setText(byId("plots-error"), problem && problem.charAt(0).toUpperCase() + problem.slice(1));
+  const { warnings = [] } = figures.plots ?? figures.all ?? {};
+  byId("plots-warnings").replaceChildren(...warnings.map((text) => el("li", { text })));
+  fillTable();
+}
+
+// Returns whether the key belonged to the tab.
+export function plotKey(event) {
+  if (!plotting()) return false;
+  if ((event.ctrlKey || event.metaKey) && event.key.toLowerCase() === "z") {
+    if (event.shiftKey) redo();
+    else undo();
+    return true;
+  }
+  if (!drawing()) return false;
+  if (event.key === "Escape") stopDrawing();
+  else if (event.key === "Enter" && sketch.kind === "polygon") finish();
+  else return false;
+  return true;
+}
+
+export function startPlotsPanel() {
+  build();
+  startCoordinates();
+  on("map", () => { if (!state.map) { figures = { all: null, plots: null, problem: "" }; shown = ""; } });
+  on("tab", () => { if (!plotting()) stopDrawing(); });
+  on("tab annotations annotating sketch", fill);
+  on("map tab annotations parameters", refresh);
+}

@@ -1,0 +1,101 @@
+"""Reviews by a person in the files of a run."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from app.batch.reviews import SAME_THING, reviewed_run, reviews_of
+from app.batch.run_folder import read_run, read_terrain
+from app.store.records import PLOT, SKIPPED, Author, Content
+from app.store.store import Store
+from pipeline.errors import SourceError
+from tests.app.batch.finished_runs import grid_run
+from tests.app.cli.test_commands import stemmap
+
+PLACES = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("contents", "reviews"),
+    [
+        ([], {}),
+        ([Content(0.1, 0.0)], {1: "confirmed"}),
+        ([Content(2.0, 0.2, "pole")], {2: "rejected"}),
+        ([Content(0.0, SAME_THING + 0.01)], {}),  # a missed tree that was added
+        ([Content(0.0, 0.0, SKIPPED), Content(2.0, 0.0, PLOT)], {}),
+        ([Content(4.0, 0.1, "bush"), Content(4.0, 0.3), Content(0.0, 0.0)], {1: "confirmed", 3: "rejected"}),
+        ([Content(4.0, 0.3), Content(4.0, 0.1, "bush")], {3: "rejected"}),
+    ],
+)
+def test_the_nearest_annotation_decides(contents, reviews):
+    assert reviews_of([1, 2, 3], PLACES, contents) == reviews
+    assert reviews_of([], np.zeros((0, 2)), contents) == {}
+
+
+def test_a_rejected_tree_stays_in_the_table_and_counts_nowhere(tmp_path):
+    folder = grid_run(tmp_path / "run")
+    run = read_run(folder)
+    (ax, ay), (bx, by) = run.trees.position[:2].tolist()
+    with reviewed_run(folder, [Content(ax, ay, "other"), Content(bx, by)]) as reviewed:
+        left = read_run(reviewed)
+        text = (reviewed / "trees.csv").read_text()
+    assert len(left.trees.number) == len(run.trees.number) - 1
+    assert left.rejected == 1
+    assert run.trees.number[0] not in left.trees.number
+    assert [n for n, review in left.reviews.items() if review == "confirmed"] == [run.trees.number[1]]
+    assert text.count(",rejected") == 1
+    assert len(text.splitlines()) == len(run.trees.number) + 1
+    with reviewed_run(folder, []) as same:
+        assert same == folder
+
+
+def test_reviews_without_their_annotations_are_open_again(tmp_path):
+    folder = grid_run(tmp_path / "run")
+    file = folder / "trees.csv"
+    for review in ("rejected", "confirmed"):
+        text = file.read_text()
+        file.write_text(text.replace(",open", f",{review}", 1))
+        with reviewed_run(folder, []) as reviewed:
+            assert (reviewed / "trees.csv").read_text() == text
+        file.write_text(text)
+
+
+def test_an_error_names_the_folder_of_the_run(tmp_path):
+    folder = grid_run(tmp_path / "run")
+    (folder / "terrain.csv").write_text("x_m\n")
+    with pytest.raises(SourceError) as caught, reviewed_run(folder, [Content(0.0, 0.0)]) as reviewed:
+        read_terrain(reviewed)
+    assert str(folder / "terrain.csv") in str(caught.value)
+
+
+def test_an_unknown_review_is_refused(tmp_path):
+    folder = grid_run(tmp_path / "run")
+    file = folder / "trees.csv"
+    file.write_text(file.read_text().replace(",open", ",maybe", 1))
+    with pytest.raises(SourceError, match="a row is damaged"):
+        read_run(folder)
+
+
+def test_commands_use_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("STEMMAP_FOLDER", str(tmp_path / "kept"))
+    folder = grid_run(tmp_path / "run")
+    run = read_run(folder)
+    x, y = run.trees.position[0].tolist()
+    store = Store(tmp_path / "kept")
+    number = store.open_run(run.record["source"].get("sha256") or run.uri, run.uri, "grid")
+    store.add(number, Author("a" * 16, "Ann"), [Content(x, y, "pole")])
+    store.close()
+    result = stemmap(capsys, "stand", folder, "--out", tmp_path / "out")
+    assert (result.code, result.err) == (0, "review: 1 tree rejected on the page left out\n")
+    assert json.loads((tmp_path / "out" / "stand.json").read_text())["trees_rejected"] == 1
+    assert "99 trees from 7 cm" in result.out
+    exported = tmp_path / "trees.geojson"
+    stemmap(capsys, "export", folder, "--to", exported)
+    features = json.loads(exported.read_text())["features"]
+    assert {each["properties"]["review"] for each in features} == {"open"}
+    assert len(features) == 99
+    stemmap(capsys, "report", folder, "--out", tmp_path / "report.html")
+    assert "trees rejected by a person: 1" in (tmp_path / "report.html").read_text()

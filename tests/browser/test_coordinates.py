@@ -1,0 +1,114 @@
+"""Coordinates on the tab Plots: control points are picked and typed, have residuals, and place the files."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import geopandas
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened
+from tests.browser.dashboard import Dashboard
+from tests.browser.serving import Server
+from tests.browser.test_annotate import place_of
+
+EAST, NORTH = 500000.0, 5300000.0
+
+
+@pytest.fixture
+def person(chromium: Browser, server: Server) -> Iterator[Dashboard]:
+    with opened(chromium, server.link) as dashboard:
+        dashboard.reset()
+        dashboard.stand()
+        dashboard.until_server("/api/trees", "it.trees.length > 20")
+        dashboard.tab("Plots")
+        dashboard.page.get_by_role("button", name="Fit").click()
+        dashboard.drawn()
+        yield dashboard
+
+
+def far_from_trees(person: Dashboard) -> tuple[float, float]:
+    """A place within the stand that is far from each tree."""
+    trees = [(tree["x"], tree["y"]) for tree in person.ask("/api/trees")["trees"]]
+    places = [((a[0] + b[0]) / 2, (a[1] + b[1]) / 2) for a in trees for b in trees]
+    return max(places, key=lambda place: min(math.dist(place, tree) for tree in trees))
+
+
+def test_control_points_are_picked_fitted_and_undone(person: Dashboard, tmp_path: Path) -> None:
+    page, canvas = person.page, person.page.locator("#map")
+    now, problem = page.locator("#coordinates-now"), page.locator("#plots-error")
+    now.click()
+    rows = page.locator("#control-points tbody tr")
+    trees = person.ask("/api/trees")["trees"][:2]
+    page.locator("#coordinates-pick").click()
+    for tree in trees:
+        canvas.click(position=place_of(person, tree["x"], tree["y"]))
+    page.keyboard.press("Escape")
+    expect(page.locator("#coordinates-pick")).to_have_attribute("aria-pressed", "false")
+    expect(rows).to_have_count(2)
+
+    page.locator("#coordinates-apply").click()
+    expect(problem).to_have_text(re.compile("reference system"))
+    page.locator("#coordinates-crs").fill("EPSG:25832")
+    page.locator("#coordinates-apply").click()
+    expect(problem).to_have_text(
+        f"East or north is missing: tree {trees[0]['number']}, tree {trees[1]['number']}."
+    )
+    for row, tree in enumerate(trees):
+        rows.nth(row).locator("[name=east]").fill(f"{EAST + tree['x']:.3f}")
+        rows.nth(row).locator("[name=north]").fill(f"{NORTH + tree['y']:.3f}")
+    page.locator("#coordinates-apply").click()
+    expect(now).to_have_text("Coordinates: EPSG:25832")
+    expect(problem).to_be_hidden()
+    expect(page.locator("#coordinates-result")).to_have_text(re.compile("UTM zone 32N: 9.00° E, 47.85° N"))
+    expect(rows.first.locator(".residual")).to_have_text(re.compile(r"^-?0\.\d, -?0\.\d$"))
+    file = page.request.get(f"{person.page.url.split('?')[0]}api/export/gpkg").body()
+    (tmp_path / "out.gpkg").write_bytes(file)
+    layer = geopandas.read_file(tmp_path / "out.gpkg", layer="trees")
+    assert layer.crs == "EPSG:25832"
+    assert layer.geometry[0].x == pytest.approx(EAST + layer["map_x_m"][0], abs=0.05)
+
+    # A change of any field is shown as not applied, and a typed place stays when the table is filled again.
+    page.locator("#coordinates-sigma").fill("0.2")
+    expect(page.locator("#coordinates-result")).to_have_text(re.compile("not applied yet"))
+    page.locator("#coordinates-pick").click()
+    canvas.click(position=place_of(person, *far_from_trees(person)))
+    canvas.press("Escape")
+    rows.nth(2).locator("[name=x]").fill("12.5")
+    page.locator("#coordinates-sigma").fill("0.125")
+    expect(rows.nth(2).locator("[name=x]")).to_have_value("12.500")
+    rows.nth(2).get_by_label("Delete point 3").click()
+
+    # A wrong point is refused by name; nothing changes.
+    rows.first.locator("[name=east]").fill(f"{EAST + 300.0:.3f}")
+    page.locator("#coordinates-apply").click()
+    expect(problem).to_have_text(re.compile("control points"))
+    expect(now).to_have_text("Coordinates: EPSG:25832")
+    expect(page.locator("#coordinates-result")).to_have_text(re.compile("earlier fit is still in force"))
+    rows.first.get_by_label("Delete point 1").click()
+    expect(rows).to_have_count(1)
+
+    page.locator("#coordinates-how").select_option("gnss")
+    page.locator("#coordinates-apply").click()
+    expect(problem).to_have_text(re.compile("no GNSS fixes"))
+    page.locator("#coordinates-how").select_option("file")  # the map is local
+    page.locator("#coordinates-apply").click()
+    expect(problem).to_have_text(re.compile("do not fit"))
+    page.locator("#coordinates-how").select_option("hand")
+    page.locator("#coordinates-east").fill("500100")
+    page.locator("#coordinates-apply").click()
+    expect(page.locator("#coordinates-result")).to_have_text(re.compile("By hand"))
+    assert person.ask("/api/annotations")["georeference"]["frame"]["east_m"] == 500100.0
+    page.locator("#plot-undo").click()
+    expect(page.locator("#coordinates-how")).to_have_value("control")
+    expect(rows).to_have_count(2)
+    page.locator("#coordinates-remove").click()
+    expect(now).to_have_text("Coordinates: local")
+    page.locator("#plot-undo").click()
+    expect(now).to_have_text("Coordinates: EPSG:25832")
+    page.locator("#plot-undo").click()
+    expect(now).to_have_text("Coordinates: local")

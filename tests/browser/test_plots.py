@@ -1,0 +1,110 @@
+"""The tab Plots: a plot is drawn on the map, has its figures, and is undone; viewers see it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from tests.browser.conftest import opened, opened_by_another
+from tests.browser.dashboard import Dashboard
+from tests.browser.serving import Server
+from tests.browser.test_annotate import place_of
+
+
+@pytest.fixture
+def person(chromium: Browser, server: Server) -> Iterator[Dashboard]:
+    with opened(chromium, server.link) as dashboard:
+        dashboard.reset()
+        dashboard.stand()
+        dashboard.until_server("/api/trees", "it.trees.length > 20")
+        dashboard.tab("Plots")
+        dashboard.page.get_by_role("button", name="Fit").click()
+        dashboard.drawn()
+        yield dashboard
+
+
+def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
+    page = person.page
+    canvas, rows = page.locator("#map"), page.locator("#plots-table tr[data-plot]")
+    expect(page.locator("#plots-table .sum")).to_contain_text("all observed")
+    assert person.ask("/api/plots")["all"]["plots"]["all"]["trees"] > 5
+
+    # A circle by dragging, a rectangle by two clicks, a polygon by its corners.
+    x, y = 4.0, 2.0
+    page.get_by_role("button", name="Circle").click()
+    start, end = place_of(person, x, y), place_of(person, x + 5.0, y)
+    box = canvas.bounding_box()
+    assert box is not None
+    page.mouse.move(box["x"] + start["x"], box["y"] + start["y"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + end["x"], box["y"] + end["y"], steps=4)
+    page.mouse.up()
+    expect(rows).to_have_count(1)
+    expect(page.locator("#plot-circle")).to_have_attribute("aria-pressed", "false")
+    (plot,) = person.ask("/api/annotations")["plots"]
+    assert plot["shape"]["radius"] == pytest.approx(5.0, abs=0.15)
+    expect(rows.locator("td").nth(3)).to_contain_text(re.compile(r"\d+ ± "))
+
+    page.get_by_role("button", name="Rectangle").click()
+    canvas.click(position=place_of(person, x - 2.0, y - 2.0))
+    canvas.click(position=place_of(person, x + 2.0, y + 2.0))
+    expect(rows).to_have_count(2)
+    page.get_by_role("button", name="Polygon").click()
+    for corner in ((0.0, 0.0), (4.0, 0.0), (4.0, 3.0)):
+        canvas.click(position=place_of(person, *corner))
+    canvas.press("Enter")
+    expect(rows).to_have_count(3)
+    assert [each["shape"]["kind"] for each in person.ask("/api/annotations")["plots"]] == [
+        "circle",
+        "rectangle",
+        "polygon",
+    ]
+    expect(page.locator("#plots-table .sum")).to_have_count(2)
+
+    # Typed values; a name is changed; all is undone and repeated.
+    page.get_by_text("Type a plot").click()
+    form = page.locator(".plot-form").first
+    form.locator("[name=x]").fill("6")
+    form.locator("[name=y]").fill("1")
+    form.locator("[name=name]").fill("north")
+    form.get_by_role("button", name="Add").click()
+    expect(rows).to_have_count(4)
+    name = page.get_by_label("Name of plot north")
+    name.fill("south")
+    name.press("Enter")
+    person.until_server("/api/annotations", "it.plots[3].name === 'south'")
+    page.get_by_label("Delete plot south").click()
+    expect(rows).to_have_count(3)
+    canvas.press("Control+z")
+    expect(rows).to_have_count(4)
+    for _ in range(5):
+        page.locator("#plot-undo").click()
+    expect(rows).to_have_count(0)
+    page.locator("#plot-redo").click()
+    expect(rows).to_have_count(1)
+    page.locator("#plot-undo").click()
+    expect(rows).to_have_count(0)
+
+
+def test_viewers_see_plots_and_cannot_change_them(
+    chromium: Browser, server: Server, person: Dashboard
+) -> None:
+    page = person.page
+    page.get_by_text("Type a plot").click()
+    page.get_by_role("button", name="Add circles").click()
+    rows = page.locator("#plots-table tr[data-plot]")
+    expect(rows.first).to_be_visible()
+    number = rows.count()
+    link = person.ask("/api/access")["viewer_link"]
+    with opened_by_another(chromium, f"http://127.0.0.1:{server.port}{link}") as viewer:
+        viewer.tab("Plots")
+        shown = viewer.page.locator("#plots-table tr[data-plot]")
+        expect(shown).to_have_count(number)
+        expect(viewer.page.locator("#plots-table input")).to_have_count(0)
+        expect(viewer.page.get_by_label(re.compile("Delete plot"))).to_be_hidden()
+        assert viewer.page.locator("#plots-edit").evaluate("node => node.inert")
+    page.locator("#plot-undo").click()
+    expect(rows).to_have_count(0)
