@@ -1,7 +1,8 @@
 """Maps a whole cloud of a plot and writes the same files as for a run.
 
 Positions are in the coordinates of the cloud. `path.csv` has no rows, because there is no drive, and there is
-no `state.zip`. `slices.csv` contains the cross-sections of all trees, `terrain.csv` the visible ground.
+no `state.zip`. `slices.csv` contains the cross-sections of all trees, `terrain.csv` the visible ground,
+`seen.csv` the area that the cloud covers.
 """
 
 from __future__ import annotations
@@ -27,7 +28,16 @@ from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap, map_plot
 from pipeline.inventory.cross_sections import slice_heights
 from pipeline.inventory.terrain_raster import TerrainRaster
-from pipeline.io.result_files import ROBOTS_FRAME, TERRAIN_COLUMNS, RunFiles, csv_text, geojson, number_text
+from pipeline.io.result_files import (
+    ROBOTS_FRAME,
+    TERRAIN_COLUMNS,
+    RunFiles,
+    csv_text,
+    geojson,
+    number_text,
+    seen_text,
+)
+from pipeline.stand.seen_area import covered_area
 from pipeline.types.clouds import WholeCloud
 from pipeline.types.records import Trees, TruthTrees, Verdict
 
@@ -95,6 +105,7 @@ def _map(
             "trees.geojson": geojson(trees, 0, frame=frame, lon_lat=lon_lat),
             "slices.csv": csv_text(SLICE_COLUMNS, _slice_rows(plot, about.offset)),
             "terrain.csv": csv_text(TERRAIN_COLUMNS, _terrain_rows(plot.ground, about.offset)),
+            "seen.csv": seen_text(covered_area(plot.whole[:, :2] + about.offset[:2])),
         },
     )
     summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]

@@ -12,7 +12,7 @@ import numpy as np
 import shapely
 
 from app.batch.georeference import WGS84, MapFrame, read_map_frame, reproject
-from app.batch.run_folder import read_ground_area, read_run, read_seen_area
+from app.batch.run_folder import read_run, read_seen_area, read_tree_places
 from app.common.text import count, version
 from pipeline.config import Parameters
 from pipeline.config.stages import Stand
@@ -28,6 +28,8 @@ from pipeline.stand.seen_area import SeenArea
 from pipeline.types.records import Bool
 
 TABLE_SIGMA = 0.05  # m, of a position in a table
+# A greater median ratio of diameters is one of units: inch to cm is 2.54, circumference to diameter pi.
+LARGEST_RATIO = 2.0
 BORDER = 0.5  # m; a table of trees covers their convex hull with this border
 COLUMNS = (
     "status",
@@ -50,13 +52,15 @@ class Visit:
 
     Attributes:
         name: For messages.
-        trees: Its trees.
-        seen: Observed area of a run; None for a table.
+        trees: Its trees, without rejected ones.
+        rejected: Positions of the trees that a person rejected, shape (R, 2) [m].
+        seen: Observed area of a run; None for a table, or a run without a record of it.
         frame: Reference system of its coordinates.
     """
 
     name: str
     trees: VisitTrees
+    rejected: Float
     seen: SeenArea | None
     frame: MapFrame
 
@@ -84,10 +88,12 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
     if path.is_dir():
         trees = read_run(path).trees
         recorded = read_seen_area(path)
-        seen = read_ground_area(path) if recorded is None else within_reach(recorded, Stand())
+        seen = None if recorded is None else within_reach(recorded, Stand())
         sigma = np.sqrt(0.5 * np.trace(trees.covariance, axis1=1, axis2=2))
         found = VisitTrees(trees.number, trees.position, sigma, trees.dbh, trees.dbh_sigma)
-        visit = Visit(str(path), found, seen, read_map_frame(path))
+        kept = set(trees.number.tolist())
+        rejected = [place for number, place in read_tree_places(path).items() if number not in kept]
+        visit = Visit(str(path), found, np.reshape(rejected, (-1, 2)), seen, read_map_frame(path))
     else:
         table = read_truth_trees(path, dbh_unit=dbh_unit)
         keep = np.array([kind == "tree" for kind in table.kind], np.bool_)
@@ -96,7 +102,7 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
         position = np.stack([table.x, table.y], axis=1)[keep]
         unknown = np.full(n, np.nan)
         found = VisitTrees(numbers, position, np.full(n, TABLE_SIGMA), np.asarray(table.dbh)[keep], unknown)
-        visit = Visit(str(path), found, None, MapFrame())
+        visit = Visit(str(path), found, np.zeros((0, 2)), None, MapFrame())
     if not len(visit.trees.number) and not may_be_empty:
         raise StemmapError("there are no trees", where=str(path))
     _check_unit(visit)
@@ -155,17 +161,17 @@ def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
     """Return one row of COLUMNS per tree, with None for unknown values; positions are in the frame of a.
 
     The status is `same`, `moved`, `missing` (only in a, at a place that b observed), `new` (only in b, at a
-    place that a observed), or `not seen in a` and `not seen in b` where the other visit did not look.
+    place that a observed), `not seen in a` and `not seen in b` where the other visit did not look, or
+    `rejected in a` and `rejected in b` where a tree within the reach of a pair was rejected there.
     """
     place_b = found.T_a_b.apply(b.trees.position)
-    seen_by_a = a.observed(place_b)
-    seen_by_b = b.observed(found.T_a_b.inverse().apply(a.trees.position))
+    only_a = _status_in(b, "b", "missing", found.T_a_b.inverse().apply(a.trees.position), found.reach)
+    only_b = _status_in(a, "a", "new", place_b, found.reach)
     rows, pair = [], 0
     for k, row in enumerate(found.b_of.tolist()):
         x, y = a.trees.position[k]
         if row < 0:
-            status = "missing" if seen_by_b[k] else "not seen in b"
-            rows.append(_row(status, a.trees.number[k], None, x, y, dbh_a=a.trees.dbh[k]))
+            rows.append(_row(only_a[k], a.trees.number[k], None, x, y, dbh_a=a.trees.dbh[k]))
             continue
         known = math.isfinite(found.growth[pair])
         rows.append(
@@ -185,9 +191,19 @@ def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
         )
         pair += 1
     for row in np.setdiff1d(np.arange(len(b.trees.number)), found.b_of).tolist():
-        status = "new" if seen_by_a[row] else "not seen in a"
-        rows.append(_row(status, None, b.trees.number[row], *place_b[row], dbh_b=b.trees.dbh[row]))
+        rows.append(_row(only_b[row], None, b.trees.number[row], *place_b[row], dbh_b=b.trees.dbh[row]))
     return rows
+
+
+def _status_in(visit: Visit, name: str, observed: str, points: Float, reach: float) -> list[str]:
+    """Return the status of each position, shape (N, 2) in the frame of a visit, at which the visit has no
+    tree: `observed` if it looked there, else "not seen in" or "rejected in" with the name of the visit."""
+    near = np.hypot(*(points[:, None, :] - visit.rejected[None]).transpose(2, 0, 1)) <= reach
+    rejected, seen = near.any(axis=1), visit.observed(points)
+    return [
+        f"rejected in {name}" if no else observed if looked else f"not seen in {name}"
+        for no, looked in zip(rejected.tolist(), seen.tolist(), strict=True)
+    ]
 
 
 def _row(
@@ -226,7 +242,7 @@ def _row(
 def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, Any]:
     """Return the figures of a comparison as JSON values, with None where there is none: `alignment`, the
     `counts` of COLUMNS' status, the number of `pairs`, RMS of their shifts, and mean, weighted mean, standard
-    error and RMS of the growth of those `with_dbh` in both."""
+    error and RMS of the growth of those `with_dbh` in both, and `warnings` for people."""
     rows = rows_of(a, b, found)
     growth = found.growth[np.isfinite(found.growth)]
     weight = 1.0 / np.square(found.growth_sigma[np.isfinite(found.growth)])
@@ -245,7 +261,7 @@ def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, A
         },
         "trees_a": len(a.trees.number),
         "trees_b": len(b.trees.number),
-        "counts": {s: sum(1 for r in rows if r["status"] == s) for s in _STATUS},
+        "counts": {s: sum(1 for r in rows if r["status"] == s) for s in _SYMBOLS},
         "pairs": len(found.shift),
         "shift_rms_m": float(np.sqrt(np.mean(np.square(found.shift)))) if len(found.shift) else None,
         "growth_mean_cm": 100.0 * float(growth.mean()) if known else None,
@@ -256,10 +272,22 @@ def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, A
         "dbh_rms_difference_cm": 100.0 * float(np.sqrt(np.mean(np.square(growth)))) if known else None,
         "with_dbh": len(growth),
         "significant": int(np.count_nonzero(found.significant)),
+        "warnings": _unit_warnings(a, b, found),
     }
 
 
-_STATUS = ("same", "moved", "missing", "new", "not seen in a", "not seen in b")
+def _unit_warnings(a: Visit, b: Visit, found: VisitComparison) -> list[str]:
+    """Return a warning if the median ratio of the diameters of pairs cannot be growth."""
+    pairs = np.flatnonzero(found.b_of >= 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = b.trees.dbh[found.b_of[pairs]] / a.trees.dbh[pairs]
+    ratio = ratio[np.isfinite(ratio)]
+    if not len(ratio) or 1.0 / LARGEST_RATIO <= (median := float(np.median(ratio))) <= LARGEST_RATIO:
+        return []
+    return [
+        f"the diameters of the later visit are {median:.3g} times those of the earlier one (median of "
+        f"{count(len(ratio), 'pair')}): check the units of both, and whether one has circumferences"
+    ]
 
 
 def comparison_lines(record: dict[str, Any]) -> list[str]:
@@ -335,6 +363,8 @@ _SYMBOLS = {
     "new": ("#2060c0", "#103060"),
     "not seen in a": ("none", "#999"),
     "not seen in b": ("none", "#999"),
+    "rejected in a": ("none", "#c080c0"),
+    "rejected in b": ("none", "#c080c0"),
 }
 
 
@@ -346,7 +376,7 @@ def comparison_map(rows: list[dict[str, Any]]) -> str:
     scale = 180.0 / max(float((high - low).max()), 1.0)
     width, height = (high - low) * scale
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width + 45:.1f} {max(height, 45) + 10:.1f}" '
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width + 45:.1f} {max(height, 57) + 10:.1f}" '
         f'style="font:3px sans-serif"><rect width="{width:.1f}" height="{height:.1f}" fill="#fff" '
         f'stroke="#555" stroke-width=".3"/>'
     ]
@@ -368,8 +398,8 @@ def comparison_map(rows: list[dict[str, Any]]) -> str:
             f'<text x="{width + 7:.1f}" y="{y + 1}">{status} ({n})</text>'
         )
     parts.append(
-        f'<circle cx="{width + 4:.1f}" cy="41" r="2.1" fill="none" stroke="#333" stroke-width=".3"/>'
-        f'<text x="{width + 7:.1f}" y="42">significant growth</text>'
+        f'<circle cx="{width + 4:.1f}" cy="53" r="2.1" fill="none" stroke="#333" stroke-width=".3"/>'
+        f'<text x="{width + 7:.1f}" y="54">significant growth</text>'
         f'<path d="M0 {height + 2:.1f} v2 h{5 * scale:.2f} v-2" fill="none" stroke="#111" stroke-width=".4"/>'
         f'<text x="{5 * scale + 2:.1f}" y="{height + 5:.1f}">5 m</text></svg>\n'
     )

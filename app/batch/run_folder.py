@@ -133,29 +133,6 @@ def read_seen_area(folder: FilePath) -> SeenArea | None:
     return SeenArea(CELL, place, c["nearest_m"], np.nan_to_num(c["views"]).astype(np.int64))
 
 
-def read_ground_area(folder: FilePath) -> SeenArea | None:
-    """Return the area in which a run observed the ground, from terrain.csv, with unknown distances (NaN) and
-    0 views; None without cells. Gaps up to 1 m, such as the feet of stems, are closed.
-
-    Raises:
-        SourceError: The file is missing or damaged, or the cells are too far apart.
-    """
-    from scipy.ndimage import binary_closing
-
-    c = _columns(folder / "terrain.csv", TERRAIN_COLUMNS)
-    if not len(c["x_m"]):
-        return None
-    places = np.unique(np.floor(np.stack([c["x_m"], c["y_m"]], axis=1) / CELL).astype(np.int64), axis=0)
-    low, high = places.min(axis=0) - 3, places.max(axis=0) + 4
-    if math.prod((high - low).tolist()) > LARGEST_FILE:
-        raise SourceError("the terrain covers too large an area", where=str(folder))
-    raster = np.zeros(high - low, np.bool_)
-    raster[tuple((places - low).T)] = True
-    closed = np.argwhere(binary_closing(raster, iterations=2)) + low
-    unknown = np.full(len(closed), np.nan)
-    return SeenArea(CELL, closed, unknown, np.zeros(len(closed), np.int64))
-
-
 def read_terrain(folder: FilePath) -> Float:
     """Return the terrain of a run, terrain.csv, as x, y, z of its cells, shape (K, 3) [m]; shape (0, 3)
     without cells.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from app.batch.georeference import MapFrame, read_map_frame
-from app.batch.run_folder import FinishedRun, read_ground_area, read_run, read_seen_area
+from app.batch.run_folder import FinishedRun, read_run, read_seen_area
 from app.common.text import count, version
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
@@ -24,7 +24,6 @@ from pipeline.stand.volume import VolumeFormula
 from pipeline.types.records import Trees
 
 ALL = "all"
-NO_RECORD = "the run has no record of what was observed; cells with ground returns are used. Map it again"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +39,8 @@ class StandResult:
         seen: Observed area within reach.
         figures: Figures of each plot by name.
         total: Mean over the plots, or the figures of the one plot.
+        left_out: Number of trees of the map that no plot counts, by reason: `rejected` (in the review),
+            `outside_of_plots`, `outside_of_observed_area` or `below_minimum_dbh`, whichever comes first.
         detection_sigma: Scale of the half-normal function [m]; inf for certain detection.
         warnings: Messages, those of plots with the name of the plot.
     """
@@ -53,14 +54,14 @@ class StandResult:
     seen: SeenArea
     figures: dict[str, StandFigures]
     total: dict[str, Estimate]
+    left_out: dict[str, int]
     detection_sigma: float
     warnings: tuple[str, ...]
 
 
 def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = ()) -> StandResult:
-    """Return the stand figures of a finished run; rejected trees do not count. Nothing is written. A run
-    without seen.csv was observed where it has ground returns, which is a warning for a drive. Diameters that
-    look like those of another unit, and few trees, are warnings, too.
+    """Return the stand figures of a finished run; rejected trees do not count. Nothing is written.
+    Diameters that look like those of another unit, and few trees, are warnings.
 
     Args:
         folder: Its folder.
@@ -74,10 +75,6 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     run, frame = read_run(folder), read_map_frame(folder)
     warnings = []
     recorded = read_seen_area(folder)
-    if recorded is None:
-        recorded = read_ground_area(folder)
-        if not run.of_cloud:
-            warnings.append(NO_RECORD)
     seen = None if recorded is None else within_reach(recorded, parameters)
     if seen is None or not len(seen.place):
         raise StemmapError(
@@ -108,9 +105,41 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         warnings.append("all diameters are below 2 cm: is the column dbh_cm of trees.csv in metres?")
     total = combined(figures) if len(chosen) > 1 else dict(figures[chosen[0].name].values)
     sigma = detection_function(trees, seen, parameters).sigma
+    left_out = {"rejected": run.rejected, **_left_out(trees, plots, seen, parameters.dbh_min)}
     return StandResult(
-        run, frame, trees, parameters, chosen, not plots, seen, figures, total, sigma, tuple(warnings)
+        run,
+        frame,
+        trees,
+        parameters,
+        chosen,
+        not plots,
+        seen,
+        figures,
+        total,
+        left_out,
+        sigma,
+        tuple(warnings),
     )
+
+
+def _left_out(
+    trees: PlotTrees, plots: Sequence[SamplePlot], seen: SeenArea, dbh_min: float
+) -> dict[str, int]:
+    """Return the number of trees that no plot counts by reason, see `StandResult.left_out`, without the
+    rejected ones, which `trees` does not have. Without plots, the plot is the observed area."""
+    reasons = {
+        "outside_of_observed_area": seen.rows(trees.position) < 0,
+        "below_minimum_dbh": trees.dbh < dbh_min,
+    }
+    if plots:
+        inside = np.any([plot.contains(trees.position) for plot in plots], axis=0)
+        reasons = {"outside_of_plots": ~inside, **reasons}
+    counted = np.ones(len(trees.dbh), np.bool_)
+    result = {}
+    for reason, applies in reasons.items():
+        result[reason] = int(np.count_nonzero(counted & applies))
+        counted &= ~applies
+    return result
 
 
 def _plot_trees(trees: Trees, formula: str) -> PlotTrees:
@@ -168,15 +197,17 @@ def stand_files(result: StandResult) -> dict[str, str]:
 
 def stand_record(result: StandResult) -> dict[str, Any]:
     """Return the figures as JSON values, the contents of stand.json: each figure is [value, standard error],
-    None for unknown values. `plots` has by name `area_m2`, `seen_m2`, `trees`, `trees_without_dbh`,
-    `trees_with_volume`, `detection`, the figures, and `classes` (from_cm, to_cm, trees, n_ha, g_ha); `mean`
-    has the figures over all plots, `units` the unit of each figure."""
+    None for unknown values. `trees_in_map` counts all trees, also rejected ones; `trees_left_out` has the
+    number of those that no plot counts by reason. `plots` has by name `area_m2`, `seen_m2`, `trees`,
+    `trees_without_dbh`, `trees_with_volume`, `detection`, the figures, and `classes` (from_cm, to_cm, trees,
+    n_ha, g_ha); `mean` has the figures over all plots, `units` the unit of each figure."""
     return {
         "stemmap": version(),
         "source": result.run.uri,
         "crs": result.frame.name,
         "parameters": result.parameters.model_dump(),
-        "trees_rejected": result.run.rejected,
+        "trees_in_map": len(result.trees.dbh) + result.run.rejected,
+        "trees_left_out": result.left_out,
         "detection_sigma_m": _finite(result.detection_sigma),
         "units": {name: unit for name, (_, unit) in FIGURES.items()},
         "plots": {
@@ -234,10 +265,13 @@ def stand_summary(result: StandResult) -> list[str]:
     of = "whole observed area" if result.whole else count(len(result.figures), "plot")
     least = f"{100.0 * result.parameters.dbh_min:g} cm"
     part = f" of {area:,.0f} m2" if area - seen > 0.5 else ""
+    left_out = ", ".join(f"{n} {reason.replace('_', ' ')}" for reason, n in result.left_out.items() if n)
     lines = [
         f"{of}: {count(trees, 'tree')} from {least} on {seen:,.0f} m2 observed{part}, "
         f"coordinates {result.frame.title}"
     ]
+    if left_out:
+        lines.append(f"trees of the map that are not counted: {left_out}")
     for name, (title, unit) in FIGURES.items():
         value, se = result.total[name]
         if math.isfinite(value):

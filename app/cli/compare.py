@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,7 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print the comparison and write its files to --out; return 0.
+    """Print the comparison and write its files to --out; return 0, or 3 with a warning on stderr if the
+    diameters of the visits seem to have different units.
 
     Raises:
         StemmapError: A visit cannot be read or has no trees, the stems do not agree with certainty, or the
@@ -61,8 +63,11 @@ def run(arguments: argparse.Namespace) -> int:
     found = compare(
         a, b, same_frame=arguments.same_frame, reach=arguments.match, dbh_sigma=0.01 * arguments.dbh_sigma
     )
-    print("\n".join(comparison_lines(comparison_record(a, b, found))))
+    record = comparison_record(a, b, found)
+    print("\n".join(comparison_lines(record)))
     if arguments.out is not None:
         write_comparison(a, b, found, arguments.out)
         print(f"files in {arguments.out}")
-    return 0
+    for text in record["warnings"]:
+        print(f"warning: {text}", file=sys.stderr)
+    return 3 if record["warnings"] else 0

@@ -36,7 +36,7 @@ from pipeline.io.result_files import (
     tree_rows,
 )
 from pipeline.stand.plots import SamplePlot
-from pipeline.stand.seen_area import SeenRecorder
+from pipeline.stand.seen_area import SeenArea, SeenRecorder, covered_area
 from pipeline.types.records import Path, Trees, TruthTrees
 
 if TYPE_CHECKING:
@@ -128,8 +128,7 @@ class ShownRun:
             yield FilePath(name)
 
     def texts(self) -> dict[str, str]:
-        """Return the texts of trees.csv, path.csv, terrain.csv, run.json and, for a run of scans, seen.csv by
-        name."""
+        """Return the texts of trees.csv, path.csv, terrain.csv, seen.csv and run.json by name."""
         ground, offset = self.shown.frame.ground, self.cloud.offset if self.cloud else (0.0, 0.0, 0.0)
         cells = [] if ground is None else list(terrain_rows(ground))
         if self.cloud is not None:
@@ -137,15 +136,22 @@ class ShownRun:
                 [*(number_text(float(v) + o, 3) for v, o in zip(row, offset, strict=False)), "", ""]
                 for row in cells
             ]
-        texts = {
+        return {
             "trees.csv": self.trees_text(),
             "path.csv": csv_text(PATH_COLUMNS, path_rows(self.path, self.start_ns)),
+            "seen.csv": seen_text(self._seen_area()),
             "terrain.csv": csv_text(TERRAIN_COLUMNS, cells),
             "run.json": json.dumps(self._record(), indent=1) + "\n",
         }
+
+    def _seen_area(self) -> SeenArea:
+        """Return the observed area in the coordinates of the files: what the scans saw, or what the points
+        of a whole cloud cover."""
         if self.cloud is None:
-            texts["seen.csv"] = seen_text(self.seen.area(self.path))
-        return texts
+            return self.seen.area(self.path)
+        pose = self.shown.frame.estimate.T_map_base
+        origin = np.array([pose.x, pose.y]) + self.cloud.offset[:2]
+        return covered_area(self.shown.frame.filtered[:, :2] + origin)
 
     def _record(self) -> dict[str, Any]:
         """Return the contents of run.json, without what only `stemmap map` counts, and with `rejected`, the

@@ -48,6 +48,7 @@ class VisitComparison:
     Attributes:
         T_a_b: Pose of the frame of b in that of a.
         b_of: Row of b of each tree of a, -1 for none, int64.
+        reach: Largest distance of a pair [m].
         stems: Number of stems that agreed in the alignment; 0 if the frames were taken as equal.
         shift: Distance of the two positions of each pair, in the order of a, shape (P,) [m].
         growth, growth_sigma: Diameter in b minus that in a, and its standard deviation, shape (P,) [m]; NaN
@@ -59,6 +60,7 @@ class VisitComparison:
 
     T_a_b: Pose2
     b_of: Int
+    reach: float
     stems: int
     shift: Float
     growth: Float
@@ -124,9 +126,8 @@ def compare_visits(
     typical = float(np.median(shift)) / 1.177 if len(shift) else 0.0
     own = np.hypot(a.sigma[rows_a], b.sigma[rows_b])
     limit = np.maximum(MOVED_SIGMAS * np.maximum(typical, own), MOVED_MIN)
-    return VisitComparison(
-        T_a_b, b_of, stems, shift, growth, sigma, _significant(growth, sigma), shift > limit
-    )
+    significant = _significant(growth, sigma)
+    return VisitComparison(T_a_b, b_of, reach, stems, shift, growth, sigma, significant, shift > limit)
 
 
 def _pairs(b_of: Int) -> tuple[Int, Int]:

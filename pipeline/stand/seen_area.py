@@ -1,4 +1,4 @@
-"""The area that a drive observed: a raster with the nearest free view of each cell."""
+"""The observed area: a raster with the nearest free view of each cell by a drive, or what a cloud covers."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ RANGE = 30.0  # m; views from farther away are not recorded
 INTO = 0.5
 # A scan is recorded after this motion [m, rad].
 SPACING, TURN = 0.5, math.radians(10.0)
+# Gaps of a cloud up to this width [m] count as covered, such as the shadow of a stem near a scanner.
+GAP = 1.0
 MOST_VIEWS = 4  # of one place; twice the views that a cell needs in a plot by default
 
 
@@ -105,6 +107,27 @@ def _grouped(place: Int, nearest: Float, views: Int, of_views: np.ufunc) -> tupl
     combined = np.zeros(len(cells), np.int64)
     of_views.at(combined, row.ravel(), views)
     return cells, least, combined
+
+
+def covered_area(points: Float) -> SeenArea:
+    """Return the area that a cloud covers seen from above: cells with a point at any height, with gaps up to
+    GAP closed. Distances and numbers of views are unknown.
+
+    Args:
+        points: Positions, shape (N, 2) [m]. They count to the millimetre, so that the offset of a file does
+            not change a cell.
+    """
+    from scipy.ndimage import binary_closing
+
+    if not len(points):
+        return SeenArea(CELL, np.zeros((0, 2), np.int64), np.zeros(0), np.zeros(0, np.int64))
+    places = np.floor(np.round(points, 3) / CELL).astype(np.int64)
+    steps = math.ceil(0.5 * GAP / CELL)  # from both sides
+    low = places.min(axis=0) - steps - 1
+    raster = np.zeros(places.max(axis=0) - low + steps + 2, np.bool_)
+    raster[tuple((places - low).T)] = True
+    closed = np.argwhere(binary_closing(raster, iterations=steps)) + low
+    return SeenArea(CELL, closed, np.full(len(closed), np.nan), np.zeros(len(closed), np.int64))
 
 
 class ViewSelection:

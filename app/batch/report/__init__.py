@@ -104,6 +104,7 @@ def report_page(
         whole=whole,
         infinity=math.inf,
         figures=figures,
+        trees_in_map=len(whole.trees.dbh) + whole.run.rejected,
         figure_names=list(FIGURES),
         units={name: unit for name, (_, unit) in FIGURES.items()},
         of_plots=of_plots,

@@ -145,9 +145,12 @@ function hint() {
   if (sketch.kind === "polygon") return "Click each corner on the map; click the first corner or press Enter to finish. Esc ends.";
   if (drawing()) return `Drag on the map from ${sketch.kind === "circle" ? "the centre outwards" : "corner to corner"}, or click both ends. Esc ends.${sketch.kind === "circle" ? " Then its radius can be typed in the list." : ""}`;
   if (!state.map) return "Nothing mapped yet: press play, then draw plots on the map.";
-  if (!plots().length) return "Draw plots on the map for their stems and basal area per hectare. Without plots, the figures are those of the whole observed area.";
-  const { trees_rejected: rejected } = figures.all ?? {};
-  return `Trees of the map at the shown time${rejected ? `, without ${rejected} rejected in the review` : ""}. ± is the standard error: 0 where all of a plot was observed; of the mean, by the variation between plots.`;
+  const drawn = plots().length > 0;
+  const { trees_in_map: all, trees_left_out: leftOut = {} } = (drawn ? figures.plots : figures.all) ?? {};
+  const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number]) => `${number} ${reason.replaceAll("_", " ")}`);
+  const trees = all === undefined ? "" : ` ${reasons.length ? `Not counted of ${all} trees in the map: ${reasons.join(", ")}.` : `All ${all} trees in the map are counted.`}`;
+  if (!drawn) return `Draw plots on the map for their stems and basal area per hectare. Without plots, the figures are those of the whole observed area.${trees}`;
+  return `Trees of the map at the shown time.${trees} ± is the standard error: 0 where all of a plot was observed; of the mean, by the variation between plots.`;
 }
 
 function fill() {

@@ -32,7 +32,7 @@ export function paintTwo(pen, view, { a, b_path: path, places_b: places, trees }
   for (const tree of trees) {
     if (tree.status === "missing") drawSign(pen, view, tree, [[-1, -1, 1, 1], [-1, 1, 1, -1]], colours.pole); // ×
     else if (tree.status === "new") drawSign(pen, view, tree, [[-1, 0, 1, 0], [0, -1, 0, 1]], colours.selection); // +
-    else if (tree.status.startsWith("not seen")) drawUnseen(pen, view, tree);
+    else if (/^(not seen|rejected) in/.test(tree.status)) drawUnseen(pen, view, tree);
     else drawTree(pen, view, tree, false);
     if (tree.status === "moved") drawArrow(pen, view, tree, places[tree.tree_b]);
     if (tree.significant) drawGrowth(pen, view, tree);

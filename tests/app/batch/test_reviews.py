@@ -90,7 +90,7 @@ def test_commands_use_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
     store.close()
     result = stemmap(capsys, "stand", folder, "--out", tmp_path / "out")
     assert (result.code, result.err) == (0, "review: 1 tree rejected on the page left out\n")
-    assert json.loads((tmp_path / "out" / "stand.json").read_text())["trees_rejected"] == 1
+    assert json.loads((tmp_path / "out" / "stand.json").read_text())["trees_left_out"]["rejected"] == 1
     assert "99 trees from 7 cm" in result.out
     exported = tmp_path / "trees.geojson"
     stemmap(capsys, "export", folder, "--to", exported)
@@ -98,4 +98,4 @@ def test_commands_use_the_reviews_of_the_page(tmp_path, capsys, monkeypatch):
     assert {each["properties"]["review"] for each in features} == {"open"}
     assert len(features) == 99
     stemmap(capsys, "report", folder, "--out", tmp_path / "report.html")
-    assert "trees rejected by a person: 1" in (tmp_path / "report.html").read_text()
+    assert "1 rejected in the review" in (tmp_path / "report.html").read_text()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -86,13 +87,38 @@ def test_the_map_and_the_files_show_every_tree(visits, tmp_path, capsys):
     stemmap(capsys, "compare", *visits, "--out", tmp_path / "out")
     svg = ElementTree.fromstring((tmp_path / "out" / "comparison.svg").read_text())  # noqa: S314 - our own
     circles = [e for e in svg.iter() if e.tag.endswith("circle") and e.get("r") == "1.3"]
-    assert len(circles) == 61 + 6
+    assert len(circles) == 61 + 8  # and those of the legend
     points = json.loads((tmp_path / "out" / "comparison.geojson").read_text())
     assert len(points["features"]) == 61
     assert points["coordinateFrame"]["type"] == "local"
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert record["pairs"] == 59
     assert sum(record["counts"].values()) == 61
+
+
+def test_a_tree_rejected_in_one_visit_is_neither_missing_nor_new(visits, tmp_path, capsys):
+    shutil.copytree(visits[0], tmp_path / "later")
+    file = tmp_path / "later" / "trees.csv"
+    lines = file.read_text().splitlines(keepends=True)
+    lines[5] = lines[5].replace(",open", ",rejected")
+    file.write_text("".join(lines))
+    for later, status in ((True, "rejected in b"), (False, "rejected in a")):
+        order = (visits[0], tmp_path / "later") if later else (tmp_path / "later", visits[0])
+        stemmap(capsys, "compare", *order, "--same-frame", "--out", tmp_path / status)
+        found = [row for row in rows(tmp_path / status) if row["status"] != "same"]
+        assert [(row["status"], row["tree_a"] or row["tree_b"]) for row in found] == [(status, "5")]
+
+
+def test_diameters_in_other_units_are_a_warning(visits, tmp_path, capsys):
+    table = tmp_path / "survey.csv"
+    trees = [row.split(",") for row in (visits[0] / "trees.csv").read_text().splitlines()]
+    x, y, dbh = (trees[0].index(name) for name in ("x_m", "y_m", "dbh_cm"))
+    girth = [f"{row[x]},{row[y]},{math.pi * float(row[dbh]):.1f}" for row in trees[1:]]
+    table.write_text("\n".join(["x_m,y_m,dbh_cm", *girth]) + "\n")
+    result = stemmap(capsys, "compare", visits[0], table, "--same-frame")
+    assert result.code == 3
+    assert "3.14 times those of the earlier one" in result.err
+    assert "circumferences" in result.err
 
 
 def test_the_same_run_twice_has_no_change(visits, tmp_path, capsys):

@@ -226,7 +226,7 @@ def test_a_missing_package_is_named_with_its_extra(runs, capsys, tmp_path, monke
 
 
 def test_a_cloud_with_a_reference_system_keeps_it(tmp_path, capsys):
-    run = grid_run(tmp_path / "cloud", cloud_crs="EPSG:25832", seen=False)
+    run = grid_run(tmp_path / "cloud", cloud_crs="EPSG:25832")
     result = stemmap(capsys, "export", run, "--to", tmp_path / "x.gpkg")
     assert "100 trees in EPSG:25832" in result.out
     with fiona.open(tmp_path / "x.gpkg", layer="trees") as table:

@@ -184,12 +184,32 @@ def test_diameters_in_another_unit_are_noticed(tmp_path, capsys):
     assert "in metres?" in stemmap(capsys, "stand", thin).err
 
 
-def test_a_run_without_a_record_of_what_was_seen_uses_the_ground(tmp_path, capsys):
+def test_a_run_without_a_record_of_the_observed_area_has_no_figures(tmp_path, capsys):
     run = grid_run(tmp_path / "old", seen=False)
     result = stemmap(capsys, "stand", run)
-    assert result.code == 3
-    assert "no record of what was observed; cells with ground returns are used" in result.err
-    assert "100 trees" in result.out
+    assert result.code == 1
+    assert "no record of what was observed" in result.err
+    assert "Map it again" in result.err
+
+
+def test_each_tree_of_the_map_is_counted_or_left_out_for_a_reason(tmp_path, capsys):
+    position = np.random.default_rng(2).uniform(1, 19, (30, 2))
+    position[:3] += 200.0  # not observed
+    dbh = np.full(30, 0.2)
+    dbh[3:5] = 0.03  # thin
+    run = write_run(tmp_path / "run", position, dbh)
+    result = stemmap(capsys, "stand", run, "--out", tmp_path / "out")
+    assert "25 trees from 7 cm" in result.out
+    assert "3 outside of observed area, 2 below minimum dbh" in result.out
+    record = json.loads((tmp_path / "out" / "stand.json").read_text())
+    assert record["trees_in_map"] == 30
+    plots = tmp_path / "plots.geojson"
+    shape = {"type": "Polygon", "coordinates": [[[1, 1], [10, 1], [10, 10], [1, 10], [1, 1]]]}
+    features = [{"type": "Feature", "properties": {"name": "a"}, "geometry": shape}]
+    plots.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    stemmap(capsys, "stand", run, "--plots", plots, "--plots-crs", "local", "--out", tmp_path / "of_plots")
+    record = json.loads((tmp_path / "of_plots" / "stand.json").read_text())
+    assert record["plots"]["a"]["trees"] + sum(record["trees_left_out"].values()) == 30
 
 
 def test_trees_far_from_every_view_are_corrected_for_detection(tmp_path, capsys):
@@ -225,7 +245,7 @@ def test_a_formula_of_the_user_gives_volumes(run, tmp_path, capsys):
 
 def test_a_reference_system_in_wkt_is_reported_by_its_name(tmp_path, capsys):
     wkt = pyproj.CRS("EPSG:25832").to_wkt()
-    run = grid_run(tmp_path / "run", seen=False, cloud_crs=wkt)
+    run = grid_run(tmp_path / "run", cloud_crs=wkt)
     result = stemmap(capsys, "stand", run)
     assert "coordinates ETRS89 / UTM zone 32N\n" in result.out
 

@@ -160,3 +160,19 @@ def test_figures_refer_to_the_observed_part_of_a_plot():
     assert figures["in"].values["n_ha"].se == 0.0
     assert (figures["out"].seen, figures["out"].trees) == (0.0, 0)
     assert "no part of the plot was observed" in figures["out"].warnings[0]
+
+
+def test_a_cloud_covers_its_cells_and_gaps_up_to_a_metre():
+    from pipeline.stand.seen_area import covered_area
+
+    side = np.arange(0.05, 10.0, 0.1)
+    points = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
+    assert len(covered_area(points).place) * 0.25 == 100.0
+    shadow = np.hypot(*(points - 5.0).T) < 0.45
+    gap = np.all(np.abs(points - [2.0, 7.0]) < 1.4, axis=1)  # 2.8 m wide
+    area = covered_area(points[~shadow & ~gap])
+    assert area.rows(np.array([[5.0, 5.0], [2.0, 7.0], [-0.1, 5.0]])).tolist()[1:] == [-1, -1]
+    assert area.rows(np.array([[5.0, 5.0]]))[0] >= 0
+    moved = covered_area(points + np.array([500_000.0, 5_300_000.0]))  # as far as UTM coordinates
+    assert len(moved.place) == 400
+    assert not len(covered_area(np.zeros((0, 2))).place)
