@@ -161,8 +161,12 @@ def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_ti
 def _segment_points(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
-    """Return the segmented scan of a LiDAR; arguments as in `segment`. Only scans that update columns or
-    terrain (`updates_columns`, `updates_terrain`) have their input."""
+    """Return the segmented scan of a LiDAR; arguments as in `segment`.
+
+    `column_input` is None unless the scan updates the columns (see `updates_columns`) and the parameter
+    `classification.method` is "columns"; `terrain` is None unless the scan updates the terrain map (see
+    `updates_terrain`). Both are None if `ground.method` is "none".
+    """
     with timer("acquisition"):
         raw, sensor_offset = acquire(step, T_base_lidar, p.acquisition)
 

@@ -121,8 +121,9 @@ def on_compiling(callback: Callable[[], None]) -> Iterator[None]:
 
 
 def others_compile() -> None:
-    """Call the functions of all open contexts of `on_compiling`, in this thread: it waits for kernels that
-    other processes compile. Without an open context, nothing happens."""
+    """Call the functions of all open contexts of `on_compiling`, in the calling thread, and return. It is
+    called repeatedly by a thread that waits for kernels which other processes compile. Without an open
+    context, nothing happens."""
     for callback in tuple(_callbacks):
         callback()
 

@@ -196,11 +196,15 @@ def stand_files(result: StandResult) -> dict[str, str]:
 
 
 def stand_record(result: StandResult) -> dict[str, Any]:
-    """Return the figures as JSON values, the contents of stand.json: each figure is [value, standard error],
-    None for unknown values. `trees_in_map` counts all trees, also rejected ones; `trees_left_out` has the
-    number of those that no plot counts by reason. `plots` has by name `area_m2`, `seen_m2`, `trees`,
-    `trees_without_dbh`, `trees_with_volume`, `detection`, the figures, and `classes` (from_cm, to_cm, trees,
-    n_ha, g_ha); `mean` has the figures over all plots, `units` the unit of each figure."""
+    """Return the contents of stand.json as JSON values.
+
+    Each figure is a list [value, standard error]; an unknown number in it is None, so that an unknown figure
+    is [None, None]. `trees_in_map` counts all trees, also rejected ones; `trees_left_out` has the number of
+    those that no plot counts, by reason. `plots` has by the name of the plot `area_m2`, `seen_m2`, `trees`,
+    `trees_without_dbh`, `trees_with_volume` (None if unknown), the figure `detection`, the other figures by
+    name, and `classes`, a list of `from_cm`, `to_cm`, `trees` and the figures `n_ha` and `g_ha`. `mean` has
+    the figures over all plots, and `units` the unit of each figure.
+    """
     return {
         "stemmap": version(),
         "source": result.run.uri,

@@ -78,15 +78,17 @@ def add_truth_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
-    """Return the file with the true trees by run; runs without a file are missing.
+    """Return the file with the true trees of each run, by its URI; runs without a file are missing.
 
     Args:
         uris: The runs in their order, held-out runs last.
-        truths: `FILE` or `RUN=FILE`. Files without a run belong to the remaining runs in their order; there
-            must be one for each of these, or none.
+        truths: `FILE` or `RUN=FILE`, where RUN is one of `uris`; a text that begins with none of them is a
+            FILE. The files without a run belong to the remaining runs in their order; there must be one for
+            each of these, or none.
 
     Raises:
-        ParameterError: A file cannot be assigned to a run, or a run has two.
+        ParameterError: The number of files without a run is not that of the remaining runs, or a run has two
+            files.
     """
     named: dict[str, str] = {}
     bare = []

@@ -86,11 +86,14 @@ def laid_over(own: TruthTrees | None, contents: Sequence[Content]) -> TruthTrees
 
 
 def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
-    """Return the number of annotations whose class differs from that of the nearest object of the source
-    within SAME_THING.
+    """Return the number of annotations whose class differs from that of their object of the source.
+
+    Annotations and objects are matched one to one within SAME_THING, see `pipeline.evaluation.match`; the
+    object of an annotation is therefore not always the nearest one. Annotations without an object do not
+    count.
 
     Args:
-        own: Ground truth of the source, if any.
+        own: Ground truth of the source; None if there is none, then the result is 0.
         rows: The annotations.
     """
     if own is None or not rows or not len(own.x):

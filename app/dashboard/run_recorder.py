@@ -180,7 +180,8 @@ class RunRecorder:
             await asyncio.gather(*self._tasks)
 
     def _soon(self, page: _Page) -> None:
-        """Start to write the record, unless it is being written."""
+        """Ensure that a background task writes the pending changes of the record: start one unless one is
+        running, which also writes the changes that are made meanwhile."""
         if page.writer is None or page.writer.done():
             page.writer = asyncio.create_task(self._write_on(page), name="run_recorder")
             self._tasks.add(page.writer)

@@ -210,12 +210,13 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, all_around:
 
 
 def _decided_by(share: Float, tree_share: float) -> tuple[Verdict, ...]:
-    """Return the only verdict that the votes give without a rule, as a tuple. If trees have most votes but
-    not their required share, it is OTHER.
+    """Return the verdict that the votes alone give, without a rule, as a tuple of one: TREE if its share is
+    at least `tree_share`, even if another class has more votes; else the class with most votes, or OTHER if
+    that is TREE.
 
     Args:
-        share: Share of votes by class, in the order of CLASSES.
-        tree_share: Share that a tree needs.
+        share: Share of votes by class, in the order of CLASSES, in which TREE is first.
+        tree_share: Minimum share of votes of a tree.
     """
     if share[0] >= tree_share:
         return (Verdict.TREE,)

@@ -37,8 +37,11 @@ WARMING = python_module("app.worker.numba_warmup", "warm_up")
 
 
 async def warm_kernels(command: Sequence[str] = WARMING) -> None:
-    """Compile the kernels of the mapper in a child process, so that the workers find them in the cache. It
-    returns when the process ends, also with an error, or after a time limit.
+    """Compile the kernels of the mapper in a child process, so that the workers find them in the cache.
+
+    Return when the child ends, whatever its return code, or after PATIENCE_S. A child that is still running
+    then, or when the call is cancelled, is killed. It must not write to its standard output: the first line
+    ends the wait, too.
 
     Args:
         command: Program and arguments of the child process.

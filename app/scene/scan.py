@@ -182,8 +182,10 @@ def height_range(frame: Frame) -> tuple[float, float]:
 
 
 def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) -> Colours:
-    """Return the colours of the filtered points, uint8, shape (M, 3). Points without a cluster have the
-    colour FILTERED, except by height. By "stage", clusters have one colour and detections another.
+    """Return the colours of the filtered points, uint8, shape (M, 3).
+
+    By "height", each point is coloured by its height. Otherwise it has the colour of its cluster, or FILTERED
+    without a cluster. By "stage", detections have one colour and all other clusters another.
 
     Args:
         frame: Results of the scan.

@@ -317,13 +317,14 @@ def _figures(scores: Sequence[MapScores]) -> dict[str, Any]:
 
 
 def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str, Any]]:
-    """Return a row of scores for the search runs, and one for the held-out runs if there are any: `held_out`,
-    number of `runs`, and the scores at the `start` and with the `best` set, see `_figures`; [] before the
-    first result.
+    """Return the scores of the start and the best parameter set: one row for the search runs, and one for the
+    held-out runs if there are any; [] before both trials are scored.
+
+    A row has `held_out`, the number of `runs`, and `start` and `best`, see `_figures`.
 
     Args:
         plan: The search.
-        start, best: The start and the best trial; None before they are scored.
+        start, best: Trial of the start and of the best set; None before they are scored.
     """
     if start is None or best is None:
         return []

@@ -226,7 +226,7 @@ class InventoryRun:
         return [_frame_of(finish(self._inventory.steps(each))) for each in sets]
 
     def parameters_at(self, index: int) -> Parameters:
-        """Return the parameters of the present map."""
+        """Return the parameters of the present map, which are the same for all scans; `index` is ignored."""
         del index
         return self._mapped_with
 
@@ -252,8 +252,15 @@ class InventoryRun:
         self._job, self._share = self._inventory.steps(self._parameters), 0.0
 
     def _advance(self) -> bool:
-        """Compute a step; return whether the map is complete, which then is the present one. An error ends
-        the inventory."""
+        """Compute the next step of the inventory.
+
+        Returns:
+            Whether this step completed the map, which is then the current one. False without an inventory.
+
+        Raises:
+            StemmapError: The cloud cannot be mapped. As after any other exception, the inventory is abandoned
+                and the current map does not change.
+        """
         job = self._job
         if job is None:
             return False

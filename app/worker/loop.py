@@ -325,7 +325,8 @@ class WorkerLoop:
         self._report()
 
     def _preparing(self) -> protocol.Status:
-        """Return the status while the mapper is prepared."""
+        """Return the status of the session with the state "starting", for the time while the mapper is
+        prepared."""
         return replace(self._session.status(), state="starting", detail="Preparing the mapper")
 
     def compiling(self) -> None:

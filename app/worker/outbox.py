@@ -156,7 +156,8 @@ class Outbox:
 
 
 def _is_standing(message: FromWorker) -> bool:
-    """Return whether a message is the status of a run that does not play."""
+    """Return whether a message is a report of the state "paused" or "finished"; other states in which the run
+    does not play, e.g. "starting", "waiting" and "failed", do not count."""
     return isinstance(message, Report) and message.status.state in ("paused", "finished")
 
 

@@ -197,9 +197,15 @@ class VoxelMap:
         return _Tables(*(getattr(self, name) for name in _Tables._fields))
 
     def _make_room(self, most: int) -> None:
-        """Make room for at least one voxel and tile, in place: double the rows of tiles if they are full,
-        else enlarge the rows of voxels to `most`, or, if there are that many, remove the half of the voxels
-        that was seen longest ago."""
+        """Make room in the table that is full, in place.
+
+        If the tiles are full, their rows are doubled. Otherwise the rows of voxels grow to `most`; if there
+        are that many already, the half of the voxels that was seen longest ago is removed. If both tables
+        are full, a second call is needed.
+
+        Args:
+            most: Largest number of voxels, a power of two.
+        """
         rows = np.arange(self.used)
         room, tile_room = len(self.key), len(self.tile_key)
         if self.tiles == tile_room:

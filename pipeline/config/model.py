@@ -95,11 +95,11 @@ class Parameters(BaseModel):
 
 
 def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by dotted name with the names of earlier versions, and choices that no longer exist,
-    replaced by the current ones. Removed parameters are left out; unknown names stay as they are.
+    """Return values by dotted name, with names and choices of earlier versions replaced by the current ones.
+    Removed parameters are left out; unknown names are kept.
 
-    Each renamed or removed parameter gives one RenamedParameterWarning. A value under the current name takes
-    precedence over one under an earlier name.
+    A RenamedParameterWarning is issued for each renamed parameter, each removed parameter and each replaced
+    choice. A value under the current name takes precedence over one under an earlier name.
     """
     result: dict[str, Any] = {}
     for name, given in values.items():

@@ -209,15 +209,19 @@ def eccentricity(eigenvalues: Float) -> Float:
 
 
 def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigma: float) -> Float:
-    """Return stems whose centre is the centroid of the visible arc, as in the paper, shape (K, COLUMNS);
-    columns as in `fit_stems`. Radius, its sigma and the lean are NaN, the arc is 0, and the radial deviation
-    is that of the distances to the centroid.
+    """Return stems whose centre is the centroid of the visible arc, as in the paper.
 
     Args:
         members: Points in the order of the clusters, shape (N, 3) [m], level sensor frame.
         bounds: First row of each cluster, and N, shape (K + 1,); no cluster is empty.
         centroid: Centroids, shape (K, 3) [m].
-        range_sigma: Standard deviation of a range [m].
+        range_sigma: Standard deviation of a range [m]; it enters the covariance across the ray only.
+
+    Returns:
+        Shape (K, COLUMNS), columns as in `fit_stems`. The standard deviation of the centre along the ray is
+        CENTROID_BIAS, since the centroid lies in front of the axis. Radius, its sigma and the lean are NaN,
+        and the arc is 0. The radial deviation is the standard deviation of the horizontal distances of the
+        points to the centroid [m].
     """
     stem = np.full((len(centroid), COLUMNS), np.nan)
     stem[:, 0:2] = centroid[:, :2]

@@ -36,8 +36,11 @@ def direction_bin(x: float, y: float, bins: int) -> int:
 
 
 def bin_direction(k: int, bins: int) -> tuple[float, float]:
-    """Return the unit vector x, y to the middle of sector k of `bins`, counted from -x over -y, +x and +y; k
-    is taken modulo `bins`. The inverse of `direction_bin`."""
+    """Return the unit vector x, y to the middle of sector k of `bins`; k is taken modulo `bins`.
+
+    The sectors are those of `direction_bin`: they begin at -x and run over -y, +x and +y, and are not equally
+    wide, because they divide a diamond and not a circle. `direction_bin` of the result is k modulo `bins`.
+    """
     along = 4.0 * ((k % bins + 0.5) / bins) - 1.0
     side = along - 1.0 if 0.0 <= along <= 2.0 else (-1.0 - along if along < 0.0 else 3.0 - along)
     x = (1.0 - abs(side)) * (1.0 if 0.0 <= along <= 2.0 else -1.0)

@@ -156,8 +156,15 @@ class Pose3:
 
 
 def euler_rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:
-    """Return R = Rz(yaw) Ry(pitch) Rx(roll), shape (3, 3), of numbers [rad]; of arrays of shape (N,), shape
-    (N, 3, 3)."""
+    """Return the rotation matrices R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Args:
+        roll, pitch, yaw: Angles [rad], three numbers or three arrays of the same shape (N,); they are not
+            broadcast.
+
+    Returns:
+        Shape (3, 3) for numbers, (N, 3, 3) for arrays.
+    """
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     cy, sy = np.cos(yaw), np.sin(yaw)
     rows = [

@@ -33,14 +33,15 @@ def observe_cells(
     Args:
         corner: Lower corner of each tile in the map frame, shape (T, 2) [m].
         at: Position of the sensor in the map frame, shape (2,) [m].
-        yaw: Yaw of the sensor [rad].
+        yaw: Yaw of the sensor in the map frame [rad].
         height, seen: Arrays of the Terrain of the scan.
         reach: Maximum distance of the middle of a cell from the sensor [m].
 
     Returns:
-        Height of the ground in the level sensor frame at the middle of each cell [m], NaN if not seen or
-        beyond `reach`; and the weight of the view [1/m^2], 0 there; both of shape (T, SIDE, SIDE), indexed by
-        tile, x and y.
+        Height of the ground in the level sensor frame at the middle of each cell [m], NaN if the ground was
+        not seen there or the cell is beyond `reach`; and the weight of each height, the inverse of its
+        variance [1/m^2], which decreases with the distance, 0 where the height is NaN. Both have the shape
+        (T, SIDE, SIDE), indexed by tile, x and y.
     """
     tiles = corner.shape[0]
     below, weight = np.full((tiles, SIDE, SIDE), np.nan), np.zeros((tiles, SIDE, SIDE))

@@ -214,7 +214,7 @@ def _trees(columns: _Trees) -> TruthTrees:
 
 
 def _path(columns: _Path) -> TruthPath:
-    """Return columns of a file as the true path, sorted by time, in the frame of the map."""
+    """Return the columns of a file, which are in the frame of the map, as the true path, sorted by time."""
     stamp_ns = np.array(columns.stamp_ns, dtype=np.int64)
     order = np.argsort(stamp_ns, kind="stable")
     x, y, yaw = (np.array(column, dtype=np.float64)[order] for column in (columns.x, columns.y, columns.yaw))

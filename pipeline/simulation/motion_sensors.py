@@ -85,7 +85,8 @@ class Inertial:
     attitude: Float
 
     def orientation(self, n: int) -> Float:
-        """Return the quaternion w, x, y, z of reading n, shape (4,), by the measured attitude."""
+        """Return the measured attitude of reading n as a unit quaternion w, x, y, z, shape (4,): the rotation
+        from the base frame to the level frame in which `attitude` is measured."""
         roll, pitch, yaw = self.attitude[n]
         return Pose3.from_euler(np.zeros(3), roll, pitch, yaw).quaternion()
 

@@ -250,9 +250,11 @@ def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
     Args:
         uri: URI of the request.
         settings: Settings of the deployment, with the data folders.
-        any_file: Whether the request may open any file of this machine, and live robots; else only simulated
-            sources and files in the data folders. For those the result is an absolute path without links, so
-            that the file that was checked is the file that is opened.
+        any_file: Whether the request may open every source, also files outside of the data folders and live
+            robots; then the URI is returned as it is. Otherwise only files in the data folders and simulated
+            runs may be opened, a scanned cloud (`sim:cloud`) only if its files `file` and `truth` are in the
+            data folders. The names of all these files are replaced by absolute paths without links, so that
+            the file that was checked is the file that is opened.
     """
     if any_file:
         return uri

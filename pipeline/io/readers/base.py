@@ -128,7 +128,8 @@ class Source(Protocol):
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of records left out so far, by reason, e.g. {"scans without points": 3}."""
+        """Number of records left out on opening and so far in the latest reading, by reason, e.g. {"scans
+        without points": 3}. Each call of `records` begins a new count; empty if nothing was left out."""
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
         """Yield records in the order of time, from `start_ns` on (None: all)."""

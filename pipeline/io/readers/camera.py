@@ -151,12 +151,15 @@ SHOWN_NS = 1_000_000_000
 
 
 def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:
-    """Return the nearest stamp for each time [ns], the earlier one of two, and whether it is within
-    `SAME_TIME_NS`, shape (M,) each.
+    """Return the stamp nearest to each time, and whether it is close enough to be of the same place.
 
     Args:
-        stamps: Stamps, ascending [ns], shape (N,), N >= 1.
+        stamps: Stamps in ascending order [ns], shape (N,), N >= 1.
         wanted_ns: Times [ns], shape (M,).
+
+    Returns:
+        The nearest stamps [ns], shape (M,), the earlier one of two that are equally near; and whether each
+        differs from its time by at most `SAME_TIME_NS`, shape (M,).
     """
     after = np.clip(np.searchsorted(stamps, wanted_ns), 0, len(stamps) - 1)
     before = np.maximum(after - 1, 0)

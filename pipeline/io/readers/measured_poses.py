@@ -582,9 +582,12 @@ class FrameAlignment:
         return None if self._origin is None or self.refused else self._try_fit(self._origin[1])
 
     def _try_fit(self, origin: Pose3) -> Any:  # noqa: ANN401
-        """Return the frame if the robot is far enough from its start for the next fit, and the fit is good;
-        else None. The last fit, at `kind.longest`, is returned in any case or sets `refused`. `origin` is
-        T_odom_start at the first scan."""
+        """Try to fit the frame; return it if the fit is good, else None.
+
+        Nothing is tried until the robot is far enough from its start for the next trial. The last trial is
+        made at `kind.longest`: its frame is returned even if the fit is not good; without a frame, `refused`
+        is set to the reason. `origin` is T_odom_start at the first scan.
+        """
         away = float(np.hypot(*(self._path[-1][1].t - self._path[0][1].t)[:2]))
         if away < self._try_at:
             return None

@@ -114,13 +114,19 @@ def _dtype(cloud: ros2.sensor_msgs__msg__PointCloud2, step: int) -> np.dtype[np.
 
 
 def decode_laser_scan(laser: ros2.sensor_msgs__msg__LaserScan, stamp_ns: int) -> Scan:
-    """Decode a LaserScan into a planar scan (z = 0, ring 0); `stamp_ns` is the time of its first beam [ns].
+    """Decode a LaserScan into a planar scan (z = 0, ring 0) in the sensor frame.
 
-    Beams outside of range_min and range_max of the message are no returns; they count in `dropped`.
-    Intensities of another number than ranges, and beam times of a sweep of 2 s or more, are not used.
+    Beams whose range is not finite, or outside of range_min and range_max of the message, are left out and
+    count in `dropped`, as do the returns that `clean_scan` refuses. Intensities are ignored if their number
+    differs from that of the ranges. Beam times are None if the time increment is not positive or the sweep
+    takes 2 s or more.
+
+    Args:
+        laser: The message.
+        stamp_ns: Time of the first beam [ns].
 
     Raises:
-        LayoutError: Its angles or ranges are impossible.
+        LayoutError: The angles are impossible, or there are too many beams.
     """
     ranges = np.asarray(laser.ranges, dtype=np.float64)
     first, step = float(laser.angle_min), float(laser.angle_increment)

@@ -240,8 +240,8 @@ class PcapSource(FileSource):
         self._file.close()
 
     def _read(self, rows: range) -> list[bytes]:
-        """Return the packets of one sweep, PACKET_BYTES each; fewer bytes if the file was shortened since it
-        was opened.
+        """Return the packets of one sweep, one for each row, of PACKET_BYTES bytes each. If the file was
+        shortened since it was opened, the last packets are shorter or empty.
 
         Args:
             rows: Rows of the packets; not empty.
