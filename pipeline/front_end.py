@@ -7,6 +7,8 @@ rules (see `pipeline.remapping`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
@@ -24,13 +26,11 @@ from pipeline.detection.free_space import clear_range
 from pipeline.detection.obstacles import find_clearance
 from pipeline.detection.truncation import is_truncated
 from pipeline.detection.verdicts import classify_clusters, detections
+from pipeline.geometry.columns import GROUND, POINT, rounded
 from pipeline.geometry.poses import Float, Pose3
-from pipeline.geometry.quantisation import GROUND, POINT, rounded
 from pipeline.ground import scan_ground
 from pipeline.ground.terrain import NO_GROUND, Terrain, height_above, heights_of_places, shows_ground
-from pipeline.preprocessing import filters
-from pipeline.preprocessing.acquisition import acquire, acquire_near, base_velocity
-from pipeline.stage_timer import StageTimer, no_timer
+from pipeline.preprocessing import acquire, acquire_near, base_velocity, pass_through, voxel_grid
 from pipeline.types.records import (
     Clearance,
     Clusters,
@@ -42,6 +42,15 @@ from pipeline.types.records import (
     Step,
     UInt16,
 )
+
+StageTimer = Callable[[str], AbstractContextManager[None]]
+"""Function of the name of a stage that returns the context in which the stage runs."""
+
+
+def no_timer(_stage: str) -> AbstractContextManager[None]:
+    """Return a context that measures nothing, for any name of a stage: the default for callers that need no
+    times."""
+    return nullcontext()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,7 +64,7 @@ class ColumnInput:
         depth: Range of the nearest return by direction and elevation (see `depth_image`).
         terrain: Ground height below the scan, as `Terrain.height`.
 
-    Points, heights and terrain are rounded to the steps of `pipeline.geometry.quantisation`.
+    Points, heights and terrain are rounded to the steps of `pipeline.geometry.columns`.
     """
 
     points: Float32
@@ -171,7 +180,7 @@ def _segment_points(
         raw, sensor_offset = acquire(step, T_base_lidar, p.acquisition)
 
     with timer("pass-through"):
-        boxed = filters.pass_through(raw, p.filters)
+        boxed = pass_through(raw, p.filters)
 
     with timer("ground"):
         terrain = None if p.ground.method == "none" else scan_ground.find_terrain(raw, p.ground)
@@ -179,7 +188,7 @@ def _segment_points(
         band = boxed if height is None else scan_ground.in_band(boxed, height, p.ground)
 
     with timer("voxel grid"):
-        filtered = filters.voxel_grid(band, p.filters)
+        filtered = voxel_grid(band, p.filters)
 
     with timer("clustering"):
         labels = cluster(filtered, sensor, p.clustering)

@@ -17,7 +17,8 @@ from pipeline.classification.forest import is_seen_all_around
 from pipeline.classification.voxel_map import FIRST_SCANS, VoxelMap
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
-from pipeline.front_end import DetectionResult, SegmentedScan, detect, segment
+from pipeline.front_end import DetectionResult, SegmentedScan, StageTimer, detect, no_timer, segment
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float, Pose2, Pose3
 from pipeline.ground.terrain_map import HeightMapper, HeightMapState
 from pipeline.loop_closure import detection
@@ -29,13 +30,11 @@ from pipeline.loop_closure.correction import (
     Smoothing,
 )
 from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.odometry.gyro import fused
 from pipeline.slam import FastSlam, Motion, SlamState
 from pipeline.slam.measured_pose import REJECTED, within_gate
 from pipeline.slam.motion import noise_of, step_variances
-from pipeline.slam.trajectory_buffer import TrajectoryBuffer
-from pipeline.stage_timer import StageTimer, no_timer
+from pipeline.slam.particle_ancestry import TrajectoryBuffer
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import (

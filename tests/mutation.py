@@ -61,7 +61,7 @@ _EVALUATION, _LIMITS_TESTS = (
 )
 _DETECTION, _SCORE = "pipeline/loop_closure/detection.py", "pipeline/evaluation/score.py"
 _CLOCK, _CHUNKS = "pipeline/io/readers/message_time.py", "pipeline/io/readers/container.py"
-_RULE, _RAYS = "pipeline/classification/decision_rule.py", "pipeline/classification/ray_statistics.py"
+_RULE, _RAYS = "pipeline/classification/column_classifier.py", "pipeline/classification/ray_statistics.py"
 _RULE_TESTS, _RAYS_TESTS = (
     "tests/pipeline/classification/test_decision_rule.py",
     "tests/pipeline/classification/test_ray_statistics.py -k absent",

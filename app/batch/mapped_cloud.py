@@ -113,7 +113,7 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     from pipeline.ground.scan_ground import find_terrain
     from pipeline.ground.terrain import height_above
     from pipeline.inventory.cloud import Thinned
-    from pipeline.preprocessing.acquisition import acquire
+    from pipeline.preprocessing import acquire
 
     run, terrain = read_run(folder), read_terrain(folder)
     if is_live(run.uri):

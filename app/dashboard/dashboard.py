@@ -36,7 +36,7 @@ from app.worker import protocol
 from app.worker.outbox import path_columns
 from pipeline.config import preset
 from pipeline.config.model import Value
-from pipeline.geometry.growing_columns import GrowingColumns
+from pipeline.geometry.columns import GrowingColumns
 from pipeline.stand.seen_area import SeenRecorder
 from pipeline.types.records import Path, TruthTrees
 

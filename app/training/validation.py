@@ -10,7 +10,7 @@ import numpy as np
 
 from app.training.examples import TREE, Examples, object_numbers
 from app.training.fit_forest import all_expanded
-from pipeline.classification.decision_rule import too_few
+from pipeline.classification.column_classifier import too_few
 from pipeline.classification.forest import Forest, forest_of, vote
 from pipeline.evaluation import Rate
 from pipeline.types.records import Bool, Float, Int

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from app.store.forests import kept_forests
 from pipeline.config import Parameters
+from pipeline.front_end import StageTimer, no_timer
 from pipeline.io.readers import SourceDescription
 from pipeline.mapper import Mapper
-from pipeline.stage_timer import StageTimer, no_timer
 
 
 def mapper_of(

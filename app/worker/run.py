@@ -30,12 +30,11 @@ from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
-from pipeline.front_end import SegmentedScan
+from pipeline.front_end import SegmentedScan, StageTimer
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import KnownMap, Rerun, ScanCaches, preview_trees, sample_scans
-from pipeline.stage_timer import StageTimer
 from pipeline.stand.seen_area import ViewSelection
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 

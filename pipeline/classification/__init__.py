@@ -1,7 +1,12 @@
 """Classification of voxel columns: the returns of all scans accumulated by position in the map."""
 
-from pipeline.classification.column_classifier import ColumnClassifier, ColumnClassifierState, no_columns
-from pipeline.classification.decision_rule import ColumnVotes, column_votes
+from pipeline.classification.column_classifier import (
+    ColumnClassifier,
+    ColumnClassifierState,
+    ColumnVotes,
+    column_votes,
+    no_columns,
+)
 from pipeline.classification.forest import Forest, ForestOf, package_alone
 from pipeline.classification.ray_statistics import ScanView, depth_image, steepest_by_direction
 from pipeline.classification.voxel_map import PackedVoxelMap

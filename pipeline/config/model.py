@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from pipeline.config import stages
-from pipeline.config.declaration import Stage
+from pipeline.config.stages import Stage
 from pipeline.errors import ParameterError
 
 Value = float | int | bool | str

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.geometry.azimuth_bins import direction_bin
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.ground.terrain import Terrain, ground_at, ring_at
 from pipeline.jit import compiled
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.types.records import Bool, Float32, HeightMap, Int
 
 CELL = 0.5  # m

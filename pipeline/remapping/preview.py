@@ -22,7 +22,7 @@ from pipeline.config import Parameters
 from pipeline.config.stages import Detection
 from pipeline.detection.verdicts import classify_clusters
 from pipeline.front_end import SegmentedScan
-from pipeline.geometry.growing_columns import GrowingColumns
+from pipeline.geometry.columns import GrowingColumns
 from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled

@@ -15,7 +15,7 @@ import numpy as np
 from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.config import Parameters
 from pipeline.front_end import ColumnInput, SegmentedScan
-from pipeline.geometry.quantisation import POINT
+from pipeline.geometry.columns import POINT
 from pipeline.io.block_file import MOST_BYTES, BlockFile
 from pipeline.io.checkpoints.codec import record_bytes, record_of
 from pipeline.types.records import Float, Float32, Int32, Scan, Step, UInt16

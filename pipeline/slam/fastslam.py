@@ -15,8 +15,8 @@ import numpy as np
 
 from pipeline.config.stages import Slam
 from pipeline.geometry.gaussian import pose_of, rows_of
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.frame_uncertainty import NOISE, FrameUncertainty, at_least
@@ -38,7 +38,10 @@ from pipeline.slam.places import ODDS, PlaceStates, agreement
 from pipeline.slam.pose_quality import (
     OdometryDoubt,
     RunningStatistics,
+    ScanStatistics,
+    disagreement,
     is_lost,
+    named_statistics,
     pose_health,
     update_statistics,
 )
@@ -50,7 +53,6 @@ from pipeline.slam.resampling import (
     normalised,
     select_best,
 )
-from pipeline.slam.scan_statistics import ScanStatistics, disagreement, named_statistics
 from pipeline.slam.slip_detection import TreeMotion
 from pipeline.slam.state import SlamState
 from pipeline.types.records import Detections, Health, Int, Landmarks, PoseEstimate, PoseMeasurement

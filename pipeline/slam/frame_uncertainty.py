@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam.motion import wrapped
 from pipeline.types.records import Int, Int32
 

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.geometry.pose_arrays import composed, inverse, rotated_rows
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.motion import compounded
 from pipeline.slam.places import REVISIT_DISTANCE, Places
-from pipeline.slam.poses import composed, inverse, rotated_rows
 from pipeline.types.records import Int
 
 Sparse = Any  # scipy.sparse.csc_matrix, or its factors; scipy has no types

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.geometry.pose_arrays import composed, interpolated, inverse, rotated_rows
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.association import associate
 from pipeline.slam.keyframe_graph import KeyframeGraph, Solution
 from pipeline.slam.motion import Noise
 from pipeline.slam.particle_maps import MapColumns
-from pipeline.slam.poses import composed, interpolated, inverse, rotated_rows
 from pipeline.types.records import Int
 
 JUMP, JUMP_TURN = 1.0, 1.0  # m, rad; a larger difference between path and odometry is no motion

@@ -11,10 +11,10 @@ from pipeline.slam.motion import OdometryTrust, moved_pose, moved_poses, weighte
 from pipeline.slam.particle_maps import ROOM, Maps, blocks_in_reach, known_near, with_room
 from pipeline.slam.particle_update import Rules, near_for, observe, predict
 from pipeline.slam.places import INACTIVE, PlaceStates, state_of
+from pipeline.slam.pose_quality import STATISTICS, mean_statistics
 from pipeline.slam.proposal import room_for
 from pipeline.slam.resampling import normalised
 from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
-from pipeline.slam.scan_statistics import STATISTICS, mean_statistics
 from pipeline.slam.slip_detection import SEARCH, TreeMotion, motion_by_trees
 from pipeline.types.records import Int
 

@@ -16,8 +16,8 @@ from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.measured_pose import MeasuredPose, correct_by_measured, update_shared_errors
 from pipeline.slam.particle_maps import ROOM, Maps, own_block, widen
 from pipeline.slam.places import ACTIVE, INACTIVE, PlaceStates, state_of
+from pipeline.slam.pose_quality import MISSED, MOST_HITS, SHIFT
 from pipeline.slam.proposal import Room, recognise
-from pipeline.slam.scan_statistics import MISSED, MOST_HITS, SHIFT
 from pipeline.types.records import Bool, Float32, Int, Int32
 
 SCORE_MAX = 20.0  # upper limit of a score, so that a felled tree is removed after finitely many misses

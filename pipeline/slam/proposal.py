@@ -18,7 +18,7 @@ from pipeline.geometry.hash_grid import Cells, cell_of, first_of_four
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
 from pipeline.slam.joint_association import CHOICES, MOST, JointSearch, choose_jointly, search_for
-from pipeline.slam.scan_statistics import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
+from pipeline.slam.pose_quality import AMBIGUOUS, FOUND, INNOVATION, MOST_HITS, RECOGNISED
 from pipeline.types.records import Bool, Int, Int32
 
 FEW = 64  # rows that are sorted by insertion

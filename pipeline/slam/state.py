@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.io.checkpoints.codec import ADDED, NOT_SAVED
 from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import KeyframeGraph, ScanDetections
 from pipeline.slam.measured_pose import SharedErrors
@@ -16,6 +15,7 @@ from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, sh
 from pipeline.slam.places import Places
 from pipeline.slam.pose_quality import RunningStatistics
 from pipeline.slam.resampling import normalised
+from pipeline.types.records import ADDED, NOT_SAVED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

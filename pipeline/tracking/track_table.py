@@ -8,11 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.geometry.poses import Float
-from pipeline.io.checkpoints.codec import ADDED
 from pipeline.jit import compiled
-from pipeline.tracking.kalman import correct
-from pipeline.tracking.split_covariance_intersection import split
-from pipeline.types.records import Bool, Int, Verdict
+from pipeline.tracking.kalman import correct, split
+from pipeline.types.records import ADDED, Bool, Int, Verdict
 
 NO_LANDMARK = -1
 

@@ -8,12 +8,11 @@ import numpy as np
 
 from pipeline.config.stages import Classification, Tracking
 from pipeline.geometry.gaussian import in_map, spread_by_pose
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.tracking.identity import are_separate, follow, merge_near, take_better_landmarks, tracks_of
-from pipeline.tracking.kalman import ENGINES
+from pipeline.tracking.kalman import ENGINES, split
 from pipeline.tracking.observation import FigureLimits, add_observations, table_figures
-from pipeline.tracking.split_covariance_intersection import split
 from pipeline.tracking.track_classification import classify, classify_new
 from pipeline.tracking.track_table import NO_LANDMARK, ScanPose, TrackTable
 from pipeline.types.records import Columns, Detections, Int, Landmarks, PoseEstimate, Trees, Verdict

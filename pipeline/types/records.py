@@ -16,6 +16,12 @@ from numpy.typing import NDArray
 from pipeline.geometry.poses import Float as Float
 from pipeline.geometry.poses import Pose2, Pose3
 
+# Metadata of fields of records that are written to files, see `pipeline.io.checkpoints`.
+NOT_SAVED = "not saved"  # of a field that is not saved and gets its default
+# Of a field that files of an earlier version lack: a function of the other fields that
+# returns its value, or None for its default.
+ADDED = "added"
+
 Float32 = NDArray[np.float32]
 Int = NDArray[np.int64]
 Int32 = NDArray[np.int32]

@@ -16,11 +16,10 @@ from app.worker.supervisor import OnMessage, WorkerProcess
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
 from pipeline.errors import SourceError
-from pipeline.front_end import SegmentedScan
+from pipeline.front_end import SegmentedScan, StageTimer, no_timer
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.mapper import Mapper
-from pipeline.stage_timer import StageTimer, no_timer
 from pipeline.types.records import (
     Clusters,
     Detections,

@@ -25,7 +25,7 @@ from pipeline.ground.terrain import height_above
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import open_simulated
 from pipeline.odometry.synchroniser import steps
-from pipeline.preprocessing.acquisition import acquire
+from pipeline.preprocessing import acquire
 from pipeline.types.records import Bool, Float, Float32, Int
 from tests.benchmarks.package_forest.labelled_scenes import labelled_points, trunks
 

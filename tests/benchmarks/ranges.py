@@ -23,8 +23,7 @@ from pipeline.ground import scan_ground
 from pipeline.ground.terrain import height_above
 from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
-from pipeline.preprocessing import filters
-from pipeline.preprocessing.acquisition import acquire
+from pipeline.preprocessing import acquire, pass_through, voxel_grid
 from pipeline.types.records import Float, Float32, Sensor, Step
 from tests.benchmarks.package_forest.street_scenes import simulate_street
 
@@ -82,9 +81,9 @@ def _count(place: Place, parameters: Parameters) -> np.ndarray[tuple[int, int], 
     step, T_base_lidar, sensor, trees = place
     p = parameters
     raw, offset = acquire(step, T_base_lidar, p.acquisition)
-    boxed = filters.pass_through(raw, p.filters)
+    boxed = pass_through(raw, p.filters)
     height = height_above(boxed, scan_ground.find_terrain(raw, p.ground))
-    points = filters.voxel_grid(scan_ground.in_band(boxed, height, p.ground), p.filters)
+    points = voxel_grid(scan_ground.in_band(boxed, height, p.ground), p.filters)
     _, described = describe_stems(points, cluster(points, sensor, p.clustering), sensor, p.shape)
     found = detections(classify_clusters(described, p.detection), offset, p.detection).centre
     here = _in_base_frame(trees, step.T_odom_base or Pose2())

@@ -20,8 +20,7 @@ from pipeline.ground import scan_ground
 from pipeline.ground.terrain import height_above
 from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
-from pipeline.preprocessing import filters
-from pipeline.preprocessing.acquisition import acquire
+from pipeline.preprocessing import acquire, pass_through, voxel_grid
 from pipeline.slam import FastSlam
 from pipeline.tracking import Tracker
 from pipeline.types.records import Detections, Float, Path, Trees, Truth
@@ -70,11 +69,11 @@ def seen_in(uri: str, parameters: Parameters | None = None) -> tuple[list[Seen],
     rows = []
     for step in steps(source.records()):
         raw, offset = acquire(step, known.T_base_lidar, p.acquisition)
-        band = filters.pass_through(raw, p.filters)
+        band = pass_through(raw, p.filters)
         if p.ground.method != "none":
             height = height_above(band, scan_ground.find_terrain(raw, p.ground))
             band = scan_ground.in_band(band, height, p.ground)
-        filtered = filters.voxel_grid(band, p.filters)
+        filtered = voxel_grid(band, p.filters)
         labels = cluster(filtered, known.sensor, p.clustering)
         _, described = describe_stems(filtered, labels, known.sensor, p.shape)
         found = detections(classify_clusters(described, p.detection), offset, p.detection)

@@ -21,12 +21,9 @@ import msgspec
 import numpy as np
 
 from pipeline.errors import StemmapError
+from pipeline.types.records import ADDED, NOT_SAVED
 
 R = TypeVar("R")
-NOT_SAVED = "not saved"  # in the metadata of a field that is not saved and gets its default
-# In the metadata of a field that files of an earlier version lack: a function of the other fields that
-# returns its value, or None for its default.
-ADDED = "added"
 _ALIGN = 8
 _LENGTH = 4  # bytes of the length of the text of a record
 _hints = cache(typing.get_type_hints)

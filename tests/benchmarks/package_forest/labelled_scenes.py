@@ -21,7 +21,7 @@ from pipeline.ground.terrain import height_above
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.odometry.synchroniser import steps
-from pipeline.preprocessing.acquisition import acquire
+from pipeline.preprocessing import acquire
 from pipeline.simulation.run import open_run
 from pipeline.simulation.scenarios import parse_uri
 from pipeline.types.records import HIDDEN, Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict

@@ -10,20 +10,20 @@ import pytest
 from pipeline.classification import ColumnClassifier, Forest, ScanView, depth_image, no_columns
 from pipeline.classification.column_classifier import (
     FOLD,
+    GONE_SCANS,
     HIGHER,
     MOST_STALE,
     corrected_voxels,
     seen_higher,
 )
-from pipeline.classification.decision_rule import GONE_SCANS
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES, DecisionTrees
 from pipeline.classification.voxel_map import TILE, VoxelMap, keys_of, tiles_of
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground.terrain import SECTORS
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.mapper import Mapper
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import DUE_NS

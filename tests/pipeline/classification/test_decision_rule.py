@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.classification import column_votes, no_columns
-from pipeline.classification.decision_rule import BREAST_HEIGHT, RAYS
+from pipeline.classification.column_classifier import BREAST_HEIGHT, RAYS
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES
 from pipeline.classification.voxel_map import SLICE, SLICES

@@ -6,10 +6,10 @@ from dataclasses import fields, replace
 
 import numpy as np
 
+from pipeline.geometry.pose_arrays import composed
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.merged_map import merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
-from pipeline.slam.poses import composed
 from pipeline.tracking.observation import SECTORS
 from pipeline.types.records import Columns
 from tests.pipeline.test_mapper import fed, mapper, run

@@ -13,15 +13,14 @@ from hypothesis import strategies as st
 from pipeline.classification.column_classifier import corrected_columns, corrected_voxels, no_columns
 from pipeline.classification.voxel_map import SIDE, VoxelMap
 from pipeline.config import preset
+from pipeline.geometry.pose_arrays import PathCorrection, composed, inverse
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground.terrain_map import CELL, COLUMNS, VIEWS, WEIGHT, corrected_tiles
 from pipeline.ground.terrain_map import SIDE as CELLS
 from pipeline.loop_closure.detection import through
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.mapper import Mapper
 from pipeline.slam.loop_correction import drift_of
 from pipeline.slam.motion import Noise, compounded
-from pipeline.slam.poses import composed, inverse
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable
 from pipeline.types.records import Landmarks, PoseEstimate

@@ -10,14 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.geometry.pose_arrays import PathCorrection, composed
 from pipeline.geometry.poses import Pose2
 from pipeline.loop_closure.detection import RunHistory, loop_to
-from pipeline.loop_closure.map_correction import PathCorrection
 from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, Solution
 from pipeline.slam.loop_correction import corrected_landmarks, without_jumps
 from pipeline.slam.particle_maps import MapColumns
-from pipeline.slam.poses import composed
 from pipeline.types.records import PoseEstimate, Trees
 from tests.pipeline.loop_closure.test_detection import NOISE, SURE, circle, driven
 from tests.pipeline.strategies import seeds

@@ -16,7 +16,7 @@ from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
 from pipeline.odometry.gyro import BIAS_UNKNOWN, NOISE, SLIPPED, WANDERS, Gyro, fused
 from pipeline.odometry.synchroniser import steps
-from pipeline.preprocessing.acquisition import acquire
+from pipeline.preprocessing import acquire
 from pipeline.slam.motion import Motion, accumulated
 from pipeline.types.records import Imu, Odometry, Scan, Sensor, Step, Turn
 from tests.pipeline.strategies import scan, seeds

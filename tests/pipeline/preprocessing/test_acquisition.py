@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose3
-from pipeline.preprocessing.acquisition import HOUSING, acquire, acquire_near
+from pipeline.preprocessing import HOUSING, acquire, acquire_near
 from pipeline.types.records import Step
 from tests.pipeline.strategies import scan
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
-from pipeline.preprocessing.filters import pass_through, voxel_grid
+from pipeline.preprocessing import pass_through, voxel_grid
 from tests.pipeline.strategies import simulated_cloud
 
 FOREST = preset("forest").filters

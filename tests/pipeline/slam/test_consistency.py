@@ -10,7 +10,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.slam.frame_uncertainty import FrameUncertainty, at_least, transported_covariance
 from pipeline.tracking import Tracker
-from pipeline.tracking.split_covariance_intersection import split, weight
+from pipeline.tracking.kalman import split, weight
 from tests.benchmarks.cases.consistency import Errors, one_run
 from tests.benchmarks.stands import STRAIGHT
 from tests.pipeline.strategies import detections, seeds, track

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from scipy.optimize import least_squares
 
+from pipeline.geometry.pose_arrays import composed, inverse
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam.keyframe_graph import (
     CAUCHY,
@@ -20,7 +21,6 @@ from pipeline.slam.keyframe_graph import (
     combined,
 )
 from pipeline.slam.places import REVISIT_DISTANCE, Places
-from pipeline.slam.poses import composed, inverse
 from tests.pipeline.strategies import seeds
 
 STEMS = np.array([[2.0, 3.0], [4.0, -3.0], [-1.0, 4.0], [6.0, 2.5], [0.5, -4.0], [9.0, 4.0]])

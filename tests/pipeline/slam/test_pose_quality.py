@@ -14,29 +14,27 @@ from pipeline.slam import FastSlam
 from pipeline.slam.particle_ancestry import FOUNDED, Genealogy
 from pipeline.slam.pose_quality import (
     FOUND_LOST,
+    INNOVATION,
     INNOVATION_WEAK,
     ODOMETRY_WEAK,
+    RECOGNISED,
+    SHIFT,
     SIGMA_GOOD,
     SIGMA_WEAK,
+    STATISTICS,
     STRANGE_LOST,
     TREE_MOTION_MAX,
     TREE_MOTION_SCANS,
     OdometryDoubt,
     RunningStatistics,
+    ScanStatistics,
     is_lost,
+    mean_statistics,
+    named_statistics,
     pose_health,
     update_statistics,
 )
 from pipeline.slam.rigid_shift_test import MANY
-from pipeline.slam.scan_statistics import (
-    INNOVATION,
-    RECOGNISED,
-    SHIFT,
-    STATISTICS,
-    ScanStatistics,
-    mean_statistics,
-    named_statistics,
-)
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 
 FOREST = preset("forest").slam.model_copy(update={"update_distance": 0.0})

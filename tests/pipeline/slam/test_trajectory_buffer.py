@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose2
-from pipeline.slam.particle_ancestry import EstimatedPath
-from pipeline.slam.trajectory_buffer import TrajectoryBuffer
+from pipeline.slam.particle_ancestry import EstimatedPath, TrajectoryBuffer
 from pipeline.types.records import Path
 
 
