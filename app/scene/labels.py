@@ -14,11 +14,6 @@ from pipeline.types.records import Frame, Verdict
 
 MOST_LABELS = 60  # more than 200 halve the frame rate of a browser
 STEM_HEIGHT = 2.0  # [m], drawn where no height was measured
-#: Usual position of a camera relative to the robot [m].
-BEHIND = (-8.0, -4.5, 6.0)
-# Sizes of labels [rad], measured in the middle of a picture with viser's field of view of 75 degrees: a text
-# keeps its share of the height of the picture.
-TREE_WIDTH, CLUSTER_WIDTH, TEXT_HEIGHT = 0.17, 0.15, 0.05
 OWN_TREE = 0.5  # m; a cluster this near to a labelled tree is that tree
 
 
@@ -85,52 +80,12 @@ class LabelNodes:
 Place = tuple[float, float, float]
 
 
-def apart(
-    places: NDArray[np.float64],
-    order: NDArray[np.int64],
-    robot: NDArray[np.float64],
-    width: float,
-    most: int,
-    taken: Sequence[Place] = (),
-) -> list[int]:
-    """Return rows of places whose labels do not overlap as seen from BEHIND the robot, in order of
-    preference, at most `most`.
-
-    Args:
-        places: x, y, z in the frame of the map, shape (N, 3) [m].
-        order: Rows, the preferred ones first.
-        robot: x, y, z of the robot, shape (3,) [m].
-        width: Width of a label [rad].
-        most: Largest number of labels, at least 1.
-        taken: Places of other labels.
-    """
-    kept: list[int] = []
-    used = [_direction(np.array(place), robot) for place in taken]
-    for row in order.tolist():
-        azimuth, elevation = _direction(places[row], robot)
-        if all(
-            abs(math.remainder(azimuth - other, math.tau)) * math.cos(elevation) >= width
-            or abs(elevation - above) >= TEXT_HEIGHT
-            for other, above in used
-        ):
-            kept.append(row)
-            used.append((azimuth, elevation))
-            if len(kept) == most:
-                break
-    return kept
-
-
-def _direction(place: NDArray[np.float64], robot: NDArray[np.float64]) -> tuple[float, float]:
-    """Return azimuth and elevation [rad] of a place (x, y, z) [m] as seen from BEHIND the robot."""
-    x, y, z = (place - robot - BEHIND).tolist()
-    return math.atan2(y, x), math.atan2(z, math.hypot(x, y))
-
-
 def cluster_labels(
     frame: Frame, numbers: np.ndarray, label_by: str, taken: Sequence[Place] = ()
 ) -> list[Label]:
-    """Return labels for the clusters of a scan without overlaps: trees first, then the nearest, at most
-    MOST_LABELS. Clusters without a text, such as those without a circle by "DBH", have none; [] by "none".
+    """Return labels for the clusters of a scan: trees first, then the nearest, at most MOST_LABELS. Clusters
+    without a text, such as those without a circle by "DBH", have none; [] by "none". The page hides the
+    labels that overlap in its view.
 
     Args:
         frame: Results of the scan.
@@ -152,11 +107,7 @@ def cluster_labels(
         for k in order.tolist()
         if texts[k] and not (np.linalg.norm(trees - places[k, :2], axis=1) < OWN_TREE).any()
     ]
-    robot = np.array([pose.x, pose.y, frame.base_z])
-    return [
-        Label(int(numbers[k]), texts[k], tuple(places[k].tolist()))
-        for k in apart(places, np.array(named, np.int64), robot, CLUSTER_WIDTH, MOST_LABELS, taken)
-    ]
+    return [Label(int(numbers[k]), texts[k], tuple(places[k].tolist())) for k in named[:MOST_LABELS]]
 
 
 def _cluster_text(frame: Frame, k: int, label_by: str) -> str:

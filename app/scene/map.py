@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from app.common.arrays import rows_of
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
-from app.scene.labels import TREE_WIDTH, Label, LabelNodes, Place, apart
+from app.scene.labels import MOST_LABELS, Label, LabelNodes, Place
 from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
 from pipeline.types.records import HIDDEN, Frame, HeightMap, Trees, TruthTrees
@@ -22,7 +22,6 @@ Ring = tuple[float, float, float] | None
 TREE_HEIGHT = 2.2  # height of a drawn trunk of a drive [m]
 BREAST_HEIGHT = 1.3  # height of a drawn trunk of a whole cloud, where its circle is fitted [m]
 UNKNOWN_RADIUS = 0.08  # radius of a drawn trunk whose diameter is unknown [m]
-NUMBERS = 20  # trees nearest to the robot that are labelled with their number and DBH
 
 
 class MapNodes:
@@ -69,7 +68,7 @@ class MapNodes:
         self._numbers = trees.number.tolist()
         self._show_trees(trees, np.round(foot, 1), frame.of_cloud, view)
         self._show_mark(trees, selected, ring, frame.base_z)
-        robot = np.array([pose.x, pose.y, frame.base_z])
+        robot = np.array([pose.x, pose.y])
         named = view.layers["trees"] and view.layers["labels"]
         labels = tree_labels(trees, robot, selected, foot) if named else []
         self._labels.show(labels)
@@ -154,16 +153,16 @@ class MapNodes:
 def tree_labels(
     trees: Trees, robot: NDArray[np.float64], selected: int | None, foot: NDArray[np.float64]
 ) -> list[Label]:
-    """Return labels for the selected tree and the trees nearest to the robot, without overlaps, at most
-    NUMBERS.
+    """Return labels for the selected tree and the trees nearest to the robot, at most MOST_LABELS. The page
+    hides the labels that overlap in its view.
 
     Args:
         trees: Trees of the map.
-        robot: Position of the robot, shape (3,) [m].
+        robot: Position of the robot, shape (2,) [m].
         selected: Number of the selected tree, or None.
         foot: Height of the ground at each tree, shape (T,) [m].
     """
-    distance = np.linalg.norm(trees.position - robot[:2], axis=1)
+    distance = np.linalg.norm(trees.position - robot, axis=1)
     order = np.lexsort((distance, trees.number != (-1 if selected is None else selected)))
     places = np.column_stack([trees.position, np.round(foot, 1) + TREE_HEIGHT + 0.15])
     return [
@@ -172,7 +171,7 @@ def tree_labels(
             _tree_text(trees, row, int(trees.number[row]) == selected),
             tuple(places[row].tolist()),
         )
-        for row in apart(places, order, robot, TREE_WIDTH, NUMBERS)
+        for row in order[:MOST_LABELS].tolist()
     ]
 
 

@@ -354,7 +354,8 @@ class GroundNode(Node[viser.MeshHandle]):
         well. None keeps the present map."""
         if ground is not None and ground is not self.shown:
             self.shown = ground
-            self._raster, self._low, self._cell = raster(ground)
+            known, self._low, self._cell = raster(ground)
+            self._raster = without_small_holes(known)
             self._mesh = surface(self._raster, self._low, self._cell)
             self.faces = len(self._mesh[1])
         vertices, faces = self._mesh
@@ -394,6 +395,18 @@ def raster(ground: HeightMap) -> tuple[Float, Float, float]:
     grid = np.full(place.max(axis=0) - low + 1, np.nan)
     grid[tuple((place - low).T)] = height
     return grid, low * cell, cell
+
+
+def without_small_holes(grid: Float) -> Float:
+    """Return the heights of a grid, shape (I, J) [m], in which an unknown cell (NaN) with at least five known
+    ones among its eight neighbours has their mean, in three passes: holes up to three cells wide, such as the
+    shadow of a trunk, are closed, and larger ones stay."""
+    for _ in range(3):
+        around = np.lib.stride_tricks.sliding_window_view(np.pad(grid, 1, constant_values=np.nan), (3, 3))
+        known = np.isfinite(around).sum(axis=(2, 3))
+        mean = np.nansum(around, axis=(2, 3)) / np.maximum(known, 1)
+        grid = np.where(np.isnan(grid) & (known >= 5), mean, grid)
+    return grid
 
 
 def surface(grid: Float, low: Float, cell: float) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

@@ -14,7 +14,6 @@ import viser
 from numpy.typing import NDArray
 
 from app.scene.colours import COLOUR_BY, ViewSettings
-from app.scene.labels import BEHIND
 from app.scene.map import Accumulated, ErrorNode, MapCloud, MapNodes, Ring
 from app.scene.panel import PanelCommands, SceneCommands, TunePanel, Value
 from app.scene.robot import RobotNodes, WayNode
@@ -303,6 +302,8 @@ class Scene:
 
 
 WORLD = "/world"  # parent of all nodes; its children are in the frame of the map
+# Positions of a camera relative to the robot [m].
+BEHIND = (-8.0, -4.5, 6.0)
 ABOVE = (0.0, -0.01, 28.0)
 SEEN = 12.0  # width of the area that these cameras show [m]
 

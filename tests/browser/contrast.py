@@ -8,7 +8,7 @@ from playwright.sync_api import Page
 
 # Each text that is seen: its own colour laid over the colours of what it stands on, up to the first that is
 # opaque. Texts that are painted on a canvas are left out, and so is what is inactive (1.4.3).
-_LOW = """() => {
+_LOW = """([needed, large_needed]) => {
   const canvas = Object.assign(document.createElement("canvas"), { width: 1, height: 1 });
   const pen = canvas.getContext("2d", { willReadFrequently: true });
   const parsed = new Map();
@@ -53,7 +53,7 @@ _LOW = """() => {
     const large = size >= 24 || (size >= 18.66 && Number(style.fontWeight) >= 700);
     const found = ratio(over([r, g, b, a * faded(node)], ground), ground);
     looked += 1;
-    if (found >= (large ? 3 : 4.5) - 0.005) return;
+    if (found >= (large ? large_needed : needed) - 0.005) return;
     const name = node.tagName.toLowerCase() + (node.id ? `#${node.id}` : "");
     low.add(`${found.toFixed(2)} ${name} “${text.trim().slice(0, 40)}”`);
   };
@@ -74,9 +74,10 @@ _LOW = """() => {
 }"""
 
 
-def too_low(page: Page) -> list[str]:
-    """The texts that are seen now whose contrast is below 4.5 (large ones: 3), each with its ratio."""
-    told: dict[str, Any] = page.evaluate(_LOW)
+def too_low(page: Page, needed: float = 4.5, large: float = 3.0) -> list[str]:
+    """The texts that are seen now whose contrast is below `needed` (large texts: `large`), each with its
+    ratio. 4.5 and 3 are level AA of WCAG, 7 and 4.5 are level AAA."""
+    told: dict[str, Any] = page.evaluate(_LOW, [needed, large])
     assert told["looked"] > 10, "nothing was seen"
     low: list[str] = told["low"]
     return low

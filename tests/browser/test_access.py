@@ -6,6 +6,7 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.browser.conftest import PATIENCE_MS
+from tests.browser.contrast import too_low
 from tests.browser.dashboard import SCENE, Dashboard
 from tests.browser.serving import Server
 
@@ -51,3 +52,32 @@ def test_the_first_theme_is_that_of_the_system_and_tab_leads_to_the_map(
     page.keyboard.press("Enter")
     expect(page.locator("#map")).to_be_focused()
     context.close()
+
+
+def test_controls_are_large_for_gloves_and_the_page_is_readable_in_the_sun(dashboard: Dashboard):
+    page = dashboard.page
+    page.set_viewport_size({"width": 820, "height": 1180})
+    page.locator("#drawer-button").click()
+    page.locator("#keys-button").click()
+    page.get_by_label("Large controls").check()
+    page.locator("#theme-choice").select_option("sunlight")
+    page.keyboard.press("Escape")
+    for tab in ("Trees", "Tune", "Annotate", "Plots", "Charts"):
+        dashboard.tab(tab)
+        assert page.evaluate(LOW) == [], tab
+        assert page.evaluate("document.documentElement.scrollWidth") <= 820
+        assert too_low(page, 7.0, 4.5) == [], tab
+    page.reload()
+    expect(page.locator("html")).to_have_attribute("data-controls", "large")
+    expect(page.locator("html")).to_have_attribute("data-contrast", "high")
+    page.locator("#keys-button").click()
+    page.get_by_label("Large controls").uncheck()
+    page.locator("#theme-choice").select_option("dark")
+    page.keyboard.press("Escape")
+    page.set_viewport_size({"width": 1260, "height": 720})
+
+
+# Controls lower than a finger in a glove needs; the marks of the timeline are as narrow as time is.
+LOW = """() => [...document.querySelectorAll(':is(header, main, footer) :is(button, select)')]
+  .filter(node => node.offsetWidth > 0 && node.offsetHeight < 44 && !node.matches('.mark'))
+  .map(node => `${node.id || node.textContent}: ${node.offsetHeight} px`)"""

@@ -402,6 +402,35 @@ def test_a_shift_click_on_a_stem_in_the_scene_adds_it(dashboard: Dashboard):
     dashboard.until_server("/api/annotations", "it.trees.length === 0")
 
 
+# The rectangles of the labels that are drawn, and how many labels the server has sent.
+LABELS = """() => {
+  const { scene } = window.__viserMutable, nodes = window.__viserSceneTree.getState();
+  const sent = Object.entries(nodes).filter(([name, node]) =>
+    /^.world.(numbers|labels)\\/\\d+$/.test(name) && node.effectiveVisibility);
+  return { boxes: scene.userData.labels, sent: sent.length };
+}"""
+
+
+@pytest.mark.usefixtures("calm")
+def test_labels_do_not_cover_one_another_wherever_the_camera_is(dashboard: Dashboard):
+    dashboard.load_scene()
+    dashboard.page.locator("#map").press("Escape")
+    for tree in (5, 23, 12):  # the camera flies to each of them
+        dashboard.tab("Trees")
+        dashboard.page.locator("#trees tbody tr").nth(tree).click()
+        dashboard.settled_places("/world/trees")
+        told = dashboard.scene.evaluate(LABELS)
+        boxes = told["boxes"]
+        assert 1 < len(boxes) < told["sent"], "some are hidden"
+        covered = [
+            (a, b)
+            for k, a in enumerate(boxes)
+            for b in boxes[k + 1 :]
+            if a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+        ]
+        assert covered == []
+
+
 # Rules of axe-core that elements of viser's client break.
 VISER = {"button-name", "landmark-one-main", "page-has-heading-one", "region"}
 

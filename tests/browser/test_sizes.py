@@ -95,3 +95,4 @@ def check_scene_on_demand(dashboard: Dashboard) -> None:
     assert dashboard.page.locator("#scene").get_attribute("src") is None
     dashboard.page.get_by_role("button", name="Show the 3D scene").click()
     dashboard.scene.wait_for_function("() => window.__viserSceneTree?.getState()['/world/robot/scan/raw']")
+    expect(dashboard.scene.get_by_text("Reset all")).not_to_be_visible()  # the panel would cover the scene

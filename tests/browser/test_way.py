@@ -20,3 +20,38 @@ def test_a_person_in_the_way_is_reported(dashboard: Dashboard):
             assert box["height"] > 20
         else:
             expect(way).to_be_hidden()
+
+
+SIGNALS = """() => {
+  window.signals = [];
+  navigator.vibrate = (pattern) => { window.signals.push('vibration'); return true; };
+  window.AudioContext = class {
+    currentTime = 0;
+    resume() { window.signals.push('sound'); }
+    createOscillator() { return { frequency: {}, connect() {}, start() {}, stop() {} }; }
+  };
+}"""
+
+
+def test_sound_and_vibration_for_the_stop_zone_are_off_until_a_person_wants_them(dashboard: Dashboard):
+    page = dashboard.page
+    page.evaluate(SIGNALS)
+    dashboard.open("sim:crossing?duration=12")
+    at_stop = "() => document.getElementById('way').dataset.zone === 'stop'"
+
+    def drive_to_the_person() -> None:
+        dashboard.command({"type": "seek", "time_s": 9.0})
+        dashboard.until_server("/api/status", "it.time_s < 9.1 && it.time_s > 8.9")
+        dashboard.command({"type": "play"})
+        dashboard.until(at_stop)
+
+    drive_to_the_person()
+    assert page.evaluate("window.signals") == []
+    for name in ("Sound", "Vibration"):
+        page.locator("#keys-button").click()
+        page.get_by_label(f"{name} while an obstacle").check()
+        page.keyboard.press("Escape")
+        assert page.evaluate("window.signals.splice(0)") == [name.lower()], "a person knows how it is"
+    drive_to_the_person()
+    dashboard.until("() => new Set(window.signals).size === 2")
+    dashboard.pause()

@@ -1,6 +1,7 @@
 // The panel of viser with the main parameters. The page moves its sliders, so that they behave as those of the tab Tune;
-// it names its widgets for screen readers, and collapses it while Tune is open.
+// it names its widgets for screen readers, and collapses it while Tune is open and where it would cover the scene.
 
+import { byId } from "../core/dom.js";
 import { on } from "../core/store.js";
 import { newGesture, setValue, tuning, valueOf } from "../tune/parameters.js";
 import { beginDrag, near, pressed } from "../tune/slider.js";
@@ -57,11 +58,15 @@ const nameWidgets = throttled(() => {
   }
 }, NAMING_PAUSE);
 
+const narrow = matchMedia("(max-width: 1180px)"), phone = matchMedia("(max-width: 700px)");
+const isCovered = () => phone.matches || (narrow.matches && byId("side").classList.contains("open")); // no room is left beside the panel
+
 // viser keeps the panel open or closed in each browser; its button is the only way to change that here.
 function collapse() {
-  const wanted = visible("tune");
+  const wanted = visible("tune") || isCovered();
   if (!inner || wanted === collapsed) return;
-  const button = inner.querySelector(`[data-dock-region] [aria-label^="${wanted ? "Collapse" : "Expand"}"]`);
+  const button = inner.querySelector(`[data-dock-region] [aria-label^="${wanted ? "Collapse" : "Expand"}"]`)
+    ?? inner.querySelector('.mantine-Paper-root [style*="cursor: pointer"][style*="height: 3.5em"]'); // of its sheet on a phone
   if (!button) return; // not built yet, or a person has done it already
   button.click();
   collapsed = wanted;
@@ -77,4 +82,6 @@ export function startScenePanel() {
     new frame.MutationObserver(() => { nameWidgets(); collapse(); }).observe(inner.body, { childList: true, subtree: true });
   });
   on("tab", collapse);
+  new MutationObserver(collapse).observe(byId("side"), { attributeFilter: ["class"] });
+  narrow.addEventListener("change", collapse);
 }

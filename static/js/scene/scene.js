@@ -6,8 +6,10 @@ import { isDark } from "../core/theme.js";
 
 const frame = byId("scene");
 const loaders = [];
+const builders = [drawWorldWithItsContent];
 
 export const onSceneLoad = (listener) => loaders.push(listener);
+export const onSceneBuilt = (listener) => builders.push(listener); // once its nodes and camera are there
 
 function address() {
   const query = new URLSearchParams();
@@ -83,7 +85,7 @@ export function startScene() {
     if (frame.contentWindow.location.search.includes("darkMode") !== isDark()) return void load();
     keepReconnecting();
     paint();
-    whenBuilt(frame.contentWindow, drawWorldWithItsContent);
+    for (const builder of builders) whenBuilt(frame.contentWindow, builder);
     for (const listener of loaders) listener(frame.contentWindow);
   });
   on("theme", () => frame.src && paint());

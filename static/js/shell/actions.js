@@ -89,5 +89,6 @@ export const ACTIONS = [
   ["Layout: exchange map and scene", "x", "x", exchange, "exchange map and scene"],
   ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],
   ["Layout: standard sizes and places", "", "", standardLayout],
+  ["Settings: theme, large controls, sound and vibration", "", "", showSheet, null, "options preferences gloves touch tablet contrast sunlight alarm warning mute"],
   ["Keyboard shortcuts", "?", "?", showSheet, null, "help keys hotkeys manual"],
 ];

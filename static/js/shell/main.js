@@ -18,6 +18,7 @@ import { startCharts } from "../charts/charts.js";
 import { startPlotsPanel } from "../plots/panel.js";
 import { startCamera } from "../scene/camera.js";
 import { startFocus } from "../scene/focus.js";
+import { startLabels } from "../scene/labels.js";
 import { startLayers } from "../scene/layers.js";
 import { startOverlay } from "../scene/overlay.js";
 import { startScenePanel } from "../scene/panel.js";
@@ -31,11 +32,12 @@ import { startTuning } from "../tune/parameters.js";
 import { startKeys } from "./keys.js";
 import { startLayout } from "./layout.js";
 import { startPalette } from "./palette.js";
+import { startSettings } from "./settings.js";
 import { startShare } from "./share.js";
 import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startPlotsPanel, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startScenePanel, startLayers, startFocus, startKeys, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

@@ -47,11 +47,11 @@ function build() {
     el("div", { class: "tune-head" },
       el("select", { id: "tune-set", "aria-label": "Preset or saved set", onchange: (event) => use(event.target.value) }),
       button("tune-undo", "Undo", "Undo the last parameter change (Ctrl+Z in this tab)", undo), button("tune-redo", "Redo", "Redo it (Ctrl+Shift+Z)", redo),
-      button("tune-reset", "Reset all", "Reset all values to the preset", () => reset([]))),
+      button("tune-reset", "Reset all", "Reset all values to the preset", () => reset([])),
+      find, el("label", { class: "tune-only" }, only, " changed only")),
     sets,
     el("p", { id: "tune-error", class: "error", role: "alert", hidden: true }),
     el("div", { class: "tune-effect" }, counts, wholeRun),
-    el("div", { class: "tune-files" }, find, el("label", { class: "tune-only" }, only, " changed only")),
     el("div", { id: "tune-rows" }, ...parts),
     el("p", { id: "tune-none", class: "empty", hidden: true }),
     el("details", { class: "tune-part" }, el("summary", { text: "Search for better values" }), searchPart));

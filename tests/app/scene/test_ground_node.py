@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.scene import Scene
-from app.scene.nodes import MOST_CELLS, raster, surface
+from app.scene.nodes import MOST_CELLS, raster, surface, without_small_holes
 from pipeline.types.records import HeightMap
 from tests.app.scene.frames import make_frame
 
@@ -38,12 +38,24 @@ def test_a_square_of_known_cells_is_two_triangles_each_seen_from_above():
     assert np.all(np.cross(b - a, c - a)[:, 2] > 0.0)
 
 
-def test_a_hole_stays_a_hole():
-    ground = make_ground(5)
-    kept = np.any(ground.place != 0, axis=1)
-    columns = {name: getattr(ground, name)[kept] for name in ("place", "height", "sigma", "views")}
-    _, faces = surface(*raster(HeightMap(cell=0.5, **columns)))
-    assert len(faces) == 32 - 8
+@pytest.mark.parametrize(("wide", "left"), [(1, 0), (3, 0), (5, 21)])
+def test_small_holes_are_closed_at_the_height_around_them_and_large_ones_stay(wide: int, left: int):
+    """Of a hole of 5 x 5 cells only the four corners are closed."""
+    ground = make_ground(11)
+    known, low, cell = raster(ground)
+    holed = known.copy()
+    half = wide // 2
+    holed[5 - half : 6 + half, 5 - half : 6 + half] = np.nan
+    closed = without_small_holes(holed)
+    assert np.count_nonzero(np.isnan(closed)) == left
+    np.testing.assert_allclose(closed[np.isfinite(closed)], known[np.isfinite(closed)], atol=0.12)
+    assert (len(surface(closed, low, cell)[1]) == 200) == (left == 0)
+
+
+def test_the_ground_is_not_extended():
+    known = raster(make_ground(5))[0]
+    outer = np.pad(known, 3, constant_values=np.nan)
+    np.testing.assert_array_equal(without_small_holes(outer), outer)
 
 
 def test_a_large_map_is_shown_with_larger_cells():

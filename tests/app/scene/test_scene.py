@@ -10,6 +10,7 @@ import pytest
 
 from app.scene import Scene
 from app.scene import scene as scene_module
+from app.scene.labels import MOST_LABELS
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import TruthTrees
 from tests.app.scene.frames import make_frame, make_trees, texts_of
@@ -99,7 +100,7 @@ def test_a_thousand_trees_are_one_mesh(scene: Scene):
     labels = [
         name for name in scene._server.scene._handle_from_node_name if name.startswith("/world/numbers/")
     ]
-    assert len(labels) <= 20
+    assert len(labels) <= MOST_LABELS
 
 
 def test_trees_that_are_not_confirmed_are_not_shown(scene: Scene):
