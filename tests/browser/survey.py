@@ -52,7 +52,6 @@ class Survey:
         if not self.takes(screen):
             return
         for theme in THEMES:
-            self.page.emulate_media(color_scheme=theme)
             self.page.evaluate(SHOW_THEME, theme)
             self.page.wait_for_timeout(SETTLE_MS)
             path = self._folder / f"{screen}-{self._size}-{theme}.png"
