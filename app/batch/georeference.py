@@ -115,7 +115,8 @@ def projected(crs: str) -> str:
         crs: A code such as "25832" or "EPSG:25832", or any text that pyproj reads.
 
     Raises:
-        StemmapError: It is unknown, has degrees (geographic) or another unit than metres.
+        StemmapError: It is unknown, not projected (geographic, geocentric, vertical, local) or has another
+            unit than metres. The message states which.
     """
     import pyproj
 
@@ -125,14 +126,23 @@ def projected(crs: str) -> str:
         raise StemmapError(
             f"{crs!r} is not a coordinate reference system", remedy="Give a code such as EPSG:25832"
         ) from None
-    units = {axis.unit_name for axis in system.axis_info[:2]}
-    if system.is_geographic or not system.is_projected:
-        raise StemmapError(
-            f"{system.name} has degrees, not metres",
-            remedy="Give a projected system, such as the UTM zone EPSG:32632",
+    units = ", ".join(sorted({axis.unit_name for axis in system.axis_info[:2]}))
+    problem = ""
+    if not system.is_projected and system.is_geocentric:
+        problem = "is geocentric: its coordinates count from the centre of the earth, not east and north"
+    elif not system.is_projected and not system.is_geographic:
+        problem = (
+            "has only heights, no east and north"
+            if system.is_vertical
+            else f"is not a map projection but of the kind {system.type_name}"
         )
-    if units != {"metre"}:
-        raise StemmapError(f"{system.name} has the unit {', '.join(sorted(units))}, not metres")
+    elif units != "metre":
+        problem = f"has {'degrees' if units == 'degree' else f'the unit {units}'}, not metres"
+    if problem:
+        raise StemmapError(
+            f"{system.name} {problem}",
+            remedy="Give a projected system in metres, such as the UTM zone EPSG:32632",
+        )
     authority = system.to_authority()
     return ":".join(authority) if authority else system.to_wkt()
 
@@ -292,7 +302,8 @@ def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
         raise SourceError(
             "the header of the control points is not complete",
             where=str(file),
-            remedy="It needs easting and northing (or lon and lat), and tree or x_m and y_m",
+            remedy="It needs easting and northing (or lon and lat), and tree or x_m and y_m; it has "
+            f"{', '.join(table.column) or 'no header'}",
         )
     if not table.rows:
         raise SourceError("the file has no control points", where=str(file))

@@ -16,6 +16,7 @@ from pipeline.io.readers.base import COORDINATE_LIMIT
 
 class CsvTable:
     """A table with a header line; commas, semicolons or tabs, whichever is most frequent in the first line.
+    With semicolons, as spreadsheets of many languages write them, numbers may have decimal commas.
 
     Args:
         text: The text.
@@ -33,15 +34,18 @@ class CsvTable:
 
     def __init__(self, text: str, what: str, where: str) -> None:
         self.where = where
-        first = text.partition("\n")[0]
+        delimiter = max(",;\t", key=text.partition("\n")[0].count)
+        self._has_semicolons = delimiter == ";"
         try:
-            reader = csv.reader(text.splitlines(), delimiter=max(",;\t", key=first.count))
+            reader = csv.reader(text.splitlines(), delimiter=delimiter)
             numbered = [(reader.line_num, row) for row in reader if any(row)]
         except csv.Error as error:
             raise SourceError(f"the {what} is not a CSV: {error}", where=where) from None
         header = [name.strip().lower() for name in numbered[0][1]] if numbered else []
         self.lines, self.rows = [line for line, _ in numbered[1:]], [row for _, row in numbered[1:]]
-        self.column = {name: k for k, name in reversed(list(enumerate(header)))}
+        self.column: dict[str, int] = {}
+        for k, name in enumerate(header):
+            self.column.setdefault(name, k)
 
     @classmethod
     def read(cls, path: Path, what: str, largest: int) -> CsvTable:
@@ -71,31 +75,43 @@ class CsvTable:
 
     def numbers(self, name: str, *, required: bool = True) -> Float:
         """Return the numbers of a column, shape (N,). Without `required`, empty cells, "nan" and "na" give
-        NaN. A column that the table does not have counts as empty cells.
+        NaN. A column that the table does not have counts as empty cells. In a column of a table with
+        semicolons in which a cell has a comma, the comma is the decimal sign and a point is an error, because
+        it may separate thousands.
 
         Raises:
             SourceError: A cell is not a finite number, or is beyond COORDINATE_LIMIT.
         """
+        texts = self.text(name)
+        has_commas = self._has_semicolons and any("," in text for text in texts)
         return np.array(
-            [self._number(text, name, k, required) for k, text in enumerate(self.text(name))], np.float64
+            [self._number(text, name, k, required, has_commas) for k, text in enumerate(texts)], np.float64
         )
 
-    def _number(self, text: str, name: str, row: int, required: bool) -> float:
+    def _number(self, text: str, name: str, row: int, required: bool, has_commas: bool) -> float:
         """Return the number of one cell, with the errors of `numbers`.
 
         Args:
             text: The cell.
             name, row: Name of the column and index of the row, for errors.
             required: Whether an unknown number is an error.
+            has_commas: Whether the decimal sign is a comma, see `numbers`.
         """
         if text == "" and not required:
             return math.nan
+        is_ambiguous = has_commas and "." in text
         try:
-            value = float(text)
+            value = math.nan if is_ambiguous else float(text.replace(",", ".") if has_commas else text)
         except ValueError:
             value = math.nan
         if not math.isfinite(value) and (required or text.lower() not in ("nan", "na")):
-            raise SourceError(f"line {self.lines[row]}: {name} = {text!r} is not a number", where=self.where)
+            raise SourceError(
+                f"line {self.lines[row]}: {name} = {text!r} is not a number",
+                where=self.where,
+                remedy="Write one decimal sign in all rows, and no sign between thousands"
+                if is_ambiguous
+                else "",
+            )
         if abs(value) >= COORDINATE_LIMIT:
             raise SourceError(
                 f"line {self.lines[row]}: {name} = {text!r} is out of range",

@@ -37,7 +37,7 @@ def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
     metres. The class of a row is one of KINDS; without such a column all rows are trees.
 
     Args:
-        path: A CSV with a header line; commas, semicolons or tabs.
+        path: A CSV with a header line; commas, semicolons or tabs. See `CsvTable` for decimal commas.
         dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit; None refuses such a column.
 
     Raises:
@@ -88,8 +88,8 @@ def _positions(table: CsvTable) -> tuple[Float, ...]:
         raise SourceError(
             "the table has no position",
             where=table.where,
-            remedy=f"Name the columns x_m and y_m, or azimuth_deg and distance_m; it has "
-            f"{', '.join(table.column) or 'no header'}",
+            remedy="Name the columns x_m and y_m, easting and northing, or azimuth_deg and distance_m; it "
+            f"has {', '.join(table.column) or 'no header'}",
         )
     angle = np.radians(table.numbers(azimuth, required=True))
     reach = table.numbers(distance, required=True)

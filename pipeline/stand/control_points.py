@@ -31,7 +31,8 @@ class ControlFit:
         sigma_point: Standard deviation of one coordinate of a point, from the residuals with 2 N - 3 degrees
             of freedom [m].
         sigma: Standard deviation of a coordinate of a position at the centre of the points [m].
-        sigma_turn: Standard deviation of the rotation [rad].
+        sigma_turn: Standard deviation of the rotation [rad]; inf if all points are at one place in the map,
+            which leaves the rotation unknown.
     """
 
     pose: Pose2
@@ -112,10 +113,11 @@ def _residual_words(residuals: Float, names: Sequence[str]) -> str:
 
 
 def fit_rigid_pairs(local: Float, known: Float) -> ControlFit:
-    """Return the fit of two or more pairs of points, without any check.
+    """Return the fit of two or more pairs of points, without any check. Points that are all at one place in
+    the map give the rotation 0 with the standard deviation inf.
 
     Args:
-        local: Positions in the map, not all at one place, shape (N, 2) [m].
+        local: Positions in the map, shape (N, 2) [m].
         known: The same points in the other frame, shape (N, 2) [m].
     """
     n, pose = len(local), fit_rigid(local, known)
@@ -129,5 +131,5 @@ def fit_rigid_pairs(local: Float, known: Float) -> ControlFit:
         math.sqrt(squares / n),
         sigma,
         sigma / math.sqrt(n),
-        sigma / spread,
+        sigma / spread if spread > 0.0 else math.inf,
     )

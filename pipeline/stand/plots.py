@@ -44,11 +44,12 @@ class SamplePlot:
 
 
 def circle(name: str, x: float, y: float, radius: float) -> SamplePlot:
-    """Return a circle around x, y [m] with the exact area of its radius [m]; the numbers are finite.
+    """Return a circle around x, y [m] with the exact area of its radius [m].
 
     Raises:
-        StemmapError: The radius is not above 0, or the area is larger than AREA_MAX.
+        StemmapError: A number is not finite, the radius is not above 0, or the area is larger than AREA_MAX.
     """
+    _check_finite(name, x=x, y=y, radius=radius)
     # A regular polygon inside of the circle is smaller than it; its corners are moved outwards.
     k = 4 * _ARC
     larger = radius * math.sqrt(2.0 * math.pi / (k * math.sin(2.0 * math.pi / k)))
@@ -62,14 +63,22 @@ def rectangle(name: str, x: float, y: float, length: float, width: float, turn: 
         name: Its name.
         x, y: Its centre [m].
         length, width: Along and across its axis [m].
-        turn: Angle of its axis from x towards y [rad]. All numbers are finite.
+        turn: Angle of its axis from x towards y [rad].
 
     Raises:
-        StemmapError: The area is 0 or larger than AREA_MAX.
+        StemmapError: A number is not finite, or the area is 0 or larger than AREA_MAX.
     """
+    _check_finite(name, x=x, y=y, length=length, width=width, turn=turn)
     corners = 0.5 * np.array([[-length, -width], [length, -width], [length, width], [-length, width]])
     c, s = math.cos(turn), math.sin(turn)
     return checked(SamplePlot(name, shapely.Polygon(corners @ np.array([[c, s], [-s, c]]) + [x, y])))
+
+
+def _check_finite(name: str, **values: float) -> None:
+    """Raise a StemmapError that names the first value that is not finite, of the plot `name`."""
+    for key, value in values.items():
+        if not math.isfinite(value):
+            raise StemmapError(f"plot {name}: its {key} is not a number", remedy=f"Give {key} as a number")
 
 
 def plot_of(name: str, shape: Mapping[str, Any]) -> SamplePlot:
@@ -128,8 +137,7 @@ def along(path: Float, every: float, radius: float) -> list[SamplePlot]:
         radius: Radius of the circles [m].
 
     Raises:
-        StemmapError: The path is shorter than half of `every`, there are more than PLOTS_MAX circles, or the
-            radius is not above 0.
+        StemmapError: See `centres_along`, or the radius is not a number above 0.
     """
     centres = centres_along(path, every).tolist()
     return [circle(f"path {k + 1}", x, y, radius) for k, (x, y) in enumerate(centres)]
@@ -140,8 +148,13 @@ def centres_along(path: Float, every: float) -> Float:
     shape (K, 2) [m], K at least 1.
 
     Raises:
-        StemmapError: The path is shorter than half of `every`, or there are more than PLOTS_MAX circles.
+        StemmapError: `every` is not a number above 0, the path is shorter than half of it, or there are more
+            than PLOTS_MAX circles.
     """
+    if not (math.isfinite(every) and every > 0.0):
+        raise StemmapError(
+            f"plots cannot be {every:g} m apart along the path", remedy="Give a distance above 0 m"
+        )
     steps = np.hypot(*np.diff(path, axis=0).T) if len(path) > 1 else np.zeros(0)
     driven = np.concatenate([[0.0], np.cumsum(steps)])
     count = int((driven[-1] + 0.5 * every) // every)

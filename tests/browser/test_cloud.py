@@ -45,10 +45,14 @@ def open_cloud(page: Dashboard, cloud: Path, drive: bool = False) -> None:
     page.page.locator("#source-button").click()
     page.page.locator("#source-uri").fill("run.mcap")
     expect(page.page.locator("#source-cloud")).to_be_hidden()
+    odometry = page.page.locator("#source-odometry")
+    expect(odometry).to_be_visible()
     page.page.locator("#source-uri").fill(str(cloud))
     expect(page.page.get_by_label("Map this cloud")).to_be_checked()
+    expect(odometry).to_be_hidden()
     if drive:
         page.page.get_by_label("Drive a simulated robot").check()
+        expect(odometry).to_be_visible()
     page.page.locator("#source-open").click()
     expect(page.page.locator("#source-dialog")).to_be_hidden()
 

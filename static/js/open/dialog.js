@@ -59,8 +59,11 @@ const entry = (uri, title, doc, address = () => uri) =>
 const isWholeCloud = (uri) => /\.(laz|las|e57|ply|npy|npz)$/i.test(uri);
 const choice = () => byId("source-form").elements.namedItem("cloud-choice").value;
 
+// A whole cloud that is mapped as it is has no odometry; a robot that drives through it has.
 function showChoice() {
-  byId("source-cloud").hidden = !isWholeCloud(byId("source-uri").value.trim());
+  const cloud = isWholeCloud(byId("source-uri").value.trim());
+  byId("source-cloud").hidden = !cloud;
+  byId("source-motion").hidden = cloud && choice() === "map";
 }
 
 // A cloud of the list is written into the field, above which the choice is.
@@ -118,6 +121,7 @@ export function startSources() {
     ask(chosenUri(byId("source-uri").value.trim()));
   });
   byId("source-uri").addEventListener("input", showChoice);
+  byId("source-cloud").addEventListener("change", showChoice);
   startInside();
   on("status", follow);
   startUpload(async ({ uri }) => { if (!dialog.open) await openSources(); ask(uri); });

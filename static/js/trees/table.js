@@ -21,15 +21,15 @@ const EVERY = 400; // [ms] between two updates
 
 const MARKS = { open: "", confirmed: " ✓", rejected: " ✕", skipped: " ↷" };
 
-// key, title, tooltip, text, value for sorting, and whether it is shown only for a whole cloud (true) or a run of scans (false)
+// key, title, tooltip, text, value for sorting (null if unknown), and whether it is shown only for a whole cloud (true) or a run of scans (false)
 const COLUMNS = [
   ["number", "tree", "Number of the tree; ✓ confirmed, ✕ rejected, ↷ skipped in the review", (t) => `${t.number}${MARKS[reviewOf(t)]}`, (t) => t.number],
   ["x", "x m", "x in the frame of the map: of a drive along the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.x, 2), (t) => t.x],
   ["y", "y m", "y in the frame of the map: of a drive to the left of the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.y, 2), (t) => t.y],
   ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
-  ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm ?? -1],
-  ["height", "height m", "Height of the tree; – where the cloud does not show its top", (t) => (t.height_m === null ? NONE : `${fixed(t.height_m, 1)} ± ${figure(t.sigma_height_m, 2)}`), (t) => t.height_m ?? -1, true],
-  ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg ?? -1, true],
+  ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm],
+  ["height", "height m", "Height of the tree; – where the cloud does not show its top", (t) => (t.height_m === null ? NONE : `${fixed(t.height_m, 1)} ± ${figure(t.sigma_height_m, 2)}`), (t) => t.height_m, true],
+  ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg, true],
   ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
   ["seen", "seen", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
 ];
@@ -72,10 +72,12 @@ function markOrder() {
   }
 }
 
+// Unknown values are last in both directions.
 function sorted(all) {
   const of = COLUMNS.find(([key]) => key === order.key)[4];
   const sign = order.descending ? -1 : 1;
-  return [...all].sort((a, b) => sign * (of(a) - of(b)) || a.number - b.number);
+  const unknown = (tree) => Number(of(tree) === null);
+  return [...all].sort((a, b) => unknown(a) - unknown(b) || sign * (of(a) - of(b)) || a.number - b.number);
 }
 
 function rowOf(tree) {

@@ -13,6 +13,7 @@ import pyproj
 import pytest
 import shapely
 
+from app.batch.export import LOCAL_WKT
 from app.batch.georeference import check_area, projected, read_map_frame
 from app.batch.run_folder import read_run
 from pipeline.errors import StemmapError
@@ -62,8 +63,8 @@ def test_control_points_at_trees_place_the_map(run, tmp_path, capsys, columns):
 
 def test_heights_of_control_points_give_the_height_of_the_map(run, tmp_path, capsys):
     file = tmp_path / "points.csv"
-    lines = ["x_m;y_m;easting;northing;elevation_m", "0.25;5;500000.25;5300005;300.025"]
-    file.write_text("\n".join([*lines, "10.25;5;500010.25;5300005;301.025"]))
+    lines = ["x_m;y_m;easting;northing;elevation_m", "0,25;5;500000,25;5300005;300,025"]
+    file.write_text("\n".join([*lines, "10,25;5;500010,25;5300005;301,025"]))
     assert stemmap(capsys, "georeference", run, "--control", file, "--crs", "25832").code == 0
     assert read_map_frame(run).z == pytest.approx(300.0, abs=0.03)
 
@@ -88,7 +89,7 @@ def test_plots_of_the_country_are_moved_into_the_map(run, tmp_path, capsys):
     ("text", "message"),
     [
         ("", "header"),
-        ("tree,easting\n1,2\n", "header"),
+        ("tree,easting\n1,2\n", "it has tree, easting"),
         ("tree,easting,northing\n", "no control points"),
         ("tree,easting,northing\n1,a,2\n", "line 2: easting = 'a'"),
         ("tree,easting,northing\n1,500000,5300000\n", "too few"),
@@ -115,6 +116,10 @@ def test_tables_that_cannot_be_used_are_refused(run, tmp_path, capsys, text, mes
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:1"], 1, "not a coordinate reference system"),
         (["--by-hand", "500000,5300000,0", "--crs", "²"], 1, "not a coordinate reference system"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4326"], 1, "degrees"),
+        (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4807"], 1, "the unit grad"),
+        (["--by-hand", "500000,5300000,0", "--crs", "EPSG:4978"], 1, "is geocentric"),
+        (["--by-hand", "500000,5300000,0", "--crs", "EPSG:5773"], 1, "has only heights"),
+        (["--by-hand", "500000,5300000,0", "--crs", LOCAL_WKT], 1, "of the kind Engineering CRS"),
         (["--by-hand", "500000,5300000,0", "--crs", "EPSG:2263"], 1, "foot"),
         (["--by-hand", "50,5,0", "--crs", "EPSG:25832"], 1, "do not fit"),
         (["--by-hand", "50,5", "--crs", "EPSG:25832"], 2, "EAST,NORTH,TURN[,Z]"),
@@ -165,6 +170,10 @@ def test_removing_makes_the_map_local(run, capsys):
     assert stemmap(capsys, "georeference", run).out.startswith("local coordinates")
     (run / "georeference.json").write_text('{"crs": 3}')
     stemmap(capsys, "georeference", run).refused(1, "georeference.json is damaged")
+
+
+def test_a_projected_system_with_heights_is_projected():
+    assert projected("EPSG:5555") == "EPSG:5555"
 
 
 def test_axes_are_east_and_north_as_in_pyproj_for_every_kind_of_system():

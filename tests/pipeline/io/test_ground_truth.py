@@ -54,6 +54,13 @@ def test_delimiters_and_line_ends(tmp_path, delimiter, ending):
     assert told.dbh[0] == pytest.approx(0.25)
 
 
+def test_a_spreadsheet_with_decimal_commas(tmp_path):
+    told = read(tmp_path, "x_m;y_m;dbh_cm\r\n1,5;-2;30,5\r\n-0,25;4,5;\r\n")
+    np.testing.assert_allclose(told.x, [1.5, -0.25])
+    np.testing.assert_allclose(told.y, [-2, 4.5])
+    np.testing.assert_allclose(told.dbh, [0.305, np.nan])
+
+
 @pytest.mark.parametrize(
     ("azimuth", "x", "y"), [(0, 0, 2), (90, 2, 0), (180, 0, -2), (270, -2, 0), (45, 2**0.5, 2**0.5)]
 )
@@ -95,6 +102,10 @@ def test_a_header_alone_is_a_table_of_nothing(tmp_path):
     [
         ("", "no position"),
         ("a,b\n1,2\n", "no position"),
+        ("a,b\n1,2\n", "easting and northing"),
+        ("x_m;y_m\n1,5;2\n1.200,5;2\n", "line 3: x_m = '1.200,5'"),
+        ("x_m;y_m\n1,5;2\n1.200;2\n", "no sign between thousands"),
+        ("x_m;y_m\n1,200,5;2\n", "line 2: x_m = '1,200,5'"),
         ("x_m\n1\n", "no position"),
         ("x_m,y_m\n1,2\n3,abc\n", "line 3: y_m = 'abc'"),
         ("x_m,y_m\n1\n", "line 2: y_m = ''"),

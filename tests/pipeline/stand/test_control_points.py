@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
-from pipeline.stand.control_points import fit_control_points
+from pipeline.stand.control_points import fit_control_points, fit_rigid_pairs
 
 SQUARE = np.array([[0.0, 0.0], [20.0, 1.0], [18.0, 22.0], [-3.0, 17.0]])
 OFF = np.array([[0, 0], [0, 0], [3, 0], [0, 0]])  # the third point is wrong
@@ -96,3 +96,18 @@ def test_two_wrong_points_are_not_explained_by_one():
 def test_a_greater_sigma_allows_greater_residuals():
     known = SQUARE + OFF
     assert fit_control_points(SQUARE, known, point_sigma=1.0).rms > 0.5
+
+
+def test_points_at_one_place_leave_the_turn_unknown():
+    local, known = np.full((2, 2), 3.0), np.array([[10.0, 0.0], [12.0, 0.0]])
+    fit = fit_rigid_pairs(local, known)
+    assert fit.sigma_turn == math.inf
+    np.testing.assert_allclose(fit.pose.apply(local), [[11.0, 0.0], [11.0, 0.0]])
+
+
+def test_a_wrong_point_at_the_place_of_another_is_named():
+    """Without the third point, the others are at one place."""
+    local = np.array([[0.0, 0.0], [0.0, 0.0], [20.0, 0.0]])
+    with pytest.raises(StemmapError, match="contradict") as error:
+        fit_control_points(local, local + np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 0.0]]))
+    assert "point 2" in error.value.remedy

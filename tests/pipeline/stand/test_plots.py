@@ -85,6 +85,25 @@ def test_what_is_no_area_is_refused(shape, text):
         checked(SamplePlot("p", shape))
 
 
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_a_number_that_is_not_finite_is_named(number):
+    for make, key in (
+        (lambda: circle("p", number, 0.0, 5.0), "x"),
+        (lambda: circle("p", 0.0, 0.0, number), "radius"),
+        (lambda: rectangle("p", 0.0, number, 5.0, 5.0), "y"),
+        (lambda: rectangle("p", 0.0, 0.0, 5.0, number), "width"),
+        (lambda: rectangle("p", 0.0, 0.0, 5.0, 5.0, number), "turn"),
+    ):
+        with pytest.raises(StemmapError, match=f"plot p: its {key} is not a number"):
+            make()
+
+
+@pytest.mark.parametrize("every", [math.nan, math.inf, 0.0, -1.0])
+def test_a_distance_along_the_path_is_above_0(every):
+    with pytest.raises(StemmapError, match="apart along the path"):
+        along(np.array([[0.0, 0.0], [10.0, 0.0]]), every, 3.0)
+
+
 def test_a_scan_observes_up_to_its_free_range_and_not_behind_a_stem():
     free = np.full(BINS, 10.0)
     free[: BINS // 4] = 3.0  # a quarter of all directions is hidden
