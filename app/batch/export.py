@@ -449,7 +449,7 @@ def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
         "program": f"stemmap {version()}",
         "source": run.uri,
         "coordinates": run.frame.name,
-        "georeference": run.frame.how or "none",
+        "georeference": run.frame.method_words if run.frame.crs else "none",
     }
     _sheet(book, "about", {"what": list(about), "value": list(about.values())}, bold)
     book.close()

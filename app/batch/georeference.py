@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
@@ -27,6 +27,23 @@ LOCAL_NAME = "local frame of the map"
 #: Longitude and latitude [deg].
 WGS84 = "EPSG:4326"
 _LARGEST_FILE = 1 << 20
+#: Numbers of the methods, by name: control points or used fixes, and all fixes; root mean square residual
+#: [m]; standard deviation of a coordinate of a point [m], and of the rotation [deg].
+METHOD_NUMBERS = {
+    "control": ("points", "rms_m", "sigma_point_m", "sigma_turn_deg"),
+    "gnss": ("points", "fixes", "rms_m", "sigma_turn_deg"),
+}
+METHODS = ("cloud", "file", "hand", *METHOD_NUMBERS)
+_METHOD_WORDS = {
+    "": "the source",
+    "cloud": "the cloud itself",
+    "file": "the coordinates of the file",
+    "hand": "hand",
+    "control": "{points:.0f} control points, {rms_m:.3f} m (RMS), one coordinate of a point "
+    "+- {sigma_point_m:.3f} m, turn +- {sigma_turn_deg:.3f} degrees",
+    "gnss": "{points:.0f} of {fixes:.0f} GNSS fixes, {rms_m:.2f} m (RMS) from the path, "
+    "turn +- {sigma_turn_deg:.2f} degrees",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +54,10 @@ class MapFrame:
         crs: Reference system as text for pyproj, such as EPSG:25832; "" for the local frame of the map.
         pose: Pose of the map in it: east, north [m], angle of the map's x axis from east to north [rad].
         z: Height of the map's zero [m].
-        how: How it was found, for people.
+        method: How it was found: "cloud" (the cloud states it), "file" (the coordinates of the file are
+            already in it), "hand", "control" (points) or "gnss" (fixes); "" if unknown.
+        numbers: Numbers of the method by name, see METHOD_NUMBERS; empty for the first three.
+        note: How it was found as an English text, of a file of an earlier version without method; "" else.
         sigma: Standard deviation of a position by this georeference, at the centre of its points [m]; NaN if
             unknown.
         residuals: Name and residual east, north [m] of each control point.
@@ -47,7 +67,9 @@ class MapFrame:
     crs: str = ""
     pose: Pose2 = field(default_factory=Pose2)
     z: float = 0.0
-    how: str = ""
+    method: str = ""
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    note: str = ""
     sigma: float = math.nan
     residuals: tuple[tuple[str, float, float], ...] = ()
     place: str = ""
@@ -62,6 +84,11 @@ class MapFrame:
         """The reference system for people: the name of one in WKT, else as `name`."""
         return self.crs.split('"')[1] if '["' in self.crs else self.name
 
+    @property
+    def method_words(self) -> str:
+        """How the frame was found, in English and to follow the word "by"."""
+        return self.note or _METHOD_WORDS[self.method].format(**self.numbers)
+
     def to_crs(self, points: Float) -> Float:
         """Return positions of the map, shape (N, 2), in the reference system: east, north [m]."""
         return self.pose.apply(np.reshape(points, (-1, 2)))
@@ -72,7 +99,8 @@ class MapFrame:
 
     def record(self) -> dict[str, Any]:
         """Return the frame as JSON values, the contents of georeference.json: `crs`, `east_m`, `north_m`,
-        `turn_rad`, `z_m`, `sigma_m` (None if unknown), `how`, `residuals_m` and `place`."""
+        `turn_rad`, `z_m`, `sigma_m` (None if unknown), `method`, `numbers`, `residuals_m`, `place` and,
+        if there is one, the note as `how`."""
         return {
             "crs": self.crs,
             "east_m": self.pose.x,
@@ -80,7 +108,9 @@ class MapFrame:
             "turn_rad": self.pose.yaw,
             "z_m": self.z,
             "sigma_m": None if math.isnan(self.sigma) else self.sigma,
-            "how": self.how,
+            "method": self.method,
+            "numbers": dict(self.numbers),
+            **({"how": self.note} if self.note else {}),
             "residuals_m": [list(row) for row in self.residuals],
             "place": self.place,
         }
@@ -240,7 +270,7 @@ def read_map_frame(folder: FilePath) -> MapFrame:
     file = folder / FILE
     if not file.is_file():
         crs = str(record["source"].get("crs") or "") if is_of_cloud(record) else ""
-        return MapFrame(crs, how="the cloud's own" if crs else "")
+        return MapFrame(crs, method="cloud" if crs else "")
     try:
         if file.stat().st_size > _LARGEST_FILE:
             raise ValueError("too large")
@@ -250,12 +280,31 @@ def read_map_frame(folder: FilePath) -> MapFrame:
         residuals = tuple((str(n), float(e), float(m)) for n, e, m in given["residuals_m"])
         if not all(abs(v) < COORDINATE_LIMIT for v in (x, y, yaw, z)):
             raise ValueError("out of range")
-        how, place = str(given["how"]), str(given.get("place", ""))
-        return MapFrame(str(given["crs"]), Pose2(x, y, yaw), z, how, sigma, residuals, place)
+        method, numbers, note = _method_of(given)
+        crs, place = str(given["crs"]), str(given.get("place", ""))
+        return MapFrame(crs, Pose2(x, y, yaw), z, method, numbers, note, sigma, residuals, place)
     except (ValueError, KeyError, TypeError, RecursionError, OSError):
         raise SourceError(
             f"{FILE} is damaged", where=str(folder), remedy="Run stemmap georeference again"
         ) from None
+
+
+def _method_of(given: dict[str, Any]) -> tuple[str, dict[str, float], str]:
+    """Return method, numbers and note of a record, see `MapFrame`. A record of an earlier version has only
+    the text `how`, of which the methods without numbers are known.
+
+    Raises:
+        ValueError, KeyError, TypeError: The method is unknown, or a number is missing.
+    """
+    if "method" not in given:
+        how = str(given["how"])
+        earlier = {"hand": "hand", "the coordinates of the file": "file"}.get(how.removeprefix("by "), "")
+        return earlier, {}, "" if earlier else how.removeprefix("by ")
+    method = str(given["method"])
+    if method and method not in METHODS:
+        raise ValueError("an unknown method")
+    numbers = {name: float(given["numbers"][name]) for name in METHOD_NUMBERS.get(method, ())}
+    return method, numbers, str(given.get("how", ""))
 
 
 def write_map_frame(folder: FilePath, record: dict[str, Any]) -> None:
@@ -373,12 +422,22 @@ def by_control_points(
                 "the run has no terrain at a control point with a height", remedy="Leave the heights out"
             )
     residuals = [(n, float(e), float(m)) for n, (e, m) in zip(names, fit.residuals, strict=True)]
-    how = (
-        f"{len(names)} control points, {fit.rms:.3f} m (RMS), one coordinate of a point "
-        f"+- {fit.sigma_point:.3f} m, turn +- {math.degrees(fit.sigma_turn):.3f} degrees"
+    numbers = {
+        "points": len(names),
+        "rms_m": fit.rms,
+        "sigma_point_m": fit.sigma_point,
+        "sigma_turn_deg": math.degrees(fit.sigma_turn),
+    }
+    return MapFrame(
+        crs,
+        fit.pose,
+        z,
+        "control",
+        numbers,
+        sigma=fit.sigma,
+        residuals=tuple(residuals),
+        place=place_words(crs, fit.pose.apply(map_centre(folder))),
     )
-    place = place_words(crs, fit.pose.apply(map_centre(folder)))
-    return MapFrame(crs, fit.pose, z, how, fit.sigma, tuple(residuals), place)
 
 
 def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, z: float) -> MapFrame:
@@ -400,8 +459,8 @@ def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, 
     pose = Pose2(east, north, turn)
     centre = pose.apply(map_centre(folder))
     check_area(crs, centre)
-    how = "hand" if any((east, north, turn, z)) else "the coordinates of the file"
-    return MapFrame(crs, pose, z, how, place=place_words(crs, centre))
+    method = "hand" if any((east, north, turn, z)) else "file"
+    return MapFrame(crs, pose, z, method, place=place_words(crs, centre))
 
 
 def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame:
@@ -461,13 +520,15 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
             f"the GNSS fixes cannot be used: {why}", where=run.uri, remedy="Use control points"
         )
     pose = fit.T_map_other.inverse()
-    how = (
-        f"{len(keep)} of {len(fixes)} GNSS fixes, {fit.residual:.2f} m (RMS) from the path, "
-        f"turn +- {math.degrees(fit.yaw_sigma):.2f} degrees"
-    )
+    numbers = {
+        "points": len(keep),
+        "fixes": len(fixes),
+        "rms_m": fit.residual,
+        "sigma_turn_deg": math.degrees(fit.yaw_sigma),
+    }
     pose = Pose2(pose.x + origin[0], pose.y + origin[1], pose.yaw)
     place = place_words(crs, pose.apply(map_centre(folder)))
-    return MapFrame(crs, pose, 0.0, how, fit.sigma, place=place)
+    return MapFrame(crs, pose, 0.0, "gnss", numbers, sigma=fit.sigma, place=place)
 
 
 def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
@@ -493,10 +554,9 @@ def frame_lines(frame: MapFrame) -> list[str]:
     if not frame.crs:
         return ["local coordinates: the map has no reference system"]
     lines = [f"the map is at {frame.place}"] if frame.place else []
-    how = frame.how.removeprefix("by ") or "the source"  # files of earlier versions have "by hand"
     lines.append(
         f"{frame.title}: origin at {frame.pose.x:.3f}, {frame.pose.y:.3f} m, x axis "
-        f"{math.degrees(frame.pose.yaw):.3f} degrees from east to north, by {how}"
+        f"{math.degrees(frame.pose.yaw):.3f} degrees from east to north, by {frame.method_words}"
     )
     if math.isfinite(frame.sigma):
         lines.append(f"a coordinate in the middle of the points +- {frame.sigma:.3f} m")

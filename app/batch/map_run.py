@@ -20,7 +20,7 @@ from app.batch.continue_map import (
     at_origin,
     continue_map,
 )
-from app.batch.run_folder import as_written, read_seen_area, score_map
+from app.batch.run_folder import as_written, read_seen_area, recorded_time, score_map
 from app.batch.summary import breaks_of, driven, far_truth, start_lines, summary_lines
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
@@ -362,8 +362,8 @@ def _run_record(
 ) -> dict[str, Any]:
     """Return the contents of run.json: `source` (that of the first drive), `continued` (further drives) and
     `chosen` where there are any, preset and parameters with their revisions, counts, pose quality (`health`),
-    scores (`evaluation`, `path_error`; None without), warnings and losses. Without times of day and computing
-    times, so that the same run gives the same bytes.
+    scores (`evaluation`, `path_error`; None without), warnings and losses. Without the time of the
+    mapping and computing times, so that the same run gives the same bytes.
 
     Args:
         plan: The run with its parameters.
@@ -385,6 +385,7 @@ def _run_record(
             "sensor": asdict(description.sensor),
         },
         **({"continued": [asdict(other) for other in others]} if others else {}),
+        **recorded_time(description.kind, start_ns),
         "seed": plan.seed,
         "odometry": plan.odometry,
         **({} if plan.chosen is None else {"chosen": plan.chosen}),

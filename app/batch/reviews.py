@@ -97,7 +97,7 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content]) -> Iterator[File
     with TemporaryDirectory(prefix="stemmap-run-") as there:
         for name in _FILES:
             if (folder / name).is_file():
-                shutil.copyfile(folder / name, FilePath(there) / name)
+                shutil.copy2(folder / name, FilePath(there) / name)  # with its date, which the report states
         write_texts(FilePath(there), {"trees.csv": csv_text(TREE_COLUMNS, texts)})
         try:
             yield FilePath(there)

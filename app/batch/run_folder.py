@@ -7,6 +7,7 @@ are killed, this partial output remains. It cannot be continued.
 from __future__ import annotations
 
 import csv
+import datetime
 import json
 import math
 from collections.abc import Sequence
@@ -142,6 +143,24 @@ def read_terrain(folder: FilePath) -> Float:
     """
     c = _columns(folder / "terrain.csv", TERRAIN_COLUMNS)
     return np.stack([c["x_m"], c["y_m"], c["z_m"]], axis=1)
+
+
+#: Earlier times count from the start of a sensor [ns since 1970].
+_FIRST_DATE_NS = 1_000_000_000_000_000_000  # 2001-09-09
+
+
+def recorded_time(kind: str, start_ns: int) -> dict[str, str]:
+    """Return {"recorded": time of the first scan in UTC (ISO 8601, seconds)} for run.json; {} for a simulated
+    run and for times that are no date.
+
+    Args:
+        kind: Name of the format of the source.
+        start_ns: Time of the first scan [ns].
+    """
+    if kind.startswith("simulated") or start_ns < _FIRST_DATE_NS:
+        return {}
+    seconds = start_ns // 1_000_000_000
+    return {"recorded": datetime.datetime.fromtimestamp(seconds, datetime.UTC).isoformat()}
 
 
 def is_of_cloud(record: dict[str, Any]) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 from app.batch.georeference import write_map_frame
 from app.batch.plot_files import placed
 from app.batch.reviews import reviews_of
-from app.batch.run_folder import as_written, score_map
+from app.batch.run_folder import as_written, recorded_time, score_map
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
 from app.sources.request import SourceRequest
@@ -170,6 +170,7 @@ class ShownRun:
         return {
             "stemmap": version(),
             "source": source,
+            **({} if self.cloud else recorded_time(status.kind, self.start_ns)),
             "seed": self.request.seed,
             "odometry": self.request.odometry,
             **({} if (chosen := self.request.kept_choices()) is None else {"chosen": chosen}),

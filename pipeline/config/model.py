@@ -218,11 +218,21 @@ class FieldSpec:
 def field_specs() -> tuple[FieldSpec, ...]:
     """Return the description of every parameter, in the order of the stages."""
     return tuple(
-        _spec(stage_name, stage_model, name)
+        spec
         for stage_name, stage_field in Parameters.model_fields.items()
         if isinstance(stage_model := stage_field.annotation, type) and issubclass(stage_model, Stage)
-        for name in stage_model.model_fields
+        for spec in stage_specs(stage_name, stage_model)
     )
+
+
+def stage_specs(stage_name: str, stage_model: type[Stage]) -> tuple[FieldSpec, ...]:
+    """Return the description of every parameter of a stage, which need not be one of `Parameters`.
+
+    Args:
+        stage_name: Name of the stage in dotted names.
+        stage_model: Class with the declarations.
+    """
+    return tuple(_spec(stage_name, stage_model, name) for name in stage_model.model_fields)
 
 
 def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:

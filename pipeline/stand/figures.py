@@ -321,8 +321,9 @@ def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estima
 
 def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> tuple[DiameterClass, ...]:
     """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
-    included; none without a diameter. Trees without a diameter are left out; thinner ones than the minimum
-    count in the first class.
+    included; none without a diameter. The first class begins at the minimum diameter, which makes it narrower
+    unless that is a multiple of the width. Trees without a diameter are left out; thinner ones than the
+    minimum count in the first class.
 
     Args:
         trees: Trees of the observed part.
@@ -344,8 +345,8 @@ def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> 
         g_se = math.sqrt(rest * float(np.square(basal).sum()) + float(variance.sum()))
         rows.append(
             DiameterClass(
-                100.0 * k * width,
-                100.0 * (k + 1) * width,
+                round(100.0 * max(k * width, parameters.dbh_min), 6),
+                round(100.0 * (k + 1) * width, 6),
                 n,
                 Estimate(scale * n, scale * math.sqrt(rest * n)),
                 Estimate(scale * float(basal.sum()), scale * g_se),

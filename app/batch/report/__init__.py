@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 import os
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path as FilePath
@@ -17,8 +18,10 @@ from typing import Any
 import numpy as np
 
 from app.batch.export import ExportedRun, read_for_export
+from app.batch.georeference import MapFrame
 from app.batch.stand import StandResult, stand_of
 from app.common.text import version
+from pipeline.config.model import field_specs, stage_specs
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
@@ -56,8 +59,12 @@ class Numbers:
         """Return a number with `digits` decimals; a dash for None, NaN and infinity."""
         if value is None or not math.isfinite(value):
             return "\N{EN DASH}"
-        text = f"{value:,.{digits}f}"
+        text = f"{value:z,.{digits}f}"  # without a sign of zero
         return text.replace(",", "\0").replace(".", self.point).replace("\0", self.group)
+
+    def short(self, value: float) -> str:
+        """Return a number with as many decimals as it has, at most six significant digits."""
+        return f"{value:.6g}".replace(".", self.point)
 
 
 def report_page(
@@ -106,7 +113,7 @@ def report_page(
         figures=figures,
         trees_in_map=len(whole.trees.dbh) + whole.run.rejected,
         figure_names=list(FIGURES),
-        units={name: unit for name, (_, unit) in FIGURES.items()},
+        units={name: squared(unit) for name, (_, unit) in FIGURES.items()},
         of_plots=of_plots,
         map=stand_map(run, whole, plots, texts, number),
         histogram=histogram(whole, texts, number),
@@ -114,8 +121,91 @@ def report_page(
         with_heights=bool(np.isfinite(run.columns["height_m"]).any()),
         warnings=warnings,
         verdicts={k: v for k, v in record.get("verdicts", {}).items() if k != "tree"},
-        parameters=parameters.model_dump(),
+        parameters=parameters,
+        figure_parameters=figure_parameters(parameters, texts, number),
+        changed=changed_parameters(record.get("changed") or {}, number),
+        georeference=georeference_words(whole.frame, texts, number),
+        frame_name=whole.frame.title if whole.frame.crs else texts["local_frame"],
+        map_date=map_date(folder).strftime(texts["date"]),
+        recorded=recorded_date(record, texts["date"]),
     )
+
+
+def map_date(folder: FilePath) -> datetime.date:
+    """Return the date on which the map of a run was written: that of its run.json, in local time. Copies of a
+    run keep it."""
+    return datetime.datetime.fromtimestamp((folder / "run.json").stat().st_mtime).astimezone().date()
+
+
+def recorded_date(record: Mapping[str, Any], form: str) -> str:
+    """Return the date of the first scan (UTC) as text; "" if run.json does not have a readable one.
+
+    Args:
+        record: The contents of run.json.
+        form: Format of the date, for strftime.
+    """
+    try:
+        return datetime.datetime.fromisoformat(str(record.get("recorded"))).strftime(form)
+    except ValueError:
+        return ""
+
+
+def squared(unit: str) -> str:
+    """Return a unit with superscript digits: "m²/ha" for "m2/ha"."""
+    return unit.replace("m2", "m²").replace("m3", "m³")
+
+
+def figure_parameters(parameters: Stand, texts: dict[str, str], number: Numbers) -> list[tuple[str, str]]:
+    """Return title and value with its unit of each parameter of the stand figures, in the language of
+    `texts`; a volume formula that is empty is left out."""
+    rows = []
+    for spec in stage_specs("stand", Stand):
+        name = spec.name.partition(".")[2]
+        value = getattr(parameters, name)
+        if spec.kind == "choice":
+            text = texts[f"value_{value}"]
+        else:
+            text = value if isinstance(value, str) else f"{number.short(value)} {spec.unit}".strip()
+        if text:
+            rows.append((texts[f"stand_{name}"], text))
+    return rows
+
+
+def changed_parameters(changed: Mapping[str, Any], number: Numbers) -> list[tuple[str, str, str]]:
+    """Return title, dotted name and value with its unit of parameters of the mapping. The titles are in
+    English, as they are declared; one that this version does not have has the title "".
+
+    Args:
+        changed: Values by dotted name.
+        number: Format of the language.
+    """
+    specs = {spec.name: spec for spec in field_specs()}
+    rows = []
+    for name, value in changed.items():
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        spec = specs.get(name)
+        text = number.short(value) if is_number else str(value)
+        rows.append((spec.title if spec else "", name, f"{text} {spec.unit if spec else ''}".strip()))
+    return rows
+
+
+def georeference_words(frame: MapFrame, texts: dict[str, str], number: Numbers) -> str:
+    """Return how a map was placed in its reference system, in the language of `texts`; a frame of an earlier
+    version may have only an English text. Without a reference system it is the text "nothing".
+
+    Args:
+        frame: The frame of the map.
+        texts: Texts of the language.
+        number: Format of the language.
+    """
+    if not frame.crs:
+        return texts["nothing"]
+    values = {
+        name: number(value, 0 if name in ("points", "fixes") else 3) for name, value in frame.numbers.items()
+    }
+    words = frame.note or texts[f"by_{frame.method or 'source'}"].format(**values)
+    sigma = f"; {texts['frame_sigma']} ± {number(frame.sigma, 3)} m" if math.isfinite(frame.sigma) else ""
+    return f"{frame.title}: {words}{sigma}"
 
 
 def _digits(estimate: Estimate) -> int:
@@ -264,13 +354,13 @@ def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dic
             "height": height * c.n_ha.value / top,
             "high": height * (1.0 - (c.n_ha.value + c.n_ha.se) / top),
             "low": height * (1.0 - max(c.n_ha.value - c.n_ha.se, 0.0) / top),
-            "label": number(c.low, 0 if float(c.low).is_integer() else 1),
+            "label": number.short(c.low),
             "edge": k * each,
         }
         for k, c in enumerate(classes)
     ]
     marks = [(height * (1.0 - v / top), number(v, 0)) for v in np.arange(0.0, top + 0.5 * step, step)]
-    last = number(classes[-1].high, 0) if classes else ""
+    last = number.short(classes[-1].high) if classes else ""
     return {
         "bars": bars,
         "marks": marks,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import math
+import os
 import zipfile
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
@@ -223,9 +224,11 @@ async def _run_folder(
     else:
         number = _number(key)
         packed = await dashboard.store.ask(lambda store: store.book.files(number))
+        changed_ns = (await dashboard.store.ask(lambda store: store.book.whole(number)))["changed_ns"]
         with TemporaryDirectory(prefix="stemmap-run-") as there:
             folder = FilePath(there)
             await asyncio.to_thread(zipfile.ZipFile(io.BytesIO(packed)).extractall, folder)
+            os.utime(folder / "run.json", ns=(changed_ns, changed_ns))  # the date of the map in the report
             source = read_run_record(folder)["source"]
             frame = await dashboard.store.ask(lambda store: stored_frame(store, source))
             if frame is not None:

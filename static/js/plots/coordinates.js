@@ -158,13 +158,22 @@ function load() {
   fill();
 }
 
+// How a reference system was found; a frame of an earlier version has it as text.
+function methodText({ method, numbers, how: text }) {
+  if (text) return text.replace(/^by /, "");
+  const { points: used, fixes, rms_m: rms, sigma_point_m: sigma, sigma_turn_deg: turn } = numbers;
+  if (method === "control") return `${count(used, "control point")}, ${fixed(rms, 3)} m (RMS), a coordinate of a point ± ${fixed(sigma, 3)} m, turn ± ${fixed(turn, 3)}°`;
+  if (method === "gnss") return `${used} of ${fixes} GNSS fixes, ${fixed(rms, 2)} m (RMS) from the path, turn ± ${fixed(turn, 2)}°`;
+  return { hand: "hand", file: "the coordinates of the file" }[method] ?? method;
+}
+
 function resultText() {
   const found = stored();
   const earlier = found ? ` The earlier fit is still in force (${found.crs}).` : "";
   if (dirty) return (how() === "control" ? `${count(points.length, "point")}, not applied yet. Two are enough; from three on the residuals check them.` : "Not applied yet.") + earlier;
   if (!found) return how() === "control" ? "Trees or marks whose coordinates are known place the map; two are enough, from three on the residuals check them." : "";
-  const { sigma_m: sigma, how: text, place = "" } = found.frame;
-  return `${place && `The map is at ${place}. `}By ${text.replace(/^by /, "")}${sigma === null ? "" : `; a coordinate in the middle of the points ± ${fixed(sigma, 3)} m`}. Plots, files and the report are in ${found.crs}.`;
+  const { sigma_m: sigma, place = "" } = found.frame;
+  return `${place && `The map is at ${place}. `}By ${methodText(found.frame)}${sigma === null ? "" : `; a coordinate in the middle of the points ± ${fixed(sigma, 3)} m`}. Plots, files and the report are in ${found.crs}.`;
 }
 
 function fill() {

@@ -156,12 +156,36 @@ def test_the_confirmation_shows_where_the_map_is(run, capsys):
         assert place in told
         assert "area of use: Europe between" in told
         assert ", by hand" in told
-    # A file of an earlier version has no place, and "by hand" with its preposition.
+
+
+@pytest.mark.parametrize(
+    ("how", "method", "words"),
+    [
+        ("by hand", "hand", "hand"),
+        ("the coordinates of the file", "file", "the coordinates of the file"),
+        ("3 control points, 0.010 m (RMS)", "", "3 control points, 0.010 m (RMS)"),
+    ],
+)
+def test_a_file_of_an_earlier_version_states_the_method_as_text(run, capsys, how, method, words):
+    stemmap(capsys, "georeference", run, "--by-hand", "391000,5819000,0", "--crs", "EPSG:25833")
     file = run / "georeference.json"
-    record = json.loads(file.read_text()) | {"how": "by hand"}
-    del record["place"]
+    record = json.loads(file.read_text()) | {"how": how}
+    for name in ("place", "method", "numbers"):
+        del record[name]
     file.write_text(json.dumps(record))
-    assert stemmap(capsys, "georeference", run).out.endswith("to north, by hand\n")
+    assert stemmap(capsys, "georeference", run).out.endswith(f"to north, by {words}\n")
+    frame = read_map_frame(run)
+    assert frame.method == method
+    file.write_text(json.dumps(frame.record()))
+    assert read_map_frame(run) == frame
+
+
+def test_an_unknown_method_is_refused(run, capsys):
+    stemmap(capsys, "georeference", run, "--by-hand", "391000,5819000,0", "--crs", "EPSG:25833")
+    file = run / "georeference.json"
+    for changes in ({"method": "guess"}, {"method": "gnss"}, {"method": "control", "numbers": {"points": 2}}):
+        file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+        stemmap(capsys, "georeference", run).refused(1, "georeference.json is damaged")
 
 
 def test_removing_makes_the_map_local(run, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import tomllib
@@ -12,7 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from app.batch.georeference import METHODS
 from app.batch.report import Numbers, find_browser
+from app.batch.run_folder import recorded_time
+from pipeline.config.model import field_specs, stage_specs
+from pipeline.config.stages import Stand
+from pipeline.types.records import Verdict
 from tests.app.batch.finished_runs import grid_run, write_run
 from tests.app.cli.test_commands import stemmap
 
@@ -87,6 +93,89 @@ def test_the_page_is_complete_and_needs_nothing_else(run, tmp_path, capsys, lang
     assert not re.search(r"\b(None|nan|inf)\b", shown)
 
 
+def catalogue_of(language):
+    """The texts of a language."""
+    text = (files("app.batch.report") / "texts.toml").read_text(encoding="utf-8")
+    return tomllib.loads(text)[language]
+
+
+def test_every_verdict_and_parameter_of_the_figures_has_its_text():
+    english = catalogue_of("en")
+    assert {name for name in english if name.startswith("verdict_")} == {
+        f"verdict_{verdict.label.replace(' ', '_')}" for verdict in Verdict
+    }
+    specs = stage_specs("stand", Stand)
+    titles = {f"stand_{spec.name.partition('.')[2]}": spec.title for spec in specs}
+    assert titles == {name: text for name, text in english.items() if name.startswith("stand_")}
+    assert {f"value_{choice}" for spec in specs for choice in spec.choices} <= set(english)
+    assert {f"by_{method}" for method in METHODS} <= set(english)
+
+
+# Words that both languages have besides those of the catalogue: names of source, preset, plots and program.
+SHARED = {"stand", "forest", "path", "stemmap", "epsg"}
+
+
+def test_the_german_report_has_no_english_words(tmp_path, capsys):
+    folder = grid_run(tmp_path / "run")
+    stemmap(capsys, "georeference", folder, "--by-hand", "500000,5300000,0", "--crs", "EPSG:25832")
+    words = ["--circle", "10,10,5", "--along", "12"]
+    english, german = (
+        Page(page_of(capsys, folder, tmp_path / f"{k}.html", [*words, "--language", k])) for k in ("en", "de")
+    )
+    texts = [
+        {w for text in page.texts[1:] for w in re.findall(r"[^\W\d_]{4,}", text.lower()) if "{" not in text}
+        for page in (english, german)
+    ]
+    known = {w for text in catalogue_of("de").values() for w in re.findall(r"[^\W\d_]{4,}", text.lower())}
+    assert texts[0] & texts[1] - known - SHARED == set()
+
+
+def test_parameters_have_titles_and_units(tmp_path, capsys):
+    folder = grid_run(tmp_path / "run")
+    file = folder / "run.json"
+    changed = {"clustering.eps": 0.3, "shape.fit": True, "no.longer": 2}
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"changed": changed}))
+    words = ["--volume", "0.001*dbh_cm^2", "--dbh-min", "0.075"]
+    shown = " ".join(Page(page_of(capsys, folder, tmp_path / "d.html", [*words, "--language", "de"])).texts)
+    assert "dbh_min" not in shown
+    assert "Kluppschwelle: 7,5 cm" in shown
+    assert "Kluppschwelle: 0,075 m; Klassenbreite: 0,04 m; Stärkste Bäume: 100 1/ha" in shown
+    assert "Korrektur: halbnormal; Volumenformel: 0.001*dbh_cm^2" in shown
+    spec = next(spec for spec in field_specs() if spec.name == "clustering.eps")
+    assert f"{spec.title} (clustering.eps): 0,3 m" in " ".join(shown.split())
+    assert "(no.longer): 2" in shown
+
+
+def test_dates_pages_units_and_zeros(run, tmp_path, capsys):
+    os.utime(run / "run.json", (1714732872, 1714732872))  # noon in Europe
+    text = page_of(capsys, run, tmp_path / "r.html")
+    assert "Mapped: 2024-05-03" in text
+    assert "Recorded" not in text
+    german = page_of(capsys, run, tmp_path / "g.html", ["--language", "de"])
+    assert "Kartierung: 03.05.2024" in german
+    assert 'content: "Seite " counter(page) " / " counter(pages)' in german
+    for page in (text, german):
+        assert "m²/ha" in page
+        assert "m2/ha" not in page
+        assert not re.search(r"-0[.,]0*\b(?![.,]?\d)", page)
+
+
+def test_the_date_of_the_recording_is_that_of_its_first_scan(tmp_path, capsys):
+    folder = grid_run(tmp_path / "run")
+    file = folder / "run.json"
+    record = json.loads(file.read_text())
+    for recorded, shown in ((recorded_time("pcap", 1714732872 * 10**9)["recorded"], True), ("soon", False)):
+        file.write_text(json.dumps(record | {"recorded": recorded}))
+        assert ("Recorded: 2024-05-03" in page_of(capsys, folder, tmp_path / "r.html")) == shown
+    assert recorded_time("simulated run", 1714732872 * 10**9) == recorded_time("pcap", 5 * 10**9) == {}
+
+
+def test_the_first_class_begins_at_the_minimum_diameter(run, tmp_path, capsys):
+    table = Page(page_of(capsys, run, tmp_path / "r.html")).texts
+    assert "7 \N{EN DASH} 8" in table
+    assert "8 \N{EN DASH} 12" in table
+
+
 def test_the_same_run_gives_the_same_page(run, tmp_path, capsys):
     assert page_of(capsys, run, tmp_path / "a.html") == page_of(capsys, run, tmp_path / "b.html")
 
@@ -114,7 +203,9 @@ def test_the_report_says_where_north_is_only_when_it_is_known(run, tmp_path, cap
     stemmap(capsys, "georeference", placed, "--by-hand", "500000,5300000,90", "--crs", "EPSG:25832")
     text = page_of(capsys, placed, tmp_path / "p.html")
     assert "the direction of north is unknown" not in text
-    assert "EPSG:25832: hand" in text
+    assert "EPSG:25832: by hand" in text
+    german = page_of(capsys, placed, tmp_path / "g.html", ["--language", "de"])
+    assert "EPSG:25832: von Hand" in german
     assert "499,981.00" in text  # y 19 m of the map points west
 
 
@@ -140,6 +231,8 @@ def test_a_run_without_trees_has_a_report(tmp_path, capsys):
 def test_numbers_are_those_of_the_language():
     english, german = Numbers(".", ","), Numbers(",", ".")
     assert (english(1234.56, 1), german(1234.56, 1)) == ("1,234.6", "1.234,6")
+    assert (english(-0.04, 1), german(-0.06, 1)) == ("0.0", "-0,1")
+    assert (english.short(7.0), german.short(7.5)) == ("7", "7,5")
     assert english(float("nan")) == english(None) == "\N{EN DASH}"
 
 
