@@ -13,7 +13,7 @@ import sqlite3
 import threading
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
@@ -47,7 +47,7 @@ LOCAL_WKT = (
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A column of the exported trees: name, name in a Shapefile (at most 10 characters), unit, meaning."""
+    """A column of an exported layer: name, name in a Shapefile (at most 10 characters), unit, meaning."""
 
     name: str
     short: str
@@ -65,30 +65,68 @@ TREE_FIELDS = (
     Field("z_m", "z_m", "m", "height of the ground at the tree"),
     Field("map_x_m", "mapx_m", "m", "x in the frame of the map"),
     Field("map_y_m", "mapy_m", "m", "y in the frame of the map"),
-    Field("observations", "obs", "", "number of scans with a detection of the tree"),
+    Field(
+        "observations",
+        "obs",
+        "",
+        "number of scans, or of sections of a whole cloud, with a detection of the tree",
+    ),
     Field("coverage_deg", "cover_deg", "deg", "part of the circumference that was observed"),
-    Field("eccentricity", "eccentr", "", "ratio of the eigenvalues of the points of a scan"),
+    Field(
+        "eccentricity",
+        "eccentr",
+        "",
+        "ratio of the eigenvalues of the points of a scan; empty for a whole cloud",
+    ),
     Field("height_m", "height_m", "m", "height of the tree; empty where its top is not seen"),
     Field("sigma_height_m", "sh_m", "m", "standard deviation of the height"),
     Field("lean_deg", "lean_deg", "deg", "angle of the stem from the vertical"),
     Field("review", "review", "", "state of the review: open, or confirmed by a person"),
 )
-#: Names of the figures of a plot in a Shapefile.
-PLOT_SHORT = {
+#: Beginnings of the names of the figures of a plot in a Shapefile, which may end in `_se`.
+_FIGURES_SHORT = {
     "n_ha": "n_ha",
     "n_ha_plain": "n_ha_plain",
-    "n_ha_corrected": "n_ha_corr",
+    "n_ha_corrected": "n_ha_c",
     "g_ha": "g_ha",
     "g_ha_plain": "g_ha_plain",
-    "g_ha_corrected": "g_ha_corr",
+    "g_ha_corrected": "g_ha_c",
     "v_ha": "v_ha",
-    "v_ha_corrected": "v_ha_corr",
+    "v_ha_corrected": "v_ha_c",
     "dg_cm": "dg_cm",
     "mean_dbh_cm": "dm_cm",
     "dominant_dbh_cm": "ddom_cm",
     "sdi": "sdi",
     "nearest_neighbour_m": "nn_m",
     "clark_evans": "ce",
+}
+
+
+def _figure_fields() -> Iterator[Field]:
+    """Yield the fields of the figures of a plot: each figure, and its standard error if it has one."""
+    for name, (title, unit) in FIGURES.items():
+        short = _FIGURES_SHORT[name]
+        yield Field(name, short, unit, title)
+        if not name.endswith("_plain"):
+            yield Field(f"{name}_se", f"{short}_se", unit, f"standard error of {name}")
+
+
+PLOT_FIELDS = (
+    Field("plot", "plot", "", "name of the plot"),
+    Field("area_m2", "area_m2", "m2", "area of the plot"),
+    Field("seen_m2", "seen_m2", "m2", "observed part of the area"),
+    Field("trees", "trees", "", "number of trees of at least the minimum diameter in the observed part"),
+    *_figure_fields(),
+)
+#: Fields of each layer.
+LAYER_FIELDS = {
+    "trees": TREE_FIELDS,
+    "path": (
+        Field("scans", "scans", "", "number of scans"),
+        Field("length_m", "length_m", "m", "length of the path"),
+    ),
+    "plots": PLOT_FIELDS,
+    "contours": (Field("z_m", "z_m", "m", "height of the contour"),),
 }
 
 
@@ -137,8 +175,9 @@ def read_for_export(folder: FilePath, of_plots: StandResult | None) -> ExportedR
     if of_plots is not None:
         for plot in of_plots.plots:
             f = of_plots.figures[plot.name]
-            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": float(f.trees)}
-            figures.update({name: f.values[name].value for name in FIGURES})
+            figures = {"area_m2": f.area, "seen_m2": f.seen, "trees": f.trees}
+            for name, estimate in f.values.items():
+                figures.update({name: estimate.value, f"{name}_se": estimate.se})
             shapes.append((plot.name, shapely.transform(plot.shape, frame.to_crs), figures))
     trees, path, terrain = run.trees, run.path, read_terrain(folder)
     ground = heights_at(terrain, trees.position) + frame.z
@@ -161,7 +200,7 @@ def read_for_export(folder: FilePath, of_plots: StandResult | None) -> ExportedR
         unknown if trees.lean is None else np.degrees(trees.lean),
         np.array(list(run.reviews.values()), np.str_),
     )
-    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 1, 0)
+    digits = (0, 1, 1, 4, 3, 3, 2, 3, 3, 0, 0, 3, 2, 2, 2, 0)
     columns = {
         field.name: np.round(v, d) if v.dtype.kind == "f" else v
         for field, v, d in zip(TREE_FIELDS, values, digits, strict=True)
@@ -225,9 +264,9 @@ def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
 
 
 def _layers(run: ExportedRun) -> dict[str, Any]:
-    """Return the layers as GeoDataFrames by name, in the coordinates of the files: `trees` (TREE_FIELDS), and
-    where there are any `path` (scans, length_m), `plots` (plot and figures) and `contours` (z_m). Raises
-    StemmapError if a package is not installed."""
+    """Return the layers as GeoDataFrames by name, in the coordinates of the files: `trees`, and where
+    there are any `path`, `plots` and `contours`; their columns are LAYER_FIELDS. Raises StemmapError if a
+    package is not installed."""
     geopandas = needed("geopandas", "gis", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -242,12 +281,8 @@ def _layers(run: ExportedRun) -> dict[str, Any]:
             crs=run.crs,
         )
     if run.plots:
-        names = list(run.plots[0][2])
         layers["plots"] = geopandas.GeoDataFrame(
-            {
-                "plot": [name for name, _, _ in run.plots],
-                **{key: [round(figures[key], 4) for _, _, figures in run.plots] for key in names},
-            },
+            _plot_table(run),
             geometry=[shape for _, shape, _ in run.plots],
             crs=run.crs,
         )
@@ -259,6 +294,14 @@ def _layers(run: ExportedRun) -> dict[str, Any]:
             crs=run.crs,
         )
     return layers
+
+
+def _plot_table(run: ExportedRun) -> dict[str, Any]:
+    """Return the values of PLOT_FIELDS of the plots by name."""
+    table: dict[str, Any] = {"plot": [name for name, _, _ in run.plots]}
+    for field in PLOT_FIELDS[1:]:
+        table[field.name] = np.array([round(figures[field.name], 4) for _, _, figures in run.plots])
+    return table
 
 
 def _write_layers(run: ExportedRun, file: FilePath) -> None:
@@ -354,7 +397,7 @@ def _write_shapefiles(run: ExportedRun, file: FilePath) -> None:
     layer. Columns have their short names; a local map has no .prj."""
     import pyogrio
 
-    short = {field.name: field.short for field in TREE_FIELDS} | PLOT_SHORT
+    short = {field.name: field.short for fields in LAYER_FIELDS.values() for field in fields}
     for name, layer in _layers(run).items():
         part = file if name == "trees" else file.with_name(f"{file.stem}_{name}{file.suffix}")
         table = layer.rename(columns=short).set_crs(run.frame.crs or None, allow_override=True)
@@ -427,24 +470,20 @@ def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
     number = run.columns["tree"]
     _sheet(book, "trees", {"tree": number, **place, **run.columns}, bold)
     if run.plots:
-        table: dict[str, Any] = {"plot": [name for name, _, _ in run.plots]}
-        for key in run.plots[0][2]:
-            table[key] = np.array([figures[key] for _, _, figures in run.plots])
-        _sheet(book, "plots", table, bold)
-    fields = [*TREE_FIELDS, Field(first, "", "m", f"coordinate in {run.frame.name}")]
-    fields.append(Field(second, "", "m", f"coordinate in {run.frame.name}"))
-    units = {"field": [f.name for f in fields], "unit": [f.unit for f in fields]}
-    figures = {"field": list(FIGURES), "unit": [u for _, u in FIGURES.values()]}
-    _sheet(
-        book,
-        "fields",
-        {
-            "field": units["field"] + (figures["field"] if run.plots else []),
-            "unit": units["unit"] + (figures["unit"] if run.plots else []),
-            "meaning": [f.meaning for f in fields] + ([t for t, _ in FIGURES.values()] if run.plots else []),
-        },
-        bold,
-    )
+        _sheet(book, "plots", _plot_table(run), bold)
+    axes = tuple(Field(name, "", "m", f"coordinate in {run.frame.name}") for name in (first, second))
+    rows = [
+        (field, layer)
+        for layer, fields in LAYER_FIELDS.items()
+        for field in ((*fields, *axes) if layer == "trees" else fields)
+    ]
+    units = {
+        "field": [field.name for field, _ in rows],
+        "unit": [field.unit for field, _ in rows],
+        "meaning": [field.meaning for field, _ in rows],
+        "layer": [layer for _, layer in rows],
+    }
+    _sheet(book, "fields", units, bold)
     about = {
         "program": f"stemmap {version()}",
         "source": run.uri,

@@ -66,7 +66,7 @@ _TREES: dict[str, Callable[[Trees, int], Iterable[str]]] = {
     "last_seen_s": lambda trees, start_ns: _seconds(trees.last_seen_ns, start_ns),
     "height_m": lambda trees, _: _numbers(trees.height, 2),
     "sigma_height_m": lambda trees, _: _numbers(trees.height_sigma, 2),
-    "lean_deg": lambda trees, _: _numbers(None if trees.lean is None else np.degrees(trees.lean), 1),
+    "lean_deg": lambda trees, _: _numbers(None if trees.lean is None else np.degrees(trees.lean), 2),
 }
 TREE_COLUMNS = (*_TREES, "review")
 _PATH: dict[str, Callable[[Path, int], Iterable[str]]] = {

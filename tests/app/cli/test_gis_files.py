@@ -17,7 +17,7 @@ import pyproj
 import pytest
 import rasterio
 
-from app.batch.export import PLOT_SHORT, TREE_FIELDS
+from app.batch.export import LAYER_FIELDS
 from app.batch.run_folder import read_run
 from pipeline.geometry.poses import Pose2
 from tests.app.batch.finished_runs import grid_run, write_run
@@ -63,7 +63,7 @@ def expected_places(runs, name):
 @pytest.mark.parametrize("suffix", ["gpkg", "shp"])
 def test_layers_have_their_fields_places_and_reference_system(runs, tmp_path, capsys, name, suffix):
     file = exported(capsys, runs[name], tmp_path / f"trees.{suffix}")
-    short = {field.name: field.short for field in TREE_FIELDS} | PLOT_SHORT
+    short = {field.name: field.short for field in LAYER_FIELDS["plots"]}
     layers = ("trees", "path", "plots", "contours")
     if suffix == "gpkg":
         assert fiona.listlayers(file) == [*layers, "layer_styles"] or set(fiona.listlayers(file)) >= set(
@@ -78,10 +78,9 @@ def test_layers_have_their_fields_places_and_reference_system(runs, tmp_path, ca
             else:
                 assert not table.crs_wkt or "local frame of the map" in table.crs_wkt
             names = set(table.schema["properties"])
+        assert names == {f.name if suffix == "gpkg" else f.short for f in LAYER_FIELDS[layer]}
         assert all(len(n) <= 10 for n in names) or suffix == "gpkg"
         if layer == "trees":
-            fields = [field.name if suffix == "gpkg" else field.short for field in TREE_FIELDS]
-            assert names == set(fields)
             places = np.array([row.geometry.coordinates[:2] for row in rows])
             np.testing.assert_allclose(places, expected_places(runs, name), atol=2e-3)
             dbh = [row.properties["dbh_cm"] for row in rows]
@@ -96,6 +95,9 @@ def test_layers_have_their_fields_places_and_reference_system(runs, tmp_path, ca
             assert len(rows) == 2
             assert rows[1].properties["trees"] == 25
             assert rows[1].properties[key] == pytest.approx(25 / 64e-4)
+            error = rows[1].properties["g_ha_se"]
+            assert 0.0 < error < 0.1 * rows[1].properties["g_ha"]
+            assert rows[1].properties[f"{short['dg_cm']}_se" if suffix == "shp" else "dg_cm_se"] > 0.0
         else:
             heights = sorted({row.properties["z_m"] for row in rows})
             low = 400.0 if name == "utm" else 0.0
@@ -175,6 +177,13 @@ def test_the_workbook_names_fields_and_units_and_leaves_the_unknown_empty(runs, 
     assert set(header) <= set(fields)
     assert fields["dbh_cm"] == "cm"
     assert ("coordinates", "EPSG:25832") in list(book["about"].values)
+    rows = [row[:4] for row in list(book["fields"].values)[1:]]
+    for layer, layer_fields in LAYER_FIELDS.items():
+        told = {row[0] for row in rows if row[3] == layer}
+        assert {field.name for field in layer_fields} <= told, layer
+    assert set(next(book["plots"].values)) == {row[0] for row in rows if row[3] == "plots"}
+    assert all(row[2] for row in rows)
+    assert ("area_m2", "m2", "area of the plot", "plots") in rows
 
 
 @pytest.mark.parametrize("name", ["local", "utm"])
