@@ -71,14 +71,35 @@ def failure_reply(status: int, error: StemmapError, retry_after_s: int | None = 
     )
 
 
+#: Bounds of numbers by the type of the error of pydantic: words, and the key of the limit.
+_BOUNDS = {
+    "greater_than": ("above", "gt"),
+    "greater_than_equal": ("at least", "ge"),
+    "less_than": ("below", "lt"),
+    "less_than_equal": ("at most", "le"),
+}
+
+
 def invalid_reply(errors: Sequence[Any]) -> Response:
-    """Return 422 with the first error of a validation: which field does not fit, and why.
+    """Return 422 with the first error of a validation: which field does not fit, and why. A number out of
+    its bounds is stated for people, with the entry of a list ("plot 1") that has it.
 
     Args:
         errors: Errors of pydantic.
     """
     first = errors[0] if errors else {}
-    place = [str(part)[:100] for part in first.get("loc", ()) if part != "body"]
+    parts = [part for part in first.get("loc", ()) if part != "body"]
+    if parts and first.get("type") in _BOUNDS:
+        words, key = _BOUNDS[first["type"]]
+        name = str(parts[-1])[:100]
+        entry = next((k for k, part in enumerate(parts) if k and isinstance(part, int)), None)
+        return error_reply(
+            422,
+            f"{name} is {str(first.get('input'))[:50]}, but must be {words} {first['ctx'][key]:g}",
+            where="" if entry is None else f"{str(parts[entry - 1]).removesuffix('s')} {parts[entry] + 1}",
+            remedy="Correct this value",
+        )
+    place = [str(part)[:100] for part in parts]
     given = first.get("ctx", {}).get("tag", "")  # an unknown kind of command
     words = f"{first.get('msg', '')} {str(given)[:100]}".strip()
     return error_reply(422, f"the request does not fit: {'.'.join(place)}: {words}".replace(": :", ":"))

@@ -104,7 +104,7 @@ def test_the_export_has_the_coordinates_of_the_file(page: Dashboard) -> None:
     assert float(values["height_m"]) > 8.0
     with page.page.expect_download() as download:
         page.page.locator("#trees-export").select_option("gpkg")
-    assert download.value.suggested_filename == "trees.gpkg"
+    assert download.value.suggested_filename == "plot_trees.gpkg"
 
 
 def test_a_robot_drives_through_the_cloud_as_the_second_choice(page: Dashboard, cloud: Path) -> None:

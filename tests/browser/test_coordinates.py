@@ -89,6 +89,7 @@ def test_control_points_are_picked_fitted_and_undone(person: Dashboard, tmp_path
     expect(problem).to_have_text(re.compile("control points"))
     expect(now).to_have_text("Coordinates: EPSG:25832")
     expect(page.locator("#coordinates-result")).to_have_text(re.compile("earlier fit is still in force"))
+    expect(rows.first.locator(".residual")).to_have_text(re.compile(r"^-?\d{4,5}\.\d, "))
     rows.first.get_by_label("Delete point 1").click()
     expect(rows).to_have_count(1)
 

@@ -63,10 +63,23 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
         "polygon",
     ]
     expect(page.locator("#plots-table .sum")).to_have_count(2)
+    heads = page.locator("#plots-table thead th").all_inner_texts()
+    assert heads[-2:] == ["Dq cm", "D cm"]
+    expect(page.locator("#plots-table .sum td").nth(heads.index("D cm") - 1)).to_contain_text(
+        re.compile(r"\d")
+    )
+    expect(page.locator("#plots-detection")).to_have_text(
+        re.compile("Detection (decreases|does not decrease)")
+    )
+    expect(page.locator("#plots-review")).to_have_text(re.compile(r"Review: 0 of \d+ found trees reviewed\."))
 
     # Typed values; a name is changed; all is undone and repeated.
     page.get_by_text("Type a plot").click()
     form = page.locator(".plot-form").first
+    form.locator("[name=radius]").fill("0")
+    form.get_by_role("button", name="Add").click()
+    assert "0.01" in form.locator("[name=radius]").evaluate("node => node.validationMessage")
+    form.locator("[name=radius]").fill("5.64")
     form.locator("[name=x]").fill("6")
     form.locator("[name=y]").fill("1")
     form.locator("[name=name]").fill("north")
@@ -87,6 +100,21 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     expect(rows).to_have_count(1)
     page.locator("#plot-undo").click()
     expect(rows).to_have_count(0)
+
+
+def test_another_run_begins_with_empty_fields(person: Dashboard) -> None:
+    page = person.page
+    page.get_by_text("Type a plot").click()
+    form = page.locator(".plot-form").first
+    form.locator("[name=kind]").select_option("rectangle")
+    form.locator("[name=x]").fill("6")
+    form.locator("[name=name]").fill("north")
+    page.locator("#plot-crs").fill("EPSG:25832")
+    person.open("sim:stand?seed=3&duration=2")
+    expect(form.locator("[name=x]")).to_have_value("0")
+    expect(form.locator("[name=name]")).to_have_value("")
+    expect(form.locator("[name=radius]")).to_have_value("5.64")
+    expect(page.locator("#plot-crs")).to_have_value("")
 
 
 def test_viewers_see_plots_and_cannot_change_them(

@@ -141,6 +141,7 @@ def test_the_map_is_saved_as_a_picture_and_as_a_table(dashboard: Dashboard, tmp_
 def test_the_table_is_saved_as_a_picture_and_as_a_table(dashboard: Dashboard, tmp_path: Path):
     page, held = dashboard.page, trees(dashboard)
     whole = saved(page, page.locator("#trees-png"), tmp_path)
+    assert whole.name == "sim_stand_trees.png"
     with Image.open(whole) as picture:
         assert picture.height == 2 * 24 * (len(held) + 1)
     assert painted(whole) > 10

@@ -9,6 +9,12 @@ function save(name, blob) {
   setTimeout(() => URL.revokeObjectURL(address), 10_000);
 }
 
+// The name of a file of a run: "pine_plot_trees.csv" for the title "pine_plot.laz" of the run.
+export function fileName(title, rest) {
+  const stem = title.replace(/\.[a-z][a-z0-9]{1,5}$/i, "").replace(/[^\p{L}\p{N}.-]+/gu, "_").replace(/^[_.]+|[_.]+$/g, "").slice(0, 80);
+  return stem ? `${stem}_${rest}` : rest;
+}
+
 const cell = (value) => {
   const text = value === null || value === undefined ? "" : String(value);
   return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;

@@ -2,7 +2,7 @@
 
 import { block } from "./api.js";
 import { el } from "./dom.js";
-import { saveBytes } from "./download.js";
+import { fileName, saveBytes } from "./download.js";
 import { attempted } from "./problem.js";
 
 const REPORTS = { "en.html": "Report (HTML)", "en.pdf": "Report (PDF)", "de.html": "Bericht (HTML)", "de.pdf": "Bericht (PDF)" };
@@ -10,11 +10,12 @@ const REPORTS = { "en.html": "Report (HTML)", "en.pdf": "Report (PDF)", "de.html
 export const reportOptions = () => Object.entries(REPORTS).map(([value, text]) => el("option", { value, text }));
 export const isReport = (choice) => choice in REPORTS;
 
-// `key` names a run as in /api/runs, or is "open"; `settings` are the parameters of the figures as URLSearchParams.
-export async function saveReport(key, choice, settings = new URLSearchParams()) {
+// `key` names a run as in /api/runs, or is "open"; `title` is that of the run; `settings` are the parameters of the figures as
+// URLSearchParams.
+export async function saveReport(key, title, choice, settings = new URLSearchParams()) {
   const [language, suffix] = choice.split(".");
   settings.set("language", language);
-  await saveWritten("Writing the report …", `report.${suffix}`, `/api/runs/${encodeURIComponent(key)}/report/${suffix}?${settings}`);
+  await saveWritten("Writing the report …", fileName(title, `report_${language}.${suffix}`), `/api/runs/${encodeURIComponent(key)}/report/${suffix}?${settings}`);
 }
 
 // Saves a file that the server writes, which takes some time; a failure is shown.
@@ -25,13 +26,13 @@ export async function saveWritten(text, name, path) {
   box.remove();
 }
 
-// A menu with the reports of a run; `settings()` returns the parameters of the figures.
-export function reportMenu(id, key, settings) {
+// A menu with the reports of a run; `title()` returns the title of the run, `settings()` the parameters of the figures.
+export function reportMenu(id, key, title, settings) {
   const menu = el("select", { id, class: "small", "aria-label": "Report of the run", title: "Stand figures, map, plots and list of trees on a page for the file", onchange: async () => {
     const choice = menu.value;
     menu.value = "";
     menu.disabled = true;
-    await saveReport(key, choice, settings?.());
+    await saveReport(key, title(), choice, settings?.());
     menu.disabled = false;
   } }, el("option", { value: "", text: "Report", selected: true }), ...reportOptions());
   return menu;

@@ -108,6 +108,28 @@ function build() {
   byId("coordinates").addEventListener("toggle", news);
 }
 
+// Known minus transformed position of each point as [east, north] of the best rigid motion of all points [m]; [] for fewer than
+// two points, or while a place or a coordinate is missing. The server fits in the same way (`fit_rigid_pairs`).
+function residualsOf(list) {
+  const pairs = list.map((point) => {
+    const place = point.tree === null ? point : treeOf(point.tree);
+    return [place?.x, place?.y, point.east, point.north].map((value) => number(value ?? "") ?? NaN);
+  });
+  if (pairs.length < 2 || pairs.flat().some(Number.isNaN)) return [];
+  const means = [0, 1, 2, 3].map((k) => pairs.reduce((sum, pair) => sum + pair[k], 0) / pairs.length);
+  const centred = pairs.map((pair) => pair.map((value, k) => value - means[k]));
+  const turn = Math.atan2(centred.reduce((sum, [x, y, e, n]) => sum + x * n - y * e, 0), centred.reduce((sum, [x, y, e, n]) => sum + x * e + y * n, 0));
+  const [c, s] = [Math.cos(turn), Math.sin(turn)];
+  return centred.map(([x, y, e, n]) => [e - (c * x - s * y), n - (s * x + c * y)]);
+}
+
+const residualText = (residual) => (residual ? residual.map((value) => (100 * value).toFixed(1)).join(", ") : NONE);
+
+function fillResiduals() {
+  const found = dirty ? residualsOf(points) : (stored()?.frame.residuals_m ?? []).map((row) => row.slice(1));
+  document.querySelectorAll("#control-points .residual").forEach((each, row) => setText(each, residualText(found[row])));
+}
+
 function cell(point, row, name, title) {
   if (point.tree !== null && PLACE.includes(name)) return el("td", { text: fixed(treeOf(point.tree)?.[name], 2) });
   const value = PLACE.includes(name) ? number(point[name])?.toFixed(3) : point[name];
@@ -116,18 +138,19 @@ function cell(point, row, name, title) {
     oninput: (event) => {
       point[name] = event.target.value;
       dirty = true;
-      for (const each of document.querySelectorAll("#control-points .residual")) setText(each, NONE);
+      fillResiduals();
       news();
     } }));
 }
 
 function fillTable() {
-  const table = byId("control-points"), residuals = dirty ? [] : stored()?.frame.residuals_m ?? [];
-  table.tHead.replaceChildren(el("tr", {}, ...COLUMNS.map(([, text, title]) => el("th", { scope: "col", text, title })), el("th", { scope: "col", text: "residual E, N cm", title: "Known position minus that of the map: east, north" }), el("td")));
+  const table = byId("control-points");
+  table.tHead.replaceChildren(el("tr", {}, ...COLUMNS.map(([, text, title]) => el("th", { scope: "col", text, title })), el("th", { scope: "col", text: "residual E, N cm", title: "Known position minus that of the map by the best fit of all points: east, north" }), el("td")));
   table.tBodies[0].replaceChildren(...points.map((point, row) => el("tr", {}, ...COLUMNS.map(([name, , title]) => cell(point, row, name, title)),
-    el("td", { class: "residual", text: row in residuals ? residuals[row].slice(1).map((value) => (100 * value).toFixed(1)).join(", ") : NONE }),
+    el("td", { class: "residual" }),
     el("td", {}, el("button", { type: "button", class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete point ${row + 1}`, onclick: () => { points.splice(row, 1); changed(); } })))));
   table.hidden = !points.length;
+  fillResiduals();
 }
 
 function reset() {

@@ -1,24 +1,28 @@
 // The tab Plots: draw, type, import and list plots, with the stand figures of each plot and of all.
 
-import { draft, redo, remove, undo } from "../annotate/annotations.js";
+import { draft, redo, remove, reviewOf, STATES, undo } from "../annotate/annotations.js";
 import { get } from "../core/api.js";
 import { button, byId, el, recall, remember, setText } from "../core/dom.js";
-import { figure, NONE, percent } from "../core/format.js";
+import { count, figure, NONE, percent } from "../core/format.js";
 import { looksOnly } from "../core/permissions.js";
 import { reportMenu } from "../core/report.js";
-import { on, state } from "../core/store.js";
+import { on, state, trees } from "../core/store.js";
 import { keepFresh } from "../core/timing.js";
+import { titleOf } from "../open/run_title.js";
 import { startCoordinates } from "./coordinates.js";
 import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plots, plotting, SHAPES, sketch, stopDrawing } from "./plots.js";
 
 const EVERY = 3000; // [ms] between two requests while the run plays
 const LARGEST_FILES = 700_000; // [bytes]
-const FIELDS = { circle: [["radius", "radius m"]], rectangle: [["length", "length m"], ["width", "width m"], ["turn_deg", "turn °"]] };
+// name, label, value and bounds of the numbers of a shape; those of the server
+const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],
+  rectangle: [["length", "length m", 10, 0.01, 2000], ["width", "width m", 10, 0.01, 2000], ["turn_deg", "turn °", 0, -360, 360]] };
 const HEADS = [["plot", ""], ["m²", "Area"], ["seen", "Observed part of the area"], ["trees", "Trees of at least the minimum diameter in the observed part"],
-  ["N/ha", "Stems per hectare"], ["G m²/ha", "Basal area per hectare"], ["Dq cm", "Quadratic mean diameter"]];
+  ["N/ha", "Stems per hectare"], ["G m²/ha", "Basal area per hectare"], ["Dq cm", "Quadratic mean diameter"], ["D cm", "Arithmetic mean diameter"]];
 const VOLUME = ["V m³/ha", "Stem volume per hectare"];
 let figures = { all: null, plots: null, problem: "" };
 let shown = ""; // what the figures are of
+let run = null; // run of the fields and the table
 
 // --- the settings of the figures, which this browser remembers ------------------------------------------------------
 
@@ -40,14 +44,14 @@ const refresh = keepFresh(async () => {
 
 // --- the controls ---------------------------------------------------------------------------------------------------
 
-const number = (name, value, title) => el("input", { type: "number", name, value, step: "any", required: true, "aria-label": title, title });
+const number = (name, value, title, min = null, max = null) => el("input", { type: "number", name, value, min, max, step: "any", required: true, "aria-label": title, title });
 const numberOf = (form, name) => Number(form.elements[name].value);
 
 function typed() {
   const kind = el("select", { name: "kind", "aria-label": "Shape", onchange: () => fields.replaceChildren(...made(kind.value)) }, ...Object.keys(FIELDS).map((each) => el("option", { value: each, text: each })));
-  const made = (each) => FIELDS[each].map(([name, title]) => el("label", {}, title, number(name, name === "turn_deg" ? 0 : each === "circle" ? 5.64 : 10, title)));
+  const made = (each) => FIELDS[each].map(([name, title, ...values]) => el("label", {}, title, number(name, values[0], title, ...values.slice(1))));
   const fields = el("span", { class: "plot-fields" }, ...made("circle"));
-  return el("form", { class: "plot-form", onsubmit: (event) => {
+  return el("form", { class: "plot-form", onreset: () => fields.replaceChildren(...made("circle")), onsubmit: (event) => {
     event.preventDefault();
     const form = event.target;
     const names = ["x", "y", ...FIELDS[kind.value].map(([name]) => name)];
@@ -59,7 +63,7 @@ function typed() {
 const alongPath = () => el("form", { class: "plot-form", onsubmit: (event) => {
   event.preventDefault();
   addAlong(numberOf(event.target, "every"), numberOf(event.target, "radius"));
-} }, el("label", {}, "every", number("every", 20, "Distance along the path, m"), "m"), el("label", {}, "radius", number("radius", 5.64, "Radius of the circles, m"), "m"), el("button", { class: "small", text: "Add circles" }));
+} }, el("label", {}, "every", number("every", 20, "Distance along the path, m", 0.01, 10_000), "m"), el("label", {}, "radius", number("radius", 5.64, "Radius of the circles, m", 0.01, 500), "m"), el("button", { class: "small", text: "Add circles" }));
 
 async function base64(file) {
   const bytes = new Uint8Array(await file.arrayBuffer());
@@ -67,7 +71,7 @@ async function base64(file) {
 }
 
 function imported() {
-  const crs = el("input", { type: "text", "aria-label": "Coordinates of a file that does not state them", placeholder: "of the file", title: "Coordinates of a file that does not state them: EPSG:25832, or local for those of the map", autocomplete: "off" });
+  const crs = el("input", { id: "plot-crs", type: "text", "aria-label": "Coordinates of a file that does not state them", placeholder: "of the file", title: "Coordinates of a file that does not state them: EPSG:25832, or local for those of the map", autocomplete: "off" });
   const file = el("input", { id: "plot-file", type: "file", multiple: true, accept: ".gpkg,.geojson,.json,.zip,.shp,.dbf,.shx,.prj,.cpg", hidden: true, "aria-label": "File of plots", onchange: async () => {
     const files = [...file.files];
     if (files.reduce((sum, { size }) => sum + size, 0) > LARGEST_FILES) {
@@ -92,11 +96,13 @@ function build() {
       el("details", { class: "plot-more" }, el("summary", { text: "Type a plot, place plots along the path, or import a file" }), typed(), alongPath(), imported()),
       el("details", { id: "coordinates", class: "plot-more" })),
     el("p", { id: "plots-hint", class: "note dim", role: "status" }), el("p", { id: "plots-error", class: "error", role: "alert", hidden: true }),
+    el("p", { id: "plots-review", class: "note dim" }),
     el("div", { class: "plots-list" }, el("table", { id: "plots-table", class: "plain" }, el("thead"), el("tbody"))),
+    el("p", { id: "plots-detection", class: "note dim" }),
     el("ul", { id: "plots-warnings", class: "plots-warnings", "aria-label": "Warnings about the figures" }),
     el("div", { class: "plot-form" }, setting("dbh-min", "trees from DBH", threshold(), "Minimum diameter, cm", "number"), "cm",
       setting("volume", "volume m³ =", formula(), "Volume of a stem in m³ as a formula of dbh_cm and height_m, with + - * / ^ ( ) exp log sqrt; empty: no volume", "text", "0.00007 * dbh_cm^1.8 * height_m^0.95")),
-    el("div", { class: "plot-form" }, reportMenu("plots-report", "open", settings), el("span", { text: "with map, plots, figures and list of trees" })));
+    el("div", { class: "plot-form" }, reportMenu("plots-report", "open", () => titleOf(state.status?.source), settings), el("span", { text: "with map, plots, figures and list of trees" })));
 }
 
 // --- the table --------------------------------------------------------------------------------------------------------
@@ -106,7 +112,7 @@ function estimate([value, se] = [null, null], digits = 3) {
 }
 
 function cells(of, withVolume) {
-  const names = ["n_ha", "g_ha", "dg_cm", ...(withVolume ? ["v_ha"] : [])];
+  const names = ["n_ha", "g_ha", "dg_cm", "mean_dbh_cm", ...(withVolume ? ["v_ha"] : [])];
   const about = of.area_m2 === undefined ? ["", "", ""] : [figure(of.area_m2), percent(of.seen_m2 / of.area_m2), String(of.trees)];
   return [...about.map((text) => el("td", { text })), ...names.map((name) => estimate(of[name]))];
 }
@@ -124,10 +130,10 @@ function line(plot, of, withVolume) {
   return el("tr", { "data-plot": plot.id }, el("th", { scope: "row" }, name, radiusOf(plot)), ...cells(of ?? {}, withVolume), el("td", {}, gone));
 }
 
-function fillTable() {
+function fillTable(another) {
   const table = byId("plots-table");
   const typing = table.contains(document.activeElement) && document.activeElement.matches("input") ? document.activeElement : null;
-  if (typing && ![...plots().map(({ name }) => name), ...plots().map(({ shape }) => String(shape.radius))].includes(typing.value)) return; // a person types
+  if (typing && !another && ![...plots().map(({ name }) => name), ...plots().map(({ shape }) => String(shape.radius))].includes(typing.value)) return; // a person types
   const edited = typing?.closest("tr").dataset.plot;
   const found = figures.plots, withVolume = Boolean(formula());
   const heads = [...HEADS, ...(withVolume ? [VOLUME] : [])];
@@ -153,8 +159,46 @@ function hint() {
   return `Trees of the map at the shown time.${trees} ± is the standard error: 0 where all of a plot was observed; of the mean, by the variation between plots.`;
 }
 
+const NO_ERROR = " ± 0 of N/ha: all of the area was observed, no diameter is near the minimum, and every tree in view counts as found; trees that were missed are not in it.";
+
+// Which of the figures with and without correction to use, as `stemmap stand` prints it, and what an error of 0 means.
+function detectionText() {
+  const { all, plots: own } = figures;
+  const shownPlots = [all, own].flatMap((each) => Object.values(each?.plots ?? {}));
+  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: stems }) => stems[1] === 0) ? NO_ERROR : "");
+}
+
+function correctionText({ detection_sigma_m: sigma, plots: of, mean }) {
+  if (!of) return "";
+  if (sigma === null) return "Detection does not decrease with distance within reach: the figures need no correction.";
+  const { n_ha_corrected: stems, g_ha_corrected: basal } = mean;
+  const words = ([value, se], unit) => `${figure(value)}${se === null ? "" : ` ± ${figure(se, 2)}`} ${unit}`;
+  return `Detection decreases with distance (half-normal, sigma ${figure(sigma)} m). The figures above have no correction: use them; the corrected ones (${words(stems, "stems/ha")}, ${words(basal, "m²/ha")}) `
+    + "only where trees far from the path were missed, because they are too large where the stand is thinner there.";
+}
+
+// How many found trees a person has reviewed; rejected ones do not count in the figures.
+function reviewText() {
+  const of = Object.fromEntries(STATES.map((name) => [name, 0]));
+  for (const tree of trees()) of[reviewOf(tree)] += 1;
+  const all = trees().length;
+  return all ? `Review: ${all - of.open} of ${count(all, "found tree")} reviewed${all === of.open ? "" : ` (${STATES.slice(1).map((name) => `${of[name]} ${name}`).join(", ")})`}.` : "";
+}
+
+// Returns whether another run is open, which begins with empty fields.
+function resetFields() {
+  const now = state.annotations?.run;
+  if (!now || now === run) return false;
+  if (run) draft.error = "";
+  run = now;
+  for (const form of document.querySelectorAll("#plots-edit form")) form.reset();
+  byId("plot-crs").value = "";
+  return true;
+}
+
 function fill() {
   if (!plotting()) return;
+  const another = resetFields();
   for (const kind of Object.keys(SHAPES)) byId(`plot-${kind}`).setAttribute("aria-pressed", String(sketch.kind === kind));
   byId("plot-undo").disabled = !draft.undo;
   byId("plot-redo").disabled = !draft.redo;
@@ -164,7 +208,9 @@ function fill() {
   setText(byId("plots-error"), problem && problem.charAt(0).toUpperCase() + problem.slice(1));
   const { warnings = [] } = figures.plots ?? figures.all ?? {};
   byId("plots-warnings").replaceChildren(...warnings.map((text) => el("li", { text })));
-  fillTable();
+  setText(byId("plots-detection"), detectionText());
+  setText(byId("plots-review"), reviewText());
+  fillTable(another);
 }
 
 // Returns whether the key belonged to the tab.

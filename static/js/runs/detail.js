@@ -2,7 +2,7 @@
 
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { saveCanvas, saveCsv } from "../core/download.js";
+import { fileName, saveCanvas, saveCsv } from "../core/download.js";
 import { clock, count, fixed, NONE } from "../core/format.js";
 import { reportMenu } from "../core/report.js";
 import { treeAt } from "../map/draw.js";
@@ -86,12 +86,12 @@ function figures(run) {
 }
 
 function more(run, map) {
-  const file = shortSource(run.name).replace(/[^\w.-]+/g, "_") || "run";
+  const title = shortSource(run.name);
   return el("div", { class: "run-more" },
     el("div", { class: "row" },
-      el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(`${file}.png`, map.canvas) }),
-      reportMenu("run-report", run.key),
-      el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(`${file}_trees.csv`, treeRows(run.map.trees)) })),
+      el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(fileName(title, "map.png"), map.canvas) }),
+      reportMenu("run-report", run.key, () => title),
+      el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(fileName(title, "trees.csv"), treeRows(run.map.trees)) })),
     ...(run.scores ? [el("div", {}, el("h3", { text: "Against the ground truth" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
     el("div", {}, el("h3", { text: "Differences from the preset" }), Object.keys(run.differences).length
       ? table(["parameter", "value"], Object.entries(run.differences).map(([name, value]) => [name, String(value)]))

@@ -72,7 +72,7 @@ export const ACTIONS = [
   ["Share: link to this moment, view-only link", "", "", click("share-button")],
   ["Save the map as a picture (PNG)", "", "", click("map-png"), null, "screenshot image export"], ["Save the map as a table (CSV)", "", "", click("map-csv")],
   ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
-  ["Download the trees as CSV", "", "", () => location.assign("/api/trees.csv"), null, "export table spreadsheet"],
+  ["Download the trees as CSV", "", "", () => byId("trees-csv").click(), null, "export table spreadsheet"],
   ["Export the map: GeoPackage, Shapefile, DXF, XLSX …", "", "", () => { toTab("trees")(); byId("trees-export").focus(); }, null, "save download gis qgis cad excel geojson"],
   ["Report of the run as HTML or PDF: figures, map, plots, trees", "", "", () => { toTab("plots")(); byId("plots-report").focus(); }, null, "print page bericht stand inventory"],
   ["Download the path as CSV", "", "", () => location.assign("/api/path.csv")],

@@ -2,7 +2,7 @@
 
 import { reviewOf } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
-import { saveCanvas } from "../core/download.js";
+import { fileName, saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
 import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
 import { select } from "../core/live_feed.js";
@@ -13,6 +13,7 @@ import { changed, isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { colour } from "../core/theme.js";
 import { openStory } from "../explain/story.js";
+import { titleOf } from "../open/run_title.js";
 import { settings } from "../plots/panel.js";
 import { openTab, visible } from "../shell/tabs.js";
 import { filterOf, HELP, sigma } from "./filter.js";
@@ -144,9 +145,10 @@ function offerCsv(any) {
 
 // The server writes the file, so that it is the same as that of `stemmap export`. A Shapefile comes as a zip archive.
 function exportAs(format) {
-  if (isReport(format)) return saveReport("open", format, settings());
-  const name = { shp: "trees_shp.zip", laz: "cloud.laz" }[format] ?? `trees.${format}`;
-  return saveWritten("Writing the file …", name, `/api/export/${format}?${settings()}`);
+  const title = titleOf(state.status?.source);
+  if (isReport(format)) return saveReport("open", title, format, settings());
+  const name = { shp: "trees_shp.zip", laz: "cloud.laz", tif: "terrain.tif" }[format] ?? `trees.${format}`;
+  return saveWritten("Writing the file …", fileName(title, name), `/api/export/${format}?${settings()}`);
 }
 
 function emptyText(all, wanted, refused) {
@@ -172,7 +174,11 @@ export function startTable() {
   const menu = byId("trees-export");
   menu.append(...reportOptions());
   menu.addEventListener("change", () => { exportAs(menu.value); menu.value = ""; });
-  byId("trees-png").addEventListener("click", () => saveCanvas("trees.png", pictureOf(byId("trees"))));
+  byId("trees-png").addEventListener("click", () => saveCanvas(fileName(titleOf(state.status?.source), "trees.png"), pictureOf(byId("trees"))));
+  csv.addEventListener("click", (event) => {
+    event.preventDefault();
+    if (csv.hasAttribute("href")) saveWritten("Writing the table …", fileName(titleOf(state.status?.source), "trees.csv"), "/api/trees.csv");
+  });
   on("map truth annotations phase", throttled(fill, EVERY));
   on("tab", fill);
   on("selection", () => {

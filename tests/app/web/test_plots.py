@@ -98,7 +98,10 @@ async def test_a_plot_is_added_renamed_deleted_and_all_of_it_undone(both) -> Non
 @pytest.mark.parametrize(
     ("shape", "words"),
     [
-        ({"kind": "circle", "x": 0.0, "y": 0.0, "radius": 0.0}, "radius"),
+        (
+            {"kind": "circle", "x": 0.0, "y": 0.0, "radius": 0.0},
+            '"what":"radius is 0.0, but must be above 0","where":"plot 1","remedy":"Correct this value"',
+        ),
         ({"kind": "circle", "x": 0.0, "y": 0.0}, "radius"),
         ({"kind": "rectangle", "x": 0.0, "y": 0.0, "length": 1.0, "width": -1.0}, "width"),
         ({"kind": "rectangle", "x": 0.0, "y": 0.0, "length": 2000.0, "width": 2000.0}, "more than 100 ha"),
