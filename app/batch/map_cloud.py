@@ -19,7 +19,7 @@ import numpy as np
 from app.batch.georeference import WGS84, reproject
 from app.batch.map_run import MappingResult
 from app.batch.run_folder import NO_PATH, as_written, score_map
-from app.batch.summary import evaluation_lines
+from app.batch.summary import FAR_FROM_PLOT, evaluation_lines
 from app.common.text import changed_values, count, preset_words, version
 from app.store.forests import kept_forests
 from pipeline.config import Parameters
@@ -89,7 +89,7 @@ def _map(
         evaluation = score_map(*as_written(trees, NO_PATH, 0), truth, parameters)
     losses = {reason: n for reason, n in cloud.losses.items() if n}
     if plot.counts["apart from the plot"]:
-        losses["points far from the plot"] = plot.counts["apart from the plot"]
+        losses[FAR_FROM_PLOT] = plot.counts["apart from the plot"]
     warnings = list(plot.warnings)
     lon_lat = _lon_lat(trees.position, about.crs, warnings)
     frame = {"type": "the cloud's own", "unit": "m", "crs": about.crs} if about.crs else _OWN_FRAME

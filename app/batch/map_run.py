@@ -21,7 +21,14 @@ from app.batch.continue_map import (
     continue_map,
 )
 from app.batch.run_folder import as_written, read_seen_area, recorded_time, score_map
-from app.batch.summary import breaks_of, driven, far_truth, start_lines, summary_lines
+from app.batch.summary import (
+    breaks_of,
+    driven,
+    far_truth,
+    start_lines,
+    summary_lines,
+    unconfirmed_warning,
+)
 from app.batch.tree_pictures import FOLDER as PICTURES
 from app.batch.tree_pictures import keep_pictures
 from app.common.text import changed_values, count, preset_words, version
@@ -171,8 +178,8 @@ def _map(
     state = _saved(plan, begun, mapper, start_ns, losses).as_bytes()
     if evaluation is not None and evaluation.TA.of + evaluation.TR.of == 0:
         tally.warned[far_truth(evaluation.reach)] += 1
-    if plan.parameters.classification.method == "none":  # else a track is classified by more than its hits
-        tally.warn_of_unconfirmed(frame, plan.parameters.tracking.hits_to_confirm)
+    if unconfirmed := unconfirmed_warning(frame, plan.parameters):
+        tally.warned[unconfirmed] += 1
     seconds, metres = driven(path, breaks_of(begun.sources))
     record = _run_record(plan, begun, frame, (seconds, metres), start_ns, evaluation, error, losses)
     record["odometry_used"] = chosen.words

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from app.common.text import count
+from pipeline.config import Parameters
 from pipeline.evaluation import MapScores, PathError, Rate
 from pipeline.types.records import Frame, Health, HealthState, Path, Verdict
 
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from app.batch.continue_map import RunSource
 
 
+#: Reason of points of a cloud that are left out.
+FAR_FROM_PLOT = "points far from the plot"
 MOST_SPANS = 200  # written; the rest is counted
 
 
@@ -194,24 +197,32 @@ class RunTotals:
         self.verdicts.update(Verdict(int(v)).label for v in frame.clusters.verdict)
         self.warned.update(frame.warnings)
 
-    def warn_of_unconfirmed(self, frame: Frame, hits: int) -> None:
-        """Add a warning with the number of trees that are not confirmed at the end, if there are any.
-
-        Args:
-            frame: Results of the last scan.
-            hits: Number of scans that confirms a tree.
-        """
-        tentative = int(np.count_nonzero(~frame.trees.confirmed))
-        if tentative:
-            them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
-            self.warned[
-                f"{them} seen fewer than {hits} times and left out of the map; "
-                "--set tracking.hits_to_confirm=1 includes them"
-            ] += 1
-
     def warnings(self) -> list[str]:
         """Return each warning once, with its number."""
-        return [text if n == 1 else f"{text} ({n:,} times)" for text, n in self.warned.items()]
+        return warning_texts(self.warned)
+
+
+def warning_texts(warned: Mapping[str, int]) -> list[str]:
+    """Return each warning once, with the number of times that it was given if that is not 1."""
+    return [text if n == 1 else f"{text} ({n:,} times)" for text, n in warned.items()]
+
+
+def unconfirmed_warning(frame: Frame, parameters: Parameters) -> str:
+    """Return a warning with the number of trees that are not confirmed; "" if there are none, or if a
+    classifier confirms trees by more than their number of scans.
+
+    Args:
+        frame: Results of the last scan.
+        parameters: Parameters of the mapping.
+    """
+    tentative = int(np.count_nonzero(~frame.trees.confirmed))
+    if parameters.classification.method != "none" or not tentative:
+        return ""
+    them = "1 tree was" if tentative == 1 else f"{tentative} trees were"
+    return (
+        f"{them} seen fewer than {parameters.tracking.hits_to_confirm} times and left out of the map; "
+        "--set tracking.hits_to_confirm=1 includes them"
+    )
 
 
 def far_truth(reach: float) -> str:

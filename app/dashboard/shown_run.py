@@ -16,6 +16,7 @@ from app.batch.georeference import write_map_frame
 from app.batch.plot_files import placed
 from app.batch.reviews import reviews_of
 from app.batch.run_folder import as_written, recorded_time, score_map
+from app.batch.summary import far_truth, unconfirmed_warning
 from app.common.text import changed_values, version
 from app.dashboard.selection import NothingMappedError
 from app.sources.request import SourceRequest
@@ -154,7 +155,7 @@ class ShownRun:
         return covered_area(self.shown.frame.filtered[:, :2] + origin)
 
     def _record(self) -> dict[str, Any]:
-        """Return the contents of run.json, without what only `stemmap map` counts, and with `rejected`, the
+        """Return the contents of run.json, without what only `stemmap map` knows, and with `rejected`, the
         number of rejected trees, which `trees` does not count. Reviews do not change the scores, which are
         those of the map."""
         status, truth = self.status, self.truth
@@ -183,7 +184,31 @@ class ShownRun:
             "trees": int(np.count_nonzero(trees.confirmed)) - rejected,
             "rejected": rejected,
             "evaluation": scores,
-            "warnings": list(status.warnings),
+            **self._counts(scores),
+        }
+
+    def _counts(self, scores: dict[str, Any] | None) -> dict[str, Any]:
+        """Return `health`, `verdicts`, `losses` and `warnings` of run.json, as `stemmap map` writes them;
+        only the warnings of the status if the counts are unknown.
+
+        Args:
+            scores: Scores of the map; None without ground truth.
+        """
+        counts = self.shown.counts
+        if counts is None:
+            return {"warnings": list(self.status.warnings)}
+        warnings = list(counts.warnings)
+        if self.cloud is None:
+            if scores is not None and scores["TA"]["of"] + scores["TR"]["of"] == 0:
+                warnings.append(far_truth(scores["reach"]))
+            if unconfirmed := unconfirmed_warning(self.shown.frame, self.parameters):
+                warnings.append(unconfirmed)
+        worst = {} if counts.sigma_xy_m is None else {"sigma_xy_m": counts.sigma_xy_m}
+        return {
+            **({"health": {"scans": counts.health, "worst": worst}} if counts.health else {}),
+            "verdicts": counts.verdicts,
+            "losses": counts.losses,
+            "warnings": warnings,
         }
 
 

@@ -6,14 +6,17 @@ begin another inventory; until it is complete, the map of the one before is show
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from app.batch.run_folder import NO_PATH
+from app.batch.summary import FAR_FROM_PLOT
 from app.common.timers import Stopwatch
 from app.store.forests import kept_forests
+from app.worker.protocol import RunCounts
 from app.worker.tree_numbers import TreeNumbers
 from pipeline.classification.column_extraction import BREAST
 from pipeline.config import Parameters
@@ -122,6 +125,17 @@ class InventoryRun:
     def share(self) -> float | None:
         """Share of the present inventory that is done, from 0 to 1; None if none is computed."""
         return None if self._job is None else self._share
+
+    def counts(self, index: int) -> RunCounts:
+        """Return the counts of the present map; empty before it is complete."""
+        del index
+        frame, plot = self.frame, self.plot
+        if frame is None or plot is None:
+            return RunCounts()
+        far = {FAR_FROM_PLOT: plot.counts["apart from the plot"]}
+        verdicts = Counter(Verdict(int(v)).label for v in plot.verdict)
+        losses = {reason: n for reason, n in {**self.source.losses, **far}.items() if n}
+        return RunCounts(verdicts=dict(sorted(verdicts.items())), losses=losses, warnings=list(plot.warnings))
 
     def kept(self, index: int) -> None:
         """Return None: the only scan is the current one."""

@@ -364,7 +364,9 @@ class WorkerLoop:
         """Queue the frame of the session with the path and the confirmation times; nothing for None."""
         session, path = self._session, self._session.path
         if frame is not None and path is not None:
-            self._put(protocol.Shown(self._run, session.time_s, frame, 0, path, session.confirmed_s))
+            self._put(
+                protocol.Shown(self._run, session.time_s, frame, 0, path, session.confirmed_s, session.counts)
+            )
 
     def _report(self) -> None:
         """Queue the views that were not sent yet, and the present status with speed, rate and scans behind.

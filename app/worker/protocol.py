@@ -207,6 +207,24 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
     requested: str = ""
 
 
+class RunCounts(msgspec.Struct, frozen=True):
+    """Counts of a run up to a scan, or of a whole cloud, as in run.json.
+
+    Attributes:
+        health: Number of scans by the state of the pose quality; empty for a whole cloud.
+        sigma_xy_m: Largest standard deviation of the position [m]; None if unknown.
+        verdicts: Number of clusters by verdict.
+        losses: Number of messages or points that were left out, by reason.
+        warnings: Each warning once, with its number.
+    """
+
+    health: dict[str, int] = field(default_factory=dict)
+    sigma_xy_m: float | None = None
+    verdicts: dict[str, int] = field(default_factory=dict)
+    losses: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
 class Shown(msgspec.Struct, frozen=True, tag="shown"):
     """Displayed frame of a scan.
 
@@ -220,6 +238,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         path: Rows of the path from there on.
         confirmed_s: Confirmation time of each tree [s], NaN if unknown; None if all are unknown. Since not
             every scan is displayed, it does not follow from the frames.
+        counts: Counts up to this scan; None if they are unknown.
     """
 
     run: int
@@ -228,6 +247,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     path_start: int
     path: Path
     confirmed_s: Float | None = None
+    counts: RunCounts | None = None
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):

@@ -5,21 +5,23 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
 import numpy as np
 
+from app.batch.summary import warning_texts
 from app.explain.history import TreeHistory
 from app.worker.frame_store import FrameStore
-from app.worker.protocol import LENGTH_BYTES, MapChanges, MessageCodec, TreeChange, WireError
+from app.worker.protocol import LENGTH_BYTES, MapChanges, MessageCodec, RunCounts, TreeChange, WireError
 from app.worker.tree_numbers import SAME
 from pipeline.config import Parameters
 from pipeline.evaluation import match
 from pipeline.front_end import SegmentedScan
+from pipeline.geometry.columns import GrowingColumns
 from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
 from pipeline.remapping import ClusterTable, Rerun
@@ -28,6 +30,52 @@ from pipeline.types.records import Columns, Float, Frame, Step, Trees, Verdict
 
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
 NS = 1_000_000_000
+_STATES = ("good", "weak", "lost")
+
+
+class ScanCounts:
+    """Verdicts, pose quality and warnings of the scans of a map, so that their totals up to each scan are
+    known, also after the run went back."""
+
+    def __init__(self) -> None:
+        self._rows = GrowingColumns(
+            np.zeros((0, len(Verdict)), np.int32), np.zeros((0, len(_STATES)), np.int32), np.zeros(0)
+        )
+        self._warnings: dict[int, tuple[str, ...]] = {}
+
+    def record(self, frame: Frame) -> None:
+        """Store the counts of a scan, in place of earlier ones. A scan beyond the next one is ignored."""
+        known = len(self._rows)
+        if frame.index > known:
+            return
+        verdicts = np.bincount(frame.clusters.verdict, minlength=len(Verdict))
+        state = np.array([frame.health.state == name for name in _STATES])
+        self._rows.write(frame.index, verdicts[None], state[None], np.array([frame.health.sigma_xy]))
+        self._rows.return_to(max(known, frame.index + 1))
+        self._warnings[frame.index] = tuple(frame.warnings)
+
+    def totals(self, index: int, warnings: Sequence[str], losses: Mapping[str, int]) -> RunCounts:
+        """Return the totals up to a scan.
+
+        Args:
+            index: Index of the scan.
+            warnings: Warnings about the source, which come first.
+            losses: Number of left-out messages by reason.
+        """
+        verdicts, states, sigma = (self._rows.column(k)[: index + 1] for k in range(3))
+        warned = Counter(warnings)
+        for scan in sorted(self._warnings):
+            if scan <= index:
+                warned.update(self._warnings[scan])
+        known = sigma[np.isfinite(sigma)]
+        counted = zip(Verdict, verdicts.sum(axis=0).tolist(), strict=True)
+        return RunCounts(
+            dict(zip(_STATES, states.sum(axis=0).tolist(), strict=True)),
+            round(float(known.max()), 4) if len(known) else None,
+            dict(sorted((verdict.label, n) for verdict, n in counted if n)),
+            {reason: n for reason, n in losses.items() if n},
+            warning_texts(warned),
+        )
 
 
 class RunMap:
@@ -47,6 +95,7 @@ class RunMap:
         history: Estimate of each tree over time.
         confirmed_s: Time at which each tree was first confirmed, by its number [s since the first scan].
         clusters: Clusters of all scans.
+        counts: Counts of all scans.
     """
 
     def __init__(
@@ -62,7 +111,7 @@ class RunMap:
         self.parameters = ParameterHistory(parameters)
         self.before = mapper.snapshot()
         self.snapshots = Snapshots(self.before, 0 if is_live else _MOST_STATES)
-        self.history, self.clusters = TreeHistory(), ClusterTable()
+        self.history, self.clusters, self.counts = TreeHistory(), ClusterTable(), ScanCounts()
         self.confirmed_s: dict[int, float] = {}
         self._start_ns, self._time_s = start_ns, -math.inf
 
@@ -72,6 +121,7 @@ class RunMap:
         start_ns = self._start_ns()
         self.history.record(frame, start_ns)
         self.clusters.record(frame)
+        self.counts.record(frame)
         time_s = (frame.stamp_ns - start_ns) / NS
         if time_s <= self._time_s:
             self.confirmed_s = {number: at for number, at in self.confirmed_s.items() if at < time_s}

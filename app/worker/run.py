@@ -6,7 +6,8 @@ mapped. It does not depend on pauses, jumps, or which states of the mapper are k
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from app.robot.source import LiveSource
 from app.sources.request import with_odometry
 from app.worker.cursor import Cursor, live_steps
 from app.worker.frame_store import StepStore
-from app.worker.protocol import Shown
+from app.worker.protocol import RunCounts, Shown
 from app.worker.remap import (
     NOT_OF_THE_MAP,
     Remapping,
@@ -55,6 +56,8 @@ class Run:
         is_live: Whether the source is a robot: its scans cannot be read again, and their frames are not
             stored.
         caches: Caches of the segmented scans of this source.
+        warnings: Warnings about the source.
+        left_out: Number of records that the cursor left out, by reason; it grows while the source is read.
 
     Attributes:
         frame: Result of the current scan; None before the first.
@@ -75,8 +78,11 @@ class Run:
         caches: ScanCaches,
         *,
         is_live: bool,
+        warnings: tuple[str, ...] = (),
+        left_out: Mapping[str, int] | None = None,
     ) -> None:
         self.source = source
+        self._warnings, self._left_out = warnings, left_out or {}
         self.odometry = odometry
         self.stopwatch = stopwatch
         self.frame: Frame | None = None
@@ -105,6 +111,11 @@ class Run:
         """Return the estimates of a tree up to a scan, see `TreeHistory.of`; empty for an unknown number."""
         in_map = self._numbers.in_map(number)
         return self._map.history.of(-1 if in_map is None else in_map, scan)
+
+    def counts(self, index: int) -> RunCounts:
+        """Return the counts of the map up to a scan that was mapped."""
+        losses = Counter(self._left_out) + Counter(self.source.losses)
+        return self._map.counts.totals(index, self._warnings, losses)
 
     @property
     def start_ns(self) -> int:
@@ -441,12 +452,17 @@ def open_run(
         raise
     stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
     description = source.description
+    left_out = Counter[str]()
     if live is None:
-        cursor = Cursor(
-            lambda: steps(moving.records(None), odometry=chosen.steps), description.uri, StepStore()
-        )
+
+        def read() -> Iterator[Step]:
+            left_out.clear()  # the source is read from its start
+            return steps(moving.records(None), odometry=chosen.steps, losses=left_out)
+
+        cursor = Cursor(read, description.uri, StepStore())
     else:
         cursor = Cursor(lambda: live_steps(live, chosen, moving), description.uri)
+    warnings = (*([chosen.warning] if chosen.warning else []), *description.warnings)
     run = Run(
         moving,
         lambda parameters: make_mapper(moving.description, parameters, seed, stopwatch),
@@ -456,8 +472,10 @@ def open_run(
         chosen.words,
         ScanCaches(),
         is_live=live is not None,
+        warnings=warnings,
+        left_out=left_out,
     )
-    return run, (*description.warnings, *([chosen.warning] if chosen.warning else []))
+    return run, warnings
 
 
 def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Parameters], ...]:

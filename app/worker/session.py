@@ -19,7 +19,17 @@ from app.explain import build as stories
 from app.robot.recorder import Recorder
 from app.robot.source import LiveSource
 from app.worker.inventory_run import CloudSource, InventoryRun
-from app.worker.protocol import LONGEST_S, CameraPicture, CloudFrame, MapChanges, Opened, Shown, State, Status
+from app.worker.protocol import (
+    LONGEST_S,
+    CameraPicture,
+    CloudFrame,
+    MapChanges,
+    Opened,
+    RunCounts,
+    Shown,
+    State,
+    Status,
+)
 from app.worker.remap import MapComparison
 from app.worker.run import MakeMapper, Run, open_run
 from pipeline.config import Parameters
@@ -116,6 +126,12 @@ class Session:
         never were confirmed; None without a frame."""
         shown = self._kept or self._run
         return shown.confirmed_s if shown else None
+
+    @property
+    def counts(self) -> RunCounts | None:
+        """Counts of the run up to the scan of `frame`; None without a frame."""
+        frame = self.frame
+        return None if self._run is None or frame is None else self._run.counts(frame.index)
 
     @property
     def is_shown(self) -> bool:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
 
+from app.batch.report import report_page
 from app.cli import main
+from app.dashboard.shown_run import ShownRun
+from app.sources.request import SourceRequest
 from app.worker.process import new_session
+from app.worker.protocol import Shown
 from app.worker.session import Session
 from pipeline.config import Parameters
+from pipeline.io.atomic_files import write_texts
 from pipeline.io.result_files import seen_text
 from pipeline.stand.seen_area import SeenRecorder
 from pipeline.types.records import Float, Frame, Path
@@ -168,3 +174,37 @@ def test_with_other_parameters_in_force_nothing_of_before_is_shown(session: Sess
     session.set_parameters(Parameters().replace({"clustering.eps": 0.4}), 1)
     assert session.advance(-10) is None  # its scan is mapped with these parameters on arrival
     assert not session.is_shown
+
+
+def test_the_page_and_the_command_line_give_the_same_report(session: Session, tmp_path: FilePath) -> None:
+    out, there = tmp_path / "out", tmp_path / "page"
+    assert main(["map", URI, "--out", str(out), "--seed", "3"]) == 0
+    seen = SeenRecorder()
+    session.advance(10_000)
+    while session.pace == "hurry":
+        session.work()
+        assert session.run is not None
+        for stamp_ns, free in session.run.take_views():
+            seen.add(stamp_ns, free)
+    assert session.run is not None
+    last = session.run.current
+    for index in (20, last):  # the counts are those of the shown scan, also after the run went back
+        stand_at(session, index)
+        assert session.counts is not None
+        assert sum(session.counts.health.values()) == index + 1
+    frame, truth = session.frame, session.run.source.truth()
+    assert frame is not None
+    assert truth is not None
+    assert session.path is not None
+    record = json.loads((out / "run.json").read_text())
+    shown = Shown(1, session.time_s, frame, 0, session.path, None, session.counts)
+    request = SourceRequest(URI, seed=3)
+    start_ns = frame.stamp_ns - round(session.time_s * 1e9)
+    run = ShownRun(
+        request, record["source"]["sha256"], session.status(), shown, session.path, start_ns, "forest",
+        Parameters(), truth.trees, seen, (), None,
+    )  # fmt: skip
+    write_texts(there, run.texts())
+    pages = [report_page(folder, language="de") for folder in (out, there)]
+    assert "Was ausgelassen wurde" in pages[0]
+    assert pages[1] == pages[0]
