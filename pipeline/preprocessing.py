@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.stages import Acquisition, Filters
+from pipeline.geometry.hash_grid import AXIS_CELLS, add_to_voxels
 from pipeline.geometry.poses import Float, Pose3
-from pipeline.geometry.voxel_grid import AXIS_CELLS, add_to_voxels
 from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int32, Step
 

@@ -53,13 +53,13 @@ class Mutant:
 
 _SLAM = "tests/pipeline/slam"
 _LOOP = "tests/pipeline/loop_closure"
-_LANDMARKS, _GRAPH = "pipeline/slam/landmarks.py", "pipeline/slam/keyframe_graph.py"
+_LANDMARKS, _GRAPH = "pipeline/slam/particle_maps.py", "pipeline/slam/keyframe_graph.py"
 _MERGED, _AUTH = "pipeline/io/checkpoints/merged_map.py", "app/web/auth.py"
 _EVALUATION, _LIMITS_TESTS = (
     "tests/pipeline/evaluation/test_evaluation.py",
     "tests/app/common/test_limited_process.py",
 )
-_DETECTION, _SCORE = "pipeline/loop_closure/detection.py", "pipeline/evaluation/score.py"
+_DETECTION, _SCORE = "pipeline/loop_closure/detection.py", "pipeline/evaluation.py"
 _CLOCK, _CHUNKS = "pipeline/io/readers/message_time.py", "pipeline/io/readers/container.py"
 _RULE, _RAYS = "pipeline/classification/column_classifier.py", "pipeline/classification/ray_statistics.py"
 _RULE_TESTS, _RAYS_TESTS = (
@@ -82,13 +82,13 @@ MUTANTS = (
     Mutant(_LANDMARKS, "S0 + R0, S1 + R1, S2 + R2", "R0, R1, R2", _UPDATE),
     Mutant(_LANDMARKS, "0.5 * (k00 * R1", "-0.5 * (k00 * R1", _UPDATE),
     Mutant(
-        "pipeline/slam/loop_correction.py",
+        "pipeline/slam/keyframe_graph.py",
         "rotated_rows(known.covariance, turn)",
         "rotated_rows(known.covariance, -turn)",
         f"{_LOOP}/test_loop_motion.py -k covariance",
     ),
     Mutant(
-        "pipeline/slam/loop_correction.py",
+        "pipeline/slam/keyframe_graph.py",
         "wrap_angle(now[:, 2] - was[:, 2])",
         "wrap_angle(was[:, 2] - now[:, 2])",
         f"{_LOOP}/test_loop_motion.py -k covariance",

@@ -38,8 +38,7 @@ from pipeline.io.result_files import (
     seen_text,
 )
 from pipeline.stand.seen_area import covered_area
-from pipeline.types.clouds import WholeCloud
-from pipeline.types.records import Trees, TruthTrees, Verdict
+from pipeline.types.records import Trees, TruthTrees, Verdict, WholeCloud
 
 SLICE_COLUMNS = (
     "tree",

@@ -18,7 +18,7 @@ from pipeline.geometry.poses import Float, Pose2
 from pipeline.io.readers.clouds import SYSTEM_OF_DRIVE
 
 if TYPE_CHECKING:
-    from pipeline.types.clouds import WholeCloud
+    from pipeline.types.records import WholeCloud
 
 EVERY = 5  # scans of a drive between two that are used
 MARGIN = 0.10  # m around the trunk at breast height, for lean and roughness of the stem
@@ -110,8 +110,7 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     from app.robot.address import is_live
     from app.sources.opening import open_source
     from app.sources.request import request_of_kept, with_odometry
-    from pipeline.ground.scan_ground import find_terrain
-    from pipeline.ground.terrain import height_above
+    from pipeline.ground.scan_ground import find_terrain, height_above
     from pipeline.inventory.cloud import Thinned
     from pipeline.preprocessing import acquire
 

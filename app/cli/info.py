@@ -15,8 +15,7 @@ if TYPE_CHECKING:
 
     from pipeline.io.readers import Source, SourceDescription
     from pipeline.io.readers.base import RecordedTopic
-    from pipeline.types.clouds import CloudDescription
-    from pipeline.types.records import Sensor, Truth
+    from pipeline.types.records import CloudDescription, Sensor, Truth
 
 HELP = "describe a source and show the commands for it"
 

@@ -15,7 +15,7 @@ from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, Inbox, Link, first_line
 from app.robot.topics import NAME, PICTURE_TYPES, SCAN_TYPES, TYPE, Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel
-from pipeline.io.readers.ros_messages import standard_types
+from pipeline.io.readers.topics import standard_types
 
 _STRING = "string"
 

@@ -10,7 +10,7 @@ from app.robot.address import ROOT
 from pipeline.errors import SourceError
 from pipeline.io.readers.camera import shared_parts
 from pipeline.io.readers.container import Channel
-from pipeline.io.readers.ros_messages import (
+from pipeline.io.readers.topics import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMU,
@@ -19,9 +19,9 @@ from pipeline.io.readers.ros_messages import (
     ODOMETRY,
     READ_TYPES,
     TRANSFORMS,
+    TYPES_BY_ROLE,
     VELODYNE_SCAN,
 )
-from pipeline.io.readers.topics import TYPES_BY_ROLE
 
 TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)::msg::dds_::([A-Za-z][A-Za-z0-9_]*)_")
 #: A name of ROS that is also a valid Zenoh key: no empty parts, no wildcards.

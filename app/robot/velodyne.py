@@ -12,7 +12,7 @@ from app.robot.link import Inbox, Link
 from app.robot.topics import Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.ros_messages import VELODYNE_SCAN, standard_types
+from pipeline.io.readers.topics import VELODYNE_SCAN, standard_types
 from pipeline.io.readers.velodyne import GAP_NS, PACKET_BYTES, PRODUCT, Rotation, is_data_packet
 
 #: The fastest sensor (VLS-128, dual return) sends fewer packets in the slowest turn.

@@ -260,7 +260,7 @@ def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> 
     """
     from scipy.spatial import cKDTree
 
-    from pipeline.evaluation.matching import match
+    from pipeline.evaluation import match
 
     true, kind = np.column_stack([truth.x, truth.y]), np.array(truth.kind, np.str_)
     confirmed = np.flatnonzero(trees.confirmed)

@@ -18,7 +18,7 @@ from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
 
 if TYPE_CHECKING:
-    from pipeline.types.clouds import WholeCloud
+    from pipeline.types.records import WholeCloud
 
 
 def check_address(uri: str) -> bool:

@@ -26,8 +26,8 @@ from pipeline.inventory import PARAMETERS, Inventory, PlotMap, finish
 from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.io.block_file import LARGE
 from pipeline.io.readers.base import FileSource, SourceDescription
-from pipeline.types.clouds import CloudDescription, WholeCloud
 from pipeline.types.records import (
+    CloudDescription,
     Clusters,
     Detections,
     Float,
@@ -41,6 +41,7 @@ from pipeline.types.records import (
     Sensor,
     Trees,
     Verdict,
+    WholeCloud,
     no_detections,
 )
 

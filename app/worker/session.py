@@ -37,7 +37,7 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.inventory import PARAMETERS
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 from pipeline.io.readers.camera import SHOWN_NS, PictureSource
-from pipeline.io.readers.ros_messages import COMPRESSED_IMAGE, IMAGE
+from pipeline.io.readers.topics import COMPRESSED_IMAGE, IMAGE
 from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.types.records import Float, Frame, Path, Trees
 

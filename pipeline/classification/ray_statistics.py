@@ -12,7 +12,7 @@ from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.detection.free_space import BEHIND, BINS
 from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.ground.terrain import ground_at
+from pipeline.ground.scan_ground import ground_at
 from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int32, UInt16
 

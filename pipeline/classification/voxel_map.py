@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from pipeline.geometry.voxel_grid import SPREAD
+from pipeline.geometry.hash_grid import SPREAD
 from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int, Int32
 

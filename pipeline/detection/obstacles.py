@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from pipeline.config.stages import Obstacles
-from pipeline.ground.terrain import Terrain, ground_at
+from pipeline.ground.scan_ground import Terrain, ground_at
 from pipeline.jit import compiled
 from pipeline.types.records import Clearance, Float, Float32, Zone
 

@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float, Pose2
-from pipeline.ground.terrain import Terrain, ground_at, ring_at
+from pipeline.ground.scan_ground import Terrain, ground_at, ring_at
 from pipeline.jit import compiled
 from pipeline.types.records import Bool, Float32, HeightMap, Int
 

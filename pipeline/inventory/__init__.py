@@ -25,8 +25,7 @@ from pipeline.inventory.crowns import Crowns, Voxels, find_crowns, voxels_of, wi
 from pipeline.inventory.stem_model import Stems, classify_stems, describe_stems, diameters, is_repeated
 from pipeline.inventory.stem_tracing import find_columns, strongest_first, trace
 from pipeline.inventory.terrain_raster import LowestReturns, TerrainRaster, heights_above
-from pipeline.types.clouds import WholeCloud
-from pipeline.types.records import Float32, Int, Int32, Trees, Verdict
+from pipeline.types.records import Float32, Int, Int32, Trees, Verdict, WholeCloud
 
 MOST_RASTER = 96 << 20  # bytes
 COARSE = 0.04  # m; coarser thinning makes diameters less precise

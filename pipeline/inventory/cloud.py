@@ -11,10 +11,9 @@ from typing import IO
 import numpy as np
 
 from pipeline.errors import SourceError
+from pipeline.geometry.hash_grid import add_to_voxels
 from pipeline.geometry.poses import Float
-from pipeline.geometry.voxel_grid import add_to_voxels
-from pipeline.types.clouds import CloudDescription, WholeCloud
-from pipeline.types.records import Float32, Int
+from pipeline.types.records import CloudDescription, Float32, Int, WholeCloud
 
 
 class SpooledCloud:

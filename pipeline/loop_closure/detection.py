@@ -18,7 +18,7 @@ from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.loop_closure.stem_matching import MapStems, find_constellation, worst_sigma
 from pipeline.slam import Loop
-from pipeline.slam.loop_correction import drift_of, without_jumps
+from pipeline.slam.keyframe_graph import drift_of, without_jumps
 from pipeline.slam.motion import Noise
 from pipeline.types.records import Int, PoseEstimate, Trees
 

@@ -1,8 +1,7 @@
 """Remapping: a run mapped again with other parameters, and the preview of its result."""
 
 from pipeline.remapping.preview import ClusterTable, KnownMap, preview_trees, sample_scans
-from pipeline.remapping.rerun import Reread, Rerun
-from pipeline.remapping.scan_cache import ScanCache, ScanCaches, segmentation_key
+from pipeline.remapping.rerun import Reread, Rerun, ScanCache, ScanCaches, segmentation_key
 
 __all__ = [
     "ClusterTable",

@@ -26,7 +26,7 @@ from pipeline.geometry.columns import GrowingColumns
 from pipeline.geometry.hash_grid import cells_for, nearest_in, per_metre, put_in, take_out
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.remapping.scan_cache import SEGMENTATION_STAGES
+from pipeline.remapping.rerun import SEGMENTATION_STAGES
 from pipeline.tracking.track_classification import REACH, nearest_other, tree_columns
 from pipeline.types.records import Bool, Clusters, Columns, Frame, Int, Path, Trees, Verdict
 

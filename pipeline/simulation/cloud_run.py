@@ -25,8 +25,7 @@ from pipeline.simulation.scenarios import RunRequest
 from pipeline.simulation.scene import SimulatedScene
 from pipeline.simulation.surfels import Surfels, first_surfels, lay_surfels
 from pipeline.simulation.terrain import SimulatedTerrain
-from pipeline.types.clouds import WholeCloud
-from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees
+from pipeline.types.records import Bool, Float, Float32, Int, TruthTrees, WholeCloud
 
 # Raise it with every change that only changes the bytes of runs through clouds.
 VERSION = 4

@@ -1,8 +1,7 @@
 """SLAM: the path of the robot and the landmarks that it was found by (Eq. 5-7)."""
 
 from pipeline.slam.fastslam import FastSlam
-from pipeline.slam.keyframe_graph import KeyframeGraph
-from pipeline.slam.loop_correction import Loop
+from pipeline.slam.keyframe_graph import KeyframeGraph, Loop
 from pipeline.slam.motion import Motion
 from pipeline.slam.particle_ancestry import Genealogy
 from pipeline.slam.state import SlamState

@@ -20,20 +20,32 @@ from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam import slip_detection
 from pipeline.slam.association import births_of, hits_less_misses
 from pipeline.slam.frame_uncertainty import NOISE, FrameUncertainty, at_least
-from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, ScanDetections, Solution, combined
-from pipeline.slam.loop_correction import (
+from pipeline.slam.keyframe_graph import (
+    Keyframe,
+    KeyframeGraph,
     Loop,
+    ScanDetections,
+    Solution,
+    combined,
     corrected_landmarks,
     corrected_path,
     joined,
     same_trees,
 )
 from pipeline.slam.measured_pose import SharedErrors
-from pipeline.slam.measurement_update import against_slip, estimated, use_scan
 from pipeline.slam.motion import Motion, accumulated, compounded, noise_of, wrapped
-from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
+from pipeline.slam.particle_ancestry import (
+    EstimatedPath,
+    Genealogy,
+    are_apart,
+    best_after_resampling,
+    draws,
+    low_variance_ancestors,
+    normalised,
+    select_best,
+)
 from pipeline.slam.particle_maps import known_near, shared_map, take_ancestors
-from pipeline.slam.particle_update import Rules
+from pipeline.slam.particle_update import Rules, against_slip, estimated, use_scan
 from pipeline.slam.places import ODDS, PlaceStates, agreement
 from pipeline.slam.pose_quality import (
     OdometryDoubt,
@@ -44,14 +56,6 @@ from pipeline.slam.pose_quality import (
     named_statistics,
     pose_health,
     update_statistics,
-)
-from pipeline.slam.resampling import (
-    are_apart,
-    best_after_resampling,
-    draws,
-    low_variance_ancestors,
-    normalised,
-    select_best,
 )
 from pipeline.slam.slip_detection import TreeMotion
 from pipeline.slam.state import SlamState

@@ -1,4 +1,5 @@
-"""Update of pose, landmarks and weight (Eq. 7) of each particle with the detections of one scan."""
+"""Update of pose, landmarks and weight (Eq. 7) of each particle with the detections of one scan, and the
+estimate of the pose from all particles."""
 
 from __future__ import annotations
 
@@ -12,12 +13,25 @@ from pipeline.geometry.gaussian import draw, rotated
 from pipeline.geometry.hash_grid import Cells, cells_for, clear, fill, per_metre
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_borrowing, compiled_within
-from pipeline.slam.landmarks import kalman_update, merge_duplicates
 from pipeline.slam.measured_pose import MeasuredPose, correct_by_measured, update_shared_errors
-from pipeline.slam.particle_maps import ROOM, Maps, own_block, widen
+from pipeline.slam.motion import OdometryTrust, moved_pose, moved_poses, weighted_pose
+from pipeline.slam.particle_ancestry import normalised
+from pipeline.slam.particle_maps import (
+    ROOM,
+    Maps,
+    blocks_in_reach,
+    kalman_update,
+    known_near,
+    merge_duplicates,
+    own_block,
+    widen,
+    with_room,
+)
 from pipeline.slam.places import ACTIVE, INACTIVE, PlaceStates, state_of
-from pipeline.slam.pose_quality import MISSED, MOST_HITS, SHIFT
-from pipeline.slam.proposal import Room, recognise
+from pipeline.slam.pose_quality import MISSED, MOST_HITS, SHIFT, STATISTICS, mean_statistics
+from pipeline.slam.proposal import Room, recognise, room_for
+from pipeline.slam.rigid_shift_test import FEWEST as FEWEST_PAIRS
+from pipeline.slam.slip_detection import SEARCH, TreeMotion, motion_by_trees
 from pipeline.types.records import Bool, Float32, Int, Int32
 
 SCORE_MAX = 20.0  # upper limit of a score, so that a felled tree is removed after finitely many misses
@@ -470,3 +484,103 @@ def _shift(
     statistics[p, SHIFT_Y] = c * dy - s * dx - motion[1]
     turn = mu[2] - yaw - motion[2]
     statistics[p, SHIFT_YAW] = turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi))
+
+
+@compiled
+def against_slip(
+    pose: Float,
+    maps: Maps,
+    best: int,
+    motion: Float,
+    motion_covariance: Float,
+    driven: float,
+    wheels: OdometryTrust,
+    centre: Float,
+    R: Float,
+    clear_range: Float,
+    places: PlaceStates,
+    rules: Rules,
+) -> TreeMotion:
+    """Return the motion by odometry, corrected with the map of the best particle, see `motion_by_trees`. With
+    fewer than FEWEST_PAIRS detections it is the odometry. Landmarks of inactive places are not used. All
+    arguments are unchanged.
+
+    Args:
+        pose: Poses before the motion, shape (P, 3).
+        maps: Maps of the particles.
+        best: Row of the best particle.
+        motion, motion_covariance, centre, R, clear_range, places, rules: See `particle_update.observe`.
+        driven: Path length since the last used scan [m], see `drift_variances`.
+        wheels: Trust in the odometry.
+    """
+    if centre.shape[0] < FEWEST_PAIRS:
+        return TreeMotion(False, motion.copy(), motion_covariance.copy(), False)
+    at = moved_pose(pose[best], motion)
+    known, spread, hits, birth = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
+    if places.state.shape[0]:
+        active = np.array([state_of(b, places) != INACTIVE for b in birth], np.bool_)
+        known, spread, hits = known[active], spread[active], hits[active]
+    return motion_by_trees(
+        pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,
+        rules.hits_to_weigh, rules.gate, clear_range,
+    )  # fmt: skip
+
+
+@compiled
+def use_scan(
+    pose: Float,
+    log_weight: Float,
+    maps: Maps,
+    motion: Float,
+    motion_covariance: Float,
+    noise: Float,
+    centre: Float,
+    R: Float,
+    clear_range: Float,
+    first_birth: int,
+    places: PlaceStates,
+    rules: Rules,
+    measured: MeasuredPose,
+) -> tuple[Maps, Float, Float, float, Int]:
+    """Update poses, log weights and maps of all particles in place; the greatest log weight is 0 then.
+
+    The arguments are those of `particle_update.observe`; there may be no detections.
+
+    Returns:
+        Maps, grown where they had no space for new landmarks (then the arrays of the argument are stale);
+        normalised weights, shape (P,); both results of `mean_statistics`; and births of the associated or new
+        landmarks, int64, shape (P, D).
+    """
+    found = centre.shape[0]
+    reach = 0.0
+    for d in range(found):
+        reach = max(reach, centre[d, 0] * centre[d, 0] + centre[d, 1] * centre[d, 1])
+    reach = max(rules.view_range, np.sqrt(reach) + rules.distance_max) if found else rules.view_range
+    moved = predict(pose, motion, motion_covariance, noise, rules.use_proposal)
+    blocks, lengths, rows = blocks_in_reach(maps, moved, reach, found)
+    maps = with_room(maps, found, rows)
+    landmarks = lengths.max() * ROOM + found
+    near, room = near_for(landmarks), room_for(found, landmarks)
+    statistics = np.zeros((pose.shape[0], STATISTICS))
+    births = np.empty((pose.shape[0], found), np.int64)
+    observe(
+        pose, moved, log_weight, maps, blocks, lengths, motion, motion_covariance, noise, centre, R,
+        clear_range, reach, first_birth, places, rules, near, room, statistics, measured, births, np.empty(3),
+        np.zeros((3, 3)),
+    )  # fmt: skip
+    log_weight -= log_weight.max()
+    weights = normalised(log_weight)
+    mean, odometry = mean_statistics(statistics, weights, motion_covariance)
+    return maps, weights, mean, odometry, births
+
+
+@compiled
+def estimated(
+    pose: Float, weights: Float, motion: Float, motion_covariance: Float
+) -> tuple[Float, Float, Float, float]:
+    """Return the poses after a motion, shape (P, 3), their mean and covariance (see `weighted_pose`), and the
+    effective number of particles, 1 / sum of squared weights; see `weighted_pose` for the arguments, except
+    that `pose` contains the poses before the motion."""
+    particles = moved_poses(pose, motion)
+    mean, covariance = weighted_pose(particles, weights, motion, motion_covariance)
+    return particles, mean, covariance, 1.0 / (weights * weights).sum()

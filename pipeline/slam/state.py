@@ -10,11 +10,10 @@ from pipeline.geometry.poses import Float
 from pipeline.slam.frame_uncertainty import FrameUncertainty
 from pipeline.slam.keyframe_graph import KeyframeGraph, ScanDetections
 from pipeline.slam.measured_pose import SharedErrors
-from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy
+from pipeline.slam.particle_ancestry import EstimatedPath, Genealogy, normalised
 from pipeline.slam.particle_maps import MapColumns, Maps, empty_maps, map_of, shared_map, taken
 from pipeline.slam.places import Places
 from pipeline.slam.pose_quality import RunningStatistics
-from pipeline.slam.resampling import normalised
 from pipeline.types.records import ADDED, NOT_SAVED
 
 

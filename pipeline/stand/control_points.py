@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import StemmapError
-from pipeline.evaluation.trajectory import fit_rigid
+from pipeline.evaluation import fit_rigid
 from pipeline.geometry.poses import Float, Pose2
 from pipeline.stand import POINT_SIGMA
 

@@ -5,10 +5,10 @@ radians. Tables are columns of equal length, not lists of objects.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -678,3 +678,53 @@ class Frame:
     def health(self) -> Health:
         """Quality of the pose."""
         return self.estimate.health
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudDescription:
+    """What is known of a whole cloud before its points are read.
+
+    Attributes:
+        uri: As the user wrote it.
+        kind: Name of the format, e.g. "LAS 1.4 compressed".
+        points: Number of points by the header.
+        offset: Offset that is subtracted from the coordinates, so that 32 bits hold the rest, shape (3,) [m].
+        crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
+        digest: SHA-256 (hex) of the file.
+        warnings: Messages for the user.
+        low, high: Corners by the header in the coordinates of the file, shape (3,) [m]; not checked.
+        attributes: Names of the columns besides the coordinates.
+        cut_above: Whether the field of view of a sensor cuts the trees, as in the cloud of a drive.
+    """
+
+    uri: str
+    kind: str
+    points: int
+    offset: Float
+    crs: str
+    digest: str
+    warnings: tuple[str, ...] = ()
+    low: Float | None = None
+    high: Float | None = None
+    attributes: tuple[str, ...] = ()
+    cut_above: bool = False
+
+
+class WholeCloud(Protocol):
+    """A whole cloud of a plot, read in parts."""
+
+    @property
+    def description(self) -> CloudDescription:
+        """Description that is known before reading."""
+
+    @property
+    def losses(self) -> dict[str, int]:
+        """Points left out in the latest reading, by reason."""
+
+    def parts(self) -> Iterator[Float32]:
+        """Yield all points in parts: x, y, z minus the offset [m], finite, float32, shape (N, 3). Each call
+        reads the cloud from its beginning.
+
+        Raises:
+            SourceError: Nothing can be read.
+        """

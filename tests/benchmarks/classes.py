@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 
 from pipeline.config.stages import Evaluation
-from pipeline.evaluation.matching import match
+from pipeline.evaluation import match
 from pipeline.types.records import Bool, Float, Int, Trees, TruthTrees
 from tests.benchmarks.table import Cell, Table
 

@@ -20,8 +20,7 @@ import numpy as np
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
-from pipeline.ground.scan_ground import find_terrain
-from pipeline.ground.terrain import height_above
+from pipeline.ground.scan_ground import find_terrain, height_above
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import open_simulated
 from pipeline.odometry.synchroniser import steps

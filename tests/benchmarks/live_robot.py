@@ -19,7 +19,7 @@ from zenoh import ext
 
 from app.robot.zenoh import ADMIN, PUBLISHER, configuration, data_key
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 
 _HASH = "RIHS01_0"
 

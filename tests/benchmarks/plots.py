@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.config import preset
 from pipeline.errors import StemmapError, UsageError
-from pipeline.evaluation.trajectory import fit_rigid
+from pipeline.evaluation import fit_rigid
 from pipeline.io.readers import Source, SourceOptions, open_source
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps

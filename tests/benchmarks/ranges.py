@@ -20,7 +20,7 @@ from pipeline.detection.clustering import cluster
 from pipeline.detection.verdicts import classify_clusters, detections
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground import scan_ground
-from pipeline.ground.terrain import height_above
+from pipeline.ground.scan_ground import height_above
 from pipeline.io.readers import open_source
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing import acquire, pass_through, voxel_grid

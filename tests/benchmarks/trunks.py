@@ -23,8 +23,7 @@ from app.common.timers import Stopwatch
 from app.training.examples import SUFFIX, Examples, read_examples
 from pipeline.classification.forest import ALL_AROUND, ONE_WAY, Forest, forest_of, package_alone
 from pipeline.config import preset
-from pipeline.evaluation import evaluate
-from pipeline.evaluation.matching import match
+from pipeline.evaluation import evaluate, match
 from pipeline.inventory.cross_sections import FIGURES, best_circle, fit_circle, without_scatter
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import SimulatedSource

@@ -13,7 +13,7 @@ from pipeline.geometry.poses import Float, Pose3
 from pipeline.io.readers.base import FileSource
 from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import header_stamp
-from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, decode
+from pipeline.io.readers.topics import CAMERA_INFO, COMPRESSED_IMAGE, decode
 from pipeline.io.readers.transforms import TransformTree, frame_name
 from pipeline.types.records import Bool, Int
 

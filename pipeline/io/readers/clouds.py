@@ -20,8 +20,7 @@ from pipeline.io.readers.point_files import (
     ScanFileError,
     open_table,
 )
-from pipeline.types.clouds import CloudDescription, WholeCloud
-from pipeline.types.records import Float, Float32
+from pipeline.types.records import CloudDescription, Float, Float32, WholeCloud
 
 if TYPE_CHECKING:
     import laspy

@@ -33,8 +33,7 @@ from pipeline.io.readers.container import Channel, Container, Message
 from pipeline.io.readers.message_time import SECOND_NS, header_stamp
 from pipeline.io.readers.ros import RosSource
 from pipeline.io.readers.ros_bags import BagFolder, bag_files, open_bag
-from pipeline.io.readers.ros_messages import standard_types
-from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed
+from pipeline.io.readers.topics import TYPES_BY_ROLE, is_fixed, standard_types
 from pipeline.io.readers.transforms import Extrinsics, TransformTree
 from pipeline.types.records import Notice, Record
 

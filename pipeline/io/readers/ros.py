@@ -24,10 +24,9 @@ from pipeline.io.readers.message_time import (
     by_stamp,
     header_stamp,
 )
-from pipeline.io.readers.ros_messages import LASER_SCAN
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
-from pipeline.io.readers.topics import choose_topics
+from pipeline.io.readers.topics import LASER_SCAN, choose_topics
 from pipeline.io.readers.transforms import Extrinsics, TransformTree, frame_name
 from pipeline.io.readers.velodyne import SENSORS
 from pipeline.types.records import Odometry, Record, Scan, Sensor, Truth

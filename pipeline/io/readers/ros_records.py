@@ -13,14 +13,6 @@ from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.measured_poses import Fix, GnssFrame, NoPoseError, OtherFrame, OtherPose
 from pipeline.io.readers.message_time import SECOND_NS
-from pipeline.io.readers.ros_messages import (
-    IMU,
-    LASER_SCAN,
-    NAV_SAT_FIX,
-    ODOMETRY,
-    POINT_CLOUD,
-    decode,
-)
 from pipeline.io.readers.scan_columns import (
     OFFSET_LIMIT_NS,
     POINT_LIMIT,
@@ -29,6 +21,14 @@ from pipeline.io.readers.scan_columns import (
     TIME,
     clean_scan,
     scan_of,
+)
+from pipeline.io.readers.topics import (
+    IMU,
+    LASER_SCAN,
+    NAV_SAT_FIX,
+    ODOMETRY,
+    POINT_CLOUD,
+    decode,
 )
 from pipeline.io.readers.transforms import TransformTree, frame_name, pose_of
 from pipeline.io.readers.velodyne import PacketDecoder, is_data_packet

@@ -9,7 +9,7 @@ import numpy as np
 
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import Channel, Container, Message
-from pipeline.io.readers.ros_messages import decode
+from pipeline.io.readers.topics import decode
 
 if TYPE_CHECKING:
     from rosbags.typesys.stores import ros2_jazzy as ros2

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.ros_messages import standard_types
+from pipeline.io.readers.topics import standard_types
 from pipeline.types.records import Imu, Odometry, Scan
 
 ODOM, BASE, LIDAR, CAMERA = "odom", "base_link", "velodyne", "camera"

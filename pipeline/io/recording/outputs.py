@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.poses import Pose2
-from pipeline.io.readers.ros_messages import standard_types
+from pipeline.io.readers.topics import standard_types
 from pipeline.io.recording.messages import BASE, encode, header, make, odometry_of, pose, vector
 from pipeline.types.records import Clearance, Frame, Path, Trees, Zone
 

@@ -9,7 +9,7 @@ from app.fleet.server import RobotWatch, address_of, recorded_apart
 from app.robot.address import ROOT, ZenohAddress, parse_address
 from app.robot.topics import Publisher, choose
 from app.worker.protocol import Open
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 from tests.app.fleet.test_fleet import make
 from tests.app.robot.conftest import free_port
 

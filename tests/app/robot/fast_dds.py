@@ -12,7 +12,7 @@ import pytest
 
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 
 PEER = Path(__file__).parent / "fastdds" / "peer.cpp"
 

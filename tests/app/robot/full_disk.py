@@ -17,7 +17,7 @@ from app.worker.protocol import Begin, Open
 from pipeline.config import Parameters
 from pipeline.io.readers.container import Message
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 from tests.app.robot.conftest import SCANS, until
 from tests.app.robot.test_live_session import URI, announce, stage
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from app.robot.recorder import Recorder
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 from pipeline.types.records import Scan
 
 _PER_SCAN_S = 0.5  # five times as long as a robot needs at 10 Hz

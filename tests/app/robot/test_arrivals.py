@@ -18,7 +18,7 @@ from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import OPENING_LIMIT, ArrivalReader
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.message_time import ClockStepFilter
-from pipeline.io.readers.ros_messages import ODOMETRY, POINT_CLOUD
+from pipeline.io.readers.topics import ODOMETRY, POINT_CLOUD
 from pipeline.types.records import Notice, Odometry, PoseMeasurement, Record, Scan
 from tests.app.robot.conftest import SCANS
 from tests.pipeline.io.recordings import START_NS, STEP_NS, write_recording

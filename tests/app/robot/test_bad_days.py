@@ -17,7 +17,7 @@ import pytest
 from app.worker.protocol import Begin, Open
 from pipeline.config import Parameters
 from pipeline.io.readers import open_source
-from pipeline.io.readers.ros_messages import IMU, ODOMETRY, POINT_CLOUD
+from pipeline.io.readers.topics import IMU, ODOMETRY, POINT_CLOUD
 from pipeline.io.recording.mcap_writer import mend
 from tests.app.robot.conftest import SCANS, Child, until
 from tests.app.robot.test_live_session import URI, announce, stage

@@ -16,7 +16,7 @@ from app.robot.address import DdsAddress, parse_address
 from app.robot.dds import Offer, common_offer, offer_of
 from app.robot.source import LiveSource
 from pipeline.errors import SourceError
-from pipeline.io.readers.ros_messages import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
+from pipeline.io.readers.topics import ODOMETRY, POINT_CLOUD, READ_TYPES, ROS1_TRANSFORMS, TRANSFORMS
 from pipeline.types.records import Odometry, Record, Scan
 from tests.app.robot.conftest import POINTS, SCANS, listening, until
 from tests.app.robot.fast_dds import Peer, messages_of

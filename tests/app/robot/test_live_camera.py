@@ -32,8 +32,8 @@ from pipeline.io.readers.container import Message
 from pipeline.io.readers.live import LiveRecording
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.ros import RosSource
-from pipeline.io.readers.ros_messages import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from pipeline.io.readers.simulated import SimulatedSource
+from pipeline.io.readers.topics import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from pipeline.io.recording import write_recording
 from pipeline.io.recording.rendering import CAMERA, with_pictures
 from pipeline.types.records import Path as Way

@@ -23,7 +23,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers import SourceOptions
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 from tests.app.fakes import make_mapper
 from tests.app.robot.conftest import SCANS, until
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose2
-from pipeline.io.readers.ros_messages import standard_types
+from pipeline.io.readers.topics import standard_types
 from pipeline.io.recording import messages, outputs
 from pipeline.types.records import Clearance, Zone
 from tests.app.fakes import START_NS, frame, path, trees

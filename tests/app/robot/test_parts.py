@@ -18,7 +18,7 @@ from app.robot.velodyne import VelodyneLink
 from app.robot.zenoh import ZenohLink, data_key, publisher_of
 from pipeline.errors import SourceError
 from pipeline.io.readers.container import Channel, Message
-from pipeline.io.readers.ros_messages import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS
+from pipeline.io.readers.topics import IMU, LASER_SCAN, NAV_SAT_FIX, ODOMETRY, POINT_CLOUD, TRANSFORMS
 from tests.app.robot.conftest import free_port, until
 
 NAMES = st.from_regex(r"\A[a-z][a-z0-9_]{0,8}\Z")

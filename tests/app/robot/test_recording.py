@@ -28,7 +28,7 @@ from pipeline.io.readers import SourceOptions, open_source
 from pipeline.io.readers.base import Source
 from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 from pipeline.io.recording import write_recording
 from pipeline.io.recording.mcap_writer import mend
 from pipeline.types.records import Scan

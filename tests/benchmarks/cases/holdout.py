@@ -122,7 +122,7 @@ def _outcome(scene: Path, forest: Forest) -> MappingResult:
     """One scene mapped by the whole mapper."""
     import numpy as np
 
-    from pipeline.evaluation.matching import match
+    from pipeline.evaluation import match
     from tests.benchmarks.classes import ByClass
     from tests.benchmarks.package_forest.labelled_scenes import labelled_points, trunks
     from tests.benchmarks.trunks import mapped

@@ -121,7 +121,7 @@ def stem_scores(place, dbh, table: Path) -> tuple[int | float | None, ...]:
 
     import numpy as np
 
-    from pipeline.evaluation.matching import match
+    from pipeline.evaluation import match
 
     if not table.is_file():
         return _NO_SCORES
@@ -158,7 +158,7 @@ def _driven(folder: Path) -> Table:
     import numpy as np
 
     from pipeline.config import preset
-    from pipeline.evaluation.matching import match
+    from pipeline.evaluation import match
     from pipeline.io.readers import open_source
     from pipeline.mapper import Mapper
     from pipeline.odometry.synchroniser import steps

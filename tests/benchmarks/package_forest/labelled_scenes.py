@@ -17,7 +17,7 @@ from pipeline.config import Parameters
 from pipeline.detection.free_space import clear_range
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground import scan_ground
-from pipeline.ground.terrain import height_above
+from pipeline.ground.scan_ground import height_above
 from pipeline.io.readers import open_source
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.odometry.synchroniser import steps

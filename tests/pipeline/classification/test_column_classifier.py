@@ -23,7 +23,7 @@ from pipeline.config import preset
 from pipeline.detection.free_space import BINS
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.ground.terrain import SECTORS
+from pipeline.ground.scan_ground import SECTORS
 from pipeline.mapper import Mapper
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_classification import DUE_NS

@@ -13,7 +13,7 @@ from pipeline.classification.voxel_map import SLICE, SLICES
 from pipeline.detection.free_space import BEHIND, BINS
 from pipeline.geometry.azimuth_bins import direction_bin
 from pipeline.geometry.poses import Pose2
-from pipeline.ground.terrain import SECTORS
+from pipeline.ground.scan_ground import SECTORS
 
 FLAT = np.full((SECTORS, 200), -1.0)  # the ground 1 m below the sensor
 AXIS = np.array([[6.0, 0.5, 0.0, 0.0, 1.0]])

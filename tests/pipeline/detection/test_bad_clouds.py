@@ -8,8 +8,7 @@ import pytest
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
-from pipeline.ground.scan_ground import find_terrain
-from pipeline.ground.terrain import NO_GROUND, height_above
+from pipeline.ground.scan_ground import NO_GROUND, find_terrain, height_above
 from pipeline.mapper import Mapper
 from pipeline.types.records import Scan, Sensor, Step
 

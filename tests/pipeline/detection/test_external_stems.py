@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import preset
 from pipeline.config.stages import Acquisition
-from pipeline.detection.external_stems import external_clusters
+from pipeline.front_end import external_clusters
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.mapper import Mapper
 from pipeline.types.records import Scan, Sensor, Stems, Step, Verdict

@@ -16,7 +16,7 @@ from pipeline.detection.obstacles import BESIDE, TIGHTEST, find_clearance, path_
 from pipeline.errors import ParameterError
 from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose3
-from pipeline.ground.terrain import RINGS, SECTORS, Terrain
+from pipeline.ground.scan_ground import RINGS, SECTORS, Terrain
 from pipeline.types.records import Clearance, Sensor, Step, Zone
 from tests.pipeline.strategies import scan
 

@@ -15,13 +15,13 @@ from pipeline.config import preset
 from pipeline.evaluation import (
     PathError,
     evaluate,
+    fit_rigid,
     match,
     matched_rows,
     pair_distances,
     pair_errors,
     path_error,
 )
-from pipeline.evaluation.trajectory import fit_rigid
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import Path, TruthPath
 from tests.pipeline.strategies import poses2, seeds, trees, truth_trees

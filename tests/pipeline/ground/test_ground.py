@@ -8,8 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import preset
-from pipeline.ground.scan_ground import find_terrain, in_band
-from pipeline.ground.terrain import SECTORS, Terrain, height_above, heights_of_places, shows_ground
+from pipeline.ground.scan_ground import (
+    SECTORS,
+    Terrain,
+    find_terrain,
+    height_above,
+    heights_of_places,
+    in_band,
+    shows_ground,
+)
 from tests.pipeline.strategies import seeds
 
 FOREST = preset("forest").ground

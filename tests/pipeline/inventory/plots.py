@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.types.clouds import CloudDescription
+from pipeline.types.records import CloudDescription
 
 
 @dataclass

@@ -23,7 +23,7 @@ from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import BrokenChunkError, unpack
 from pipeline.io.readers.mcap_file import MAGIC, MESSAGE_HEAD, RECORD, McapFile
 from pipeline.io.readers.message_time import WINDOW_NS, Stamped, by_stamp
-from pipeline.io.readers.ros_messages import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD
 from pipeline.io.readers.transforms import TransformTree
 from pipeline.types.records import Scan
 from tests.pipeline.io.conftest import Opened

@@ -19,7 +19,7 @@ from pipeline.ground.terrain_map import CELL, COLUMNS, VIEWS, WEIGHT, corrected_
 from pipeline.ground.terrain_map import SIDE as CELLS
 from pipeline.loop_closure.detection import through
 from pipeline.mapper import Mapper
-from pipeline.slam.loop_correction import drift_of
+from pipeline.slam.keyframe_graph import drift_of
 from pipeline.slam.motion import Noise, compounded
 from pipeline.tracking import Tracker
 from pipeline.tracking.track_table import TrackTable

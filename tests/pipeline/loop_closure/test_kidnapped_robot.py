@@ -18,7 +18,7 @@ from pipeline.loop_closure.kidnapped_robot import Relocaliser, RelocaliserState,
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import Loop, Motion, SlamState
-from pipeline.slam.resampling import draws
+from pipeline.slam.particle_ancestry import draws
 from pipeline.types.records import PoseMeasurement
 from tests.pipeline.strategies import NOTHING_SEEN, detections
 from tests.pipeline.test_mapper import as_bytes

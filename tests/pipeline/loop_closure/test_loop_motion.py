@@ -14,8 +14,7 @@ from pipeline.geometry.pose_arrays import PathCorrection, composed
 from pipeline.geometry.poses import Pose2
 from pipeline.loop_closure.detection import RunHistory, loop_to
 from pipeline.slam.frame_uncertainty import FrameUncertainty
-from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, Solution
-from pipeline.slam.loop_correction import corrected_landmarks, without_jumps
+from pipeline.slam.keyframe_graph import Keyframe, KeyframeGraph, Solution, corrected_landmarks, without_jumps
 from pipeline.slam.particle_maps import MapColumns
 from pipeline.types.records import PoseEstimate, Trees
 from tests.pipeline.loop_closure.test_detection import NOISE, SURE, circle, driven

@@ -15,7 +15,7 @@ from pipeline.front_end import SegmentedScan
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints import encode
 from pipeline.remapping import Rerun, ScanCache, ScanCaches
-from pipeline.remapping.scan_cache import HIGHEST, unpack
+from pipeline.remapping.rerun import HIGHEST, unpack
 from pipeline.types.records import PoseMeasurement, Scan, Step, Turn
 from tests.pipeline.remapping.mapped import BASE, fill, frames, mapper, run
 

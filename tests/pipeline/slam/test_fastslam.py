@@ -14,10 +14,16 @@ from pipeline.config import preset
 from pipeline.geometry.pose_arrays import composed
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam import FastSlam, Motion
-from pipeline.slam.landmarks import VARIANCE_MIN, kalman_update
 from pipeline.slam.motion import compound, compounded, moved_poses, noise_of, step_variances
-from pipeline.slam.particle_maps import ROOM, own_block, take_ancestors, with_room
-from pipeline.slam.resampling import low_variance_ancestors, normalised
+from pipeline.slam.particle_ancestry import low_variance_ancestors, normalised
+from pipeline.slam.particle_maps import (
+    ROOM,
+    VARIANCE_MIN,
+    kalman_update,
+    own_block,
+    take_ancestors,
+    with_room,
+)
 from pipeline.slam.state import SlamState
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, seeds
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
-from pipeline.slam.resampling import (
+from pipeline.slam.particle_ancestry import (
     are_apart,
     best_after_resampling,
     draws,

@@ -1,5 +1,9 @@
-"""Scores of a map against the ground truth: TA, TR, FA and FR as in the paper, completeness, correctness, and
-the errors of positions, diameters and distances between trees."""
+"""Evaluation of a map against ground truth.
+
+Trees are matched one to one with the minimum sum of distances. The scores are TA, TR, FA and FR as in the
+paper, completeness, correctness, and the errors of positions, diameters and distances between trees; for the
+path it is the absolute trajectory error (ATE).
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,97 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.config.stages import Evaluation
-from pipeline.evaluation.matching import match
-from pipeline.geometry.poses import Float
-from pipeline.types.records import HIDDEN, Bool, Trees, TruthTrees
+from pipeline.geometry.poses import Float, Pose2
+from pipeline.types.records import HIDDEN, Bool, Int, Path, Trees, TruthPath, TruthTrees
+
+
+def match(found: Float, truth: Float, distance_max: float) -> Int:
+    """Return the row of `truth` that is assigned to each row of `found`, -1 for none, int64, shape (N,).
+    Positions that are not finite have no partner; either side may be empty.
+
+    The assignment has the maximum number of pairs within `distance_max`, and among such assignments the
+    minimum sum of distances (Kuhn 1955, solved by scipy).
+
+    Args:
+        found: Positions, shape (N, 2) [m].
+        truth: Positions in the same frame, shape (M, 2) [m].
+        distance_max: Maximum distance of a pair [m].
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    truth_of = np.full(len(found), -1, np.int64)
+    rows, columns = _near(found, truth, distance_max)
+    if not len(rows):
+        return truth_of
+    # Groups that share no allowed pair are independent problems. Solving them one by one takes milliseconds
+    # for thousands of trees; the time for one matrix of all trees grows with the cube of their number.
+    size = len(found) + len(truth)
+    graph = coo_array((np.ones(len(rows), np.bool_), (rows, columns + len(found))), shape=(size, size))
+    _, group_of = connected_components(graph, directed=False)
+    group = group_of[rows]
+    order = np.argsort(group, kind="stable")
+    for part in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
+        _solve(found, truth, distance_max, rows[part], columns[part], truth_of)
+    return truth_of
+
+
+def _near(found: Float, truth: Float, distance_max: float) -> tuple[Int, Int]:
+    """Return rows of `found` and of `truth` for all pairs within `distance_max` [m], int64, shape (K,) each.
+    A position that is not finite has no pair."""
+    from scipy.spatial import cKDTree
+
+    mine, others = (np.flatnonzero(np.isfinite(each).all(axis=1)) for each in (found, truth))
+    if not len(mine) or not len(others):
+        return mine[:0], mine[:0]
+    reach = distance_max * (1.0 + 1e-9)  # scipy rounds the distance in another way
+    pairs = cKDTree(found[mine]).sparse_distance_matrix(cKDTree(truth[others]), reach, output_type="ndarray")
+    rows, columns = mine[pairs["i"]], others[pairs["j"]]
+    near = np.hypot(*(found[rows] - truth[columns]).T) <= distance_max
+    return rows[near], columns[near]
+
+
+def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: Int, truth_of: Int) -> None:
+    """Assign one group of positions, and write the rows of `truth` into `truth_of`.
+
+    Args:
+        found, truth: All positions, shape (N, 2) and (M, 2) [m].
+        distance_max: Maximum distance of a pair [m].
+        rows, columns: Allowed pairs of the group: rows of `found` and of `truth`.
+        truth_of: Result, shape (N,), modified in place.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    if len(rows) == 1:
+        truth_of[rows] = columns
+        return
+    mine, others = np.unique(rows), np.unique(columns)
+    distance = np.hypot(*(found[mine][:, None, :] - truth[others][None, :, :]).transpose(2, 0, 1))
+    # One forbidden pair costs more than all allowed pairs together.
+    forbidden = (min(len(mine), len(others)) + 1) * distance_max
+    chosen, partner = linear_sum_assignment(np.where(distance <= distance_max, distance, forbidden))
+    good = distance[chosen, partner] <= distance_max
+    truth_of[mine[chosen[good]]] = others[partner[good]]
+
+
+def matched_rows(trees: Trees, truth: TruthTrees, distance_max: float) -> tuple[Int, Int]:
+    """Return the rows of the matched mapped trees in `trees`, and of the real trees in `truth` that they are
+    assigned to, int64, shape (K,) each. Pairs with another object of the ground truth are omitted.
+
+    Args:
+        trees: The map; confirmed trees are matched.
+        truth: Ground truth in the frame of the map.
+        distance_max: Maximum distance of a pair [m].
+    """
+    confirmed = np.flatnonzero(trees.confirmed)
+    is_tree = np.array([kind == "tree" for kind in truth.kind], np.bool_)
+    position = np.stack([truth.x, truth.y], axis=1)
+    truth_of = match(trees.position[confirmed], position, distance_max)
+    # Other objects take part in the assignment, as in the scores; their pairs are dropped afterwards.
+    good = truth_of >= 0
+    good[good] = is_tree[truth_of[good]]
+    return confirmed[good], truth_of[good]
+
 
 # A ground truth is doubtful if less than this share of at least so many trees matches.
 _DOUBTFUL_SHARE, _DOUBTFUL_TREES = 0.25, 4
@@ -213,3 +305,81 @@ def _harmonic(a: float | None, b: float | None) -> float | None:
 def _rms(error: Float) -> float | None:
     """Return the root mean square of errors, shape (N,); None without any."""
     return float(np.sqrt((error**2).mean())) if len(error) else None
+
+
+@dataclass(frozen=True, slots=True)
+class PathError:
+    """Distances between the path and the true path at the times of the true path.
+
+    Attributes:
+        rms, median, largest: Over all compared positions [m].
+        at_end: At the last common time [m].
+        compared: Number of true positions within the time of the path.
+        aligned: Whether a rigid motion was fitted first.
+    """
+
+    rms: float
+    median: float
+    largest: float
+    at_end: float
+    compared: int
+    aligned: bool
+
+
+def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> PathError | None:
+    """Return the error of a path, or None if it has fewer than two poses or fewer than three true positions
+    are within its time. The path is interpolated linearly at the times of the true positions.
+
+    Args:
+        path: In the frame of the map.
+        truth: In the frame of the map or in another one.
+        align: Whether to fit a rigid motion in the plane first; None fits it if the frames differ.
+    """
+    if len(path.stamp_ns) < 2:
+        return None
+    common = (truth.stamp_ns >= path.stamp_ns[0]) & (truth.stamp_ns <= path.stamp_ns[-1])
+    if np.count_nonzero(common) < 3:
+        return None
+    t = truth.stamp_ns[common]
+    ours = np.stack([_at(t, path.stamp_ns, path.x), _at(t, path.stamp_ns, path.y)], axis=1)
+    theirs = np.stack([truth.x[common], truth.y[common]], axis=1)
+    aligned = not truth.same_frame if align is None else align
+    if aligned:
+        ours = fit_rigid(ours, theirs).apply(ours)
+    distance = np.hypot(*(ours - theirs).T)
+    return PathError(
+        rms=float(np.sqrt((distance**2).mean())),
+        median=float(np.median(distance)),
+        largest=float(distance.max()),
+        at_end=float(distance[-1]),
+        compared=len(distance),
+        aligned=aligned,
+    )
+
+
+def fit_rigid(a: Float, b: Float) -> Pose2:
+    """Return the pose T_b_a that minimises sum |b - T_b_a a|^2 over N pairs of points (Umeyama 1991, without
+    scale), N > 0; the yaw is 0 for coincident points.
+
+    Args:
+        a, b: Points in the two frames, shape (N, 2) [m] each.
+    """
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    M = (a - mean_a).T @ (b - mean_b)
+    yaw = float(np.arctan2(M[0, 1] - M[1, 0], M[0, 0] + M[1, 1]))
+    turned = Pose2(0.0, 0.0, yaw).apply(mean_a[None, :])[0]
+    return Pose2(float(mean_b[0] - turned[0]), float(mean_b[1] - turned[1]), yaw)
+
+
+def _at(wanted_ns: Int, stamp_ns: Int, value: Float) -> Float:
+    """Return values interpolated linearly at other times, shape (K,); outside of the times the first or last
+    value.
+
+    Args:
+        wanted_ns: Times [ns], int64, shape (K,).
+        stamp_ns: Times of the values, ascending [ns], int64, shape (N,), N > 0.
+        value: Values, shape (N,).
+    """
+    start = stamp_ns[0]  # int64 nanoseconds since the epoch do not fit a float; differences do
+    result: Float = np.interp((wanted_ns - start) * 1e-9, (stamp_ns - start) * 1e-9, value)
+    return result
