@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from app.common.arrays import rows_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.evaluation import MapScores, evaluate
+from pipeline.geometry.columns import rows_of
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import UNFINISHED
 from pipeline.io.result_files import (

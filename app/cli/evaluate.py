@@ -18,9 +18,8 @@ from pipeline.errors import ParameterError, StemmapError
 if TYPE_CHECKING:
     from app.batch.run_folder import FinishedRun
     from app.tuning.jobs import JobResult
-    from app.tuning.report import Comparison
+    from app.tuning.report import Comparison, SweepPlan
     from app.tuning.scoring import PreparedRun
-    from app.tuning.sweep import SweepPlan
     from pipeline.config import Parameters
     from pipeline.config.model import Value
     from pipeline.evaluation import MapScores
@@ -251,8 +250,7 @@ def run_grid(arguments: argparse.Namespace) -> int:
     if not runs:
         return 1
 
-    from app.tuning.report import compare_results
-    from app.tuning.sweep import plan_jobs
+    from app.tuning.report import compare_results, plan_jobs
 
     plan = plan_jobs(runs, sets, lambda run, changes: _base(arguments, run, changes))
     answers = _swept(arguments, plan)
@@ -299,8 +297,8 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
     """Compute all jobs of a plan with a progress bar, in --jobs processes (default: one per usable core, at
     most one per job). Return their results, and print warnings to standard error."""
     from app.common.text import count
-    from app.tuning.sweep import sweep
-    from app.tuning.workers import ResultStore, ScoringProcesses
+    from app.tuning.jobs import ResultStore, ScoringProcesses
+    from app.tuning.report import sweep
 
     kept = ResultStore(flags.kept_results(arguments))
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -88,7 +88,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     watched = _watched(sources)
     if watched is not None or len(sources) > 1:
-        from app.fleet.server import named, serve_fleet
+        from app.fleet import named, serve_fleet
 
         return serve_fleet(
             settings,
@@ -122,6 +122,6 @@ def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
         return replace(address, robot=""), sources[0]
     if address.topics:  # a topic belongs to one robot
         return None
-    from app.fleet.server import robots_at
+    from app.fleet import robots_at
 
     return (address, sources[0]) if len(robots_at(address)) > 1 else None

@@ -27,14 +27,6 @@ def count(n: int, one: str, many: str = "") -> str:
     return f"{n:,} {one if n == 1 else many or f'{one}s'}"
 
 
-def value_text(value: Value) -> str:
-    """Return the value of a parameter in the syntax of `--set`, for example "0.2", "true" or "dbscan". Floats
-    have six significant digits."""
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
 MOST = 6  # maximum number of values in a line
 
 

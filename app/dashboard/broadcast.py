@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from app.common.arrays import first_difference
+from pipeline.geometry.columns import first_difference
 
 _encode = msgspec.json.encode
 

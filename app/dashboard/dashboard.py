@@ -33,10 +33,9 @@ from app.store.async_store import AsyncStore
 from app.tuning.job import TuneSearch
 from app.tuning.sensitivity import Sensitivity, question_of
 from app.worker import protocol
-from app.worker.outbox import path_columns
 from pipeline.config import preset
 from pipeline.config.model import Value
-from pipeline.geometry.columns import GrowingColumns
+from pipeline.geometry.columns import GrowingColumns, columns_of
 from pipeline.stand.seen_area import SeenRecorder
 from pipeline.types.records import Path, TruthTrees
 
@@ -451,7 +450,7 @@ class Dashboard:
             self.scene.suit(cloud=shown.frame.of_cloud)
             self.live.publish("view", self.scene.view)
         new_xy = np.column_stack([shown.path.x, shown.path.y])
-        self._path_rows.write(shown.path_start, *path_columns(shown.path), new_xy)
+        self._path_rows.write(shown.path_start, *columns_of(shown.path), new_xy)
         *columns, self.path_xy = self._path_rows.shared()
         self.path = Path(*columns)
         if shown.frame.ground is None and self.shown is not None:

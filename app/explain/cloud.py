@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from app.common.arrays import evenly_spaced
 from app.explain.history import half_axes
 from app.explain.records import CheckResult, ClusterStory, CrossSection, TreeStory
 from app.worker.inventory_run import InventoryRun
@@ -14,6 +13,7 @@ from pipeline.classification.column_extraction import BREAST
 from pipeline.config import field_specs
 from pipeline.detection.verdicts import Check
 from pipeline.errors import StemmapError
+from pipeline.geometry.columns import evenly_spaced
 from pipeline.geometry.poses import Float
 from pipeline.inventory import PlotMap
 from pipeline.inventory.cross_sections import STEP, THICK, slice_heights

@@ -205,7 +205,7 @@ class TreeStory(msgspec.Struct, frozen=True):
         cluster: Row of its cluster in the current scan; None without one.
         column: Classification of the accumulated scans at its place; None without them.
         points: Accumulated points around it: x, y from its position in the frame of the map and height above
-            the ground [m], see `app.explain.gathered.points_around`; empty without them.
+            the ground [m], see `app.explain.build.points_around`; empty without them.
         history: Estimates in order of time.
         height, height_sigma: Of the tree [m]; NaN where its top is not seen.
         height_hidden: Reason why the height is not seen; empty where it is.

@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from app.robot.address import ROOT
 from pipeline.errors import SourceError
 from pipeline.io.readers.camera import shared_parts
 from pipeline.io.readers.container import Channel
@@ -89,7 +88,7 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
     there = [p for p in publishers if OWN not in p.topic.split("/")[:-1]]
     named = topics.get("scan")
     scans = [p for p in there if p.msgtype in SCAN_TYPES]
-    wanted = robot.strip(ROOT)
+    wanted = robot.strip("/")
     fitting = [p for p in scans if (not robot or p.robot == wanted) and (named is None or p.topic == named)]
     if not fitting:
         _refuse_wrong_type(there, topics, "scan", SCAN_TYPES, where)

@@ -9,12 +9,12 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from app.common.arrays import rows_of
 from app.scene import colours, nodes
 from app.scene.colours import ViewSettings
 from app.scene.labels import MOST_LABELS, Label, LabelNodes, Place
 from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
+from pipeline.geometry.columns import rows_of
 from pipeline.types.records import HIDDEN, Frame, HeightMap, Trees, TruthTrees
 
 Ring = tuple[float, float, float] | None

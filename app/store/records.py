@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 from pipeline.types.records import TruthTrees
+
+if TYPE_CHECKING:
+    from app.sources.request import SourceRequest
 
 KINDS = ("tree", "pole", "person", "bush", "other")
 # Class of an annotation of a tree about which a person did not decide. It states nothing, so it is no

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from app.common.text import value_text
 from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs
 from pipeline.config.model import Value
-from pipeline.config.text import parsed, toml_table
+from pipeline.config.text import parsed, toml_table, value_text
 from pipeline.errors import ParameterError
 
 PRESET = "preset"  # the axis whose values are names of presets, which the other axes change

@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 import msgspec
 
-from app.common.text import value_text
 from app.sources.request import SourceRequest
 from app.store.records import Content
 from app.tuning.grid import checked_value, grid_axis, spec_of
 from pipeline.config import FieldSpec, Parameters
 from pipeline.config.model import Value, validated
+from pipeline.config.text import value_text
 from pipeline.errors import ParameterError
 from pipeline.evaluation import MapScores
 

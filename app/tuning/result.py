@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import tomli_w
 
-from app.common.text import count, value_text, version
+from app.common.text import count, version
 from app.dashboard.parameters import file_of
 from app.tuning.plan import Goal, Plan, Trial, pool
 from pipeline.config import Parameters
+from pipeline.config.text import value_text
 from pipeline.errors import StemmapError
 from pipeline.evaluation import MapScores
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from app.batch.summary import far_map, far_truth
 from app.common.child_process import ParentConnection, run_child
-from app.tuning.jobs import Job, JobResult
+from app.tuning.jobs import COMMAND, Job, JobResult, ResultStore, ScoringProcesses
 from app.tuning.plan import (
     Plan,
     Trial,
@@ -29,7 +29,6 @@ from app.tuning.plan import (
 )
 from app.tuning.result import SearchMessage, best_of, result_of
 from app.tuning.scoring import prepare_run
-from app.tuning.workers import COMMAND, ResultStore, ScoringProcesses
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError
 from pipeline.evaluation import MapScores

@@ -15,9 +15,8 @@ from typing import Any
 from app.common.timers import cancel
 from app.sources.request import SourceRequest
 from app.tuning.grid import spec_of
-from app.tuning.jobs import Job, JobResult, RunWithTruth, check_run
-from app.tuning.workers import COMMAND as SCORING
-from app.tuning.workers import ResultStore, ScoringProcesses
+from app.tuning.jobs import COMMAND as SCORING
+from app.tuning.jobs import Job, JobResult, ResultStore, RunWithTruth, ScoringProcesses, check_run
 from pipeline.config import Parameters
 from pipeline.config.model import Value
 from pipeline.errors import ParameterError, StemmapError

@@ -31,8 +31,7 @@ from app.web.auth import Guard, viewer_token
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
 from app.web.routes import georeference, page, parameters, plots, results, run, runs, sockets, tuning
-from app.web.routes.access import Limits
-from app.web.routes.run import NotPermittedError
+from app.web.routes.access import Limits, NotPermittedError
 from app.web.uploads import UploadError, Uploads
 from app.worker.protocol import Open, WorkerBusyError
 from app.worker.supervisor import WorkerProcess

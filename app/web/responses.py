@@ -32,6 +32,17 @@ class Body(BaseModel):
     model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+# Letters of any script: readable everywhere, and without characters that steer a terminal or a path.
+SetName = Annotated[str, Field(pattern=r"^\w[\w .+-]{0,39}$", max_length=40)]
+
+
+class SaveSet(Body):
+    """Name of a saved parameter set, and the person who saves it."""
+
+    name: SetName
+    who: UserName = "somebody"
+
+
 class BadRequestError(StemmapError):
     """A request that does not fit the route."""
 

@@ -11,15 +11,41 @@ from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import count, islice
+from typing import TYPE_CHECKING
 
-from app.robot.source import LiveSource
 from app.sources.request import ChosenOdometry
-from app.worker.frame_store import StepStore
 from pipeline.errors import SourceError
+from pipeline.io.block_file import BlockFile
+from pipeline.io.checkpoints import record_bytes, record_of
 from pipeline.io.readers.base import Source
 from pipeline.odometry.odometry_override import OdometryOverride
 from pipeline.odometry.synchroniser import Synchroniser
 from pipeline.types.records import Step
+
+if TYPE_CHECKING:
+    from app.robot.source import LiveSource
+
+MOST_STEP_BYTES = 4 << 30  # of the steps of a source; a scan of 30,000 points takes 0.3 MB
+
+
+class StepStore:
+    """The steps of a source."""
+
+    def __init__(self) -> None:
+        self._blocks = BlockFile(MOST_STEP_BYTES)
+
+    def put(self, step: Step) -> None:
+        """Store a step, unless one of its index is stored or no more can be stored."""
+        if step.index not in self._blocks:
+            self._blocks.put_block(step.index, record_bytes(step))
+
+    def read(self, index: int) -> Step | None:
+        """Return the step with an index; None if it is not stored."""
+        return self._blocks.read_block(index, lambda block: record_of(Step, block))
+
+    def close(self) -> None:
+        """Delete the file."""
+        self._blocks.close()
 
 
 class Cursor:

@@ -1,5 +1,4 @@
-"""The steps of a source and the results of the mapped scans on disk, so that a scan that was mapped is shown
-again without mapping it."""
+"""The results of the mapped scans on disk, to show a scan that was mapped again without mapping it."""
 
 from __future__ import annotations
 
@@ -9,35 +8,12 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from app.common.arrays import rows_of
-from app.worker.outbox import path_columns, rows_in_common
 from app.worker.protocol import LENGTH_BYTES, MessageCodec, Shown, WireError
+from pipeline.geometry.columns import columns_of, rows_in_common, rows_of
 from pipeline.io.block_file import BlockFile
-from pipeline.io.checkpoints import record_bytes, record_of
-from pipeline.types.records import Float, Float32, Frame, Path, Step
+from pipeline.types.records import Float, Float32, Frame, Path
 
 MOST_FRAME_BYTES = 1 << 30  # of the frames of one map; a scan takes 20 to 100 kB
-MOST_STEP_BYTES = 4 << 30  # of the steps of a source; a scan of 30,000 points takes 0.3 MB
-
-
-class StepStore:
-    """The steps of a source."""
-
-    def __init__(self) -> None:
-        self._blocks = BlockFile(MOST_STEP_BYTES)
-
-    def put(self, step: Step) -> None:
-        """Store a step, unless one of its index is stored or no more can be stored."""
-        if step.index not in self._blocks:
-            self._blocks.put_block(step.index, record_bytes(step))
-
-    def read(self, index: int) -> Step | None:
-        """Return the step with an index; None if it is not stored."""
-        return self._blocks.read_block(index, lambda block: record_of(Step, block))
-
-    def close(self) -> None:
-        """Delete the file."""
-        self._blocks.close()
 
 
 class StoredScan(msgspec.Struct, frozen=True):
@@ -156,7 +132,7 @@ class FrameStore:
         if self._path is None:
             return None
         parts.append(rows_of(self._path, slice(end)))
-        return Path(*map(np.concatenate, zip(*map(path_columns, reversed(parts)), strict=True)))
+        return Path(*map(np.concatenate, zip(*map(columns_of, reversed(parts)), strict=True)))
 
     def _read(self, index: int) -> StoredScan | None:
         """Return what is stored of a scan; None if it is not stored."""

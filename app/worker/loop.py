@@ -28,8 +28,7 @@ from typing import TypeVar
 import msgspec
 
 from app.common.text import COMPILING
-from app.explain.build import cluster_story, tree_story
-from app.explain.gathered import section
+from app.explain.build import cluster_story, section, tree_story
 from app.explain.history import RecentScans
 from app.worker import protocol
 from app.worker.outbox import for_comparison

@@ -11,9 +11,9 @@ from typing import BinaryIO
 import numpy as np
 from msgspec import structs
 
-from app.common.arrays import evenly_spaced, first_difference, rows_of
 from app.explain.history import RecentScans
 from app.worker.protocol import FromWorker, Opened, Report, Shown, WireError, from_worker
+from pipeline.geometry.columns import evenly_spaced, rows_in_common, rows_of
 from pipeline.types.records import Frame, HeightMap, Path
 
 # A higher frame rate is not visible and would only fill the pipe and the sockets.
@@ -169,16 +169,6 @@ def _replaces(newer: FromWorker, older: FromWorker) -> bool:
     if not isinstance(newer, Report) or not isinstance(older, Report):
         return False
     return (newer.status.source, newer.status.state) == (older.status.source, older.status.state)
-
-
-def path_columns(path: Path) -> list[np.ndarray]:
-    """Return the columns of a path, shape (N,) each, in the order of its fields; not copies."""
-    return [getattr(path, name) for name in Path.__slots__]
-
-
-def rows_in_common(old: Path, new: Path) -> int:
-    """Return the number of equal leading rows of two paths."""
-    return min(map(first_difference, path_columns(old), path_columns(new)))
 
 
 MOST_POINTS = 200_000

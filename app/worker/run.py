@@ -17,8 +17,7 @@ from app.common.timers import Stopwatch
 from app.explain.records import History
 from app.robot.source import LiveSource
 from app.sources.request import with_odometry
-from app.worker.cursor import Cursor, live_steps
-from app.worker.frame_store import StepStore
+from app.worker.cursor import Cursor, StepStore, live_steps
 from app.worker.protocol import RunCounts, Shown
 from app.worker.remap import (
     NOT_OF_THE_MAP,

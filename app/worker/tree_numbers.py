@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from app.common.arrays import rows_of
 from pipeline.evaluation import match
+from pipeline.geometry.columns import rows_of
 from pipeline.types.records import Trees
 
 Place = tuple[float, float]

@@ -36,6 +36,14 @@ def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
     )
 
 
+def value_text(value: Value) -> str:
+    """Return the value of a parameter in the syntax of `--set`, for example "0.2", "true" or "dbscan". Floats
+    have six significant digits."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def parsed(spec: FieldSpec, text: str) -> Value:
     """Return the value of a parameter from its text; bounds and choices are checked later, with the whole
     set. The text of a bool other than "true" and "false" is returned as it is, so that this check refuses it.

@@ -1,4 +1,4 @@
-"""Columns of numbers: columns that grow at the end, and quantisation.
+"""Tables of columns of equal length: columns that grow at the end, rows of a table, and quantisation.
 
 The front end quantises the data of a scan that is integrated over many scans, for a first run and for a
 rerun, so that the scan cache stores it in few bytes without loss. The steps are powers of two, so that their
@@ -7,6 +7,7 @@ multiples are exact.
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any, TypeVar
 
 import numpy as np
@@ -15,10 +16,10 @@ from numpy.typing import NDArray
 POINT = 1.0 / 256  # m; step of a return: a standard error of 1.1 mm, that of a sensor is 10 to 30 mm
 GROUND = 1.0 / 1024  # m; step of a ground height
 
-T = TypeVar("T", np.float32, np.float64)
+Real = TypeVar("Real", np.float32, np.float64)
 
 
-def rounded(values: NDArray[T], step: float) -> NDArray[T]:
+def rounded(values: NDArray[Real], step: float) -> NDArray[Real]:
     """Return values rounded to the nearest multiple of `step`, with their type and shape; a value half-way
     between two multiples is rounded to the even one, and -0 becomes 0. NaN and infinity remain.
 
@@ -27,7 +28,7 @@ def rounded(values: NDArray[T], step: float) -> NDArray[T]:
         step: A power of two.
     """
     kind = values.dtype.type
-    result: NDArray[T] = np.rint(values * kind(1.0 / step)) * kind(step) + kind(0.0)  # + 0 turns -0 into 0
+    result: NDArray[Real] = np.rint(values * kind(1.0 / step)) * kind(step) + kind(0.0)  # + 0 turns -0 into 0
     return result
 
 
@@ -83,3 +84,58 @@ class GrowingColumns:
         """Set the number of rows to `length`, which was reached before; rows after the present ones are those
         that were written there last."""
         self._length = length
+
+
+Table = TypeVar("Table")
+
+
+def rows_of(table: Table, rows: Any) -> Table:  # noqa: ANN401 - what indexes an array
+    """Return some rows of a record of columns, for example of `Trees`; columns that are None stay None. The
+    columns are copies; for a slice they are views.
+
+    Args:
+        table: A dataclass whose fields are arrays of equal length, or None.
+        rows: Indexes, a mask or a slice.
+    """
+    columns = {f.name: getattr(table, f.name) for f in fields(table)}  # type: ignore[arg-type]
+    return type(table)(**{name: None if c is None else c[rows] for name, c in columns.items()})
+
+
+def columns_of(table: object) -> list[Column]:
+    """Return the columns of a record whose fields are arrays, such as a `Path`, in the order of fields."""
+    return [getattr(table, f.name) for f in fields(table)]  # type: ignore[arg-type]
+
+
+def rows_in_common(old: Table, new: Table) -> int:
+    """Return the number of leading rows that two records of columns share, at most the rows of the shorter
+    one; see `first_difference`."""
+    return min(map(first_difference, columns_of(old), columns_of(new)))
+
+
+def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:
+    """Return the number of leading rows that are equal in two arrays, at most the number of rows of the
+    shorter one. NaN differs from NaN, except in arrays that share their memory, see `GrowingColumns`.
+
+    Args:
+        old: Shape (M, ...); None has no rows.
+        new: Shape (N, ...), with the same number of columns.
+    """
+    if old is None:
+        return 0
+    n = min(len(old), len(new))
+    if _has_same_memory(old, new):
+        return n
+    differs = (old[:n] != new[:n]).reshape(n, -1).any(axis=1) if n else np.zeros(0, np.bool_)
+    return int(np.argmax(differs)) if differs.any() else n
+
+
+def _has_same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:
+    """Return whether two arrays have their rows at the same addresses."""
+    layouts = [(x.__array_interface__["data"], x.strides, x.dtype) for x in (a, b)]
+    return layouts[0] == layouts[1]
+
+
+def evenly_spaced(n: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` row numbers of a table of n rows, int64, evenly spaced, ascending and without
+    repetition; all of them if there are no more."""
+    return np.arange(n) if n <= most else np.arange(most) * n // most

@@ -1,6 +1,6 @@
 """What annotations of simulated streets and parks change: `python -m tests.benchmarks.learned`.
 
-Every column of the scenes counts as annotated; scenes are left out as wholes, see `app.training.validation`.
+Every column of the scenes counts as annotated; scenes are left out as wholes, see `app.training.learning`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import argparse
 from dataclasses import replace
 
 from app.training.examples import UNKNOWN, Examples
-from app.training.validation import Rates, validate
+from app.training.learning import Rates, validate
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, ONE_WAY, read_forests, standard_forest
 from pipeline.config import Parameters, preset
 from pipeline.types.records import Verdict

@@ -1,4 +1,5 @@
-"""Dependencies of the routes: the dashboard, the role of the request, and the limits of viewers."""
+"""Shared parts of the routes: the dashboard, the role of the request, the limits of viewers, the files that a
+sender may open, and edits of annotations."""
 
 from __future__ import annotations
 
@@ -12,19 +13,26 @@ from contextlib import (
     contextmanager,
     nullcontext,
 )
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
+from urllib.parse import parse_qsl, urlencode
 
+import msgspec
 from fastapi import Depends, Query
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 from starlette.requests import HTTPConnection
+from starlette.responses import Response
 
 from app.common.request_queue import RequestQueue
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
+from app.sources.request import FILE, SourceRequest
+from app.store.records import Author
 from app.web.auth import Role, is_local, role_of
-from app.web.responses import BadRequestError
+from app.web.responses import BadRequestError, Body, Number, UserName, json_reply
 from pipeline.config.stages import Stand
+from pipeline.errors import StemmapError
 from pipeline.stand.volume import LONGEST
 
 #: Largest number of connections of one kind.
@@ -127,3 +135,135 @@ CallerRole = Annotated[Role, Depends(_role)]
 AnyFile = Annotated[bool, Depends(_may_open_any_file)]
 #: For routes that cost the mapping process or this one more than some milliseconds.
 ViewerTurn = Depends(_viewer_turn, scope="function")
+
+
+# --- which files may be opened ------------------------------------------------------------------------
+
+
+_ODOMETRY = ("auto", "wheels", "kiss-icp", "static")
+
+
+class NotPermittedError(StemmapError):
+    """The request names a file that its sender may not open."""
+
+
+def not_permitted(uri: str) -> NotPermittedError:
+    """Return the error for a source that the request may not open."""
+    return NotPermittedError(
+        "only scenarios and the recordings of the data folder can be opened here",
+        where=uri,
+        remedy="Put it into the folder of recordings, or start stemmap with STEMMAP_FILES=any",
+    )
+
+
+def permitted_request(request: SourceRequest, settings: Settings, any_file: bool) -> SourceRequest:
+    """Return the request with paths that may be opened.
+
+    Args:
+        request: The request of the browser.
+        settings: Settings of the deployment.
+        any_file: See `permitted_uri`.
+
+    Raises:
+        NotPermittedError: A file may not be opened.
+        BadRequestError: The odometry is unknown.
+    """
+    uri, odometry = permitted_uri(request.uri, settings, any_file), request.odometry
+    if uri is None:
+        raise not_permitted(request.uri)
+    if odometry.startswith(FILE):
+        poses = permitted_uri(odometry.removeprefix(FILE), settings, any_file)
+        if poses is None:
+            raise not_permitted(odometry)
+        odometry = f"{FILE}{poses}"
+    elif odometry not in _ODOMETRY:
+        raise BadRequestError(
+            f"the odometry {odometry[:40]!r} is unknown",
+            where="odometry",
+            remedy=f"Use {', '.join(_ODOMETRY)} or file:PATH",
+        )
+    return msgspec.structs.replace(request, uri=uri, odometry=odometry)
+
+
+def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
+    """Return the source that is opened for a URI, or None if it may not be opened. Whether it exists is not
+    checked.
+
+    Args:
+        uri: URI of the request.
+        settings: Settings of the deployment, with the data folders.
+        any_file: Whether the request may open every source, also files outside of the data folders and live
+            robots; then the URI is returned as it is. Otherwise only files in the data folders and simulated
+            runs may be opened, a scanned cloud (`sim:cloud`) only if its files `file` and `truth` are in the
+            data folders. The names of all these files are replaced by absolute paths without links, so that
+            the file that was checked is the file that is opened.
+    """
+    if any_file:
+        return uri
+    try:
+        if uri.startswith("sim:") and not Path(uri).exists():
+            return _permitted_simulation(uri, settings)
+        return _permitted_path(uri.removeprefix("file://"), settings)
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: "~name" of an unknown user
+        return None
+
+
+def _permitted_path(name: str, settings: Settings) -> str | None:
+    """Return the absolute path without links if it is in a data folder; else None. Raises OSError, ValueError
+    or RuntimeError for a text that is no path."""
+    path = Path(name).expanduser().resolve()
+    inside_folder = any(path.is_relative_to(folder.resolve()) for folder in settings.data_folders)
+    return str(path) if inside_folder else None
+
+
+def _permitted_simulation(uri: str, settings: Settings) -> str | None:
+    """Return the address of a simulated run. For a scan of a cloud, its files are replaced by their permitted
+    paths; None if one is not permitted. Other scenarios are permitted as they are."""
+    name, _, query = uri.removeprefix("sim:").partition("?")
+    if name != "cloud":
+        return uri
+    values = dict(parse_qsl(query, keep_blank_values=True))
+    for key in ("file", "truth"):
+        if key in values:
+            path = _permitted_path(values[key], settings)
+            if path is None:
+                return None
+            values[key] = path
+    return f"sim:cloud?{urlencode(values)}"
+
+
+# --- edits of annotations --------------------------------------------------------------------------
+
+# Eastings and northings on the earth are smaller.
+FARTHEST_M = 1e7
+BROWSER = r"^[0-9a-f]{16,40}$"
+Metres = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+
+
+class Edit(Body):
+    """The fields of every edit: the run, the browser, and the person."""
+
+    run: Number
+    browser: Annotated[str, Field(pattern=BROWSER)]
+    who: UserName
+
+    @property
+    def author(self) -> Author:
+        """Author of the edit."""
+        return Author(self.browser, self.who)
+
+
+async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], status: int = 200) -> Response:
+    """Return a response with further values, the number of edits so far (`serial`), and how many edits of
+    this browser can be undone and redone.
+
+    Args:
+        dashboard: The dashboard.
+        edit: The edit, with its browser.
+        payload: Further values.
+        status: HTTP status.
+    """
+    serial = dashboard.annotation_editor.serial
+    steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, edit.browser))
+    undo_count, redo_count = steps or (0, 0)
+    return json_reply({**payload, "serial": serial, "undo": undo_count, "redo": redo_count}, status)

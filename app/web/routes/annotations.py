@@ -14,33 +14,15 @@ from starlette.responses import Response
 
 from app.dashboard.annotations import Against, row_payload
 from app.dashboard.dashboard import Dashboard
-from app.store.records import MOST_ANNOTATIONS, Author, Content, contents_of, moment
-from app.web.responses import BadRequestError, Body, Number, UserName, json_reply, text_reply
-from app.web.routes.access import Dash
+from app.store.records import MOST_ANNOTATIONS, Content, contents_of, moment
+from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
+from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, edited
 from pipeline.errors import SourceError
 
 router = APIRouter(prefix="/api")
 
-# Eastings and northings on the earth are smaller.
-_FARTHEST_M = 1e7
 _LARGEST_DBH_M = 10.0
-_BROWSER = r"^[0-9a-f]{16,40}$"
-
-Metres = Annotated[float, Field(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 _Columns = ("x_m", "y_m", "dbh_cm", "class", "who", "edited")
-
-
-class Edit(Body):
-    """The fields of every edit: the run, the browser, and the person."""
-
-    run: Number
-    browser: Annotated[str, Field(pattern=_BROWSER)]
-    who: UserName
-
-    @property
-    def author(self) -> Author:
-        """Author of the edit."""
-        return Author(self.browser, self.who)
 
 
 class _Add(Edit):
@@ -81,7 +63,7 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
     """Return the annotations of the run, and how many edits this browser can undo and redo; both 0 without a
     run or with an invalid name of the browser."""
     steps = None
-    if re.fullmatch(_BROWSER, browser):
+    if re.fullmatch(BROWSER, browser):
         steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, browser))
     undo, redo = steps or (0, 0)
     return json_reply({**dashboard.annotation_editor.as_plain(), "undo": undo, "redo": redo})
@@ -180,22 +162,6 @@ async def export_geojson(dashboard: Dash) -> Response:
     return text_reply(json.dumps(collection, indent=1) + "\n", "truth.geojson", "application/geo+json")
 
 
-async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], status: int = 200) -> Response:
-    """Return a response with further values, the number of edits so far (`serial`), and how many edits of
-    this browser can be undone and redone.
-
-    Args:
-        dashboard: The dashboard.
-        edit: The edit, with its browser.
-        payload: Further values.
-        status: HTTP status.
-    """
-    serial = dashboard.annotation_editor.serial
-    steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, edit.browser))
-    undo_count, redo_count = steps or (0, 0)
-    return json_reply({**payload, "serial": serial, "undo": undo_count, "redo": redo_count}, status)
-
-
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
     """Return the annotations of the open run, see `row_payload`, those of a whole cloud in the coordinates of
     its file."""
@@ -235,8 +201,8 @@ def _check(content: Content, row: int) -> None:
         content: The row.
         row: Its number, from 0 on.
     """
-    if max(abs(content.x), abs(content.y)) > _FARTHEST_M:
-        raise BadRequestError(f"row {row + 1} is farther than {_FARTHEST_M:.0f} m from the origin")
+    if max(abs(content.x), abs(content.y)) > FARTHEST_M:
+        raise BadRequestError(f"row {row + 1} is farther than {FARTHEST_M:.0f} m from the origin")
     if content.dbh is not None and content.dbh > _LARGEST_DBH_M:
         raise BadRequestError(
             f"row {row + 1} has a DBH of {content.dbh:.1f} m", remedy="Check the unit of the diameter"

@@ -18,8 +18,7 @@ from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.store.records import FRAME, Content
 from app.web.responses import BadRequestError, Body, Number
-from app.web.routes.access import Dash, in_thread
-from app.web.routes.annotations import Edit, Metres, edited
+from app.web.routes.access import Dash, Edit, Metres, edited, in_thread
 from pipeline.errors import StemmapError
 from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.stand import POINT_SIGMA

@@ -11,13 +11,11 @@ from pydantic import Field
 from starlette.responses import Response
 
 from app.dashboard.parameters import file_of, read_file
-from app.web.responses import Body, UserName, Value, Word, json_reply, text_reply
+from app.web.responses import Body, SaveSet, SetName, Value, Word, json_reply, text_reply
 from app.web.routes.access import Dash
 
 router = APIRouter(prefix="/api")
 
-# Letters of any script: readable everywhere, and without characters that steer a terminal or a path.
-SetName = Annotated[str, Field(pattern=r"^\w[\w .+-]{0,39}$", max_length=40)]
 _LONGEST_FILE = 100_000
 _TOML = "application/toml"
 
@@ -45,13 +43,6 @@ class _Reset(Body):
 class _ViewChoice(Body):
     name: Word
     value: bool | Word
-
-
-class SaveSet(Body):
-    """Name of a saved parameter set, and the person who saves it."""
-
-    name: SetName
-    who: UserName = "somebody"
 
 
 class _SetName(Body):

@@ -26,8 +26,7 @@ from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.store.records import PLOT, Content, UnknownError
 from app.web.responses import BadRequestError, Body, Number, json_reply
-from app.web.routes.access import Dash, FigureParameters, ViewerTurn, in_thread
-from app.web.routes.annotations import Edit, Metres, edited
+from app.web.routes.access import Dash, Edit, FigureParameters, Metres, ViewerTurn, edited, in_thread
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
 from pipeline.stand.plots import centres_along, plot_of

@@ -7,18 +7,16 @@ import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
-from urllib.parse import parse_qsl, urlencode
 
 import msgspec
 from fastapi import APIRouter
 from pydantic import Field, field_validator
 from starlette.responses import Response
 
-from app.common.settings import Settings
 from app.sources.inspection import ask
-from app.sources.request import FILE, LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
+from app.sources.request import LARGEST_SEED, LONGEST_URI, Role, SourceRequest, mount_of_degrees
 from app.web.responses import BadRequestError, Body, Value, Word, json_reply
-from app.web.routes.access import AnyFile, Dash, Deployment
+from app.web.routes.access import AnyFile, Dash, Deployment, not_permitted, permitted_request, permitted_uri
 from app.worker.protocol import FASTEST, LONGEST_S, MOST_SCANS, Command
 from pipeline.errors import StemmapError
 
@@ -27,7 +25,6 @@ router = APIRouter(prefix="/api")
 _MOST_RECORDINGS = 500
 SHORTEST_LOOP_S = 0.5
 SLOWEST = 0.01
-_ODOMETRY = ("auto", "wheels", "kiss-icp", "static")
 
 _Uri = Annotated[str, Field(min_length=1, max_length=LONGEST_URI)]
 _Seconds = Annotated[float, Field(ge=0.0, le=LONGEST_S)]
@@ -196,95 +193,3 @@ def recordings(folders: Sequence[Path]) -> list[Path]:
         with contextlib.suppress(OSError):
             found += sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     return [path for path in found if not (path / "run.json").is_file()][:_MOST_RECORDINGS]
-
-
-# --- which files may be opened ------------------------------------------------------------------------
-
-
-class NotPermittedError(StemmapError):
-    """The request names a file that its sender may not open."""
-
-
-def not_permitted(uri: str) -> NotPermittedError:
-    """Return the error for a source that the request may not open."""
-    return NotPermittedError(
-        "only scenarios and the recordings of the data folder can be opened here",
-        where=uri,
-        remedy="Put it into the folder of recordings, or start stemmap with STEMMAP_FILES=any",
-    )
-
-
-def permitted_request(request: SourceRequest, settings: Settings, any_file: bool) -> SourceRequest:
-    """Return the request with paths that may be opened.
-
-    Args:
-        request: The request of the browser.
-        settings: Settings of the deployment.
-        any_file: See `permitted_uri`.
-
-    Raises:
-        NotPermittedError: A file may not be opened.
-        BadRequestError: The odometry is unknown.
-    """
-    uri, odometry = permitted_uri(request.uri, settings, any_file), request.odometry
-    if uri is None:
-        raise not_permitted(request.uri)
-    if odometry.startswith(FILE):
-        poses = permitted_uri(odometry.removeprefix(FILE), settings, any_file)
-        if poses is None:
-            raise not_permitted(odometry)
-        odometry = f"{FILE}{poses}"
-    elif odometry not in _ODOMETRY:
-        raise BadRequestError(
-            f"the odometry {odometry[:40]!r} is unknown",
-            where="odometry",
-            remedy=f"Use {', '.join(_ODOMETRY)} or file:PATH",
-        )
-    return msgspec.structs.replace(request, uri=uri, odometry=odometry)
-
-
-def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
-    """Return the source that is opened for a URI, or None if it may not be opened. Whether it exists is not
-    checked.
-
-    Args:
-        uri: URI of the request.
-        settings: Settings of the deployment, with the data folders.
-        any_file: Whether the request may open every source, also files outside of the data folders and live
-            robots; then the URI is returned as it is. Otherwise only files in the data folders and simulated
-            runs may be opened, a scanned cloud (`sim:cloud`) only if its files `file` and `truth` are in the
-            data folders. The names of all these files are replaced by absolute paths without links, so that
-            the file that was checked is the file that is opened.
-    """
-    if any_file:
-        return uri
-    try:
-        if uri.startswith("sim:") and not Path(uri).exists():
-            return _permitted_simulation(uri, settings)
-        return _permitted_path(uri.removeprefix("file://"), settings)
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: "~name" of an unknown user
-        return None
-
-
-def _permitted_path(name: str, settings: Settings) -> str | None:
-    """Return the absolute path without links if it is in a data folder; else None. Raises OSError, ValueError
-    or RuntimeError for a text that is no path."""
-    path = Path(name).expanduser().resolve()
-    inside_folder = any(path.is_relative_to(folder.resolve()) for folder in settings.data_folders)
-    return str(path) if inside_folder else None
-
-
-def _permitted_simulation(uri: str, settings: Settings) -> str | None:
-    """Return the address of a simulated run. For a scan of a cloud, its files are replaced by their permitted
-    paths; None if one is not permitted. Other scenarios are permitted as they are."""
-    name, _, query = uri.removeprefix("sim:").partition("?")
-    if name != "cloud":
-        return uri
-    values = dict(parse_qsl(query, keep_blank_values=True))
-    for key in ("file", "truth"):
-        if key in values:
-            path = _permitted_path(values[key], settings)
-            if path is None:
-                return None
-            values[key] = path
-    return f"sim:cloud?{urlencode(values)}"

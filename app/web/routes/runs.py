@@ -39,8 +39,15 @@ from app.web.responses import (
     error_reply,
     json_reply,
 )
-from app.web.routes.access import AnyFile, Dash, Deployment, FigureParameters, ViewerTurn, in_thread
-from app.web.routes.run import permitted_request
+from app.web.routes.access import (
+    AnyFile,
+    Dash,
+    Deployment,
+    FigureParameters,
+    ViewerTurn,
+    in_thread,
+    permitted_request,
+)
 from pipeline.config import PRESETS, preset
 from pipeline.geometry.poses import Pose2
 from pipeline.io.atomic_files import write_texts

@@ -14,10 +14,8 @@ from app.dashboard.dashboard import Dashboard
 from app.tuning.job import MOST_OTHERS, OtherRun, SearchRequest, other_runs, plan_of
 from app.tuning.plan import GOALS, SENSIBLE, Plan
 from app.tuning.sensitivity import MOST_VALUES
-from app.web.responses import Body, Value, Word, json_reply
-from app.web.routes.access import AnyFile, Dash, Deployment, Trainer
-from app.web.routes.parameters import SaveSet
-from app.web.routes.run import permitted_uri
+from app.web.responses import Body, SaveSet, Value, Word, json_reply
+from app.web.routes.access import AnyFile, Dash, Deployment, Trainer, permitted_uri
 from pipeline.errors import StemmapError
 
 router = APIRouter(prefix="/api")

@@ -10,9 +10,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.common.arrays import first_difference
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.payload import clearance_payload, ellipses
+from pipeline.geometry.columns import first_difference
 from pipeline.types.records import Clearance, Zone
 
 

@@ -6,8 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.explain.build import tree_story
-from app.explain.gathered import BREAST_HIGH, BREAST_LOW, REACH, points_around, section
+from app.explain.build import BREAST_HIGH, BREAST_LOW, REACH, points_around, section, tree_story
 from app.worker.session import Session
 from pipeline.classification.voxel_map import SIDE, VoxelMap
 

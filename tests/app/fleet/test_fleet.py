@@ -15,11 +15,10 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
+import app.fleet as fleet_module
 from app.common.settings import Settings
 from app.dashboard.run_recorder import _Page
-from app.fleet import fleet as fleet_module
-from app.fleet.fleet import Fleet, Frames
-from app.fleet.server import build_fleet, named, warm_kernels
+from app.fleet import Fleet, Frames, build_fleet, named, warm_kernels
 from app.sources.request import SourceRequest
 from app.store.records import NewRun
 from app.web.auth import viewer_token

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.fleet import fleet as module
-from app.fleet.fleet import LEAST_TREES, MORE_TREES, Frames
+import app.fleet as module
+from app.fleet import LEAST_TREES, MORE_TREES, Frames
 from pipeline.geometry.poses import Pose2
 
 STEMS = np.random.default_rng(3).uniform(-15.0, 15.0, (30, 2))

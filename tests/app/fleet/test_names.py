@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from app.fleet.fleet import NAMELESS
-from app.fleet.server import RobotWatch, address_of, recorded_apart
+from app.fleet import NAMELESS, RobotWatch, address_of, recorded_apart
 from app.robot.address import ROOT, ZenohAddress, parse_address
 from app.robot.topics import Publisher, choose
 from app.worker.protocol import Open

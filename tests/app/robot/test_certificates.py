@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from app.fleet.server import address_of
+from app.fleet import address_of
 from app.robot.address import ZenohAddress, parse_address
 from app.robot.source import LiveSource, open_live
 from app.robot.zenoh import configuration, data_key

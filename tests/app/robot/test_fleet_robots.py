@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 from app.cli import serve
-from app.fleet.server import RobotWatch, robots_at
+from app.fleet import RobotWatch, robots_at
 from app.robot.address import ZenohAddress, parse_address
 from app.worker.protocol import Open
 from tests.app.fleet.test_fleet import make

@@ -20,8 +20,7 @@ from app.store.store import Store
 from app.training.annotated_runs import CLASS_OF_KIND, SEEN, ExampleCollector
 from app.training.examples import TREE, Examples, object_numbers
 from app.training.fit_forest import PRIOR, SETTINGS, all_expanded, expanded
-from app.training.learning import seen_by, what_lacks
-from app.training.validation import SAME_PLACE, Rates, fold_of, groups_of, validate
+from app.training.learning import SAME_PLACE, Rates, fold_of, groups_of, seen_by, validate, what_lacks
 from pipeline.classification import no_columns
 from pipeline.classification.features import COUNT, NAMES
 from pipeline.classification.forest import ALL_AROUND, CLASSES, FILE, FREE_END, ONE_WAY, forest_of, vote

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Any
 
-from app.tuning.jobs import Job, JobResult
+from app.tuning.jobs import Job, JobResult, ResultStore, ScoringProcesses
 from app.tuning.scoring import Scorer
-from app.tuning.workers import ResultStore, ScoringProcesses
 
 
 class InlineProcesses(ScoringProcesses[Any]):

@@ -14,6 +14,7 @@ from app.tuning.jobs import JobResult
 from app.tuning.report import (
     CRITERIA,
     Comparison,
+    SweepPlan,
     best_of,
     compare_results,
     files,
@@ -22,7 +23,6 @@ from app.tuning.report import (
     page,
 )
 from app.tuning.scoring import PreparedRun
-from app.tuning.sweep import SweepPlan
 from pipeline.config.model import Value
 from tests.app.tuning.jobs import job, scores
 

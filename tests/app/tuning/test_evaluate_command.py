@@ -29,7 +29,7 @@ def here(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_is_known_is_not_computed_again_and_a_run_that_fails_is_said(
     here, tmp_path, capsys, monkeypatch
 ):
-    monkeypatch.setattr("app.tuning.workers.COMMAND", ("false",))  # a worker that ends at once
+    monkeypatch.setattr("app.tuning.jobs.COMMAND", ("false",))  # a worker that ends at once
     assert evaluate(tmp_path, "--jobs", "1", "--keep", str(here / "keep")) == 3
     told = capsys.readouterr()
     assert "3 stored results used" in told.err

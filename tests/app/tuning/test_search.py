@@ -18,11 +18,10 @@ from app.cli.flags import files_of
 from app.dashboard.parameters import read_file
 from app.sources.request import SourceRequest
 from app.store.records import Content, as_truth, contents_of
-from app.tuning.jobs import JobResult
+from app.tuning.jobs import JobResult, ResultStore
 from app.tuning.plan import Plan, PlannedRun, Trial, axes_of
 from app.tuning.result import result_of
 from app.tuning.search import Search, search_processes
-from app.tuning.workers import ResultStore
 from pipeline.config import preset
 from pipeline.errors import ParameterError, StemmapError
 from tests.app.tuning.inline_worker import InlineProcesses

@@ -14,9 +14,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from app.tuning.jobs import Job, JobResult, code_digest
-from app.tuning.sweep import sweep
-from app.tuning.workers import MOST_LOSSES, LostError, ResultStore, ScoringProcesses
+from app.tuning.jobs import MOST_LOSSES, Job, JobResult, LostError, ResultStore, ScoringProcesses, code_digest
+from app.tuning.report import sweep
 from tests.app.tuning.inline_worker import InlineProcesses
 from tests.app.tuning.jobs import job, scores
 from tests.app.tuning.scores import scores as plain_scores
@@ -65,7 +64,7 @@ def test_threads_that_store_the_same_result_do_not_disturb_one_another(tmp_path)
 
 
 def test_only_the_results_used_last_stay(tmp_path, monkeypatch):
-    monkeypatch.setattr("app.tuning.workers.MOST_FILES", 3)
+    monkeypatch.setattr("app.tuning.jobs.MOST_FILES", 3)
     kept, answer = ResultStore(tmp_path), JobResult(scores(0.5))
     for number in range(6):
         kept.put(str(number), answer)
@@ -164,7 +163,7 @@ def test_another_run_or_set_has_another_key(change):
 
 def test_results_of_other_code_are_computed_again(tmp_path, monkeypatch):
     sweep([job(0.1)], InlineProcesses(fine, kept=ResultStore(tmp_path)))
-    monkeypatch.setattr("app.tuning.workers.code_digest", lambda: "older")
+    monkeypatch.setattr("app.tuning.jobs.code_digest", lambda: "older")
     assert ResultStore(tmp_path).get(job(0.1).key()) is None
 
 

@@ -8,7 +8,7 @@ import contextlib
 import httpx
 import pytest
 
-from app.web import http_protocol
+from app.web import serving
 from tests.app.server_for_tests import BEARER, served
 
 HEADER_S = 0.6
@@ -16,7 +16,7 @@ HEADER_S = 0.6
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_protocol, "HEADER_S", HEADER_S)
+    monkeypatch.setattr(serving, "HEADER_S", HEADER_S)
 
 
 async def connect(host: str) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
@@ -72,8 +72,8 @@ async def test_a_request_whose_answer_takes_longer_is_not_closed() -> None:
 
 
 async def test_connections_without_a_request_are_limited_per_address(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_protocol, "MOST_WAITING", 5)
-    monkeypatch.setattr(http_protocol, "HEADER_S", 30.0)
+    monkeypatch.setattr(serving, "MOST_WAITING", 5)
+    monkeypatch.setattr(serving, "HEADER_S", 30.0)
     async with served() as (host, _):
         held = [await connect(host) for _ in range(5)]
         await asyncio.sleep(0.1)

@@ -18,7 +18,7 @@ import pytest
 from app.common.settings import Files, Settings
 from app.dashboard.dashboard import Dashboard
 from app.web.auth import viewer_token
-from app.web.routes.run import permitted_uri
+from app.web.routes.access import permitted_uri
 from app.worker.protocol import (
     Advance,
     Answer,

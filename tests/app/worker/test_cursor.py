@@ -6,8 +6,7 @@ from contextlib import closing
 
 import pytest
 
-from app.worker.cursor import Cursor
-from app.worker.frame_store import StepStore
+from app.worker.cursor import Cursor, StepStore
 from pipeline.io.block_file import BlockFile
 from pipeline.io.checkpoints import encode
 from pipeline.odometry.synchroniser import steps

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from app.explain.build import cluster_story, tree_story
-from app.explain.gathered import section as at_breast
+from app.explain.build import section as at_breast
 from app.worker.outbox import picture_of
 from app.worker.process import new_session, open_any_or_cloud
 from app.worker.protocol import Report, Shown, from_worker

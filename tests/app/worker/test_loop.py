@@ -17,7 +17,7 @@ import pytest
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
 from app.worker.loop import WorkerLoop
-from app.worker.outbox import MOST_POINTS, Outbox, picture_of, rows_in_common
+from app.worker.outbox import MOST_POINTS, Outbox, picture_of
 from app.worker.protocol import (
     Advance,
     Answer,
@@ -41,6 +41,7 @@ from app.worker.protocol import (
 )
 from pipeline.config import Parameters
 from pipeline.errors import StemmapError
+from pipeline.geometry.columns import rows_in_common
 from tests.app.explain.stories import cluster_story
 from tests.app.fakes import FakeSource, frame, make_session, opened, path
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from app.common.settings import Settings
-from app.web.routes.run import permitted_uri
+from app.web.routes.access import permitted_uri
 from pipeline.errors import SourceError
 from pipeline.io.readers.simulated import open_simulated as open_source
 from pipeline.simulation import cloud_run
+from pipeline.simulation.cloud_run import first_surfels, lay_surfels
 from pipeline.simulation.lidar import SpinningLidar
 from pipeline.simulation.scenarios import parse_uri
-from pipeline.simulation.surfels import first_surfels, lay_surfels
 from tests.pipeline.inventory.plots import PLACES, plot, stem, write_las
 
 UTM = (470600.0, 3810200.0, 2278.0)

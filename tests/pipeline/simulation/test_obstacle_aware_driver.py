@@ -11,9 +11,8 @@ import pytest
 from pipeline.config import Parameters
 from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose2
-from pipeline.simulation.obstacle_aware_driver import obstacle_aware_drive
 from pipeline.simulation.robot_motion import RATE_HZ, lay_course, speed_limit
-from pipeline.simulation.run import MOUNTING, SimulatedRun, open_run
+from pipeline.simulation.run import MOUNTING, SimulatedRun, obstacle_aware_drive, open_run
 from pipeline.simulation.scenarios import parse_uri
 from pipeline.types.records import Step, Zone
 
