@@ -57,7 +57,7 @@ _LANDMARKS, _GRAPH = "pipeline/slam/particle_maps.py", "pipeline/slam/keyframe_g
 _MERGED, _AUTH = "pipeline/io/checkpoints/merged_map.py", "app/web/auth.py"
 _EVALUATION, _LIMITS_TESTS = (
     "tests/pipeline/evaluation/test_evaluation.py",
-    "tests/app/common/test_limited_process.py",
+    "tests/app/sources/test_limited_process.py",
 )
 _DETECTION, _SCORE = "pipeline/loop_closure/detection.py", "pipeline/evaluation.py"
 _CLOCK, _CHUNKS = "pipeline/io/readers/message_time.py", "pipeline/io/readers/container.py"
@@ -66,7 +66,7 @@ _RULE_TESTS, _RAYS_TESTS = (
     "tests/pipeline/classification/test_decision_rule.py",
     "tests/pipeline/classification/test_ray_statistics.py -k absent",
 )
-_LIMITED = "app/common/limited_process.py"
+_LIMITED = "app/sources/opening.py"
 _UPDATE = f"{_SLAM}/test_fastslam.py -k 'textbook or views or positive'"
 _GRAPH_TESTS = f"{_SLAM}/test_keyframe_graph.py -k 'turns or turned or weight'"
 _MERGED_TESTS = "tests/pipeline/io/test_merged_map.py"

@@ -312,11 +312,7 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
         answers = sweep(list(plan.jobs.values()), processes, bar.update)
     if kept.used:
         print(f"{count(kept.used, 'stored result')} used", file=sys.stderr)
-    lost = [
-        f"{count(times, 'process', 'processes')} lost during a job: {reason}"
-        for reason, times in sorted(processes.lost.items())
-    ]
-    for warning in (*kept.warnings(), *lost):
+    for warning in processes.warnings():
         print(f"warning: {flags.plain(warning)}", file=sys.stderr)
     return answers
 

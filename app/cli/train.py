@@ -24,9 +24,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("runs", metavar="RUN", nargs="*", help="annotated runs by URI or name (default: all)")
     parser.add_argument(
-        "--annotations", action="store_true", help="accepted for commands of earlier versions: the default"
-    )
-    parser.add_argument(
         "--out", metavar="FILE", type=Path, help="JSON file to write (default: in the data folder)"
     )
     parser.add_argument("--seed", type=whole_seed, default=0, metavar="N", help="random seed (default: 0)")

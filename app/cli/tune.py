@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     with closing(search_processes(plan, arguments.workers)) as workers:
         search = Search(plan, workers)
         stopped = _search(search)
-        for warning in workers.kept.warnings():
+        for warning in workers.warnings():
             print(f"warning: {flags.plain(warning)}", file=sys.stderr)
         return _finish(search, arguments, stopped=stopped)
 
@@ -206,9 +206,6 @@ def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool) -> 
     for line in lines_of(plan, result):
         print(line)
     print(f"written to {arguments.out}; use it with --config {arguments.out}")
-    for reason, times in sorted(search.lost.items()):
-        lost = count(times, "process", "processes")
-        print(f"warning: {lost} ended early and were restarted: {reason}", file=sys.stderr)
     if warning := warning_of(result):
         print(f"warning: {warning}", file=sys.stderr)
     if stopped:

@@ -145,16 +145,10 @@ def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
         environment: The variables; None for those of this process.
 
     Raises:
-        StemmapError: A variable has an invalid value, the host is not a loopback address, the folder of
-            recordings does not exist, or STEMMAP_DATABASE of earlier versions is set.
+        StemmapError: A variable has an invalid value, the host is not a loopback address, or the folder of
+            recordings does not exist.
     """
     variables = os.environ if environment is None else environment
-    if variables.get("STEMMAP_DATABASE"):
-        raise StemmapError(
-            "other databases than the SQLite file in STEMMAP_FOLDER are no longer supported",
-            where="STEMMAP_DATABASE",
-            remedy="Unset it",
-        )
     try:
         given = msgspec.convert(dict(variables), Environment, strict=False)
     except msgspec.ValidationError as error:

@@ -1,4 +1,5 @@
-"""Opening of files from outside: first in a child process with limits, then in this one.
+"""Opening of files from outside: first in a copy of this process with limits on memory, computing time and
+time, then in this one.
 
 A damaged or hostile file can take gigabytes, hang, or end the process that opens it. The limits grow with the
 size of the file.
@@ -7,18 +8,145 @@ size of the file.
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import faulthandler
+import os
+import select
+import signal
+import sys
+import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
-from app.common.limited_process import ProcessLimits, run_limited
+import msgspec
+
 from app.robot.address import is_live, parse_address
+from pipeline.errors import SourceError, StemmapError
 from pipeline.io.readers import Source, SourceOptions, check_existence, is_cloud
 from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
 
 if TYPE_CHECKING:
     from pipeline.types.records import WholeCloud
+
+
+_PR_SET_PDEATHSIG = 1
+_DAMAGED = "The file is damaged, or this is a fault in stemmap"
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessLimits:
+    """Limits of a child process.
+
+    Attributes:
+        memory: Memory that it may take in addition to that of its parent [bytes].
+        cpu_s: Computing time [s].
+        wall_s: Time [s].
+    """
+
+    memory: int
+    cpu_s: int
+    wall_s: float
+
+    @classmethod
+    def for_size(cls, size: int) -> ProcessLimits:
+        """Return the limits for reading a file of `size` bytes: 512 MB and twice its size of memory, 6 s and
+        1 s per 4 MB of computing time, 60 s and 1 s per 5 MB of time."""
+        return cls((512 << 20) + 2 * size, 6 + size // 4_000_000, 60.0 + size / 5_000_000)
+
+
+def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -> None:
+    """Run a function in a copy of this process, which is killed at its limits; its result is discarded.
+
+    The copy has only the calling thread: the function must not wait for other threads. It is available on
+    Linux; on other systems nothing is run.
+
+    Args:
+        work: The function.
+        limits: Limits of the copy.
+        where: File in errors.
+
+    Raises:
+        SourceError: The function raised a StemmapError, whose text it has; or the copy exceeded a limit, or
+            ended without an answer, as after any other exception.
+    """
+    if sys.platform != "linux":
+        return
+    receiving, sending = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(receiving)
+        _be_child(work, limits, where, sending)
+    os.close(sending)
+    try:
+        answer = _answer(receiving, limits.wall_s)
+    finally:
+        os.close(receiving)
+        os.kill(child, signal.SIGKILL)  # also at Ctrl-C; not reaped yet, so the number is still its own
+        _, status = os.waitpid(child, 0)
+    if answer is None:
+        raise SourceError("it takes too long to be read", where=where, remedy=_DAMAGED)
+    if not answer:
+        slow = os.WIFSIGNALED(status) and os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL)
+        what = "it takes too long to be read" if slow else "the reader ended without an answer"
+        raise SourceError(what, where=where, remedy=_DAMAGED)
+    error = msgspec.json.decode(answer, type=tuple[str, str, str] | None)
+    if error is not None:
+        what, place, remedy = error
+        raise SourceError(what, where=place, remedy=remedy)
+
+
+def _answer(receiving: int, wall_s: float) -> bytes | None:
+    """Return what the child writes until it ends; None if it does not end within `wall_s` [s]."""
+    answer, until_s = b"", time.monotonic() + wall_s
+    while select.select([receiving], [], [], max(until_s - time.monotonic(), 0.0))[0]:
+        block = os.read(receiving, 1 << 16)
+        if not block:
+            return answer
+        answer += block
+    return None
+
+
+def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sending: int) -> NoReturn:
+    """Run the function in the copy with its limits, write its error as JSON (null without one), and end the
+    copy; nothing is written after exceptions other than StemmapError and MemoryError.
+
+    Args:
+        work, limits, where: As in `run_limited`.
+        sending: File descriptor of the pipe to the parent.
+    """
+    import resource
+
+    error: tuple[str, str, str] | None = None
+    try:
+        faulthandler.disable()
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_DFL)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 2)  # libraries print why they end the process
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        used_s = resource.getrusage(resource.RUSAGE_SELF)
+        cpu_s = int(used_s.ru_utime + used_s.ru_stime) + limits.cpu_s
+        resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s + 1))
+        resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + limits.memory,) * 2)
+        work()
+    except StemmapError as raised:
+        error = raised.what, raised.where, raised.remedy
+    except MemoryError:
+        error = "it takes more memory than a file of its size should", where, _DAMAGED
+    except BaseException:
+        os._exit(1)
+    os.write(sending, msgspec.json.encode(error))
+    os._exit(0)
+
+
+def _data_bytes() -> int:
+    """Return the private memory of this process that RLIMIT_DATA counts [bytes]."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
 
 
 def check_address(uri: str) -> bool:

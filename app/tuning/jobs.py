@@ -286,6 +286,14 @@ class ScoringProcesses(Generic[T]):
         processes, and StemmapError if no process can be started."""
         return self._threads.submit(self._known_or_computed, worker, job)
 
+    def warnings(self) -> list[str]:
+        """Return warnings on lost processes, and on stored results that could not be read or written."""
+        lost = [
+            f"{count(times, 'process', 'processes')} lost during a job and replaced: {reason}"
+            for reason, times in sorted(self.lost.items())
+        ]
+        return [*self.kept.warnings(), *lost]
+
     def close(self) -> None:
         """End all processes and wait for their threads."""
         with self._lock:

@@ -8,7 +8,6 @@ the stored results of the trials that it made.
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
@@ -126,11 +125,6 @@ class Search:
             (planned.source.uri, run.digest, planned.held_out)
             for planned, run in zip(self.plan.runs, self._runs, strict=True)
         ]
-
-    @property
-    def lost(self) -> Counter[str]:
-        """Number of processes that ended during a job, by reason."""
-        return self._processes.lost
 
     @property
     def is_complete(self) -> bool:

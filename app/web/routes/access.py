@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import (
     AbstractContextManager,
     ExitStack,
@@ -14,7 +14,7 @@ from contextlib import (
     nullcontext,
 )
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
 from urllib.parse import parse_qsl, urlencode
 
 import msgspec
@@ -29,6 +29,7 @@ from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.sources.request import FILE, SourceRequest
 from app.store.records import Author
+from app.store.store import Store
 from app.web.auth import Role, is_local, role_of
 from app.web.responses import BadRequestError, Body, Number, UserName, json_reply
 from pipeline.config.stages import Stand
@@ -37,6 +38,7 @@ from pipeline.stand.volume import LONGEST
 
 #: Largest number of connections of one kind.
 MOST: dict[Role, int] = {"owner": 50, "viewer": 50}
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -267,3 +269,17 @@ async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], stat
     steps = await dashboard.annotation_editor.read(lambda store, run: store.steps(run, edit.browser))
     undo_count, redo_count = steps or (0, 0)
     return json_reply({**payload, "serial": serial, "undo": undo_count, "redo": redo_count}, status)
+
+
+async def apply_edit(
+    dashboard: Dashboard,
+    edit: Edit,
+    change: Callable[Concatenate[Store, int, Author, P], T],
+    *values: P.args,
+    **named: P.kwargs,
+) -> T:
+    """Call a method of the store with the run and the author of an edit and further arguments, and return its
+    result; see `AnnotationEditor.edit`, also for the errors."""
+    return await dashboard.annotation_editor.edit(
+        edit.run, lambda store: change(store, edit.run, edit.author, *values, **named)
+    )

@@ -15,8 +15,9 @@ from starlette.responses import Response
 from app.dashboard.annotations import Against, row_payload
 from app.dashboard.dashboard import Dashboard
 from app.store.records import MOST_ANNOTATIONS, Content, contents_of, moment
+from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply, text_reply
-from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, edited
+from app.web.routes.access import BROWSER, FARTHEST_M, Dash, Edit, Metres, apply_edit, edited
 from pipeline.errors import SourceError
 
 router = APIRouter(prefix="/api")
@@ -74,9 +75,7 @@ async def add(body: _Add, dashboard: Dash) -> Response:
     """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
     and not exported); return its number and the numbers of edits that can be undone and repeated, with 201.
     409 if another run was opened meanwhile or nothing can be annotated."""
-    (added,) = await dashboard.annotation_editor.edit(
-        body.run, lambda store: store.add(body.run, body.author, [body.content])
-    )
+    (added,) = await apply_edit(dashboard, body, Store.add, [body.content])
     return await edited(dashboard, body, {"id": added}, 201)
 
 
@@ -84,9 +83,7 @@ async def add(body: _Add, dashboard: Dash) -> Response:
 async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
     """Change an annotation; 409 if it does not have this version any more or another run was opened, 404 for
     an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
-    await dashboard.annotation_editor.edit(
-        body.run, lambda store: store.change(body.run, body.author, number, body.version, body.content)
-    )
+    await apply_edit(dashboard, body, Store.change, number, body.version, body.content)
     return await edited(dashboard, body, {"id": number})
 
 
@@ -94,9 +91,7 @@ async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
 async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
     """Delete an annotation; 409 if it does not have this version any more or another run was opened, 404 for
     an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
-    await dashboard.annotation_editor.edit(
-        body.run, lambda store: store.change(body.run, body.author, number, body.version, None)
-    )
+    await apply_edit(dashboard, body, Store.change, number, body.version, None)
     return await edited(dashboard, body, {"id": number})
 
 
@@ -104,7 +99,7 @@ async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
 async def undo(body: Edit, dashboard: Dash) -> Response:
     """Undo the last edit of the browser; return the numbers of edits that can be undone and repeated. 409 if
     there is none, or if another person has changed the annotation since."""
-    await dashboard.annotation_editor.edit(body.run, lambda store: store.undo(body.run, body.author))
+    await apply_edit(dashboard, body, Store.undo)
     return await edited(dashboard, body, {})
 
 
@@ -112,7 +107,7 @@ async def undo(body: Edit, dashboard: Dash) -> Response:
 async def redo(body: Edit, dashboard: Dash) -> Response:
     """Repeat the edit that the browser undid last; return the numbers of edits that can be undone and
     repeated. 409 if there is none, or if another person has changed the annotation since."""
-    await dashboard.annotation_editor.edit(body.run, lambda store: store.redo(body.run, body.author))
+    await apply_edit(dashboard, body, Store.redo)
     return await edited(dashboard, body, {})
 
 
@@ -125,7 +120,7 @@ async def import_table(body: _Import, dashboard: Dash) -> Response:
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new = [content for content in contents if _key(content) not in existing]
     if new:
-        await dashboard.annotation_editor.edit(body.run, lambda store: store.add(body.run, body.author, new))
+        await apply_edit(dashboard, body, Store.add, new)
     return await edited(dashboard, body, {"added": len(new), "left_out": len(contents) - len(new)})
 
 

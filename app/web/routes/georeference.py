@@ -17,8 +17,9 @@ from app.dashboard.selection import NothingMappedError
 from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.store.records import FRAME, Content
+from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number
-from app.web.routes.access import Dash, Edit, Metres, edited, in_thread
+from app.web.routes.access import Dash, Edit, Metres, apply_edit, edited, in_thread
 from pipeline.errors import StemmapError
 from pipeline.io.readers.base import COORDINATE_LIMIT
 from pipeline.stand import POINT_SIGMA
@@ -108,14 +109,9 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
     values = {**by, "table": "", "points": points, "crs": crs, "frame": found["frame"]}
     content, before = Content(0.0, 0.0, FRAME, None, values), dashboard.annotation_editor.frame
     if before is None:
-        await dashboard.annotation_editor.edit(
-            body.run, lambda store: store.add(body.run, body.author, [content])
-        )
+        await apply_edit(dashboard, body, Store.add, [content])
     else:
-        await dashboard.annotation_editor.edit(
-            body.run,
-            lambda store: store.change(body.run, body.author, before.id, before.version, content),
-        )
+        await apply_edit(dashboard, body, Store.change, before.id, before.version, content)
     return await edited(dashboard, body, {})
 
 

@@ -25,8 +25,18 @@ from app.dashboard.selection import NothingMappedError
 from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.store.records import PLOT, Content, UnknownError
+from app.store.store import Store
 from app.web.responses import BadRequestError, Body, Number, json_reply
-from app.web.routes.access import Dash, Edit, FigureParameters, Metres, ViewerTurn, edited, in_thread
+from app.web.routes.access import (
+    Dash,
+    Edit,
+    FigureParameters,
+    Metres,
+    ViewerTurn,
+    apply_edit,
+    edited,
+    in_thread,
+)
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
 from pipeline.stand.plots import centres_along, plot_of
@@ -179,9 +189,7 @@ async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
             raise BadRequestError("only a circle has a radius", where=f"plot {number}")
         plot["shape"] = {**plot["shape"], "radius": body.radius}
     content = replace(row.content, plot=plot)
-    await dashboard.annotation_editor.edit(
-        body.run, lambda store: store.change(body.run, body.author, number, body.version, content)
-    )
+    await apply_edit(dashboard, body, Store.change, number, body.version, content)
     return await edited(dashboard, body, {"id": number})
 
 
@@ -212,9 +220,7 @@ async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, di
             f"a run can have at most {MOST_PLOTS} plots with {_MOST_CORNERS} corners",
             remedy="Simplify the plots, or use stemmap stand --plots FILE",
         )
-    ids = await dashboard.annotation_editor.edit(
-        body.run, lambda store: store.add(body.run, body.author, contents)
-    )
+    ids = await apply_edit(dashboard, body, Store.add, contents)
     return await edited(dashboard, body, {"ids": ids}, 201)
 
 

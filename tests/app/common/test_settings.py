@@ -67,7 +67,6 @@ def test_annotations_are_kept_where_the_system_keeps_data(given: dict[str, str],
         ("STEMMAP_TOKEN", "öööööööööööööööööö"),
         ("STEMMAP_RECORDINGS", "/no/such/folder"),
         ("STEMMAP_FILES", "all"),
-        ("STEMMAP_DATABASE", "postgresql://ann@server/stand"),
     ],
 )
 def test_what_cannot_be_used_names_the_variable(name: str, value: str) -> None:

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from app.cli import main
-from app.common.limited_process import ProcessLimits
 from app.robot.source import open_any
-from app.sources.opening import open_source
+from app.sources.opening import ProcessLimits, open_source
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import SourceOptions
 

@@ -269,22 +269,22 @@ def test_a_run_that_was_annotated_is_learned_from(tmp_path, monkeypatch, capsys)
     base = tmp_path / "base.json"
     base.write_text(json.dumps(data()))
     monkeypatch.setattr("app.training.learning.FILE", base)  # forty large trees take longer to learn
-    assert main(["train", "--annotations"]) == 1
+    assert main(["train"]) == 1
     assert "there are no annotations" in capsys.readouterr().err
     uri = "sim:stand?duration=2&trees=40"
     digest, truth = true_things(uri)
     store = Store(tmp_path)
     run = store.open_run(digest, uri, uri)
     store.add(run, ANN, [c for c in truth if c.kind == "tree"][:3])
-    assert main(["train", "--annotations"]) == 1
+    assert main(["train"]) == 1
     assert "10 trees and 5 other objects are needed" in capsys.readouterr().err
-    assert main(["train", "--annotations", "sim:slope"]) == 2
+    assert main(["train", "sim:slope"]) == 2
     assert "there is no annotated run 'sim:slope'" in capsys.readouterr().err
     for row in store.annotations(run):
         store.change(run, ANN, row.id, row.version, None)
     store.add(run, ANN, truth)
     store.close()
-    assert main(["train", "--annotations", uri]) == 0
+    assert main(["train", uri]) == 0
     table = capsys.readouterr().out
     assert "no place in two of them" in table
     assert [line.split()[0] for line in table.splitlines()[2:5]] == ["TA", "old", "new"]
@@ -296,7 +296,7 @@ def test_a_run_that_was_annotated_is_learned_from(tmp_path, monkeypatch, capsys)
     assert preset("forest").classification.forest == "package"
     assert Forests(tmp_path)(kept.stem, True) is not None
     # The same again, now from kept examples.
-    assert main(["train", "--annotations", "--out", str(tmp_path / "again.json")]) == 0
+    assert main(["train", "--out", str(tmp_path / "again.json")]) == 0
     again, first = (json.loads(f.read_text()) for f in (tmp_path / "again.json", kept))
     assert {**again["learned"], "date": ""} == {**first["learned"], "date": ""}
     assert name_of(again) == kept.stem

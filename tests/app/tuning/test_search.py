@@ -144,7 +144,7 @@ def test_two_processes_make_as_many_trials_and_one_that_is_killed_is_replaced(wh
         made = search.trials()
         assert [trial.number for trial in made] == [0, 1, 2, 3]
         assert whole[0].values in [trial.values for trial in made]
-        assert sum(search.lost.values()) <= 1
+        assert sum(workers.lost.values()) <= 1
 
 
 # --- the command ----------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from app.worker.frame_store import FrameStore
+from app.worker.remap import FrameStore
 from pipeline.io.block_file import BlockFile
 from tests.app import fakes
 

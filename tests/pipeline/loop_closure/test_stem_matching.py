@@ -10,12 +10,12 @@ from scipy.stats import chi2
 
 from pipeline.config.stages import Relocalisation
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.loop_closure.pose_hypotheses import pairs_within
 from pipeline.loop_closure.stem_matching import (
     MapStems,
     aligned,
     alignment_covariance,
     find_constellation,
+    pairs_within,
     worst_sigma,
 )
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from app.common.limited_process import ProcessLimits, run_limited
+from app.sources.opening import ProcessLimits, run_limited
 from pipeline.errors import SourceError
 
 DESCRIPTORS = Path("/proc/self/fd")
