@@ -107,7 +107,7 @@ class Recorder:
             self._skipped.setdefault(message.channel, []).append(message.log_ns)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Record results of the mapping, see `pipeline.io.recording.outputs`."""
+        """Record results of the mapping, see `pipeline.io.recording.messages`."""
         size = sum(map(len, messages_by_topic.values()))
         self._put(size, lambda writer: writer.add_outputs(messages_by_topic))
 

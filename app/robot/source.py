@@ -32,7 +32,7 @@ from pipeline.io.block_file import BlockFile
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions, count_loss
 from pipeline.io.readers.camera import SAME_TIME_NS, Camera, Picture
 from pipeline.io.readers.live import ArrivalReader, LiveCamera, camera_topics
-from pipeline.io.recording import outputs
+from pipeline.io.recording.messages import map_messages, scan_messages
 from pipeline.types.records import Frame, Path, Record, Truth
 
 #: Motion between two stored pictures, which shows every tree from near, and limits of the disk space.
@@ -322,11 +322,11 @@ class LiveSource:
                 self._kept.add(picture, path)
         if self._publisher is None and self._recorder is None:
             return
-        messages = outputs.scan_messages(frame)
+        messages = scan_messages(frame)
         now_s = time.monotonic()
         if now_s >= self._map_at_s + _MAP_PAUSE_S:
             self._map_at_s = now_s
-            messages |= outputs.map_messages(frame, path)
+            messages |= map_messages(frame, path)
         if self._publisher is not None:
             self._publisher.publish(messages)
         if self._recorder is not None:

@@ -16,7 +16,7 @@ from app.robot.link import LOST_SCANS, MESSAGE_LIMIT, Inbox, Link, first_line
 from app.robot.topics import NAME, SCAN_TYPES, TYPE, Publisher
 from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel
-from pipeline.io.recording import outputs
+from pipeline.io.recording.messages import LATCHED, TYPES, type_hash
 
 ADMIN = "@ros2_lv"
 PUBLISHER = "MP"
@@ -246,21 +246,21 @@ class RosPublisher:
         head = f"{ADMIN}/{domain}/{session.info.zid()}/0"
         tail = f"%/{namespace}/{NODE}"
         self._declare(session, f"{head}/0/NN/{tail}")
-        for number, topic in enumerate(outputs.TYPES, 1):
-            key = data_key(domain, self.name(topic), outputs.TYPES[topic], outputs.type_hash(topic))
-            qos = _LATCHED if topic in outputs.LATCHED else _VOLATILE
+        for number, topic in enumerate(TYPES, 1):
+            key = data_key(domain, self.name(topic), TYPES[topic], type_hash(topic))
+            qos = _LATCHED if topic in LATCHED else _VOLATILE
             name = self.name(topic).replace("/", "%")
             kind, kind_hash = key.split("/")[-2:]
             token = f"{head}/{number}/{PUBLISHER}/{tail}/{name}/{kind}/{kind_hash}/{qos}"
             self._declare(session, token)
-            self._publishers[topic] = _Topic(session, key, token, latched=topic in outputs.LATCHED)
+            self._publishers[topic] = _Topic(session, key, token, latched=topic in LATCHED)
 
     def name(self, topic: str) -> str:
         """Return the full name of a topic."""
         return f"{self._prefix}/{topic}"
 
     def publish(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Publish messages in CDR by topic, see `pipeline.io.recording.outputs`. It does not wait for slow
+        """Publish messages in CDR by topic, see `pipeline.io.recording.messages`. It does not wait for slow
         subscribers; KeyError for an unknown topic."""
         for topic, payload in messages_by_topic.items():
             self._publishers[topic].put(payload)

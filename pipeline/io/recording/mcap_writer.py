@@ -25,7 +25,7 @@ from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.live import NAME, PARAMETERS, SKIPPED, VERSION
 from pipeline.io.readers.mcap_file import NOT_FINISHED, McapFile
 from pipeline.io.readers.topics import is_fixed
-from pipeline.io.recording import messages, outputs
+from pipeline.io.recording import messages
 from pipeline.types.records import Imu, Odometry, Record, Scan, Sensor, Truth
 
 CHUNK_SIZE = 1 << 20
@@ -248,8 +248,8 @@ class LiveWriter(_RosWriter):
         self._numbers = {c.number: self._channel(c.topic, c.msgtype) for c in channels}
         prefix = f"/{robot}/stemmap" if robot else "/stemmap"
         self._outputs = {
-            topic: self._channel(f"{prefix}/{topic}", kind, topic in outputs.LATCHED)
-            for topic, kind in outputs.TYPES.items()
+            topic: self._channel(f"{prefix}/{topic}", kind, topic in messages.LATCHED)
+            for topic, kind in messages.TYPES.items()
         }
         self._parameters = self._channel(PARAMETERS, _TEXT, latched=True)
         self._skipped = self._channel(SKIPPED, _TEXT)
@@ -266,7 +266,7 @@ class LiveWriter(_RosWriter):
         self._write(self._numbers[message.channel], self._last_ns, message.payload)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Write results of the mapping (CDR by topic of `outputs.TYPES`), at the time of the last message of
+        """Write results of the mapping (CDR by topic of `messages.TYPES`), at the time of the last message of
         the robot, 0 before it.
 
         Raises:

@@ -17,7 +17,7 @@ from app.robot.source import LiveSource, open_live
 from app.robot.zenoh import configuration, data_key
 from pipeline.errors import SourceError
 from pipeline.io.readers.mcap_file import McapFile
-from pipeline.io.recording import outputs
+from pipeline.io.recording import messages
 from tests.app.fakes import START_NS, frame, path
 from tests.app.robot.certificates import Authority
 from tests.app.robot.conftest import ROOT, free_port, listening, until
@@ -91,7 +91,7 @@ def test_with_its_certificate_stemmap_hears_the_robot_and_says_its_own_results(
         until(lambda: own.listen() or "announced and silent" in own.waiting_for(), own.waiting_for)
         assert own.robots == ["robot1"]
         until(lambda: send() or own.listen(), own.waiting_for)
-        pose = data_key(0, "/robot1/stemmap/pose", outputs.TYPES["pose"], outputs.type_hash("pose"))
+        pose = data_key(0, "/robot1/stemmap/pose", messages.TYPES["pose"], messages.type_hash("pose"))
 
         def said() -> bool:
             own.mapped(frame(0, START_NS), path([0.0, 1.0]))

@@ -14,7 +14,7 @@ import pytest
 from app.robot.link import LOST_SCANS
 from app.robot.source import LiveSource, open_live
 from pipeline.errors import SourceError
-from pipeline.io.recording import outputs
+from pipeline.io.recording import messages
 from pipeline.types.records import Clearance, Odometry, Record, Scan, Zone
 from tests.app.fakes import START_NS, frame, path, trees
 from tests.app.robot.conftest import POINTS, SCANS, Child, Robot, free_port, listening, until
@@ -100,7 +100,7 @@ def test_others_hear_the_pose_and_the_trees(router: int, robots: Callable[[str],
         stop.set()
         saying.join()
         listener.kill()
-        assert told["topics"] == [f"/red/stemmap/{name}" for name in sorted(outputs.TYPES)]
+        assert told["topics"] == [f"/red/stemmap/{name}" for name in sorted(messages.TYPES)]
         assert (told["pose_frame"], told["child"]) == ("map", "base_link")
         assert (told["markers"], told["poses"]) == (1 + 2 * 3, 2)
         assert (told["ahead"], told["zone"]) == (1.75, int(Zone.SLOW))

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers.topics import standard_types
-from pipeline.io.recording import messages, outputs
+from pipeline.io.recording import messages
 from pipeline.types.records import Clearance, Zone
 from tests.app.fakes import START_NS, frame, path, trees
 
@@ -22,51 +22,51 @@ from tests.app.fakes import START_NS, frame, path, trees
 def decoded(topic: str, payload: bytes) -> Any:
     """A message by its own definition alone."""
     store = get_typestore(Stores.EMPTY)
-    store.register(get_types_from_msg(messages.definition(outputs.TYPES[topic]), outputs.TYPES[topic]))
-    return store.deserialize_cdr(payload, outputs.TYPES[topic])
+    store.register(get_types_from_msg(messages.definition(messages.TYPES[topic]), messages.TYPES[topic]))
+    return store.deserialize_cdr(payload, messages.TYPES[topic])
 
 
 @given(st.floats(-100, 100), st.floats(-100, 100), st.floats(-3, 3))
 def test_the_pose_and_its_covariance_arrive(x: float, y: float, yaw: float):
     seen = frame(0, START_NS)
     estimate = replace(seen.estimate, T_map_base=Pose2(x, y, yaw), covariance=np.diag([0.04, 0.09, 0.01]))
-    found = outputs.pose_messages(replace(seen, estimate=estimate))
-    for topic in (outputs.POSE, outputs.ODOMETRY):
+    found = messages.pose_messages(replace(seen, estimate=estimate))
+    for topic in (messages.POSE, messages.ODOMETRY):
         message = decoded(topic, found[topic])
-        pose = message.pose if topic == outputs.POSE else message.pose.pose
+        pose = message.pose if topic == messages.POSE else message.pose.pose
         assert (pose.position.x, pose.position.y, pose.position.z) == (x, y, 0.0)
         assert 2 * np.arctan2(pose.orientation.z, pose.orientation.w) == pytest.approx(yaw)
         assert message.header.frame_id == "map"
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS
-    covariance = decoded(outputs.ODOMETRY, found[outputs.ODOMETRY]).pose.covariance.reshape(6, 6)
+    covariance = decoded(messages.ODOMETRY, found[messages.ODOMETRY]).pose.covariance.reshape(6, 6)
     assert [covariance[k, k] for k in (0, 1, 5)] == [0.04, 0.09, 0.01]
     assert np.count_nonzero(covariance) == 3
 
 
 def test_each_confirmed_tree_is_a_stem_a_number_and_a_detection():
     seen = replace(frame(3, START_NS), trees=trees(5))  # the last one is not confirmed
-    found = outputs.map_messages(seen, path([0.0, 1.0, 2.0]))
-    markers = decoded(outputs.TREES, found[outputs.TREES]).markers
+    found = messages.map_messages(seen, path([0.0, 1.0, 2.0]))
+    markers = decoded(messages.TREES, found[messages.TREES]).markers
     assert markers[0].action == 3, "first all of before is deleted"
     stems = [marker for marker in markers[1:] if marker.type == 3]
     assert [stem.id for stem in stems] == [1, 2, 3, 4]
     assert [stem.pose.position.x for stem in stems] == [0.0, 2.0, 4.0, 6.0]
     assert [stem.scale.x for stem in stems] == [0.3, 0.2, 0.3, 0.2], "where no diameter is known, a usual one"
     assert [m.text for m in markers if m.type == 9] == ["1: 30 cm", "2", "3: 30 cm", "4"]
-    detections = decoded(outputs.DETECTIONS, found[outputs.DETECTIONS]).detections
+    detections = decoded(messages.DETECTIONS, found[messages.DETECTIONS]).detections
     assert [each.id for each in detections] == ["1", "2", "3", "4"]
     assert [each.bbox.size.x for each in detections] == [0.3, 0.0, 0.3, 0.0]
     assert {each.results[0].hypothesis.class_id for each in detections} == {"tree"}
     assert detections[0].results[0].pose.covariance.reshape(6, 6)[0, 0] == 0.04
-    assert len(decoded(outputs.PATH, found[outputs.PATH]).poses) == 3
+    assert len(decoded(messages.PATH, found[messages.PATH]).poses) == 3
 
 
 @pytest.mark.parametrize("length", [0, 1, 999, 1000, 1001, 3333])
 def test_a_long_path_is_thinned_and_ends_at_the_robot(length: int):
-    found = outputs.map_messages(frame(0, START_NS), path([float(k) for k in range(length)]))
-    poses = decoded(outputs.PATH, found[outputs.PATH]).poses
-    assert len(poses) <= outputs.MOST_POSES
-    assert len(poses) >= min(length, outputs.MOST_POSES // 2)
+    found = messages.map_messages(frame(0, START_NS), path([float(k) for k in range(length)]))
+    poses = decoded(messages.PATH, found[messages.PATH]).poses
+    assert len(poses) <= messages.MOST_POSES
+    assert len(poses) >= min(length, messages.MOST_POSES // 2)
     if length:
         assert poses[-1].pose.position.x == length - 1
     steps = {b.pose.position.x - a.pose.position.x for a, b in pairwise(poses)}
@@ -77,7 +77,7 @@ def test_the_hash_of_a_type_is_that_of_ros():
     """The hash of std_msgs/String as ROS 2 prints it in `ros2 topic info --verbose`."""
     known = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
     assert standard_types("cdr").hash_rihs01("std_msgs/msg/String") == known
-    assert len({outputs.type_hash(topic) for topic in outputs.TYPES}) == len(outputs.TYPES)
+    assert len({messages.type_hash(topic) for topic in messages.TYPES}) == len(messages.TYPES)
 
 
 @pytest.mark.parametrize(
@@ -89,10 +89,10 @@ def test_the_hash_of_a_type_is_that_of_ros():
     ],
 )
 def test_how_far_the_way_is_free_arrives(clearance: Clearance, told: float):
-    found = outputs.scan_messages(replace(frame(0, START_NS), clearance=clearance))
-    way = decoded(outputs.CLEARANCE, found[outputs.CLEARANCE])
+    found = messages.scan_messages(replace(frame(0, START_NS), clearance=clearance))
+    way = decoded(messages.CLEARANCE, found[messages.CLEARANCE])
     assert (way.header.frame_id, way.max_range) == ("base_link", 3.0)
     np.testing.assert_equal(float(way.range), told)
-    assert decoded(outputs.ZONE, found[outputs.ZONE]).data == int(clearance.zone)
-    silent = outputs.scan_messages(replace(frame(0, START_NS), clearance=None))
-    assert silent.keys() == {outputs.POSE, outputs.ODOMETRY}
+    assert decoded(messages.ZONE, found[messages.ZONE]).data == int(clearance.zone)
+    silent = messages.scan_messages(replace(frame(0, START_NS), clearance=None))
+    assert silent.keys() == {messages.POSE, messages.ODOMETRY}
