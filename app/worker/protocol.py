@@ -218,11 +218,11 @@ class RunCounts(msgspec.Struct, frozen=True):
         warnings: Each warning once, with its number.
     """
 
-    health: dict[str, int] = field(default_factory=dict)
+    health: dict[str, int] = {}
     sigma_xy_m: float | None = None
-    verdicts: dict[str, int] = field(default_factory=dict)
-    losses: dict[str, int] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    verdicts: dict[str, int] = {}
+    losses: dict[str, int] = {}
+    warnings: list[str] = []
 
 
 class Shown(msgspec.Struct, frozen=True, tag="shown"):

@@ -102,8 +102,13 @@ def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session
             < 0.5
         )
     codec = from_worker()
-    there = codec.decode(codec.encode(Shown(1, 0.0, picture_of(frame), 0, session.path))[4:])  # type: ignore[arg-type]
+    assert session.path is not None
+    shown = Shown(1, 0.0, picture_of(frame), 0, session.path, None, session.counts)
+    there = codec.decode(codec.encode(shown)[4:])
     assert isinstance(there, Shown)
+    assert there.counts is not None
+    assert there.counts == session.counts
+    assert there.counts.verdicts["tree"] == len(PLACES)
     assert there.frame.of_cloud
     np.testing.assert_array_equal(there.frame.trees.lean, frame.trees.lean)
     status = codec.decode(codec.encode(Report(session.status()))[4:])
