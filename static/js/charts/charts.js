@@ -1,17 +1,24 @@
 // The tab Charts: figures 6 and 7 of the paper, and the course of the run. Plotly is loaded when it is first needed.
 
-import { get } from "../core/api.js";
-import { byId, el, setText } from "../core/dom.js";
+import { command, get } from "../core/api.js";
+import { byId, el, recall, remember, setText } from "../core/dom.js";
 import { saveCsv } from "../core/download.js";
 import { select } from "../core/live_feed.js";
+import { edits } from "../core/permissions.js";
+import { attempted } from "../core/problem.js";
 import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
+import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
+import { available, QUANTITIES, recorded, startHistory } from "./history.js";
 
 const EVERY = 2000; // [ms] between two updates
-const LONGEST = 1200; // samples kept of each curve
-const none = () => ({ time: [], n_eff: [], sigma: [], yaw: [], stages: {}, stageTime: [] });
-const history = none();
+const CURSOR_EVERY = 200; // [ms] between two moves of the cursor
+const LONGEST = 1200; // samples drawn of each curve
+const ROW = 120; // [px] of height that a curve of its own needs
+const HEAD = 0.2; // share of its height for its name
+const FIXED = { n_eff: ["n_eff"], sigma: ["sigma", "yaw"] }; // charts of certain quantities
+let chosen = (recall("quantities") ?? "trees,sigma").split(",").filter((name) => name in QUANTITIES);
 let plotly = null, busy = false;
 
 function load() {
@@ -51,28 +58,69 @@ async function matrix(kind) {
     hovertemplate: `tree %{y} to tree %{x}<br>%{z:.3~r} ${unit}<extra></extra>` }], figure];
 }
 
-function curve(kind) {
-  if (history.time.length < 2) return "Nothing to plot yet. Press play.";
-  const figure = layout({ showlegend: kind !== "n_eff", legend: { orientation: "h", y: 1.02, yanchor: "bottom" } });
-  if (kind === "time") figure.margin.t = 74;
-  if (kind === "sigma") return pose(figure);
-  figure.xaxis.title = { text: "time in the run, s" };
-  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: kind === "time" ? "ms per scan" : "effective particles" } });
-  if (kind === "n_eff") return [[line(history.time, history.n_eff, "N_eff")], figure];
-  return [Object.entries(history.stages).map(([name, values]) => ({ ...line(history.stageTime, values, name), stackgroup: "one" })), figure];
+// Times of the stages, one above the other.
+function stages() {
+  const scans = recorded(LONGEST);
+  if (scans.length < 2) return NOTHING;
+  const time = scans.map((scan) => scan.time), names = [...new Set(scans.flatMap((scan) => Object.keys(scan.stages)))];
+  const figure = layout({ showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, shapes: [cursor()] });
+  figure.margin.t = 74;
+  figure.xaxis.title = { text: TIME };
+  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "ms per scan" } });
+  return [names.map((name) => ({ ...line(time, scans.map((scan) => scan.stages[name] ?? null), name), stackgroup: "one" })), figure];
 }
 
-// Position on the left axis, heading on the right one.
-function pose(figure) {
-  const right = { ...figure.yaxis, overlaying: "y", side: "right", rangemode: "tozero", showgrid: false, title: { text: "heading, °" } };
-  Object.assign(figure, { yaxis2: right });
-  Object.assign(figure.margin, { t: 30, r: 46 });
-  Object.assign(figure.xaxis, { title: { text: "time in the run, s" } });
-  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "position, cm" } });
-  return [[line(history.time, history.sigma, "position, cm"), { ...line(history.time, history.yaw, "heading, °"), yaxis: "y2" }], figure];
+const NOTHING = "Nothing to plot yet: the curves begin with the first scan that this page receives. Press play.";
+const TIME = "time in the run, s";
+
+// Curves of quantities below one another, with one axis of time.
+function curves(names) {
+  const scans = recorded(LONGEST);
+  if (scans.length < 2) return NOTHING;
+  if (!names.length) return "Add a quantity to see its curve.";
+  const time = scans.map((scan) => scan.time), figure = layout({ hovermode: "x", hoversubplots: "axis", showlegend: false, shapes: [cursor()] });
+  const { yaxis } = figure, height = 1 / names.length;
+  figure.annotations = [];
+  names.forEach((name, place) => {
+    const [title, unit] = QUANTITIES[name];
+    const top = 1 - (place + HEAD) * height;
+    figure[`yaxis${place ? place + 1 : ""}`] = { ...yaxis, domain: [1 - (place + 1) * height, top], nticks: 5, automargin: true };
+    figure.annotations.push({ text: `${title}${unit && `, ${unit}`}`, showarrow: false, xref: "paper", x: 0, xanchor: "left", yref: "paper", y: top, yanchor: "bottom" });
+  });
+  Object.assign(figure.xaxis, { title: { text: TIME }, anchor: names.length > 1 ? `y${names.length}` : "y", showspikes: true, spikemode: "across", spikethickness: 1, spikedash: "dot", spikecolor: colour("dim") });
+  return [names.map((name, place) => ({ ...line(time, scans.map((scan) => scan.values[name]), QUANTITIES[name][0]), yaxis: place ? `y${place + 1}` : "y" })), figure];
 }
 
-const line = (x, y, name) => ({ type: "scatter", mode: "lines", x, y, name, line: { width: 1.5 }, hovertemplate: `%{y:.3~r}<extra>${name}</extra>` });
+// The current scan as a line over all curves.
+const cursor = () => ({ type: "line", yref: "paper", y0: 0, y1: 1, x0: state.map?.time_s ?? 0, x1: state.map?.time_s ?? 0, line: { color: colour("selection"), width: 1.5 } });
+
+const moveCursor = throttled(() => {
+  const chart = byId("chart");
+  if (!visible("charts") || busy || !chart.data || chart.hidden || !chart.layout.shapes?.length || !state.map) return;
+  window.Plotly.relayout(chart, { "shapes[0].x0": state.map.time_s, "shapes[0].x1": state.map.time_s });
+}, CURSOR_EVERY);
+
+const line = (x, y, name) => ({ type: "scatter", mode: y.includes(null) ? "lines+markers" : "lines", marker: { size: 4 }, x, y, name, line: { width: 1.5 }, hovertemplate: `%{y:.3~r}<extra>${name}</extra>` });
+
+// --- choice of the quantities ------------------------------------------------------------------
+
+function choose(names) {
+  chosen = names;
+  remember("quantities", names.join(","));
+  showChosen();
+  draw();
+}
+
+function showChosen() {
+  const box = byId("chart-quantities");
+  box.hidden = byId("chart-choice").value !== "quantities";
+  const add = el("select", { id: "chart-add", "aria-label": "Add a quantity", onchange: () => { if (add.value) choose([...chosen, add.value]); } },
+    el("option", { value: "", text: "Add a quantity …" }),
+    ...available().filter((name) => !chosen.includes(name)).map((name) => el("option", { value: name, text: QUANTITIES[name][0] })));
+  box.replaceChildren(...chosen.map((name) => el("button", { class: "small", text: `${QUANTITIES[name][0]} ✕`, "aria-label": `Remove ${QUANTITIES[name][0]}`, onclick: () => choose(chosen.filter((each) => each !== name)) })), add);
+}
+
+const drawingOf = (kind) => (kind in SCALES ? matrix(kind) : kind === "time" ? stages() : curves(FIXED[kind] ?? chosen));
 
 async function draw() {
   if (!visible("charts") || busy) return;
@@ -80,7 +128,7 @@ async function draw() {
   try {
     const kind = byId("chart-choice").value;
     if (!plotly) showText("Loading …");
-    const [Plotly, drawing] = await Promise.all([load(), kind in SCALES ? matrix(kind) : curve(kind)]);
+    const [Plotly, drawing] = await Promise.all([load(), drawingOf(kind)]);
     const isText = typeof drawing === "string"; // why there is no plot
     showText(isText ? drawing : "");
     if (!isText) await show(Plotly, kind, ...drawing);
@@ -102,34 +150,14 @@ async function show(Plotly, kind, traces, figure) {
   const chart = byId("chart");
   if (chart.data && chart.dataset.kind !== kind) Plotly.purge(chart); // axes of another figure must not be reused
   chart.dataset.kind = kind;
+  chart.style.minHeight = kind in SCALES ? "" : `${ROW * traces.length + 60}px`;
+  if (kind === "time") chart.style.minHeight = "";
   const fresh = !chart.data;
   await Plotly.react(chart, traces, figure, { displayModeBar: false, responsive: true });
-  if (fresh) chart.on("plotly_click", ({ points }) => points[0].data.type === "heatmap" && select(Number(points[0].y)));
+  if (fresh) chart.on("plotly_click", ({ points: [point] }) => (point.data.type === "heatmap" ? select(Number(point.y)) : goTo(point.x)));
 }
 
-function push(list, value) {
-  list.push(value);
-  if (list.length > LONGEST) list.shift();
-}
-
-function recordMap({ map }) {
-  if (!map) return clearHistory();
-  if (history.time.length && map.time_s < history.time.at(-1)) clearHistory();
-  push(history.time, map.time_s);
-  push(history.n_eff, map.n_eff);
-  push(history.sigma, 100 * (map.health?.sigma_xy_m ?? map.sigma_xy));
-  push(history.yaw, map.health?.sigma_yaw_deg ?? null);
-}
-
-function recordStatus({ status }) {
-  if (status.scan_index < 0 || status.time_s === history.stageTime.at(-1)) return;
-  push(history.stageTime, status.time_s);
-  for (const [name, milliseconds] of Object.entries(status.stage_ms ?? {})) push((history.stages[name] ??= []), milliseconds);
-}
-
-function clearHistory() {
-  Object.assign(history, none());
-}
+const goTo = edits((time) => attempted(() => command("seek", { time_s: time + 0.01 })));
 
 async function savePng() {
   const chart = byId("chart");
@@ -148,11 +176,19 @@ function saveTable() {
 }
 
 export function startCharts() {
+  startHistory();
   byId("chart-png").addEventListener("click", savePng);
   byId("chart-csv").addEventListener("click", saveTable);
-  on("map", recordMap);
-  on("status", recordStatus);
+  const list = byId("chart-choice");
+  list.value = recall("chart") ?? list.value;
+  if (!list.value) list.selectedIndex = 0; // a chart of another version
+  list.addEventListener("change", () => {
+    remember("chart", list.value);
+    showChosen();
+    draw();
+  });
+  on("tab", () => visible("charts") && showChosen());
   on("tab theme", draw);
-  byId("chart-choice").addEventListener("change", draw);
+  on("history", moveCursor);
   setInterval(() => state.status?.state !== "failed" && draw(), EVERY);
 }

@@ -1,0 +1,56 @@
+"""The tab Charts: quantities over time with a common cursor."""
+
+from __future__ import annotations
+
+import pytest
+from playwright.sync_api import expect
+
+from tests.browser.dashboard import Dashboard
+
+DRAWN = """() => {
+  const chart = document.getElementById('chart');
+  if (chart.hidden || chart.dataset.kind !== 'quantities' || !chart.data) return null;
+  const [line] = chart.layout.shapes;
+  return { names: chart.data.map(({ name }) => name), times: chart.data[0].x, cursor: line.x0,
+    line: [line.yref, line.y0, line.y1] };
+}"""
+
+
+@pytest.mark.usefixtures("calm")
+def test_quantities_are_chosen_have_one_cursor_and_a_click_goes_there(dashboard: Dashboard):
+    page = dashboard.page
+    dashboard.tab("Charts")
+    page.locator("#chart-choice").select_option("quantities")
+    start = dashboard.ask("/api/status")["scan_index"]
+    for _ in range(5):
+        page.locator("#on1").click()
+    dashboard.until_server("/api/status", f"it.scan_index === {start} + 5")
+    page.locator("#chart-add").select_option("innovation")
+    names = ["trees", "sigma of the position", "normalised innovation"]
+    dashboard.until(f"names => ({DRAWN})()?.names.join() === names.join()", names)
+    page.get_by_role("button", name="Remove trees").click()
+    dashboard.until(f"() => ({DRAWN})()?.names.length === 2")
+
+    last = dashboard.ask("/api/status")["time_s"]
+    page.locator("#back1").click()
+    dashboard.until_server("/api/status", f"it.time_s < {last} - 0.05")
+    dashboard.until(
+        f"last => ({DRAWN})()?.times.at(-1) > last - 0.05 && ({DRAWN})().cursor < last - 0.05", last
+    )
+    drawn = page.evaluate(DRAWN)
+    assert drawn["line"] == ["paper", 0, 1], "one line over all curves"
+    assert drawn["times"] == sorted(drawn["times"]), "a step back adds no second branch"
+
+    chart = page.locator("#chart")
+    first = drawn["times"][0]
+    chart.evaluate(
+        "(node, time) => node.emit('plotly_click', { points: [{ x: time, data: { type: 'scatter' } }] })",
+        first,
+    )
+    dashboard.until_server("/api/status", f"Math.abs(it.time_s - {first}) < 0.06")
+
+    page.reload()
+    dashboard.tab("Charts")
+    expect(page.locator("#chart-choice")).to_have_value("quantities")
+    expect(page.get_by_role("button", name="Remove normalised innovation")).to_be_visible()
+    page.locator("#chart-choice").select_option("distance")
