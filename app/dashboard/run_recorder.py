@@ -214,7 +214,7 @@ class RunRecorder:
         def work(store: Store) -> None:
             figures = _figures_of(state, page.all_scans)
             if page.record is None:
-                page.record = store.book.begin(_named(page.beginning, store), figures)
+                page.record = store.book.begin(page.beginning, figures)
             else:
                 store.book.update(page.record, figures)
             if changes:
@@ -253,12 +253,6 @@ def packed(texts: Mapping[str, str]) -> bytes:
         for name, text in texts.items():
             archive.writestr(zipfile.ZipInfo(name), text, zipfile.ZIP_DEFLATED)
     return content.getvalue()
-
-
-def _named(beginning: NewRun, store: Store) -> NewRun:
-    """Return the start of a run; of an uploaded file a copy with the name that the file had before."""
-    uploaded = store.book.uploads().get(beginning.name)
-    return beginning if uploaded is None else replace(beginning, name=uploaded["name"])
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:

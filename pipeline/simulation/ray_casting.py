@@ -499,22 +499,3 @@ def first_returns(
                 ranges[c, k] = t
                 owner[c, k] = GROUND
     return ranges, owner
-
-
-@compiled
-def first_along(solids: Solids, directions: Float, key: int) -> Float:
-    """Return the range [m] at which each ray from the origin first meets a shape, infinite without, shape
-    (N,). There is no ground.
-
-    Args:
-        solids: The shapes, relative to the origin of the rays.
-        directions: Unit vectors, shape (N, 3).
-        key: Seed of the depths at which foliage stops light.
-    """
-    kind, shape, surface = solids.kind, solids.shape, solids.surface
-    ranges, origin = np.full(directions.shape[0], np.inf), np.zeros(3)
-    for n in range(kind.shape[0]):
-        for k in range(directions.shape[0]):
-            met = meet_solid(kind[n], shape[n], surface[n], origin, directions[k], random_unit(key, k, n))
-            ranges[k] = min(ranges[k], met)
-    return ranges

@@ -125,7 +125,6 @@ class SimulatedRun:
         text += f"; drive {request.drive}" if request.drive else ""
         text += "; obeys" if scenario.obeys else ""
         text += f"; crossings {scenario.crossings}" if scenario.crossings else ""
-        text += "; furnished" if request.furnished else ""
         return hashlib.sha256(text.encode()).hexdigest()
 
     def _mounting(self) -> list[float]:

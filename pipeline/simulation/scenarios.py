@@ -272,9 +272,6 @@ _CLOUD_KEYS = {
     "truth": "a table (CSV) of its trees in the coordinates of the cloud",
     **_COMMON_KEYS,
 }
-# Numbers of poles, standing persons, bushes, boxes and walking persons of stands with many objects that are
-# not trees.
-FURNISHED = {"stand": (24, 6, 12, 5, 2), "slope": (24, 6, 12, 5, 2), "dense": (12, 4, 12, 2, 1)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,7 +287,6 @@ class RunRequest:
         trees: Number of trees.
         drive: Number of the drive; other drives through the same scene have other noise.
         file, truth: Cloud of a run through a real plot and table of its trees, or empty.
-        furnished: Whether a stand has more objects that are not trees, see FURNISHED.
     """
 
     name: str
@@ -302,16 +298,11 @@ class RunRequest:
     drive: int = field(default=0, repr=False)
     file: str = ""
     truth: str = ""
-    furnished: bool = field(default=False, repr=False)
 
     @property
     def scenario(self) -> Scenario:
         """The scenario with the requested objects. KeyError for a run through a cloud, which has none."""
-        scenario = replace(SCENARIOS[self.name], trees=self.trees)
-        if not self.furnished or self.name not in FURNISHED:
-            return scenario
-        poles, standing, bushes, boxes, walking = FURNISHED[self.name]
-        return replace(scenario, poles=poles, standing=standing, bushes=bushes, boxes=boxes, walking=walking)
+        return replace(SCENARIOS[self.name], trees=self.trees)
 
 
 def parse_uri(uri: str, seed: int = 0) -> RunRequest:

@@ -21,9 +21,10 @@ from app.training.examples import Examples, stored_or_computed
 from pipeline.config import Parameters
 from pipeline.geometry.poses import Pose2
 from pipeline.io.readers import open_source
+from pipeline.jit import compiled
 from pipeline.simulation.lidar import SolidStateLidar, sweep_scene
 from pipeline.simulation.primitives import Solids
-from pipeline.simulation.ray_casting import first_along
+from pipeline.simulation.ray_casting import meet_solid, random_unit
 from pipeline.simulation.scene_objects import SceneBuilder
 from pipeline.simulation.terrain import SimulatedTerrain
 from pipeline.types.records import Bool, Float, Float32, Int, Scan, Step
@@ -224,6 +225,25 @@ def _seen_with(
     kept = to_real < first_along(solids, towards, key) + BEHIND
     seen = ~_hidden(new, points)
     return np.concatenate([points[kept], new[seen]]), np.concatenate([label[kept], kind[seen]])
+
+
+@compiled
+def first_along(solids: Solids, directions: Float, key: int) -> Float:
+    """Return the range [m] at which each ray from the origin first meets a shape, infinite without, shape
+    (N,). There is no ground.
+
+    Args:
+        solids: The shapes, relative to the origin of the rays.
+        directions: Unit vectors, shape (N, 3).
+        key: Seed of the depths at which foliage stops light.
+    """
+    kind, shape, surface = solids.kind, solids.shape, solids.surface
+    ranges, origin = np.full(directions.shape[0], np.inf), np.zeros(3)
+    for n in range(kind.shape[0]):
+        for k in range(directions.shape[0]):
+            met = meet_solid(kind[n], shape[n], surface[n], origin, directions[k], random_unit(key, k, n))
+            ranges[k] = min(ranges[k], met)
+    return ranges
 
 
 def _hidden(new: Float32, real: Float32) -> Bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.odometry.synchroniser import steps
 from pipeline.preprocessing import acquire
 from pipeline.simulation.run import open_run
-from pipeline.simulation.scenarios import parse_uri
+from pipeline.simulation.scenarios import RunRequest, Scenario, parse_uri
 from pipeline.types.records import HIDDEN, Columns, Float, Float32, Int, Sensor, Step, TruthTrees, Verdict
 from tests.benchmarks.package_forest.street_scenes import simulate_street
 
@@ -41,10 +41,24 @@ TRUNK = LABELS["trunk"]
 KIND_OF_LABEL = {TRUNK: Verdict.TREE, 80: Verdict.POLE, 81: Verdict.POLE, 30: Verdict.PERSON, 70:
 Verdict.BUSH,
                  50: Verdict.WALL, 51: Verdict.WALL, 52: Verdict.WALL}  # fmt: skip
+# Numbers of poles, standing persons, bushes, boxes and walking persons of stands with many objects that are
+# not trees.
+FURNISHED = {"stand": (24, 6, 12, 5, 2), "slope": (24, 6, 12, 5, 2), "dense": (12, 4, 12, 2, 1)}
 REACH_OF_KIND = {"pole": 0.35, "person": 0.5, "bush": 0.9, "other": 1.3}
 _VERDICT_OF_KIND = {
     "pole": Verdict.POLE, "person": Verdict.PERSON, "bush": Verdict.BUSH, "other": Verdict.WALL,
 }  # fmt: skip
+
+
+class FurnishedStand(RunRequest):
+    """A run through a stand of FURNISHED with more objects that are not trees."""
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario with the objects."""
+        poles, standing, bushes, boxes, walking = FURNISHED[self.name]
+        plain = super().scenario
+        return replace(plain, poles=poles, standing=standing, bushes=bushes, boxes=boxes, walking=walking)
 
 
 def columns_of(
@@ -112,7 +126,8 @@ def stand_examples(
         every: Only each scan whose number is a multiple of it is simulated.
         furnished: Whether objects that are not trees are added to the scene.
     """
-    source = SimulatedSource(uri, open_run(replace(parse_uri(uri), furnished=furnished)))
+    request = parse_uri(uri)
+    source = SimulatedSource(uri, open_run(FurnishedStand(*astuple(request)) if furnished else request))
     about, truth = source.description, source.run.true_trees()
     run, around = steps(source.records(every=every)), about.sensor.rings > 0
     for columns in columns_of(run, about.sensor, about.T_base_lidar, parameters):

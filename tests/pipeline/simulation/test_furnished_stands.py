@@ -4,25 +4,23 @@ change the others."""
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import astuple
 
 import numpy as np
 import pytest
 
 from pipeline.io.readers.simulated import SimulatedSource
 from pipeline.simulation.run import open_run
-from pipeline.simulation.scenarios import FURNISHED, SCENARIOS, RunRequest, parse_uri
+from pipeline.simulation.scenarios import SCENARIOS, parse_uri
 from pipeline.types.records import Scan
-
-
-def furnished_stand(uri: str) -> RunRequest:
-    return replace(parse_uri(uri), furnished=True)
+from tests.benchmarks.package_forest.labelled_scenes import FURNISHED, FurnishedStand
 
 
 @pytest.mark.parametrize("name", FURNISHED)
 def test_a_furnished_stand_keeps_its_trees_and_has_more_of_all_else(name):
     uri = f"sim:{name}?seed=3&odometry=exact"
-    plain, furnished = open_run(parse_uri(uri)).scene, open_run(furnished_stand(uri)).scene
+    request = parse_uri(uri)
+    plain, furnished = open_run(request).scene, open_run(FurnishedStand(*astuple(request))).scene
     trees = [np.array(scene.truth.kind) == "tree" for scene in (plain, furnished)]
     np.testing.assert_array_equal(plain.truth.x[trees[0]], furnished.truth.x[trees[1]])
     np.testing.assert_array_equal(plain.truth.dbh[trees[0]], furnished.truth.dbh[trees[1]])
@@ -30,13 +28,6 @@ def test_a_furnished_stand_keeps_its_trees_and_has_more_of_all_else(name):
     poles, standing, bushes, boxes, _ = FURNISHED[name]
     assert poles > SCENARIOS[name].poles
     assert [count[kind] for kind in ("pole", "person", "bush", "other")] == [poles, standing, bushes, boxes]
-
-
-def test_a_scenario_without_an_entry_stays_as_it_is():
-    uri = "sim:paper?seed=3"
-    plain, same = open_run(parse_uri(uri)).scene.truth, open_run(furnished_stand(uri)).scene.truth
-    assert same.kind == plain.kind
-    np.testing.assert_array_equal(same.x, plain.x)
 
 
 def test_scans_that_are_left_out_change_nothing_of_the_others():

@@ -16,7 +16,7 @@ from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.lidar import SpinningLidar, sweep_scene
 from pipeline.simulation.motion_sensors import SPIN, wheel_odometry
 from pipeline.simulation.primitives import ELLIPSOID, STEM, Section, SolidsBuilder
-from pipeline.simulation.ray_casting import first_along, meet_cone, meet_stem
+from pipeline.simulation.ray_casting import meet_cone, meet_stem
 from pipeline.simulation.robot_motion import drive_course, lay_course, lay_on_terrain
 from pipeline.simulation.scenarios import QUALITIES, SCENARIOS, WILD
 from pipeline.simulation.scene import Plot
@@ -31,6 +31,7 @@ from pipeline.simulation.wild_scenes import (
     draw_section,
 )
 from pipeline.types.records import HIDDEN, Float, TruthTrees
+from tests.benchmarks.package_forest.augmentation import first_along
 from tests.pipeline.strategies import trees
 
 SEEDS = st.integers(0, 2**32 - 1)
