@@ -18,6 +18,7 @@ TABS = ("Trees", "Clusters", "Story", "Tune", "Annotate", "Scores", "Plots", "Ch
 DIALOGS = ("source-button", "share-button", "keys-button", "palette-button")
 # Buttons with the part of the page that each of them shows.
 OVERLAYS = {
+    "views-button": "#view-list",
     "layers-button": "#layer-list",
     "stages-button": "#over-stages",
     "compare-button": "#over-compare",

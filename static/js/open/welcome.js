@@ -18,6 +18,7 @@ export function startWelcome() {
   byId("welcome-robot").addEventListener("click", () => card.addEventListener("close", () => openSources(ROBOT), { once: true }));
   let asked = false;
   on("status", ({ status }) => {
+    if (!status.source) return; // no run is opened yet
     const first = !asked && recall("welcomed") === null;
     asked = true;
     if (!card.open && !first) return;

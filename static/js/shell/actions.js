@@ -51,6 +51,7 @@ export const ACTIONS = [
   ["Follow the robot in the scene, or stop following", "f", "", edits(toggleFollow)],
   ["Focus: move the camera to the selected tree or cluster, or stop", "", "", toggleFocus],
   ["View the robot from above", "t", "", edits(() => pressInScene("t"))], ["View the robot from behind", "b", "", edits(() => pressInScene("b"))],
+  ["Views: save this view of the scene, or return to a saved one", "", "", click("views-button"), null, "camera bookmark viewpoint position"],
   ["Measure a distance on the map", "m", "m", toggleMeasure],
   ["Show the whole map", "", "", click("map-fit"), null, "fit zoom reset"],
   ["Zoom in on the map", "+", "", pressOnMap("+"), "on the map: zoom in", "enlarge magnify closer"], ["Zoom out of the map", "-", "", pressOnMap("-"), "on the map: zoom out", "shrink farther"],

@@ -24,6 +24,7 @@ import { startOverlay } from "../scene/overlay.js";
 import { startScenePanel } from "../scene/panel.js";
 import { startScene } from "../scene/scene.js";
 import { startStages } from "../scene/stages.js";
+import { startViews } from "../scene/views.js";
 import { startScores } from "../scores/scores.js";
 import { startTable } from "../trees/table.js";
 import { startCompare } from "../tune/compare.js";
@@ -38,6 +39,6 @@ import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startPlotsPanel, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();

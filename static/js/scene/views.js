@@ -1,0 +1,89 @@
+// Views of the scene that a person saves by name: position and target of the camera in the frame of the map, kept in this browser
+// for each source.
+
+import { byId, el, recall, remember } from "../core/dom.js";
+import { on, state } from "../core/store.js";
+import { onSceneBuilt } from "./scene.js";
+
+const MOST_VIEWS = 20, MOST_SOURCES = 30, LONGEST_NAME = 40;
+const calm = matchMedia("(prefers-reduced-motion: reduce)");
+let scene = null;
+
+function stored() {
+  try {
+    const all = JSON.parse(recall("views") ?? "{}");
+    return typeof all === "object" && all && !Array.isArray(all) ? all : {};
+  } catch {
+    return {};
+  }
+}
+
+const isView = (view) => Array.isArray(view) && view.length === 6 && view.every(Number.isFinite);
+
+// The saved views of the open source as [[name, view], ...].
+export const savedViews = () => Object.entries(stored()[state.status?.source] ?? {}).filter(([, view]) => isView(view));
+
+function keep(views) {
+  const source = state.status?.source ?? "", { [source]: _, ...others } = stored(); // this source comes last
+  const all = Object.entries({ ...others, ...(views.length ? { [source]: Object.fromEntries(views) } : {}) });
+  remember("views", JSON.stringify(Object.fromEntries(all.slice(-MOST_SOURCES))));
+  show();
+}
+
+function parts() {
+  const { camera, cameraControl: control, nodeRefFromName: nodes } = scene?.__viserMutable ?? {};
+  return control && nodes?.["/world"] ? { camera, control, world: nodes["/world"].matrixWorld } : null;
+}
+
+// The present view in the frame of the map; null before the scene is there.
+function present() {
+  const at = parts();
+  if (!at) return null;
+  const toMap = at.world.clone().invert(), point = () => at.camera.position.clone();
+  return [at.control.getPosition(point()), at.control.getTarget(point())].flatMap((each) => each.applyMatrix4(toMap).toArray());
+}
+
+export function lookFrom(view) {
+  const at = parts();
+  if (!at) return;
+  const [from, to] = [view.slice(0, 3), view.slice(3)].map((xyz) => at.camera.position.clone().set(...xyz).applyMatrix4(at.world));
+  at.control.setLookAt(...from.toArray(), ...to.toArray(), !calm.matches);
+}
+
+function save(event) {
+  event.preventDefault();
+  const name = byId("view-name").value.trim(), view = present();
+  if (!name || !view) return;
+  keep([...savedViews().filter(([other]) => other !== name), [name, view]].slice(-MOST_VIEWS));
+  byId("view-save").focus();
+}
+
+function show() {
+  const list = byId("view-list"), views = savedViews();
+  if (list.hidden) return;
+  list.replaceChildren(
+    ...views.map(([name, view]) => el("div", { class: "row" }, el("button", { class: "small grow", text: name, onclick: () => lookFrom(view) }),
+      el("button", { class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete the view ${name}`, onclick: () => keep(savedViews().filter(([other]) => other !== name)) }))),
+    views.length ? "" : el("p", { class: "dim note", text: "A saved view returns to the same place of the map." }),
+    el("form", { class: "row", onsubmit: save },
+      el("input", { id: "view-name", type: "text", maxlength: String(LONGEST_NAME), placeholder: "name", "aria-label": "Name of the view", autocomplete: "off" }),
+      el("button", { id: "view-save", class: "small", text: "Save", title: "Save the present view of the camera under this name" })));
+}
+
+export function startViews() {
+  const button = byId("views-button"), list = byId("view-list");
+  const open = (wanted) => {
+    list.hidden = !wanted;
+    button.setAttribute("aria-expanded", String(wanted));
+    show();
+  };
+  button.addEventListener("click", () => open(list.hidden));
+  list.addEventListener("keydown", (event) => {
+    if (event.key !== "Escape") return;
+    event.stopPropagation();
+    open(false);
+    button.focus();
+  });
+  on("source", show);
+  onSceneBuilt((inner) => { scene = inner; });
+}
