@@ -112,6 +112,11 @@ def report_page(
         infinity=math.inf,
         figures=figures,
         trees_in_map=len(whole.trees.dbh) + whole.run.rejected,
+        no_error=any(
+            round(f.values["n_ha"].se, 3) == 0.0
+            for result in (whole, of_plots)
+            for f in (result.figures.values() if result else ())
+        ),
         figure_names=list(FIGURES),
         units={name: squared(unit) for name, (_, unit) in FIGURES.items()},
         of_plots=of_plots,
@@ -208,11 +213,16 @@ def georeference_words(frame: MapFrame, texts: dict[str, str], number: Numbers) 
     return f"{frame.title}: {words}{sigma}"
 
 
-def _digits(estimate: Estimate) -> int:
-    """Return the number of decimals that the size of a figure deserves: 0 from 100 on and where not finite, 1
-    from 10 on, else 2."""
+def _digits(estimate: Estimate, least: int | None = None) -> int:
+    """Return the number of decimals of a figure and its standard error: `least`, by default what the size of
+    the figure deserves (0 from 100 on and where not finite, 1 from 10 on, else 2), and more, up to 3, where
+    the error would be rounded to 0."""
     size = abs(estimate.value)
-    return 0 if not math.isfinite(size) or size >= 100 else 1 if size >= 10 else 2
+    if least is None:
+        least = 0 if not math.isfinite(size) or size >= 100 else 1 if size >= 10 else 2
+    if not math.isfinite(size + estimate.se):
+        return least
+    return next((d for d in range(least, 4) if round(estimate.se, d) > 0.0), least)
 
 
 def tree_rows(run: ExportedRun, texts: dict[str, str], number: Numbers) -> list[list[str]]:

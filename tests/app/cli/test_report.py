@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import tomllib
@@ -14,10 +15,11 @@ import numpy as np
 import pytest
 
 from app.batch.georeference import METHODS
-from app.batch.report import Numbers, find_browser
+from app.batch.report import Numbers, _digits, find_browser
 from app.batch.run_folder import recorded_time
 from pipeline.config.model import field_specs, stage_specs
 from pipeline.config.stages import Stand
+from pipeline.stand.figures import Estimate
 from pipeline.types.records import Verdict
 from tests.app.batch.finished_runs import grid_run, write_run
 from tests.app.cli.test_commands import stemmap
@@ -168,6 +170,16 @@ def test_the_date_of_the_recording_is_that_of_its_first_scan(tmp_path, capsys):
         file.write_text(json.dumps(record | {"recorded": recorded}))
         assert ("Recorded: 2024-05-03" in page_of(capsys, folder, tmp_path / "r.html")) == shown
     assert recorded_time("simulated run", 1714732872 * 10**9) == recorded_time("pcap", 5 * 10**9) == {}
+
+
+def test_a_small_error_is_not_rounded_to_0_and_an_error_of_0_is_explained(run, tmp_path, capsys):
+    errors = {0.0: 0, 3.0: 0, 0.3: 1, 0.04: 2, 1e-9: 0, math.nan: 0}
+    assert {se: _digits(Estimate(1365.6, se)) for se in errors} == errors
+    assert _digits(Estimate(5.0, 0.2), 0) == 1
+    text = page_of(capsys, run, tmp_path / "r.html")  # at 20 cm of 1 cm, 7 cm is far
+    assert catalogue_of("en")["zero_error"] in text
+    fewer = page_of(capsys, run, tmp_path / "f.html", ["--dbh-min", "0.2"])
+    assert catalogue_of("en")["zero_error"] not in fewer
 
 
 def test_the_first_class_begins_at_the_minimum_diameter(run, tmp_path, capsys):
