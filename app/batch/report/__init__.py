@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import math
 import os
+import re
 import shutil
 import subprocess
 import tomllib
@@ -36,16 +38,41 @@ _LABELS_MAX = 400  # trees with a number on the map
 _PATH_POINTS = 2000
 
 
+@functools.cache
+def _catalogue() -> dict[str, dict[str, str]]:
+    """Return texts.toml: the texts by key of each language."""
+    return tomllib.loads((files(__package__) / "texts.toml").read_text(encoding="utf-8"))
+
+
 def texts_of(language: str) -> dict[str, str]:
     """Return the texts of a language by key, from texts.toml.
 
     Raises:
         StemmapError: The language is unknown.
     """
-    catalogue = tomllib.loads((files(__package__) / "texts.toml").read_text(encoding="utf-8"))
+    catalogue = _catalogue()
     if language not in catalogue:
         raise StemmapError(f"there is no language {language!r}", remedy=f"Languages: {', '.join(catalogue)}")
     return dict(catalogue[language])
+
+
+def translated(message: str, texts: dict[str, str]) -> str:
+    """Return a warning about stand figures in a language; one that is not in the catalogue unchanged.
+
+    Args:
+        message: The warning, in English.
+        texts: Texts of the language.
+    """
+    for key, english in texts_of("en").items():
+        if not key.startswith("warning_"):
+            continue
+        pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+?)", re.escape(english))
+        if found := re.fullmatch(pattern, message):
+            values = found.groupdict()
+            if "text" in values:  # the warning about a plot
+                values["text"] = translated(values["text"], texts)
+            return texts[key].format(**values)
+    return message
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +124,7 @@ def report_page(
         loader=PackageLoader("app.batch.report", "."), autoescape=True, trim_blocks=True, lstrip_blocks=True
     )
     figures = whole.figures["all"]
-    warnings = [*record.get("warnings", []), *whole.warnings]
+    warnings = [*whole.warnings]
     if of_plots is not None:
         warnings += [text for text in of_plots.warnings if text not in warnings]
     return environment.get_template("report.html.j2").render(
@@ -124,7 +151,8 @@ def report_page(
         histogram=histogram(whole, texts, number),
         trees=tree_rows(run, texts, number),
         with_heights=bool(np.isfinite(run.columns["height_m"]).any()),
-        warnings=warnings,
+        warnings=[translated(text, texts) for text in warnings],
+        messages=record.get("warnings", []),
         verdicts={k: v for k, v in record.get("verdicts", {}).items() if k != "tree"},
         parameters=parameters,
         figure_parameters=figure_parameters(parameters, texts, number),
