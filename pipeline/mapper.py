@@ -374,7 +374,9 @@ class Mapper:
         with self._timer("gathering"):
             pose, offset = estimate.T_map_base, scan.sensor_offset
             view = ScanView(pose, offset, scan.free, given.steepest, given.depth, given.terrain)
-            self._columns.all_around = is_seen_all_around(self._sensor.rings, self._slam.path()[:, :2])
+            rings = self._sensor.rings  # with rings, the path does not matter; it is long to copy
+            path = np.zeros((0, 2)) if rings else self._slam.path()[:, :2]
+            self._columns.all_around = is_seen_all_around(rings, path)
             self._columns.add(given.points, given.height, step.index, view)
             self._columns.columns = self._tracker.classify(
                 step.scan.stamp_ns, self._columns.columns, self._parameters.classification
@@ -504,14 +506,14 @@ class Mapper:
 
     def _correct_map(self, correction: PathCorrection | None, before: PoseEstimate) -> bool:
         """Move trees, columns and terrain with the path; return whether there is a correction. Columns and
-        terrain are moved only when all corrections since then displace a scan by CORRECTION_MIN or more.
-        `before` is the pose before the correction."""
+        terrain are moved only when all corrections since then together can displace a column by
+        CORRECTION_MIN or more. `before` is the pose before the correction."""
         if correction is None:
             return False
         estimate = self._slam.estimate(before)
         self._tracker.correct(correction, self._path.stamp_ns, estimate, self._slam.landmarks())
         self._delayed = correction if self._delayed is None else self._delayed.followed_by(correction)
-        if self._delayed.largest >= CORRECTION_MIN:
+        if self._delayed.largest(self.parameters.classification.range_max) >= CORRECTION_MIN:
             self._columns.correct(self._delayed)
             self._terrain.correct(self._delayed)
             self._delayed = None

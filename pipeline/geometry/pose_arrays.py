@@ -88,10 +88,12 @@ class PathCorrection:
     before: Float
     after: Float
 
-    @property
-    def largest(self) -> float:
-        """Largest displacement of a scan in x and y [m]; 0 without scans."""
-        return float(np.hypot(*(self.after - self.before)[:, :2].T).max(initial=0.0))
+    def largest(self, reach: float) -> float:
+        """Return a bound of the displacement of objects up to `reach` [m] from the pose with which they move:
+        the largest displacement of a scan and the arc of its rotation together [m]; 0 without scans."""
+        step = self.after - self.before
+        arc = reach * np.abs(wrap_angle(step[:, 2]))
+        return float((np.hypot(*step[:, :2].T) + arc).max(initial=0.0))
 
     def followed_by(self, later: PathCorrection) -> PathCorrection:
         """Return this correction and a later one as one. The path of the later one begins with the scans of

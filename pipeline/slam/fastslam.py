@@ -151,7 +151,7 @@ class FastSlam:
         self.state = state = replace(state, genealogy=genealogy, path=path, frame=frame)
         # A survivor of the resampling keeps its row, so that row `best` is still that of the best particle.
         if births is None:
-            landmark_of = births_of(detections, estimate, self.landmarks())
+            landmark_of = births_of(detections, estimate, self._usable_landmarks())
             scan = ScanStatistics(len(landmark_of), recognised=float(np.count_nonzero(landmark_of >= 0)))
         else:
             landmark_of = births[state.best]
@@ -183,7 +183,8 @@ class FastSlam:
         if graph.keyframes:
             keyframe = self._keyframe(self.state, (), self.state.detections)
             keyframe = replace(keyframe, covariance=np.full((3, 3), np.inf))
-            graph = graph.with_keyframe(keyframe, T_map_base.as_array()).with_loop(0, T_map_base, covariance)
+            graph = graph.with_keyframe(keyframe, T_map_base.as_array())
+            graph = graph.with_loop(0, T_map_base, covariance, self.path())
         self.state = replace(
             self.state,
             graph=graph,
@@ -250,7 +251,8 @@ class FastSlam:
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        graph = graph.without_uncertain(state.places).with_loop(loop.anchor, loop.T_map_base, loop.covariance)
+        graph = graph.without_uncertain(state.places)
+        graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance, self.path())
         solution = graph.solve(new_loop=True)
         if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
             return None
@@ -295,7 +297,7 @@ class FastSlam:
             genealogy=Genealogy.of_path(after, particles),
             path=EstimatedPath.of(after),
             recent=before.recent,
-            frame=frame.without_hidden(),
+            frame=frame.with_total(covariance, solution.covariance[-1], after[-1]),
             graph=graph.solved_by(solution),
             keyframe_motion=np.zeros(3),
             keyframe_covariance=np.zeros((3, 3)),
@@ -350,6 +352,20 @@ class FastSlam:
         known, p = self.state.map_of(self.state.best), self.parameters
         score = hits_less_misses(known.hits, known.score, p.misses_per_hit)
         return Landmarks(known.birth, known.mean, known.covariance, score, p.gate, p.distance_max)
+
+    def _usable_landmarks(self) -> Landmarks:
+        """Return `landmarks` without those of inactive places, which take no part in the data association."""
+        known, places = self.landmarks(), self.state.places
+        if not places.inactive.any():
+            return known
+        rows = places.is_usable(known.birth)
+        return replace(
+            known,
+            birth=known.birth[rows],
+            position=known.position[rows],
+            covariance=known.covariance[rows],
+            score=known.score[rows],
+        )
 
     def begun_since(self, scan: int) -> tuple[Float, Float]:
         """Return the landmarks of the best particle that were begun at a scan or later and have at least
@@ -430,7 +446,7 @@ class FastSlam:
             motion_covariance=np.zeros((3, 3)),
             keyframe_motion=keyframe_motion,
             keyframe_covariance=keyframe_covariance,
-            distance=state.distance + (state.since_update if math.isfinite(state.since_update) else 0.0),
+            distance=state.distance + state.since_update,
             since_update=0.0,
             detections=state.detections + found,
             best=select_best(weights, state.best, state.pose, rules.distance_max),
@@ -465,7 +481,7 @@ class FastSlam:
             reach: Distance of the farthest detection [m].
         """
         distance = state.distance
-        places = state.places.with_scan(distance, state.detections - len(centre), births[births >= 0])
+        places = state.places.with_scan(distance, state.detections - len(centre), births)
         if len(centre) and places.is_old(distance).any():
             x, y, yaw = state.pose[state.best].tolist()
             mean, covariance, hits, birth = known_near(state.maps, state.best, x, y, reach)
@@ -488,17 +504,16 @@ class FastSlam:
         Args:
             state: State after the scan.
             detections: Detections of the scan.
-            birth: Birth number of the landmark of each detection, int64, shape (D,); rows with -1 are
-                omitted.
+            birth: Birth number of the landmark of each detection, int64, shape (D,).
         """
         graph, scans, spacing = state.graph, state.since_keyframe, self.parameters.keyframe_distance
         # Scans from the same place share their errors.
         if len(detections.cluster) and (
             not scans or state.distance - scans[-1].distance >= spacing / SCANS_MAX
         ):
-            scan, known = len(state.genealogy) - 1, birth >= 0  # -1: undecided between two landmarks
-            R = rows_of(detections.covariance)[known]
-            shown = ScanDetections(scan, state.distance, birth[known], detections.centre[known], R)
+            scan = len(state.genealogy) - 1
+            R = rows_of(detections.covariance)
+            shown = ScanDetections(scan, state.distance, birth, detections.centre, R)
             scans = (*scans, shown)
         if graph.keyframes and state.distance - graph.keyframes[-1].distance < spacing:
             return state if scans is state.since_keyframe else replace(state, since_keyframe=scans)

@@ -174,9 +174,20 @@ class FrameUncertainty:
         return replace(self, pose=correction.poses(self.pose, self.scan), covariance=covariance)
 
     def without_hidden(self) -> FrameUncertainty:
-        """Return the state with `hidden` = 0: the particles were drawn with the complete covariance of the
-        pose. All reference poses remain."""
+        """Return the state with `hidden` = 0, for particles that are drawn with the complete covariance of
+        the pose. All reference poses remain."""
         return replace(self, hidden=np.zeros((3, 3)))
+
+    def with_total(self, spread: Float, total: Float, at: Float) -> FrameUncertainty:
+        """Return the state in which `hidden` is what the particles lack of a covariance of the pose, in each
+        principal axis (`at_least`). All reference poses remain.
+
+        Args:
+            spread: Covariance from which the particles are drawn, shape (3, 3).
+            total: Covariance of the pose in the frame of the map, shape (3, 3).
+            at: x, y [m], yaw [rad] of the pose, shape (3,).
+        """
+        return replace(self, hidden=at_least(spread, np.ascontiguousarray(total)) - spread, at=at)
 
 
 @compiled

@@ -194,7 +194,7 @@ class KeyframeGraph:
         )
         return graph.thinned() if len(graph.keyframes) > KEYFRAMES_MAX else graph
 
-    def with_loop(self, anchor: int, T_map_base: Pose2, covariance: Float) -> KeyframeGraph:
+    def with_loop(self, anchor: int, T_map_base: Pose2, covariance: Float, path: Float) -> KeyframeGraph:
         """Return the graph with a loop from an earlier keyframe to the newest one; unchanged with fewer than
         two keyframes.
 
@@ -203,11 +203,13 @@ class KeyframeGraph:
                 at the first keyframe for an earlier scan.
             T_map_base: Pose of the newest keyframe, found by the trees around the anchor.
             covariance: Covariance of x, y [m], yaw [rad] of this pose, axes of the map, shape (3, 3).
+            path: Estimated pose of each scan, x, y [m], yaw [rad], shape (N, 3). The trees around the anchor
+                are mapped from it; `pose` is that of single particles until the first solution.
         """
         if len(self.keyframes) < 2:
             return self
         row = max(int(np.searchsorted(self.scans[:-1], anchor, side="right")) - 1, 0)
-        pose = self.pose[row]
+        pose = path[self.keyframes[row].scan]
         motion = composed(inverse(pose[None]), T_map_base.as_array()[None])[0]
         c, s = np.cos(pose[2]), np.sin(pose[2])
         C = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -86,17 +86,16 @@ def drift_variances(motion: Float, driven: float, trust: OdometryTrust) -> tuple
 
     Args:
         motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
-        driven: Path length since that scan, plus TURN_AS_DISTANCE per radian [m]; infinite if it was not
-            measured. It is ignored while the odometry is distrusted, because each step then has a larger
-            covariance (see `advanced`).
+        driven: Path length since that scan, plus TURN_AS_DISTANCE per radian [m]. It is ignored while the
+            odometry is distrusted, because each step then has a larger covariance (see `advanced`).
         trust: State of the odometry.
 
     Returns:
         Variance of x and of y [m^2], and variance of yaw [rad^2].
     """
     distance, turned = np.hypot(motion[0], motion[1]), abs(motion[2])
-    counted = np.isfinite(driven) and trust.distrust == 0.0
-    detour = max(driven - distance - TURN_AS_DISTANCE * turned, 0.0) if counted else 0.0
+    trusted = trust.distrust == 0.0
+    detour = max(driven - distance - TURN_AS_DISTANCE * turned, 0.0) if trusted else 0.0
     detour += trust.unobserved  # the share of turns in this distance is unknown
     distance, turned = distance + detour, turned + detour / TURN_AS_DISTANCE
     position, heading = step_variances(distance, 0.0, turned, trust.noise)

@@ -418,11 +418,13 @@ def merge_duplicates(
     birth: Int,
     known: int,
     seen: Bool,
+    frozen: Bool,
     gate: float,
     cells: Cells,
     scale: float,
 ) -> None:
-    """Merge each landmark that was seen with those within the gate that were not seen, in place.
+    """Merge each landmark that was seen with those within the gate that were not seen and are not
+    frozen, in place.
 
     The merged position is the Kalman update of both, the hits are added, and the better score and the lower
     birth number remain; the other row gets the score 0 and is removed later. Landmarks that are both seen in
@@ -432,6 +434,7 @@ def merge_duplicates(
         mean, covariance, hits, score, birth: Landmarks, see Maps.
         known: Number of leading rows that are examined.
         seen: Whether a landmark was detected in this scan, shape (L,).
+        frozen: Whether a landmark must not change, shape (L,); a frozen one is not seen.
         gate: Maximum Mahalanobis distance [sigma].
         cells: Hash grid of these rows; the position of those that were not seen is up to date.
         scale: Cells per metre.
@@ -454,7 +457,7 @@ def merge_duplicates(
                 continue
             # The trace bounds the larger eigenvalue.
             a, d = covariance[j, 0] + covariance[k, 0], covariance[j, 2] + covariance[k, 2]
-            if square > gate2 * (a + d) or seen[k] or score[k] <= 0.0:
+            if square > gate2 * (a + d) or seen[k] or frozen[k] or score[k] <= 0.0:
                 continue
             b = covariance[j, 1] + covariance[k, 1]
             if d * y0 * y0 - 2.0 * b * y0 * y1 + a * y1 * y1 > gate2 * (a * d - b * b):

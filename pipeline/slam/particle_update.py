@@ -72,6 +72,7 @@ class Near(NamedTuple):
         block, place: Block of the particle and place in it, int32, shape (L,).
         mean, covariance, hits, score, birth: As in Maps, shape (L, ...).
         seen: Whether the landmark was detected in this scan, shape (L,).
+        frozen: Whether it belongs to an uncertain place, so that it does not change, shape (L,).
         changed: Whether the row differs from the map, shape (L,).
         free: Block and place of unused places, int32, shape (L, 2).
         cells: Hash grid of the landmarks known before the scan, at their positions before it.
@@ -85,6 +86,7 @@ class Near(NamedTuple):
     score: Float32
     birth: Int
     seen: Bool
+    frozen: Bool
     changed: Bool
     free: Int32
     cells: Cells
@@ -102,6 +104,7 @@ def near_for(landmarks: int) -> Near:
         np.empty(n, np.int32),
         np.empty(n, np.float32),
         np.empty(n, np.int64),
+        np.empty(n, np.bool_),
         np.empty(n, np.bool_),
         np.empty(n, np.bool_),
         np.empty((n, 2), np.int32),
@@ -221,7 +224,7 @@ def observe(
         log_weight[p] += rules.weight_power * (likelihood - rules.miss_weight * missed)
         merge_duplicates(
             near.mean, near.covariance, near.hits, near.score, near.birth, known, near.seen,
-            rules.merge_gate, near.cells, scale,
+            near.frozen, rules.merge_gate, near.cells, scale,
         )  # fmt: skip
         for d in range(centre.shape[0]):
             j = room.landmark_of[d]
@@ -242,8 +245,7 @@ def _gather(
     near: Near,
 ) -> tuple[int, int]:
     """Copy the landmarks of particle p within `reach` of the pose into `near`, except those of inactive
-    places. Landmarks of uncertain places are marked as seen, so that they are neither updated nor missed nor
-    merged.
+    places. Landmarks of uncertain places are frozen: they are neither updated nor missed nor merged.
 
     Args:
         maps: Maps of the particles; unchanged.
@@ -284,7 +286,7 @@ def _gather(
                 maps.score[b, o],
                 maps.birth[b, o],
             )
-            near.seen[n], near.changed[n] = state != ACTIVE, False
+            near.seen[n], near.frozen[n], near.changed[n] = False, state != ACTIVE, False
             n += 1
     return n, free
 
@@ -307,7 +309,7 @@ def _learn(
     """Update the landmarks of particle p that were detected, mark them as seen, and append a new landmark for
     each detection without one; return the number of rows of `near` then.
 
-    Landmarks that were marked as seen before (of uncertain places) are unchanged. A score grows by 1 up to
+    Frozen landmarks are unchanged. A score grows by 1 up to
     SCORE_MAX. A new landmark has one hit, the score 1 and the covariance of its detection.
 
     Args:
@@ -330,7 +332,7 @@ def _learn(
         R0, R1, R2 = rotated(R, d, c, s)
         j = landmark_of[d]
         if j >= 0:
-            if near.seen[j]:  # of an uncertain place
+            if near.frozen[j]:
                 continue
             kalman_update(near.mean, near.covariance, j, z0, z1, R0, R1, R2)
             near.hits[j] += 1
@@ -375,9 +377,9 @@ def _miss(
     rules: Rules,
     statistics: Float,
 ) -> float:
-    """Decrease the score of the landmarks in free view that were not seen, by `rules.miss`; return the number
-    of well-known ones among them. Their hits, each at most MOST_HITS, are added to the column MISSED of row
-    p.
+    """Decrease the score of the landmarks in free view that were not seen and are not frozen by `rules.miss`;
+    return the number of well-known ones among them. Their hits, each at most MOST_HITS, are added to the
+    column MISSED of row p.
 
     A landmark is in free view if it is nearer than the free range in its direction less BEHIND.
 
@@ -396,7 +398,7 @@ def _miss(
     if farthest == 0.0:
         return missed
     for j in range(known):
-        if near.seen[j]:
+        if near.seen[j] or near.frozen[j]:
             continue
         dx, dy = near.mean[j, 0] - pose[p, 0], near.mean[j, 1] - pose[p, 1]
         square = dx * dx + dy * dy
@@ -502,7 +504,7 @@ def against_slip(
     rules: Rules,
 ) -> TreeMotion:
     """Return the motion by odometry, corrected with the map of the best particle, see `motion_by_trees`. With
-    fewer than FEWEST_PAIRS detections it is the odometry. Landmarks of inactive places are not used. All
+    fewer than FEWEST_PAIRS detections it is the odometry. Only landmarks of active places are used. All
     arguments are unchanged.
 
     Args:
@@ -518,7 +520,7 @@ def against_slip(
     at = moved_pose(pose[best], motion)
     known, spread, hits, birth = known_near(maps, best, at[0], at[1], rules.view_range + SEARCH)
     if places.state.shape[0]:
-        active = np.array([state_of(b, places) != INACTIVE for b in birth], np.bool_)
+        active = np.array([state_of(b, places) == ACTIVE for b in birth], np.bool_)
         known, spread, hits = known[active], spread[active], hits[active]
     return motion_by_trees(
         pose[best], motion, motion_covariance, driven, wheels, centre, R, known, spread, hits,

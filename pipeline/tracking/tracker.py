@@ -264,7 +264,6 @@ class Tracker:
         self.next_number += len(new)
 
 
-AGREE = 3.0  # sigma; maximum distance between a track and its landmark
 # ns; in this time a robot that drives 1 m/s drifts by 0.25 m if its odometry errs by 2.5 %, less than the
 # distance of two landmarks of one trunk. Later, a landmark next to a tree may be that of another tree.
 SAME_VISIT_NS = 10_000_000_000

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Pose2, Pose3, euler_rotation, interpolate, wrap_angle
 from tests.pipeline.strategies import angles, poses2, poses3
 
@@ -116,3 +117,15 @@ def test_interpolation_includes_its_ends_and_turns_the_shorter_way(a, b, fractio
     turn = abs(float(wrap_angle(b.yaw - a.yaw)))
     part = abs(float(wrap_angle(interpolate(a, b, fraction).yaw - a.yaw)))
     assert part == pytest.approx(fraction * turn, abs=1e-9)
+
+
+def test_a_correction_by_a_turn_alone_displaces_what_is_far():
+    correction = PathCorrection(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.02]]))
+    assert correction.largest(0.0) == 0.0
+    assert correction.largest(25.0) == pytest.approx(0.5)
+    place = np.array([[25.0, 0.0]])
+    moved, _ = correction.moved(place, np.array([0]))
+    assert np.hypot(*(moved - place)[0]) <= correction.largest(25.0)
+    both = PathCorrection(np.zeros((2, 3)), np.array([[0.3, 0.4, 0.0], [0.1, 0.0, -0.02]]))
+    assert both.largest(10.0) == pytest.approx(0.5)
+    assert PathCorrection(np.zeros((0, 3)), np.zeros((0, 3))).largest(25.0) == 0.0

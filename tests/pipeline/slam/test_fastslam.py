@@ -561,3 +561,24 @@ def test_the_power_of_the_weights_is_that_of_the_likelihood():
         ratios[power] = slam.state.log_weight[1] - slam.state.log_weight[0]
     assert ratios[1.0] < -0.5
     assert ratios[0.25] == pytest.approx(0.25 * ratios[1.0])
+
+
+def test_the_covariance_after_smoothing_is_that_of_the_graph():
+    """All particles are drawn given the map, whose own error they share."""
+    rng = np.random.default_rng(1)
+    world = rng.uniform([-5.0, -12.0], [40.0, 12.0], (60, 2))
+    slam = FastSlam(preset("forest").slam.model_copy(update={"particles": 30}), 2)
+    k, estimate = 0, slam.process(0, Pose2(), seen_from(Pose2(), world, rng, sigma=0.04), NOTHING_SEEN)
+    while not (k > 40 and slam.state.graph.newest_scan == k):
+        k += 1
+        step = Pose2(0.5 + rng.normal(0, 0.02), rng.normal(0, 0.02), rng.normal(0, 0.005))
+        shown = seen_from(Pose2(0.5 * k, 0.0, 0.0), world, rng, sigma=0.04, reach=12.0)
+        estimate = slam.process(k, step, shown, NOTHING_SEEN)
+    solution = slam.state.graph.solve()
+    assert solution is not None
+    marginal = solution.covariance[-1]
+    assert slam.smooth(k) is not None
+    after, spread = slam.estimate(estimate).covariance, slam.estimate(estimate).relative
+    assert np.trace(after[:2, :2]) >= 0.7 * np.trace(marginal[:2, :2])
+    assert spread is not None
+    assert np.trace(spread[:2, :2]) < 0.5 * np.trace(marginal[:2, :2]), "else this test shows nothing"

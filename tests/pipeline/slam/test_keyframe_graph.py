@@ -148,7 +148,9 @@ def test_a_loop_counts_where_the_graph_does_not_contradict_it(shift, weight):
     true = arc(40)
     graph = graph_of(true, np.random.default_rng(2))
     place = Pose2(true[-1, 0] + shift, true[-1, 1], true[-1, 2])
-    solution = graph.with_loop(0, place, np.diag(np.square([0.05, 0.05, 0.01]))).solve(new_loop=True)
+    solution = graph.with_loop(0, place, np.diag(np.square([0.05, 0.05, 0.01])), graph.pose).solve(
+        new_loop=True
+    )
     assert (solution.loop_weight[-1] > weight) == (shift == 0.0)
     assert off(solution.pose, true).max() < 0.3
 
@@ -156,7 +158,7 @@ def test_a_loop_counts_where_the_graph_does_not_contradict_it(shift, weight):
 def test_a_loop_corrects_the_drift_of_the_way_between():
     true = arc(42)
     bare = graph_of(true, np.random.default_rng(3), STEMS[:0])
-    loop = bare.with_loop(0, Pose2(*true[-1]), 1e-6 * np.eye(3)).solve(new_loop=True)
+    loop = bare.with_loop(0, Pose2(*true[-1]), 1e-6 * np.eye(3), bare.pose).solve(new_loop=True)
     assert off(loop.pose, true)[-1] < 0.01
     assert off(loop.pose, true).mean() < 0.7 * off(bare.pose, true).mean()
 
@@ -170,8 +172,19 @@ def test_the_covariance_of_a_loop_is_turned_into_the_axes_of_its_first_keyframe(
     assert abs(np.sin(2.0 * yaw)) > 0.5
     C = np.eye(3)
     C[:2, :2] = Pose2(0.0, 0.0, yaw).rotation().T
-    edge = graph.with_loop(0, Pose2(*true[-1]), covariance).loops[-1]
+    edge = graph.with_loop(0, Pose2(*true[-1]), covariance, graph.pose).loops[-1]
     np.testing.assert_allclose(edge.covariance, C @ covariance @ C.T, atol=1e-12)
+
+
+def test_a_loop_is_relative_to_the_estimated_path_and_not_to_single_particles():
+    true = arc(5)
+    graph = graph_of(true, np.random.default_rng(3), STEMS[:0])
+    path = np.repeat(true, 10, axis=0)
+    keyframes = tuple(replace(k, scan=10 * row) for row, k in enumerate(graph.keyframes))
+    graph = replace(graph, keyframes=keyframes, pose=true + np.array([0.1, 0.0, 0.01]))
+    edge = graph.with_loop(15, Pose2(*true[-1]), np.eye(3), path).loops[-1]
+    assert edge.scans == (10, 40)
+    np.testing.assert_allclose(edge.motion, composed(inverse(true[1:2]), true[-1:])[0], atol=1e-12)
 
 
 def test_a_loop_overrules_associations_by_the_drifted_path():
@@ -190,7 +203,7 @@ def test_a_loop_overrules_associations_by_the_drifted_path():
         graph = graph.with_keyframe(Keyframe(k, 4 * k, 6.0 * k, motion, 4.0 * Q, birth, centre, R), T)
     graph = graph.without_uncertain(places)
     assert [len(k.birth) for k in graph.keyframes] == [4] * 4 + [0] * 38
-    solution = graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3)).solve(new_loop=True)
+    solution = graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3), graph.pose).solve(new_loop=True)
     assert solution is not None
     assert solution.loop_weight[0] > 0.9
     assert off(solution.pose, true)[-1] < 0.1
@@ -251,7 +264,7 @@ def test_the_graph_stays_bounded_and_keeps_its_motion():
 def test_loops_stay_at_their_scans_when_the_graph_is_thinned():
     true = arc(42)
     graph = graph_of(true[:40], np.random.default_rng(3), STEMS[:0])
-    graph = graph.with_loop(5, Pose2(*true[39]), 1e-6 * np.eye(3))
+    graph = graph.with_loop(5, Pose2(*true[39]), 1e-6 * np.eye(3), graph.pose)
     for k in (40, 41):
         motion = composed(inverse(true[k - 1 : k]), true[k : k + 1])[0]
         none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))

@@ -13,6 +13,8 @@ from pipeline.config import preset
 from pipeline.geometry.gaussian import Pose
 from pipeline.geometry.poses import Pose2
 from pipeline.slam import FastSlam
+from pipeline.slam.motion import Motion
+from pipeline.slam.particle_maps import MapColumns
 from pipeline.slam.places import (
     ACTIVE,
     AGREEING,
@@ -27,6 +29,7 @@ from pipeline.slam.places import (
     agreement,
     state_of,
 )
+from pipeline.slam.state import SlamState
 from tests.pipeline.strategies import detections, seeds
 
 R = [0.03**2, 0.0, 0.03**2]
@@ -139,3 +142,30 @@ def test_landmarks_of_uncertain_places_correct_the_pose_and_stay():
     assert estimate.landmark_of.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(slam.landmarks().position, known.position)
     assert not slam.state.places.is_old(slam.state.distance).any(), "three trees that agree decide"
+
+
+def test_a_scan_that_does_not_update_the_filter_ignores_landmarks_of_inactive_places():
+    slam = mapped()
+    slam.state = replace(slam.state, places=slam.state.places.with_contradiction(slam.landmarks().birth))
+    assert slam.state.places.inactive.any()
+    estimate = slam.process(4, Pose2(0.1, 0.0, 0.0), detections(TREES - [1.6, 0.2]), np.zeros(128))
+    assert np.all(estimate.landmark_of == -1)
+
+
+def test_a_landmark_is_not_merged_into_one_of_an_uncertain_place():
+    old = np.array([[5.0, 0.0], [5.0, 4.0], [8.0, 2.0]])
+    mean = np.vstack([old, [[5.05, 0.0]]])
+    columns = MapColumns(
+        mean,
+        np.tile([0.0025, 0.0, 0.0025], (4, 1)),
+        np.full(4, 20, np.int32),
+        np.full(4, 20.0, np.float32),
+        np.array([0, 1, 2, 100]),
+    )
+    slam = FastSlam(preset("stems").slam.model_copy(update={"particles": 3}), 1)
+    places = Places(np.array([0, 100]), np.array([0.0, 60.0]), np.array([0.0, 60.0]), np.zeros(2, np.bool_))
+    state = SlamState.in_map(np.zeros((3, 3)), columns)
+    slam.state = replace(state, places=places, distance=61.0, detections=102)
+    motion = Motion(Pose2(), due=True)
+    slam.process(1, motion, detections(old[2:]), np.zeros(128))  # shows nothing of the landmark 100
+    assert slam.landmarks().birth.tolist() == [0, 1, 2, 100]
