@@ -167,28 +167,40 @@ class FrameStore:
 NOT_OF_THE_MAP = {"evaluation", "obstacles"}  # stages that do not change the map
 NS = 1_000_000_000
 _STATES = ("good", "weak", "lost")
+_MOST_WARNINGS = 200  # texts, which are sent with each scan
 
 
 class ScanCounts:
     """Verdicts, pose quality and warnings of the scans of a map, so that their totals up to each scan are
-    known, also after the run went back."""
+    known, also after the run went back. The totals of the next scan add to those of the scan before."""
 
     def __init__(self) -> None:
         self._rows = GrowingColumns(
             np.zeros((0, len(Verdict)), np.int32), np.zeros((0, len(_STATES)), np.int32), np.zeros(0)
         )
-        self._warnings: dict[int, tuple[str, ...]] = {}
+        self._warnings: dict[int, tuple[str, ...]] = {}  # of the scans with warnings
+        self._begin()
+
+    def _begin(self) -> None:
+        """Set the totals to those of no scan."""
+        self._summed = 0  # scans
+        self._verdicts, self._states = np.zeros(len(Verdict), np.int64), np.zeros(len(_STATES), np.int64)
+        self._sigma, self._warned = -math.inf, Counter[str]()
 
     def record(self, frame: Frame) -> None:
         """Store the counts of a scan, in place of earlier ones. A scan beyond the next one is ignored."""
-        known = len(self._rows)
-        if frame.index > known:
+        index, known = frame.index, len(self._rows)
+        if index > known:
             return
+        if index < self._summed:
+            self._begin()
         verdicts = np.bincount(frame.clusters.verdict, minlength=len(Verdict))
         state = np.array([frame.health.state == name for name in _STATES])
-        self._rows.write(frame.index, verdicts[None], state[None], np.array([frame.health.sigma_xy]))
-        self._rows.return_to(max(known, frame.index + 1))
-        self._warnings[frame.index] = tuple(frame.warnings)
+        self._rows.write(index, verdicts[None], state[None], np.array([frame.health.sigma_xy]))
+        self._rows.return_to(max(known, index + 1))
+        self._warnings.pop(index, None)
+        if frame.warnings:
+            self._warnings[index] = tuple(frame.warnings)
 
     def totals(self, index: int, warnings: Sequence[str], losses: Mapping[str, int]) -> RunCounts:
         """Return the totals up to a scan.
@@ -198,19 +210,22 @@ class ScanCounts:
             warnings: Warnings about the source, which come first.
             losses: Number of left-out messages by reason.
         """
-        verdicts, states, sigma = (self._rows.column(k)[: index + 1] for k in range(3))
-        warned = Counter(warnings)
-        for scan in sorted(self._warnings):
-            if scan <= index:
-                warned.update(self._warnings[scan])
-        known = sigma[np.isfinite(sigma)]
-        counted = zip(Verdict, verdicts.sum(axis=0).tolist(), strict=True)
+        if index + 1 < self._summed:
+            self._begin()
+        verdicts, states, sigma = (self._rows.column(k)[self._summed : index + 1] for k in range(3))
+        self._verdicts += verdicts.sum(axis=0)
+        self._states += states.sum(axis=0)
+        self._sigma = float(np.max(sigma[np.isfinite(sigma)], initial=self._sigma))
+        for scan in range(self._summed, index + 1):
+            self._warned.update(self._warnings.get(scan, ()))
+        self._summed = index + 1
+        counted = zip(Verdict, self._verdicts.tolist(), strict=True)
         return RunCounts(
-            dict(zip(_STATES, states.sum(axis=0).tolist(), strict=True)),
-            round(float(known.max()), 4) if len(known) else None,
+            dict(zip(_STATES, self._states.tolist(), strict=True)),
+            round(self._sigma, 4) if math.isfinite(self._sigma) else None,
             dict(sorted((verdict.label, n) for verdict, n in counted if n)),
             {reason: n for reason, n in losses.items() if n},
-            warning_texts(warned),
+            warning_texts(Counter(warnings) + self._warned)[:_MOST_WARNINGS],
         )
 
 

@@ -1,0 +1,44 @@
+"""Counts of the scans of a map, also after the run went back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from app.worker.remap import ScanCounts
+from pipeline.types.records import Frame, Verdict
+from tests.app import fakes
+
+
+def scan(index: int, *verdicts: Verdict, warnings: tuple[str, ...] = ()) -> Frame:
+    """A scan with clusters of some verdicts."""
+    frame = fakes.frame(index, index, warnings=warnings)
+    return replace(frame, clusters=replace(frame.clusters, verdict=np.array(verdicts, np.int32)))
+
+
+def test_totals_are_those_of_the_scans_up_to_the_asked_one() -> None:
+    counts = ScanCounts()
+    for index in range(4):
+        counts.record(scan(index, Verdict.TREE, Verdict.POLE, warnings=("slow",) * (index == 2)))
+    for index in (3, 0, 1, 3, 2):  # in any order
+        found = counts.totals(index, ["no clock"], {"lost": 2, "late": 0})
+        assert found.verdicts == {"pole": index + 1, "tree": index + 1}
+        assert found.health == {"good": index + 1, "weak": 0, "lost": 0}
+        assert found.losses == {"lost": 2}
+        assert found.warnings == ["no clock", "slow"][: 2 if index >= 2 else 1]
+
+
+def test_a_scan_that_is_mapped_again_replaces_its_counts() -> None:
+    counts = ScanCounts()
+    for index in range(4):
+        counts.record(scan(index, Verdict.TREE, warnings=("slow",)))
+    assert counts.totals(3, [], {}).warnings == ["slow (4 times)"]
+    counts.record(scan(1, Verdict.BUSH, Verdict.BUSH))
+    assert counts.totals(1, [], {}).verdicts == {"bush": 2, "tree": 1}
+    assert counts.totals(3, [], {}).verdicts == {"bush": 2, "tree": 3}, (
+        "later scans stay until they are mapped"
+    )
+    assert counts.totals(3, [], {}).warnings == ["slow (3 times)"]
+    counts.record(scan(9, Verdict.WALL))  # beyond the next one
+    assert counts.totals(3, [], {}).verdicts == {"bush": 2, "tree": 3}
