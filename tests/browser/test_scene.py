@@ -459,3 +459,34 @@ GROUND = """() => {
   while (node && !node.style.backgroundColor) node = node.parentElement;
   return getComputedStyle(node).backgroundColor;
 }"""
+
+
+# How many trees of the scene are grey, and how many there are.
+GREYED = """() => {
+  let mesh = null;
+  const node = window.__viserMutable.nodeRefFromName['/world/trees'];
+  node.traverse(each => { if (each.getColorAt) mesh ??= each; });
+  const isGrey = (k) => { const { r, g, b } = mesh.getColorAt(k); return r === g && g === b; };
+  const all = Array.from({ length: mesh.instancesCount }, (_, k) => isGrey(k));
+  return [all.filter(Boolean).length, all.length];
+}"""
+
+
+@pytest.mark.usefixtures("calm")
+def test_the_scene_greys_the_trees_that_the_filter_leaves_out(dashboard: Dashboard):
+    dashboard.load_scene()
+    dashboard.tab("Trees")
+    measured = sum(row["dbh_cm"] is not None for row in trees_of(dashboard))
+    greyed = lambda: dashboard.scene.evaluate(GREYED)  # noqa: E731
+    assert greyed()[0] == 0
+    dashboard.page.locator("#find").fill("dbh > 30")
+    count = dashboard.page.locator("#trees tbody tr").count
+    dashboard.eventually(lambda: greyed()[0] == greyed()[1] - count() and 0 < count() < measured, greyed)
+    dashboard.page.locator("#find").fill("")
+    dashboard.eventually(lambda: greyed()[0] == 0, greyed)
+
+
+def trees_of(dashboard: Dashboard) -> list[dict[str, float | None]]:
+    """The trees of the map that the page shows."""
+    read = "async () => (await import('/static/js/core/store.js')).trees()"
+    return list(dashboard.page.evaluate(read))

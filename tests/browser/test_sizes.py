@@ -79,6 +79,10 @@ def check_map_stays(dashboard: Dashboard) -> None:
             dashboard.tab(tab)
             heights.add(frame.evaluate("node => node.getBoundingClientRect().height"))
         assert len(heights) == 1, f"at {size} the map jumps with the tab: {heights}"
+    dashboard.page.set_viewport_size({"width": 1280, "height": 720})
+    dashboard.tab("Tune")
+    expect(dashboard.page.locator("#tune-rows input[type=range]").first).to_be_in_viewport(ratio=1)
+    dashboard.page.set_viewport_size({"width": 1280, "height": 800})
 
 
 def check_drawer(dashboard: Dashboard) -> None:

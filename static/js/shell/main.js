@@ -17,6 +17,7 @@ import { startTimeline } from "../playback/timeline.js";
 import { startCharts } from "../charts/charts.js";
 import { startPlotsPanel } from "../plots/panel.js";
 import { startCamera } from "../scene/camera.js";
+import { startDimming } from "../scene/dimming.js";
 import { startFocus } from "../scene/focus.js";
 import { startLabels } from "../scene/labels.js";
 import { startLayers } from "../scene/layers.js";
@@ -39,6 +40,6 @@ import { startStatus } from "./status.js";
 import { startDrawer, startTabs } from "./tabs.js";
 
 for (const start of [startTheme, startStatus, startTabs, startMap, startMeasure, startTable, startScores, startCharts, startClusters, startStory, startAnnotating, startAnnotatePanel, startSceneAnnotating, startPlotsPanel, startTunePanel, startTuning, startOverlay, startStages, startCompare, startCamera,
-  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
+  startTimeline, startMarks, startSources, startScene, startScenePanel, startLabels, startDimming, startViews, startLayers, startFocus, startKeys, startSettings, startPalette, startDrawer, startLayout, startWelcome, startShare]) start();
 addEventListener("unhandledrejection", ({ reason }) => showProblem(reason?.message ? reason : String(reason)));
 connect();
