@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Route, expect
 
 from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
@@ -59,6 +59,18 @@ def test_runs_are_stored_compared_renamed_deleted_and_replayed(own: Dashboard, t
     assert told["parameters"] == [{"name": "tracking.hits_to_confirm", "a": 3, "b": 25}]
     expect(page.locator("#compare-figures dd").first).to_have_text(str(told["record"]["pairs"]))
     expect(page.get_by_text("tracking.hits_to_confirm")).to_be_visible()
+
+    def unaligned(route: Route) -> None:
+        route.fulfill(json={**told, "aligned": False})
+
+    page.route("**/api/runs/compare?*", unaligned)  # as of two places
+    rows.nth(1).get_by_role("button").click()
+    page.get_by_role("button", name="Compare two").click()
+    expect(page.locator("#run-detail [role=alert]")).to_contain_text(
+        "The stems of the two visits do not agree"
+    )
+    expect(page.locator("#run-detail h2")).to_contain_text("A: ")
+    page.unroute("**/api/runs/compare?*")
 
     rows.nth(1).get_by_role("button").click()
     page.get_by_role("button", name="Rename").click()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 from playwright.sync_api import expect
 
@@ -118,6 +120,29 @@ def test_an_object_without_a_cluster_says_why_and_when_the_robot_was_nearest(das
     expect(panel).to_contain_text("No cluster of this scan and no tree of the map is at this place")
     page.locator("#map").press("Escape")
     expect(panel.locator(".empty")).to_contain_text("Nothing selected")
+
+
+def test_a_click_on_an_object_beside_a_tree_means_the_object(dashboard: Dashboard):
+    """The object of the ground truth that is nearest to a tree of the map, a pixel from its middle."""
+    page = dashboard.page
+    x, y, gap = page.evaluate(BESIDE_A_TREE)
+    assert 3 < gap < 30, "a click there is within reach of the tree"
+    page.locator("#map").click(position={"x": x, "y": y})
+    panel = page.locator("#panel-story")
+    expect(panel).to_have_attribute("data-story", re.compile("truth|cluster"))
+    page.locator("#map").press("Escape")
+
+
+BESIDE_A_TREE = """async () => {
+  const { state, trees } = await import('/static/js/core/store.js');
+  const { screenOf } = await import('/static/js/map/map.js');
+  const others = state.truth.filter(({ kind }) => kind !== 'tree');
+  const all = others.flatMap(({ x, y }) => trees().map(tree => {
+    const [[a, b], [c, d]] = [screenOf(x, y), screenOf(tree.x, tree.y)];
+    return [a, b, Math.hypot(a - c, b - d)];
+  }));
+  return all.filter(([, , gap]) => gap > 3).sort((a, b) => a[2] - b[2])[0];
+}"""
 
 
 def test_a_typed_time_is_gone_to(dashboard: Dashboard):

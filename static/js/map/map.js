@@ -89,10 +89,11 @@ function showLegend() {
 }
 
 function choose(at) {
-  const cluster = clusterAt(at);
+  const cluster = clusterAt(at), truth = truthAt(at), gap = gapTo(at);
   let tree = treeAt(trees(), at, map.view);
-  // A click on the square of a rejected cluster next to a tree means the cluster.
-  if (tree && cluster && cluster.verdict !== "tree" && gapTo(at)(cluster) < gapTo(at)(tree)) tree = null;
+  // A click on the symbol of a rejected cluster or of another object next to a tree means the cluster or the object.
+  const others = [cluster?.verdict === "tree" ? null : cluster, truth?.kind === "tree" ? null : truth];
+  if (tree && others.some((other) => other && gap(other) < gap(tree))) tree = null;
   if (tree && tree.number !== state.selected) {
     openStory("tree");
     select(tree.number);
@@ -101,7 +102,7 @@ function choose(at) {
     selectCluster(state.map.index, cluster.row);
   } else {
     select(null);
-    state.selectedTruth = truthAt(at);
+    state.selectedTruth = truth;
     if (state.selectedTruth) openStory("truth");
   }
 }

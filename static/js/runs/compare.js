@@ -23,7 +23,7 @@ export async function showTwo(a, b) {
     return;
   }
   if (!both.aligned) {
-    put(head(both), figures(both), more(both, null));
+    put(null, head(both), figures(both), more(both, null));
     return;
   }
   both.trees = both.rows.map((row) => ({ ...row, x: row.x_m, y: row.y_m, number: row.tree_a ?? row.tree_b, dbh_cm: row.dbh_a_cm ?? row.dbh_b_cm, ellipse: [0, 0, 0] }));
