@@ -178,8 +178,8 @@ class Dashboard:
         """Set a choice of the 3D scene for all browsers.
 
         Args:
-            name: Name of a layer, "follow", "colour_by" or "label_by".
-            value: Visibility or following as bool; for colours and labels the name of the choice.
+            name: Name of a layer, "follow", or a name in colours.CHOICES.
+            value: Visibility or following as bool; for CHOICES one of their values.
 
         Raises:
             ParameterError: There is no such choice, or the value is not one of it.

@@ -171,7 +171,9 @@ LAYERS = {
     "voxels": Layer("Voxels", VOXELS, on=False),
     "way": Layer("Path ahead and obstacles", PATH),
 }
-CHOICES = {"colour_by": COLOUR_BY, "label_by": LABEL_BY}
+# Scans of which the accumulated map shows the points, by the time before the current scan [s].
+WINDOWS = {"whole run": None, "last 1 s": 1.0, "last 3 s": 3.0, "last 10 s": 10.0}
+CHOICES = {"colour_by": COLOUR_BY, "label_by": LABEL_BY, "accumulated": tuple(WINDOWS)}
 
 
 @dataclass(slots=True)
@@ -180,6 +182,7 @@ class ViewSettings:
 
     colour_by: str = COLOUR_BY[0]
     label_by: str = LABEL_BY[0]
+    accumulated: str = next(iter(WINDOWS))
     follow: bool = True
     layers: dict[str, bool] = field(
         default_factory=lambda: {name: layer.on for name, layer in LAYERS.items()}
@@ -189,8 +192,8 @@ class ViewSettings:
         """Set one choice of the view.
 
         Args:
-            name: Name of a layer, "follow", "colour_by" or "label_by".
-            value: Visibility or following as bool; for colours and labels the name of the choice.
+            name: Name of a layer, "follow", or a name in CHOICES.
+            value: Visibility or following as bool; for CHOICES one of their values.
 
         Raises:
             ParameterError: There is no such choice, or the value is not one of it.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import viser
@@ -299,6 +299,8 @@ def _crosses(places: Float) -> Float:
 
 SIDE = 0.1  # side of a cell, which is shown as one point [m]
 MOST_POINTS = 200_000
+MOST_RECENT = 400_000  # points of the scans that are kept for the time windows
+RECENT_STEP_NS = 200_000_000  # between two of these scans [ns]
 BLOCK = 20_000  # points per node, so that a large map is not sent again with each scan
 STEP, TURN = 0.25, 0.17  # motion after which the next scan is added [m, rad]
 LOW, HIGH = 0.0, 3.0  # heights at the ends of the colour ramp [m]
@@ -316,6 +318,7 @@ class Accumulated:
     def __init__(self) -> None:
         self.points = np.zeros((0, 3), np.float32)
         self.left_out = 0
+        self._recent: list[_PlacedScan] = []
         self._keys = np.zeros(0, np.int64)
         self._scans: list[tuple[int, int, NDArray[np.float64]]] = []  # scan, points before it, pose
 
@@ -330,16 +333,14 @@ class Accumulated:
             Whether `points` changed.
         """
         went_back = self._go_back(frame.index)
+        placed = _placed(frame)
+        self._keep_recent(frame, placed)
         pose = frame.estimate.T_map_base.as_array()
         if self._scans:
             moved = pose - self._scans[-1][2]
             turned = abs((moved[2] + np.pi) % (2.0 * np.pi) - np.pi)
             if np.hypot(*moved[:2]) < STEP and turned < TURN:
                 return went_back
-        points = frame.filtered + frame.sensor_offset.astype(np.float32)
-        placed = np.column_stack(
-            [frame.estimate.T_map_base.apply(points[:, :2].astype(np.float64)), points[:, 2] + frame.base_z]
-        )
         keys, first = np.unique(_keys(placed), return_index=True)
         new = np.sort(first[~np.isin(keys, self._keys)])
         room = MOST_POINTS - len(self.points)
@@ -352,6 +353,32 @@ class Accumulated:
         self._keys = np.concatenate([self._keys, _keys(placed[new])])
         return went_back or len(new) > 0
 
+    def points_of(self, window: str) -> NDArray[np.float32]:
+        """Return the points that the layer shows, float32, shape (N, 3) [m], one per cell: those of the whole
+        run or, by the poses of the time, of the scans shortly before the last one.
+
+        Args:
+            window: One of colours.WINDOWS.
+        """
+        seconds = colours.WINDOWS[window]
+        if seconds is None or not self._recent:
+            return self.points
+        start = self._recent[-1].stamp_ns - round(1e9 * seconds)
+        points = np.concatenate([scan.points for scan in self._recent if scan.stamp_ns >= start])
+        first = np.unique(_keys(points), return_index=True)[1]
+        return points[np.sort(first)]
+
+    def _keep_recent(self, frame: Frame, placed: NDArray[np.float64]) -> None:
+        """Keep the points of a scan for `points_of`, unless the last kept scan was less than RECENT_STEP_NS
+        before; the oldest scans go once there are more than MOST_RECENT points."""
+        while self._recent and self._recent[-1].index >= frame.index:
+            self._recent.pop()
+        if self._recent and frame.stamp_ns - self._recent[-1].stamp_ns < RECENT_STEP_NS:
+            return
+        self._recent.append(_PlacedScan(frame.index, frame.stamp_ns, placed.astype(np.float32)))
+        while len(self._recent) > 1 and sum(len(scan.points) for scan in self._recent) > MOST_RECENT:
+            del self._recent[0]
+
     def _go_back(self, index: int) -> bool:
         """Remove the points of the scan with this index and of later ones, and reset `left_out` if there were
         any; return whether there were."""
@@ -362,6 +389,22 @@ class Accumulated:
             return False
         self.points, self._keys, self.left_out = self.points[:keep], self._keys[:keep], 0
         return True
+
+
+class _PlacedScan(NamedTuple):
+    """The filtered points of a scan in the frame of the map, float32, shape (N, 3) [m]."""
+
+    index: int
+    stamp_ns: int
+    points: NDArray[np.float32]
+
+
+def _placed(frame: Frame) -> NDArray[np.float64]:
+    """Return the filtered points of a scan in the frame of the map by its pose, shape (N, 3) [m]."""
+    points = frame.filtered + frame.sensor_offset.astype(np.float32)
+    return np.column_stack(
+        [frame.estimate.T_map_base.apply(points[:, :2].astype(np.float64)), points[:, 2] + frame.base_z]
+    )
 
 
 class MapCloud:

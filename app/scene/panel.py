@@ -178,8 +178,8 @@ class SceneCommands(Protocol):
         """Set one choice of the view.
 
         Args:
-            name: Name of a layer, "follow", "colour_by" or "label_by".
-            value: Visibility or following as bool; for colours and labels the name of the choice.
+            name: Name of a layer, "follow", or a name in colours.CHOICES.
+            value: Visibility or following as bool; for CHOICES one of their values.
 
         Raises:
             ParameterError: There is no such choice.

@@ -138,7 +138,7 @@ class Scene:
         return {
             "ground": self._map.ground.faces,
             "voxels": self._voxels.count,
-            "gathered": len(self._accumulated.points),
+            "gathered": len(self._accumulated.points_of(self._view.accumulated)),
             "errors": self._errors.count,
         }
 
@@ -245,7 +245,7 @@ class Scene:
             self._map.show_truth(self._truth, self._view)
             self._robot.show(frame, self._path, self._view, self._map.ground)
             self._scan.show(frame, self._view, self._map.labelled)
-            self._gathered.show(layers["gathered"], self._accumulated.points)
+            self._gathered.show(layers["gathered"], self._accumulated.points_of(self._view.accumulated))
             self._voxels.show(layers["voxels"], frame, parameters.filters.voxel_size)
             self._way.show_ahead(layers["way"], frame, parameters.obstacles)
             self._errors.show_errors(

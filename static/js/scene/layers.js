@@ -8,7 +8,7 @@ import { throttled } from "../core/timing.js";
 import { pressInScene } from "./scene.js";
 
 const EVERY = 500; // [ms] between two updates of the counts
-const TITLES = { colour_by: "Colour by", label_by: "Labels" };
+const TITLES = { colour_by: "Colour by", label_by: "Labels", accumulated: "Accumulated" };
 const counts = {};
 const newest = {}; // newest counts by layer
 

@@ -23,7 +23,7 @@ const ALSO = {
   "clustering.eps": "neighbourhood tolerance cluster distance epsilon", "clustering.min_points": "cluster size density minpts", "filters.voxel_size": "resolution downsample thin leaf grid",
   "slam.particles": "accuracy hypotheses", "acquisition.range_max": "far reach distance",
 };
-const CHOICES = { colour_by: "Colour the scene by", label_by: "Label the scene with" };
+const CHOICES = { colour_by: "Colour the scene by", label_by: "Label the scene with", accumulated: "Accumulated map of the" };
 
 // Whether a button exists and is not hidden, apart from its panel being closed.
 function exists(id) {

@@ -13,6 +13,7 @@ from app.scene import Scene
 from app.scene.map import BLOCK, SIDE, STEP, Accumulated, errors
 from pipeline.config import preset
 from pipeline.config.stages import Evaluation
+from pipeline.errors import ParameterError
 from pipeline.geometry.poses import Pose2
 from pipeline.types.records import HIDDEN, TruthTrees
 from tests.app.scene.frames import make_frame, make_trees
@@ -60,6 +61,44 @@ def test_what_has_no_room_is_counted(monkeypatch: pytest.MonkeyPatch):
     gathered.take(make_frame(0))
     assert len(gathered.points) == 50
     assert gathered.left_out > 0
+
+
+def test_a_time_window_has_the_points_of_the_last_seconds_also_after_a_step_back():
+    second = 1_000_000_000
+    run = [replace(make_frame(k, pose=Pose2(6.0 * k, 0.0, 0.0)), stamp_ns=k * second) for k in range(6)]
+    gathered = Accumulated()
+    shown = []
+    for frame in run:
+        gathered.take(frame)
+        shown.append(gathered.points_of("last 3 s"))
+    alone = Accumulated()
+    for frame in run[2:]:
+        alone.take(frame)
+    np.testing.assert_array_equal(shown[5], alone.points)
+    assert len(shown[5]) < len(gathered.points) == len(gathered.points_of("whole run"))
+    gathered.take(run[4])
+    np.testing.assert_array_equal(gathered.points_of("last 3 s"), shown[4])
+
+
+def test_the_oldest_scans_leave_the_window_when_there_is_no_room(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("app.scene.map.MOST_RECENT", 1)
+    gathered = Accumulated()
+    for frame in frames([(0.0, 0.0), (9.0, 0.0)]):
+        gathered.take(replace(frame, stamp_ns=frame.index * 500_000_000))
+    assert 0 < len(gathered.points_of("last 10 s")) < len(gathered.points)
+
+
+async def test_a_window_is_chosen_in_the_scene(scene: Scene):
+    for index in range(4):
+        frame = make_frame(index, pose=Pose2(6.0 * index, 0.0, 0.0))
+        scene.show(replace(frame, stamp_ns=2_000_000_000 * index), PATH[: index + 1])
+    scene.choose("gathered", True)
+    whole = scene.counts["gathered"]
+    scene.choose("accumulated", "last 1 s")
+    assert 0 < scene.counts["gathered"] < whole
+    assert len(node(scene, "/world/gathered/0").points) == scene.counts["gathered"]
+    with pytest.raises(ParameterError):
+        scene.choose("accumulated", "last 5 years")
 
 
 async def test_the_accumulated_map_is_shown_when_it_is_asked_for(scene: Scene):
