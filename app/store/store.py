@@ -422,6 +422,14 @@ class Store:
         with self._engine.begin() as connection:
             return [_content(row) for row in connection.execute(query.order_by(_annotations.c.id))]
 
+    def annotation_counts(self) -> dict[int, int]:
+        """Return the number of annotations of KINDS by the number of the source, without sources that have
+        none."""
+        a = _annotations.c
+        query = select(a.run, func.count()).where(a.deleted.is_(False), a.kind.in_(KINDS)).group_by(a.run)
+        with self._engine.begin() as connection:
+            return {row.run: row[1] for row in connection.execute(query)}
+
     def annotated_sources(self) -> list[AnnotatedSource]:
         """Return all sources with annotations of KINDS, in the order of their first opening, and how each was
         mapped last."""

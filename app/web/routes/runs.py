@@ -71,14 +71,17 @@ class _Name(Body):
 
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
-    """GET /api/runs: return at most 500 runs without their maps (`runs`), the newest first, finished folders
-    (`folders`), and the number of the open run (`open`)."""
+    """GET /api/runs: return at most 500 runs without their maps (`runs`), the newest first, each with the
+    number of annotations of its recording (`annotated`), finished folders (`folders`), and the number of the
+    open run (`open`)."""
     await dashboard.run_recorder.write_now()
-    rows = await dashboard.store.ask(lambda store: store.book.listed())
+    rows, annotated = await dashboard.store.ask(
+        lambda store: (store.book.listed(), store.annotation_counts())
+    )
     folders = await asyncio.to_thread(_folders, settings)
     return json_reply(
         {
-            "runs": [_row(row) for row in rows],
+            "runs": [{**_row(row), "annotated": annotated.get(row["run"], 0)} for row in rows],
             "folders": [
                 {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed_s}
                 for name, changed_s in folders.items()

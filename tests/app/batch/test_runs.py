@@ -226,6 +226,19 @@ async def test_learning_uses_topics_mounting_seed_and_odometry_of_the_mapped_run
     assert annotated_run(source).request == source.request
 
 
+async def test_the_list_has_the_number_of_annotations_of_each_recording(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard)
+    run, author = dashboard.annotation_editor.run, Author("b" * 16, "Ann")
+    assert run is not None
+    (listed,) = (await client.get("/api/runs")).json()["runs"]
+    assert listed["annotated"] == 0
+    contents = [Content(1.0, 2.0), Content(4.0, 2.0, "bush"), Content(9.0, 2.0, "skipped")]
+    await dashboard.store.ask(lambda store: store.add(run, author, contents))
+    (listed,) = (await client.get("/api/runs")).json()["runs"]
+    assert listed["annotated"] == 2, "a skipped tree is not annotated"
+
+
 async def test_a_shared_run_is_opened_with_its_parameters(both: Running) -> None:
     client, dashboard = both
     body = {"uri": "run.mcap", "seed": 3, "preset": "paper", "parameters": {"clustering.eps": 0.3}}
