@@ -364,19 +364,19 @@ class Accumulated:
         if seconds is None or not self._recent:
             return self.points
         start = self._recent[-1].stamp_ns - round(1e9 * seconds)
-        points = np.concatenate([scan.points for scan in self._recent if scan.stamp_ns >= start])
+        points = np.concatenate([each.points for each in self._recent if each.stamp_ns >= start])
         first = np.unique(_keys(points), return_index=True)[1]
         return points[np.sort(first)]
 
     def _keep_recent(self, frame: Frame, placed: NDArray[np.float64]) -> None:
         """Keep the points of a scan for `points_of`, unless the last kept scan was less than RECENT_STEP_NS
         before; the oldest scans go once there are more than MOST_RECENT points."""
-        while self._recent and self._recent[-1].index >= frame.index:
+        while self._recent and self._recent[-1].scan >= frame.index:
             self._recent.pop()
         if self._recent and frame.stamp_ns - self._recent[-1].stamp_ns < RECENT_STEP_NS:
             return
         self._recent.append(_PlacedScan(frame.index, frame.stamp_ns, placed.astype(np.float32)))
-        while len(self._recent) > 1 and sum(len(scan.points) for scan in self._recent) > MOST_RECENT:
+        while len(self._recent) > 1 and sum(len(each.points) for each in self._recent) > MOST_RECENT:
             del self._recent[0]
 
     def _go_back(self, index: int) -> bool:
@@ -394,7 +394,7 @@ class Accumulated:
 class _PlacedScan(NamedTuple):
     """The filtered points of a scan in the frame of the map, float32, shape (N, 3) [m]."""
 
-    index: int
+    scan: int
     stamp_ns: int
     points: NDArray[np.float32]
 
