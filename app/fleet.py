@@ -37,8 +37,7 @@ from app.web.app import FleetLink, MakeScene, MakeWorker, build, guarded
 from app.web.auth import role_of
 from app.web.responses import error_reply
 from app.web.routes.access import ConnectionLimit
-from app.web.routes.page import access, lead_on, page_answer, page_file, page_folder
-from app.web.routes.sockets import telling
+from app.web.routes.page import access, lead_on, page_answer, page_file, page_folder, telling
 from app.web.serving import first_free, run_server, uvicorn_config
 from app.worker.numba_warmup import PATIENCE_S
 from app.worker.protocol import Open

@@ -30,7 +30,7 @@ from app.web import uploads as upload_routes
 from app.web.auth import Guard, viewer_token
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
-from app.web.routes import georeference, page, parameters, plots, results, run, runs, sockets, tuning
+from app.web.routes import georeference, page, parameters, plots, results, run, runs, tuning
 from app.web.routes.access import Limits, NotPermittedError
 from app.web.uploads import UploadError, Uploads
 from app.worker.protocol import Open, WorkerBusyError
@@ -55,7 +55,6 @@ ROUTERS = tuple(
         georeference,
         tuning,
         upload_routes,
-        sockets,
     )
 )
 
