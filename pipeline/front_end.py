@@ -379,7 +379,6 @@ def _clusters(place: Float, dbh: Float) -> Clusters:
     return Clusters(
         size=np.ones(n, np.int64),
         centroid=place,
-        eigenvalues=np.full((n, 3), np.nan),
         eccentricity=unknown,
         centre=place[:, :2].copy(),
         covariance=np.zeros((n, 2, 2)),

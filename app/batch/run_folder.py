@@ -79,8 +79,8 @@ class FinishedRun:
 
 def read_run(folder: FilePath) -> FinishedRun:
     """Return the run in a folder that `stemmap map` wrote: its run.json, path.csv and trees.csv, without the
-    trees that a person rejected. The trees have the velocity 0, diagonal covariances, and are all confirmed;
-    times count from the first scan, unknown ones of trees are -1; other unknown values are NaN.
+    trees that a person rejected. The trees have diagonal covariances and are all confirmed; times count from
+    the first scan, unknown ones of trees are -1; other unknown values are NaN.
 
     Raises:
         SourceError: A file is missing, damaged or larger than 256 MB.
@@ -190,8 +190,8 @@ def _damaged(folder: FilePath) -> SourceError:
 
 def as_written(trees: Trees, path: Path, start_ns: int) -> tuple[Trees, Path]:
     """Return copies of the confirmed trees and of the path with the precision of their files, so that scores
-    after mapping equal scores of the files. As from `read_run`, the trees have the velocity 0 and diagonal
-    covariances, times count from `start_ns`, and unknown times of trees are -1.
+    after mapping equal scores of the files. As from `read_run`, the trees have diagonal covariances, times
+    count from `start_ns`, and unknown times of trees are -1.
 
     Args:
         trees, path: The map.
@@ -308,7 +308,6 @@ def _trees(c: dict[str, Float]) -> Trees:
         number=c["tree"].astype(np.int64),
         position=np.stack([c["x_m"], c["y_m"]], axis=1),
         covariance=covariance,
-        velocity=np.zeros((n, 2)),
         dbh=c["dbh_cm"] / 100.0,
         dbh_sigma=c["sigma_dbh_cm"] / 100.0,
         eccentricity=c["eccentricity"],

@@ -93,7 +93,6 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
     offset = points[:, :2] - clusters.centre[cluster] if fit is None else fit.offset
     some = evenly_spaced(len(points), _MOST_POINTS)
     place = pose.apply(clusters.centre[cluster] + frame.sensor_offset[:2])
-    tree, tree_distance = _nearest_tree(frame, place, parameters.slam.distance_max)
     return ClusterStory(
         scan=frame.index,
         cluster=cluster,
@@ -109,8 +108,7 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
         residual=[] if fit is None else fit.residual[some].tolist(),
         circle=None if fit is None else _circle(fit, clusters.covariance[cluster], to_picture),
         axes=_axes(points[:, :2], to_picture),
-        tree=tree,
-        tree_distance=tree_distance,
+        tree=_nearest_tree(frame, place, parameters.slam.distance_max),
         column=column_story(frame, place, parameters, _is_seen_all_around(run)),
     )
 
@@ -239,8 +237,8 @@ def _decided_by(share: Float, tree_share: float) -> tuple[Verdict, ...]:
     return (Verdict.OTHER,) if most is Verdict.TREE else (most,)
 
 
-def _nearest_tree(frame: Frame, place: Float, reach: float) -> tuple[int | None, float]:
-    """Return number and distance [m] of the nearest confirmed tree; None and NaN if none is within `reach`.
+def _nearest_tree(frame: Frame, place: Float, reach: float) -> int | None:
+    """Return the number of the nearest confirmed tree; None if none is within `reach`.
 
     Args:
         frame: Results of the scan.
@@ -250,12 +248,10 @@ def _nearest_tree(frame: Frame, place: Float, reach: float) -> tuple[int | None,
     trees = frame.trees
     rows = np.flatnonzero(trees.confirmed)
     if not len(rows):
-        return None, float("nan")
+        return None
     distance = np.linalg.norm(trees.position[rows] - place, axis=1)
     nearest = int(np.argmin(distance))
-    if distance[nearest] > reach:
-        return None, float("nan")
-    return int(trees.number[rows[nearest]]), float(distance[nearest])
+    return int(trees.number[rows[nearest]]) if distance[nearest] <= reach else None
 
 
 def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
@@ -446,7 +442,6 @@ def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
         size=int(frame.clusters.size[row]),
         position=(float(place[0]), float(place[1])),
         tree=int(frame.trees.number[tree[0]]) if len(tree) else None,
-        tree_distance=0.0 if len(tree) else float("nan"),
         sections=cross_sections(plot, row),
     )
 

@@ -133,7 +133,7 @@ class ClusterStory(msgspec.Struct, frozen=True):
         residual: Residuals of the same points, positive outside of the circle [m]; empty without a circle.
         circle: None if the preset fits no circle or the points are too few.
         axes: One standard deviation along the principal axes in the picture: (right, up) of each [m].
-        tree, tree_distance: The nearest confirmed tree and its distance [m]; None and NaN if none is near.
+        tree: The nearest confirmed tree; None if none is near.
         column: Classification of the accumulated scans at its place; None without them.
         sections: Cross-sections of a candidate of a whole cloud; None for a cluster of a scan.
     """
@@ -153,7 +153,6 @@ class ClusterStory(msgspec.Struct, frozen=True):
     circle: Circle | None = None
     axes: list[tuple[float, float]] = []
     tree: int | None = None
-    tree_distance: float = math.nan
     column: ColumnStory | None = None
     sections: list[CrossSection] | None = None
 

@@ -356,7 +356,6 @@ def _clusters_of(plot: PlotMap, middle: Float, base_z: float, labels: Int32) -> 
     return Clusters(
         size=size.astype(np.int64),
         centroid=np.column_stack([plot.place - middle, foot + low + 0.5 * height]),
-        eigenvalues=np.full((n, 3), np.nan),
         eccentricity=nan,
         centre=plot.place - middle,
         covariance=np.tile(np.eye(2) * np.nan, (n, 1, 1)),

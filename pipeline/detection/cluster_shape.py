@@ -173,7 +173,6 @@ def describe(
     return Clusters(
         size=size,
         centroid=centroid,
-        eigenvalues=eigenvalues,
         eccentricity=eccentricity(eigenvalues),
         centre=np.ascontiguousarray(stem[:, 0:2]),
         covariance=np.take(stem, [2, 3, 3, 4], axis=1).reshape(-1, 2, 2),

@@ -308,7 +308,6 @@ def _trees(stems: Stems, arc_min: float, crowns: Crowns) -> Trees:
         number=np.arange(1, n + 1),
         position=np.column_stack([stems["x"], stems["y"]]),
         covariance=covariance,
-        velocity=np.zeros((n, 2)),
         dbh=dbh,
         dbh_sigma=sigma,
         eccentricity=np.full(n, np.nan),

@@ -180,7 +180,6 @@ class Tracker:
             number=t.number.copy(),
             position=t.x[:, :2].copy(),
             covariance=t.P[:, :2, :2] + SHARED_COVARIANCE,
-            velocity=t.x[:, 2:].copy(),
             dbh=dbh,
             dbh_sigma=dbh_sigma,
             eccentricity=eccentricity,

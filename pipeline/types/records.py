@@ -333,7 +333,6 @@ class Clusters:
     Attributes:
         size: int64, number of points.
         centroid: shape (K, 3) [m].
-        eigenvalues: shape (K, 3) [m^2], descending, of the horizontal covariance; the third is 0.
         eccentricity: lambda1 / lambda2 >= 1 (Eq. 4); inf for points on a line.
         centre: shape (K, 2) [m], the estimate of the trunk's axis.
         covariance: shape (K, 2, 2) [m^2], of `centre`.
@@ -348,7 +347,6 @@ class Clusters:
 
     size: Int
     centroid: Float
-    eigenvalues: Float
     eccentricity: Float
     centre: Float
     covariance: Float
@@ -399,7 +397,6 @@ class Trees:
         number: int64, from 1; a tree never changes its number.
         position: shape (T, 2) [m].
         covariance: shape (T, 2, 2) [m^2].
-        velocity: shape (T, 2) [m/s], of the Kalman filter's state (Eq. 10).
         dbh: Diameter at breast height [m], NaN if no arc was wide enough.
         dbh_sigma: Its standard deviation [m], or NaN.
         eccentricity: Mean over the observations.
@@ -417,7 +414,6 @@ class Trees:
     number: Int
     position: Float
     covariance: Float
-    velocity: Float
     dbh: Float
     dbh_sigma: Float
     eccentricity: Float

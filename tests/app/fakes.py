@@ -175,7 +175,6 @@ def trees(n: int = 0) -> Trees:
         number=k + 1,
         position=np.stack([2.0 * k, np.zeros(n)], axis=1),
         covariance=np.tile(np.diag([0.04, 0.01]), (n, 1, 1)),
-        velocity=np.zeros((n, 2)),
         dbh=np.where(k % 2 == 0, 0.3, np.nan),
         dbh_sigma=np.where(k % 2 == 0, 0.01, np.nan),
         eccentricity=np.full(n, 6.0),
@@ -193,7 +192,6 @@ def frame(
     clusters = Clusters(
         size=np.array([30]),
         centroid=np.zeros((1, 3)),
-        eigenvalues=np.ones((1, 3)),
         eccentricity=np.array([np.inf]),
         centre=np.zeros((1, 2)),
         covariance=np.eye(2)[None],

@@ -130,7 +130,6 @@ def clusters(**columns: Any):
     good = Clusters(
         size=np.array([60]),
         centroid=np.array([[4.0, 0.0, 0.5]]),
-        eigenvalues=np.array([[0.01, 0.002, 0.0]]),
         eccentricity=np.array([5.0]),
         centre=np.array([[4.2, 0.0]]),
         covariance=np.eye(2)[None] * 1e-4,
@@ -154,7 +153,6 @@ def trees(position, *, dbh=0.3, confirmed=True):
         number=np.arange(1, n + 1),
         position=rows,
         covariance=np.tile(np.eye(2) * 1e-4, (n, 1, 1)),
-        velocity=np.zeros((n, 2)),
         dbh=np.full(n, dbh),
         dbh_sigma=np.full(n, 0.01),
         eccentricity=np.full(n, 5.0),

@@ -71,7 +71,6 @@ class SourceDescription:
         preset: Parameter preset for this kind of source.
         topics: Topics of a recording of messages; () for other sources.
         warnings: Messages for the user, e.g. that there is no odometry.
-        in_order_of_arrival: Whether records come in the order of arrival (live run), not sorted by time.
         revisions: Parameters of a recorded run, in the order of their scans.
         gnss: How GNSS fixes are used, as text; "" when they are not used.
         other_slam: How the poses of another SLAM are used, as text; "" when they are not used.
@@ -90,7 +89,6 @@ class SourceDescription:
     preset: str = "forest"
     topics: tuple[RecordedTopic, ...] = ()
     warnings: tuple[str, ...] = ()
-    in_order_of_arrival: bool = False
     revisions: tuple[Revision, ...] = ()
     gnss: str = ""
     other_slam: str = ""

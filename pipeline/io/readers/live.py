@@ -180,7 +180,7 @@ class ArrivalReader:
             self._first_ns, self._heard = now_ns, 0  # wait another second
             return []
         known = self._source.description
-        self.description = replace(known, scans=None, end_ns=None, digest="", in_order_of_arrival=True)
+        self.description = replace(known, scans=None, end_ns=None, digest="")
         opening, self._opening = self._opening, []
         return [record for message in opening for record in self._records_of(self._source, message)]
 

@@ -34,7 +34,6 @@ def write_run(folder, position, dbh, *, dbh_sigma=0.01, side=20.0, seen=True, nu
         np.arange(1, n + 1) if numbers is None else np.array(numbers),
         position,
         np.tile(np.diag([0.02**2, 0.02**2]), (n, 1, 1)),
-        np.zeros((n, 2)),
         dbh,
         np.where(np.isfinite(dbh), dbh_sigma, np.nan),
         np.full(n, 5.0),

@@ -34,7 +34,7 @@ def trees_at(*places: tuple[float, float]) -> Trees:
     many = np.ones(n, np.int64)
     return Trees(
         np.arange(1, n + 1), np.array(places, np.float64).reshape(n, 2), np.tile(0.01 * np.eye(2), (n, 1, 1)),
-        np.zeros((n, 2)), np.full(n, 0.3), np.full(n, 0.02), np.ones(n), many, np.ones(n), many, many,
+        np.full(n, 0.3), np.full(n, 0.02), np.ones(n), many, np.ones(n), many, many,
         np.ones(n, np.bool_),
     )  # fmt: skip
 

@@ -54,7 +54,6 @@ def cluster_story(**fields: Any) -> ClusterStory:
         circle=Circle(0.2, 0.01, 90.0, 0.0, 1.57, (0.01, 0.02), 1.3, (0.02, 0.01, 0.5)),
         axes=[(0.1, 0.0), (0.0, 0.01)],
         tree=12,
-        tree_distance=0.05,
         column=GATHERED,
     )
     return msgspec.structs.replace(story, **fields)

@@ -39,7 +39,6 @@ def test_a_row_of_messages_gives_the_records_of_its_file(drive: Path):
         numbers = [channel.number for channel in container.channels]
         reader, records = read(container.channels, container.messages(numbers, None, {}))
         assert reader.description is not None
-        assert reader.description.in_order_of_arrival
         assert reader.description.has_odometry
         np.testing.assert_allclose(reader.description.T_base_lidar.t, source.description.T_base_lidar.t)
         assert reader.losses == {}

@@ -19,7 +19,6 @@ def make_trees(count: int, seed: int = 1) -> Trees:
         number=numbers,
         position=4.0 * (grid - 0.5 * side) + rng.normal(0.0, 0.6, (count, 2)),
         covariance=np.tile(np.array([[4e-4, 1e-4], [1e-4, 2e-4]]), (count, 1, 1)),
-        velocity=np.zeros((count, 2)),
         dbh=np.where(numbers % 5 == 0, np.nan, rng.uniform(0.15, 0.5, count)),
         dbh_sigma=np.full(count, 0.01),
         eccentricity=rng.uniform(2.0, 20.0, count),
@@ -47,7 +46,6 @@ def make_frame(index: int = 0, *, trees: int = 25, clusters: int = 8, pose: Pose
     table = Clusters(
         size=np.full(clusters, 20),
         centroid=np.column_stack([centres + np.array([0.0, 0.1]), np.full(clusters, 0.15)]),
-        eigenvalues=np.tile([0.02, 0.004, 0.001], (clusters, 1)),
         eccentricity=np.where(np.arange(clusters) == 1, np.inf, 5.0 + np.arange(clusters)),
         centre=centres,
         covariance=np.tile(4e-4 * np.eye(2), (clusters, 1, 1)),

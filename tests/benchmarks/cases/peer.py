@@ -170,7 +170,6 @@ def _judged(uri: str, parameters: Any, result: dict[str, Any]) -> MapScores:
         number=np.arange(1, n + 1),
         position=position,
         covariance=np.zeros((n, 2, 2)),
-        velocity=np.zeros((n, 2)),
         dbh=unknown,
         dbh_sigma=unknown,
         eccentricity=unknown,

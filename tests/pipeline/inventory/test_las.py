@@ -59,6 +59,7 @@ def test_a_cloud_is_mapped_into_the_files_of_a_run(tmp_path, points, crs, capsys
         "path.csv",
         "terrain.csv",
         "run.json",
+        "seen.csv",
     }
     assert {path.name for path in out.iterdir()} == names
     assert (out / "path.csv").read_text().count("\n") == 1

@@ -32,7 +32,7 @@ def trees(place, first_ns, last_ns):
     n = len(place)
     ones, full = np.ones(n), np.full(n, 20)
     return Trees(
-        np.arange(1, n + 1), place, np.tile(0.01 * np.eye(2), (n, 1, 1)), np.zeros((n, 2)), ones, ones, ones,
+        np.arange(1, n + 1), place, np.tile(0.01 * np.eye(2), (n, 1, 1)), ones, ones, ones,
         full, ones, np.asarray(first_ns), np.asarray(last_ns), np.ones(n, np.bool_),
     )  # fmt: skip
 
