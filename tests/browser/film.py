@@ -155,12 +155,11 @@ def annotate(dashboard: Dashboard, camera: Camera) -> None:
     """Trees are judged one after the other."""
     page = dashboard.page
     dashboard.tab("Annotate")
-    for number in range(1, 5):
-        page.locator("#annotate-next").click()
+    page.locator("#annotate-next").click()
+    for number in range(1, 5):  # the next tree is selected after each
         page.locator("#annotate-yes").click()
         page.locator("#annotate-count", has_text=f"{number} of").wait_for()
         camera.roll()
-    page.locator("#annotate-next").click()
     page.wait_for_timeout(1500)
     camera.picture("annotate")
     camera.roll(2)

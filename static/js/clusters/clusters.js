@@ -36,7 +36,7 @@ function bars(verdicts) {
       el("span", { text: label }),
       el("span", { class: "bar", style: { background: colour, width: `${(100 * number) / most}%` } }),
       el("span", { class: "count", text: String(number) }),
-      el("span", { class: "reason", text: reason }));
+      el("span", { class: "reason", text: isCloud() && label === "tree" ? "A stem of the map." : reason }));
   }));
 }
 

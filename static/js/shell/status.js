@@ -11,6 +11,7 @@ const WORDS = {
   starting: "Starting", playing: "Playing", paused: "Paused", finished: "Finished", waiting: "Waiting", failed: "Failed",
 };
 const NO_FIGURES = ["starting", "failed"];
+const TESTED = ["good", "weak", "lost"]; // the pose was tested by trees; else its sigma says nothing
 const OLD_AFTER = 3000; // [ms] without a message while a run plays
 const COMPILED_FOR = 20_000; // [ms] after compiling in which the first scans take longer
 
@@ -23,7 +24,7 @@ const FIGURES = {
   mapping: ["per scan", "ms", (s) => [s.mapping_ms ? figure(s.mapping_ms) : NONE, s.mapping_ms > budget(s) ? "warn" : "", `per scan (limit ${figure(budget(s))} ms)`], "minor"],
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
-  sigma: ["pose sigma", "cm", (s) => [state.map && s.health !== "static" ? figure(100 * state.map.sigma_xy) : NONE], "minor"], // a pose that was never tested has none
+  sigma: ["pose sigma", "cm", (s) => [state.map && TESTED.includes(s.health) ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
   f1: ["F1 to truth", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
 const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
