@@ -66,6 +66,7 @@ def test_controls_are_large_for_gloves_and_the_page_is_readable_in_the_sun(dashb
         dashboard.tab(tab)
         assert page.evaluate(LOW) == [], tab
         assert page.evaluate("document.documentElement.scrollWidth") <= 820
+        assert page.evaluate(OUTSIDE) == [], tab
         assert too_low(page, 7.0, 4.5) == [], tab
     page.reload()
     expect(page.locator("html")).to_have_attribute("data-controls", "large")
@@ -76,6 +77,15 @@ def test_controls_are_large_for_gloves_and_the_page_is_readable_in_the_sun(dashb
     page.keyboard.press("Escape")
     page.set_viewport_size({"width": 1260, "height": 720})
 
+
+# Controls that the drawer cuts.
+OUTSIDE = """() => {
+  const { right: edge } = document.querySelector('#side').getBoundingClientRect();
+  const isCut = (node) => node.offsetWidth && node.getBoundingClientRect().right > edge + 1
+    && !node.closest('.scroll, .plots-list'); // these scroll
+  const all = [...document.querySelectorAll('#side :is(button, select, input)')];
+  return all.filter(isCut).map(node => node.id || node.textContent);
+}"""
 
 # Controls lower than a finger in a glove needs; the marks of the timeline are as narrow as time is.
 LOW = """() => [...document.querySelectorAll(':is(header, main, footer) :is(button, select)')]
