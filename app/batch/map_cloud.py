@@ -104,7 +104,7 @@ def _map(
             "trees.geojson": geojson(trees, 0, frame=frame, lon_lat=lon_lat),
             "slices.csv": csv_text(SLICE_COLUMNS, _slice_rows(plot, about.offset)),
             "terrain.csv": csv_text(TERRAIN_COLUMNS, _terrain_rows(plot.ground, about.offset)),
-            "seen.csv": seen_text(covered_area(plot.whole[:, :2] + about.offset[:2])),
+            "seen.csv": seen_text(covered_area(plot.ground.covered_places() + about.offset[:2])),
         },
     )
     summary = [*_summary(about.uri, plot, trees, evaluation), preset_words(preset, parameters)]

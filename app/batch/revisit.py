@@ -30,6 +30,7 @@ from pipeline.types.records import Bool
 TABLE_SIGMA = 0.05  # m, of a position in a table
 # A greater median ratio of diameters is one of units: inch to cm is 2.54, circumference to diameter pi.
 LARGEST_RATIO = 2.0
+FEWEST_RATIOS = 3  # a median of fewer may be one wrong pair
 BORDER = 0.5  # m; a table of trees covers their convex hull with this border
 COLUMNS = (
     "status",
@@ -153,8 +154,22 @@ def compare(
         StemmapError: The stems do not agree with certainty.
     """
     first, second = (with_known_sigma(visit.trees, dbh_sigma) for visit in (a, b))
-    pose, stems = (Pose2(), 0) if same_frame else align_visits(first, second, Parameters().relocalisation)
+    try:
+        pose, stems = (Pose2(), 0) if same_frame else align_visits(first, second, Parameters().relocalisation)
+    except StemmapError as error:
+        raise StemmapError(error.what, remedy=f"{error.remedy}{_other_unit(first, second)}") from None
     return compare_visits(first, second, pose, reach=reach, refine=not same_frame, stems=stems)
+
+
+def _other_unit(a: VisitTrees, b: VisitTrees) -> str:
+    """Return a hint for an error if the median diameters of two visits seem to have other units, else ""."""
+    known = [visit.dbh[np.isfinite(visit.dbh)] for visit in (a, b)]
+    if not all(len(dbh) for dbh in known):
+        return ""
+    first, second = (float(np.median(dbh)) for dbh in known)
+    if 1.0 / LARGEST_RATIO <= second / first <= LARGEST_RATIO:
+        return ""
+    return f". The median diameters are {100 * first:.1f} and {100 * second:.1f} cm: check their units"
 
 
 def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
@@ -282,7 +297,10 @@ def _unit_warnings(a: Visit, b: Visit, found: VisitComparison) -> list[str]:
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = b.trees.dbh[found.b_of[pairs]] / a.trees.dbh[pairs]
     ratio = ratio[np.isfinite(ratio)]
-    if not len(ratio) or 1.0 / LARGEST_RATIO <= (median := float(np.median(ratio))) <= LARGEST_RATIO:
+    if len(ratio) < FEWEST_RATIOS:
+        return []
+    median = float(np.median(ratio))
+    if 1.0 / LARGEST_RATIO <= median <= LARGEST_RATIO:
         return []
     return [
         f"the diameters of the later visit are {median:.3g} times those of the earlier one (median of "
@@ -355,7 +373,7 @@ def _geojson(a: Visit, rows: list[dict[str, Any]]) -> str:
     return json.dumps(collection, indent=1, allow_nan=False) + "\n"
 
 
-#: Symbol of each status on the map: fill, line, text of the legend.
+#: Symbol of each status on the map: fill and line.
 _SYMBOLS = {
     "same": ("#5f8f64", "#1e5b24"),
     "moved": ("#e0b000", "#6b5400"),

@@ -75,12 +75,16 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
     run, frame = read_run(folder), read_map_frame(folder)
     warnings = []
     recorded = read_seen_area(folder)
-    seen = None if recorded is None else within_reach(recorded, parameters)
-    if seen is None or not len(seen.place):
+    if recorded is None:
         raise StemmapError(
-            "the run has no record of what was observed",
+            "the run has no record of what was observed (seen.csv)", where=str(folder), remedy="Map it again"
+        )
+    seen = within_reach(recorded, parameters)
+    if not len(seen.place):
+        raise StemmapError(
+            "no area was observed within reach",
             where=str(folder),
-            remedy="Map it again, or allow a greater --reach or fewer --views-min",
+            remedy="Map more of it, or allow a greater reach (--reach) or fewer views (--views-min)",
         )
     names = [plot.name for plot in plots]
     if len(set(names)) < len(names):
@@ -93,7 +97,8 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         raise StemmapError(
             f"{'the plot is' if len(chosen) == 1 else 'all plots are'} outside of what the run observed",
             where=str(folder),
-            remedy=f"Check the coordinates; the map is in {frame.title} coordinates, {_extent(seen.centres)}",
+            remedy=f"Check the coordinates; the map is in {frame.title} coordinates, "
+            f"{_extent(frame.to_crs(seen.centres))}",
         )
     for name, f in figures.items():
         warnings += [f"plot {name}: {text}" if plots else text for text in f.warnings]

@@ -150,9 +150,9 @@ class ShownRun:
         of a whole cloud cover."""
         if self.cloud is None:
             return self.seen.area(self.path)
-        pose = self.shown.frame.estimate.T_map_base
-        origin = np.array([pose.x, pose.y]) + self.cloud.offset[:2]
-        return covered_area(self.shown.frame.filtered[:, :2] + origin)
+        counts = self.shown.counts
+        covered = np.zeros((0, 2)) if counts is None or counts.covered is None else counts.covered
+        return covered_area(covered + self.cloud.offset[:2])
 
     def _record(self) -> dict[str, Any]:
         """Return the contents of run.json, without what only `stemmap map` knows, and with `rejected`, the

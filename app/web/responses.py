@@ -106,7 +106,7 @@ def invalid_reply(errors: Sequence[Any]) -> Response:
         entry = next((k for k, part in enumerate(parts) if k and isinstance(part, int)), None)
         return error_reply(
             422,
-            f"{name} is {str(first.get('input'))[:50]}, but must be {words} {first['ctx'][key]:g}",
+            f"{name} is {str(first.get('input'))[:50]}, but must be {words} {first['ctx'][key]:,.10g}",
             where="" if entry is None else f"{str(parts[entry - 1]).removesuffix('s')} {parts[entry] + 1}",
             remedy="Correct this value",
         )

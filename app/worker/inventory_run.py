@@ -136,7 +136,12 @@ class InventoryRun:
         far = {FAR_FROM_PLOT: plot.counts["apart from the plot"]}
         verdicts = Counter(Verdict(int(v)).label for v in plot.verdict)
         losses = {reason: n for reason, n in {**self.source.losses, **far}.items() if n}
-        return RunCounts(verdicts=dict(sorted(verdicts.items())), losses=losses, warnings=list(plot.warnings))
+        return RunCounts(
+            verdicts=dict(sorted(verdicts.items())),
+            losses=losses,
+            warnings=list(plot.warnings),
+            covered=plot.ground.covered_places(),
+        )
 
     def kept(self, index: int) -> None:
         """Return None: the only scan is the current one."""
@@ -151,7 +156,7 @@ class InventoryRun:
         return self.plot.points[:, [0, 1, 3]].astype(np.float32)
 
     def take_views(self) -> list[tuple[int, Float]]:
-        """Return nothing: what a whole cloud observed is its ground."""
+        """Return nothing: the area that a whole cloud covers does not come from views."""
         return []
 
     @property

@@ -216,6 +216,7 @@ class RunCounts(msgspec.Struct, frozen=True):
         verdicts: Number of clusters by verdict.
         losses: Number of messages or points that were left out, by reason.
         warnings: Each warning once, with its number.
+        covered: Centres of the cells that a whole cloud covers, shape (K, 2) [m]; None for a run of scans.
     """
 
     health: dict[str, int] = {}
@@ -223,6 +224,7 @@ class RunCounts(msgspec.Struct, frozen=True):
     verdicts: dict[str, int] = {}
     losses: dict[str, int] = {}
     warnings: list[str] = []
+    covered: Float | None = None
 
 
 class Shown(msgspec.Struct, frozen=True, tag="shown"):

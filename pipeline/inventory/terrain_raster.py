@@ -37,12 +37,14 @@ class TerrainRaster:
         height: Heights at the centres of the cells, shape (columns, rows) [m]; interpolated where a cell
             has no ground returns.
         seen: Whether a cell has ground returns, shape (columns, rows).
+        covered: Whether a cell has any point, shape (columns, rows).
     """
 
     low: Float
     cell: float
     height: Float
     seen: Bool
+    covered: Bool
 
     def at(self, x: Float, y: Float) -> Float:
         """Return heights [m], shape (N,), at positions x, y of shape (N,) each [m], finite, by bilinear
@@ -54,6 +56,10 @@ class TerrainRaster:
         Outside of the raster, the values at its border are returned."""
         x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
         return _evaluate(self.height, self.low, self.cell, np.ascontiguousarray(x), np.ascontiguousarray(y))
+
+    def covered_places(self) -> Float:
+        """Return the centres of the cells with any point, shape (N, 2) [m]."""
+        return self.low + (np.argwhere(self.covered) + 0.5) * self.cell
 
     def cells_seen_around(self, places: Float) -> Int:
         """Return the number of cells with ground returns among the 3 x 3 cells around each position, shape
@@ -112,7 +118,7 @@ class LowestReturns:
         centre = self._low + (np.moveaxis(np.indices(z.shape), 0, -1) + 0.5) * CELL
         height = _interpolated(ground[seen][:, :2], z[seen], centre)
         height += centre @ trend[:2] + trend[2]
-        return TerrainRaster(self._low, CELL, height, seen)
+        return TerrainRaster(self._low, CELL, height, seen, self._count > 0)
 
 
 def heights_above(points: Float32, ground: TerrainRaster) -> Float32:

@@ -309,8 +309,8 @@ def _learn(
     """Update the landmarks of particle p that were detected, mark them as seen, and append a new landmark for
     each detection without one; return the number of rows of `near` then.
 
-    Frozen landmarks are unchanged. A score grows by 1 up to
-    SCORE_MAX. A new landmark has one hit, the score 1 and the covariance of its detection.
+    Frozen landmarks are unchanged. A score grows by 1 up to SCORE_MAX. A new landmark has one
+    hit, the score 1 and the covariance of its detection.
 
     Args:
         pose: Poses after the scan, shape (P, 3).

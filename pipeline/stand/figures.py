@@ -132,8 +132,9 @@ def stand_figures(
         parameters: Limits of diameters and classes.
 
     Returns:
-        The figures. Those that are unknown are NaN: all without observed area, corrected ones without a
-        probability above 0, those of diameters without a diameter, those of volumes without a volume.
+        The figures. Those that are unknown are NaN: all but `_plain` ones without observed area, corrected
+        ones without a probability above 0, those of diameters without a diameter, those of volumes without a
+        volume.
 
     Raises:
         ValueError: The plot has no area.
@@ -161,15 +162,15 @@ def stand_figures(
         warnings.append(f"only {100.0 * seen / area:.0f} % of the plot was observed")
     p, p_se = detection
     values = dict.fromkeys(FIGURES, Estimate())
+    every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
+    plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))))
+    values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)
+    values["g_ha_plain"] = Estimate(HECTARE * float(plain.sum()) / area)
     if seen <= 0.0:
         return StandFigures(area, 0.0, 0, 0, volumes, Estimate(p, p_se), values, (), tuple(warnings))
     share = min(seen / area, 1.0)
     basal, basal_var = _basal_areas(kept)
     unsure = _threshold_variance(trees, parameters.dbh_min)
-    every = np.concatenate([kept.dbh, outside.dbh[~(outside.dbh < parameters.dbh_min)]])
-    plain, _ = _basal_areas(PlotTrees(np.zeros((len(every), 2)), every, np.zeros(len(every))))
-    values["n_ha_plain"] = Estimate(HECTARE * len(every) / area)
-    values["g_ha_plain"] = Estimate(HECTARE * float(plain.sum()) / area)
     totals = [
         ("n_ha", np.ones(n), unsure),
         ("g_ha", basal, float(basal_var.sum()) + unsure * _least_basal(parameters) ** 2),
@@ -193,12 +194,16 @@ def stand_figures(
 
 
 def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
-    """Return the mean of each figure over plots, weighted by their observed area, with the standard error of
-    the variation between plots (ratio estimator). The error is NaN with one plot. Plots without the figure do
-    not count; a figure that none has is NaN."""
+    """Return the mean of each figure over plots, with the standard error of the variation between plots
+    (ratio estimator). The weights are the observed areas; those of `_plain` figures are the whole areas. The
+    error is NaN with one plot. Plots without the figure do not count; a figure that none has is NaN."""
     result = {}
     for name in FIGURES:
-        rows = [(f.seen, f.values[name].value) for f in plots.values() if math.isfinite(f.values[name].value)]
+        rows = [
+            (f.area if name.endswith("_plain") else f.seen, f.values[name].value)
+            for f in plots.values()
+            if math.isfinite(f.values[name].value)
+        ]
         if not rows:
             result[name] = Estimate()
             continue

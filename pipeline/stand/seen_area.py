@@ -114,8 +114,8 @@ def covered_area(points: Float) -> SeenArea:
     GAP closed. Distances and numbers of views are unknown.
 
     Args:
-        points: Positions, shape (N, 2) [m]. They count to the millimetre, so that the offset of a file does
-            not change a cell.
+        points: Positions, shape (N, 2) [m], closer to one another than CELL. They count to the millimetre, so
+            that the offset of a file does not change a cell.
     """
     from scipy.ndimage import binary_closing
 

@@ -69,8 +69,13 @@ def translated(message: str, texts: dict[str, str]) -> str:
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>.+?)", re.escape(english))
         if found := re.fullmatch(pattern, message):
             values = found.groupdict()
-            if "text" in values:  # the warning about a plot
-                values["text"] = translated(values["text"], texts)
+            if "text" in values:  # the warning about a plot, whose name may contain a colon
+                words = f"{values['name']}: {values['text']}".split(": ")
+                for k in range(1, len(words)):
+                    rest = ": ".join(words[k:])
+                    if (text := translated(rest, texts)) != rest:
+                        values = {"name": ": ".join(words[:k]), "text": text}
+                        break
             return texts[key].format(**values)
     return message
 
@@ -140,7 +145,7 @@ def report_page(
         figures=figures,
         trees_in_map=len(whole.trees.dbh) + whole.run.rejected,
         no_error=any(
-            round(f.values["n_ha"].se, 3) == 0.0
+            round(f.values["n_ha"].se, 3) == 0.0 and f.trees > 0 and f.seen >= f.area
             for result in (whole, of_plots)
             for f in (result.figures.values() if result else ())
         ),

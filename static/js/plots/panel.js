@@ -165,7 +165,7 @@ const NO_ERROR = " ± 0 of N/ha: all of the area was observed, no diameter is ne
 function detectionText() {
   const { all, plots: own } = figures;
   const shownPlots = [all, own].flatMap((each) => Object.values(each?.plots ?? {}));
-  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: stems }) => stems[1] === 0) ? NO_ERROR : "");
+  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: stems, trees, seen_m2: seen, area_m2: area }) => stems[1] === 0 && trees > 0 && seen >= area) ? NO_ERROR : "");
 }
 
 function correctionText({ detection_sigma_m: sigma, plots: of, mean }) {

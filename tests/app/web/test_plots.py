@@ -136,7 +136,7 @@ async def test_figures_refer_to_what_was_observed(both) -> None:
     client, dashboard = both
     nothing = (await client.get("/api/plots")).json()
     assert nothing["all"] is None
-    assert "no record of what was observed" in nothing["problem"]
+    assert "no area was observed" in nothing["problem"]
     await look(dashboard)
     whole = (await client.get("/api/plots")).json()
     assert (whole["plots"], whole["problem"]) == (None, "")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from app.explain.build import cluster_story, tree_story
 from app.explain.build import section as at_breast
@@ -107,7 +108,9 @@ def test_the_frame_shows_the_cloud_with_the_points_of_each_tree(session: Session
     there = codec.decode(codec.encode(shown)[4:])
     assert isinstance(there, Shown)
     assert there.counts is not None
-    assert there.counts == session.counts
+    assert session.counts is not None
+    np.testing.assert_array_equal(there.counts.covered, session.counts.covered)
+    assert replace(there.counts, covered=None) == replace(session.counts, covered=None)
     assert there.counts.verdicts["tree"] == len(PLACES)
     assert there.frame.of_cloud
     np.testing.assert_array_equal(there.frame.trees.lean, frame.trees.lean)

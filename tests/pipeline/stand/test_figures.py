@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -211,3 +212,16 @@ def test_volume_counts_the_trees_that_have_one():
     assert combined({"a": f, "b": empty})["v_ha"].value == pytest.approx(22.5)
     assert figures(trees).with_volume is None
     assert math.isnan(figures(trees).values["v_ha"].value)
+
+
+def test_plain_figures_of_several_plots_refer_to_their_whole_area():
+    """Also to that of a plot that was not observed at all."""
+    inside = PlotTrees(np.array([[1.0, 1.0], [4.0, 4.0]]), np.full(2, 0.2), np.full(2, 0.01))
+    nothing = inside.where(np.zeros(2, np.bool_))
+    common: dict[str, Any] = {"perimeter": 40.0, "detection": (1.0, 0.0), "parameters": Stand()}
+    plots = {
+        "seen": stand_figures(inside, nothing, area=100.0, seen=100.0, **common),
+        "hidden": stand_figures(nothing, inside, area=300.0, seen=0.0, **common),
+    }
+    assert combined(plots)["n_ha_plain"].value == pytest.approx(1e4 * 4 / 400.0)
+    assert combined(plots)["n_ha"].value == pytest.approx(1e4 * 2 / 100.0)
