@@ -82,7 +82,9 @@ def test_plots_of_the_country_are_moved_into_the_map(run, tmp_path, capsys):
             row = next(csv.DictReader(text))
         assert row["trees"] == "25"
         assert float(row["area_m2"]) == pytest.approx(100.0, abs=0.1)
-    stemmap(capsys, "stand", run, "--circle", "500000,5300000,5").refused(1, "EPSG:25832", "x 0 to 20 m")
+    stemmap(capsys, "stand", run, "--circle", "500000,5300000,5").refused(
+        1, "EPSG:25832", "x 499991 to 500017 m"
+    )
 
 
 @pytest.mark.parametrize(
@@ -233,3 +235,9 @@ def test_fixes_of_the_recording_place_the_map_in_spite_of_outliers(run, capsys, 
     assert np.abs(frame.to_crs(centre) - TRUE.apply(centre)).max() < 0.2
     assert frame.pose.yaw == pytest.approx(TRUE.yaw, abs=0.03)
     assert 0.0 < frame.sigma < 1.0
+
+
+def test_a_system_whose_metres_are_not_those_of_the_ground_is_refused():
+    with pytest.raises(StemmapError, match=r"a metre on the ground is 1\.37 m in WGS 84 / Pseudo-Mercator"):
+        check_area("EPSG:3857", np.array([[500_000.0, 5_300_000.0]]))
+    check_area("EPSG:25832", np.array([[300_000.0, 5_300_000.0]]))  # beyond the border of its zone
