@@ -86,7 +86,8 @@ class Served:
                     await asyncio.sleep(0.01)
                 return {"port": self._port, "token": self._token}
             case "heard":
-                heard, self._heard = self._heard, []
+                heard = self._heard.copy()
+                self._heard.clear()  # the worker appends to this list
                 return {"heard": heard}
             case "cpu":
                 return {"web": _cpu_s(os.getpid()), "worker": _cpu_s(self._dashboard.worker.pid)}
