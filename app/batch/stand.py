@@ -10,6 +10,7 @@ from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+import shapely
 
 from app.batch.georeference import MapFrame, read_map_frame
 from app.batch.run_folder import FinishedRun, read_run, read_seen_area
@@ -102,6 +103,9 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         )
     for name, f in figures.items():
         warnings += [f"plot {name}: {text}" if plots else text for text in f.warnings]
+    areas = [plot.shape for plot in chosen]
+    if shapely.union_all(areas).area < 0.999 * sum(shape.area for shape in areas):
+        warnings.append("plots overlap: what they share counts in each of them")
     if len(chosen) > 1 and 0 < sum(f.trees for f in figures.values()) < FEW_TREES:
         warnings.append("fewer than ten trees in all plots: the figures are uncertain")
     if np.nanmax(trees.dbh, initial=0.0) > 3.0:

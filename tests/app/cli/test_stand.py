@@ -48,7 +48,7 @@ def test_the_whole_observed_area_is_a_plot_by_default(run, tmp_path, capsys):
 def test_plots_have_rows_of_their_own_and_a_mean(run, tmp_path, capsys):
     words = ["--circle", "10,10,5.641896", "--rectangle", "10,10,9,9", "--along", "9", "--radius", "4"]
     result = stemmap(capsys, "stand", run, *words, "--out", tmp_path / "out")
-    assert result.code == 0, result.err
+    assert result.err == "warning: plots overlap: what they share counts in each of them\n"
     rows = table(tmp_path / "out" / "stand.csv")
     assert list(rows) == ["1", "2", "path 1", "path 2", "path 3", "mean"]
     assert float(rows["1"]["area_m2"]) == pytest.approx(100.0, abs=0.01)
@@ -190,6 +190,13 @@ def test_a_run_without_a_record_of_the_observed_area_has_no_figures(tmp_path, ca
     assert result.code == 1
     assert "no record of what was observed" in result.err
     assert "Map it again" in result.err
+
+
+def test_plots_that_overlap_are_a_warning(run, capsys):
+    apart = stemmap(capsys, "stand", run, "--circle", "5,5,3", "--circle", "12,5,3")
+    assert "overlap" not in apart.err
+    both = stemmap(capsys, "stand", run, "--circle", "5,5,3", "--circle", "6,5,3")
+    assert "plots overlap: what they share counts in each of them" in both.err
 
 
 def test_each_tree_of_the_map_is_counted_or_left_out_for_a_reason(tmp_path, capsys):
