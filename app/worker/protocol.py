@@ -208,7 +208,7 @@ class Opened(msgspec.Struct, frozen=True, tag="opened"):
 
 
 class RunCounts(msgspec.Struct, frozen=True):
-    """Counts of a run up to a scan, or of a whole cloud, as in run.json.
+    """Counts of a run up to a scan, as in run.json, or of a whole cloud, with the cells that it covers.
 
     Attributes:
         health: Number of scans by the state of the pose quality; empty for a whole cloud.

@@ -95,7 +95,7 @@ def fit_control_points(
             remedy="Check which tree each point is, and its coordinates",
         )
     residuals = known - rest[best].pose.apply(local)
-    # Points that agree within their expected error cannot be told apart: three points can leave two suspects.
+    # Two points that agree within their expected error are equally suspect: three points can leave two.
     suspects = [names[k] for k in np.flatnonzero(sigmas <= max(point_sigma, sigmas[best]))]
     text += f"; without point {names[best]} {rest[best].rms:.2f} m, {_residual_words(residuals, names)}"
     which = (

@@ -115,3 +115,16 @@ def calm(dashboard: Dashboard) -> Iterator[None]:
     yield
     for dialog in dashboard.page.locator("dialog[open]").all():
         dialog.press("Escape")
+
+
+@pytest.fixture
+def on_plots(chromium: Browser, server: Server) -> Iterator[Dashboard]:
+    """The tab Plots with the whole map of a run that stands, without annotations."""
+    with opened(chromium, server.link) as dashboard:
+        dashboard.reset()
+        dashboard.stand()
+        dashboard.until_server("/api/trees", "it.trees.length > 20")
+        dashboard.tab("Plots")
+        dashboard.page.get_by_role("button", name="Fit").click()
+        dashboard.drawn()
+        yield dashboard

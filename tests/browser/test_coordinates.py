@@ -4,31 +4,21 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import geopandas
 import pytest
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import expect
 
-from tests.browser.conftest import opened
 from tests.browser.dashboard import Dashboard
-from tests.browser.serving import Server
 from tests.browser.test_annotate import place_of
 
 EAST, NORTH = 500000.0, 5300000.0
 
 
 @pytest.fixture
-def person(chromium: Browser, server: Server) -> Iterator[Dashboard]:
-    with opened(chromium, server.link) as dashboard:
-        dashboard.reset()
-        dashboard.stand()
-        dashboard.until_server("/api/trees", "it.trees.length > 20")
-        dashboard.tab("Plots")
-        dashboard.page.get_by_role("button", name="Fit").click()
-        dashboard.drawn()
-        yield dashboard
+def person(on_plots: Dashboard) -> Dashboard:
+    return on_plots
 
 
 def far_from_trees(person: Dashboard) -> tuple[float, float]:

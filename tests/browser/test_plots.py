@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, expect
 
-from tests.browser.conftest import opened, opened_by_another
+from tests.browser.conftest import opened_by_another
 from tests.browser.dashboard import Dashboard
 from tests.browser.serving import Server
 from tests.browser.test_annotate import place_of
 
 
 @pytest.fixture
-def person(chromium: Browser, server: Server) -> Iterator[Dashboard]:
-    with opened(chromium, server.link) as dashboard:
-        dashboard.reset()
-        dashboard.stand()
-        dashboard.until_server("/api/trees", "it.trees.length > 20")
-        dashboard.tab("Plots")
-        dashboard.page.get_by_role("button", name="Fit").click()
-        dashboard.drawn()
-        yield dashboard
+def person(on_plots: Dashboard) -> Dashboard:
+    return on_plots
 
 
 def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:

@@ -38,7 +38,7 @@ class _Add(Edit):
         return Content(self.x, self.y, self.kind, None if self.dbh_cm is None else self.dbh_cm / 100.0)
 
 
-class _Change(_Add):
+class _AnnotationChange(_Add):
     version: Number
 
 
@@ -80,7 +80,7 @@ async def add(body: _Add, dashboard: Dash) -> Response:
 
 
 @router.patch("/annotations/{number}")
-async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
+async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Response:
     """Change an annotation; 409 if it does not have this version any more or another run was opened, 404 for
     an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
     await apply_edit(dashboard, body, Store.change, number, body.version, body.content)

@@ -99,7 +99,7 @@ class _Along(Edit):
     radius: Annotated[float, Field(gt=0.0, le=500.0)]
 
 
-class _Change(Edit):
+class _PlotChange(Edit):
     """A new name, or a new radius of a circle [m]; None leaves it."""
 
     version: Number
@@ -174,7 +174,7 @@ async def import_file(body: _ImportPlots, dashboard: Dash) -> Response:
 
 
 @router.patch("/plots/{number}")
-async def change(body: _Change, number: Number, dashboard: Dash) -> Response:
+async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response:
     """Rename a plot, or change the radius of a circle; return its number and the numbers of edits that can be
     undone and repeated. 404 for an unknown plot, 409 if it does not have this version any more, 422 for a
     name that is empty or taken, or the radius of another shape."""

@@ -175,7 +175,7 @@ export const unreviewed = () => trees().filter((tree) => !isReviewed(tree)).sort
 
 export const isReviewed = (tree) => (annotationOf(tree)?.kind ?? SKIPPED) !== SKIPPED;
 
-// "3 of 52 trees reviewed" where trees without annotation would count as wrong although nobody has looked at them; else "".
+// Returns the progress of an incomplete review ("3 of 52 trees reviewed"), in which open trees have no verdict yet; else "".
 export function reviewProgress() {
   const left = state.annotations?.used === "annotations" ? unreviewed().length : 0;
   return left ? `${trees().length - left} of ${count(trees().length, "tree")} reviewed` : "";
