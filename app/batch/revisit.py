@@ -84,7 +84,7 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
         may_be_empty: Whether it may have no trees.
 
     Raises:
-        StemmapError: It cannot be read, has no trees, or its median diameter is below 5 mm or above 3 m.
+        StemmapError: It cannot be read or has no trees.
     """
     if path.is_dir():
         trees = read_run(path).trees
@@ -106,7 +106,6 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
         visit = Visit(str(path), found, np.zeros((0, 2)), None, MapFrame())
     if not len(visit.trees.number) and not may_be_empty:
         raise StemmapError("there are no trees", where=str(path))
-    _check_unit(visit)
     return visit
 
 
@@ -121,22 +120,6 @@ def _numbers(path: FilePath, keep: Bool) -> np.ndarray:
     if len(numbers) != len(keep) or len(np.unique(numbers)) < len(numbers):
         numbers = np.arange(1, len(keep) + 1)
     return numbers[keep]
-
-
-def _check_unit(visit: Visit) -> None:
-    """Check that the median diameter is 5 mm to 3 m; raises StemmapError if not. Nothing without
-    diameters."""
-    known = visit.trees.dbh[np.isfinite(visit.trees.dbh)]
-    if len(known) and float(np.median(known)) > 3.0:
-        raise StemmapError(
-            f"the median diameter is {np.median(known):.1f} m", where=visit.name, remedy="Check its unit"
-        )
-    if len(known) and float(np.median(known)) < 0.005:
-        raise StemmapError(
-            f"the median diameter is {1000 * np.median(known):.2f} mm",
-            where=visit.name,
-            remedy="Check its unit: dbh_cm is in centimetres, dbh_m in metres",
-        )
 
 
 def compare(

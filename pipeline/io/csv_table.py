@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
 from collections.abc import Iterable
@@ -12,6 +13,23 @@ import numpy as np
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Float
 from pipeline.io.readers.base import COORDINATE_LIMIT
+
+
+def decoded(content: bytes) -> str:
+    """Return the text of a table that a spreadsheet wrote: UTF-16 if it begins with a byte order mark of
+    UTF-16, else UTF-8 if it is valid, with or without a mark, else Windows-1252.
+
+    Raises:
+        UnicodeDecodeError: It is none of these, or has a zero byte, as binary files have.
+    """
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16")
+    if (zero := content.find(0)) >= 0:
+        raise UnicodeDecodeError("utf-8", content, zero, zero + 1, "zero byte")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252")
 
 
 class CsvTable:
@@ -49,17 +67,19 @@ class CsvTable:
 
     @classmethod
     def read(cls, path: Path, what: str, largest: int) -> CsvTable:
-        """Return the table of a file, without a byte order mark; `what` names it in errors.
+        """Return the table of a file; `what` names it in errors.
 
         Raises:
-            SourceError: It cannot be read, is larger than `largest` bytes, is not UTF-8, or is no CSV.
+            SourceError: It cannot be read, is larger than `largest` bytes, or is no CSV; see `decoded`.
         """
         try:
             if path.stat().st_size > largest:
                 raise SourceError(f"the {what} is larger than {largest >> 20} MB", where=str(path))
-            text = path.read_text(encoding="utf-8-sig")
+            content = path.read_bytes()
         except OSError as error:
             raise SourceError(f"cannot read the {what}: {error.strerror}", where=str(path)) from None
+        try:
+            text = decoded(content)
         except UnicodeDecodeError:
             raise SourceError(f"the {what} is not text", where=str(path)) from None
         return cls(text, what, str(path))

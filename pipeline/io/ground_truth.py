@@ -23,9 +23,12 @@ _X = ("x_m", "x", "treelocationx", "easting", "easting_m", "east", "utm_x")
 _Y = ("y_m", "y", "treelocationy", "northing", "northing_m", "north", "utm_y")
 _AZIMUTH = ("azimuth_deg", "azimuth")
 _DISTANCE = ("distance_m", "distance", "dist_m")
-#: Names of diameters with their units [m].
-_DBH = {"dbh_cm": 0.01, "dbh_m": 1.0, "dbh_mm": 0.001}
-_DBH_OF_UNKNOWN_UNIT = ("dbh", "diameter")
+_UNITS = {"cm": 0.01, "m": 1.0, "mm": 0.001}  # [m]
+#: Names of diameters with their units [m]; `bhd` is the German abbreviation.
+_DBH = {f"{name}_{unit}": metres for name in ("dbh", "bhd") for unit, metres in _UNITS.items()}
+_DBH_OF_UNKNOWN_UNIT = ("dbh", "bhd", "diameter")
+#: Range of the median diameter of a table [m]: from a seedling's to that of the thickest trees there are.
+_MEDIAN_DBH = (0.005, 3.0)
 _KIND = ("class", "kind", "type")
 
 
@@ -105,17 +108,30 @@ def _diameters(table: CsvTable, dbh_unit: str | None) -> Float:
         dbh_unit: Unit of a column whose name does not state it: "m", "cm" or "mm".
 
     Raises:
-        SourceError: The unit is unknown, or a cell is not a number.
+        SourceError: The unit is unknown, a cell is not a number, or the median is outside of _MEDIAN_DBH.
     """
     name = table.find((*_DBH, *_DBH_OF_UNKNOWN_UNIT))
     if name is None:
         return np.full(len(table.rows), np.nan)
-    unit = name if name in _DBH else f"dbh_{dbh_unit}"
-    if unit not in _DBH:
+    unit = _DBH.get(name) or _UNITS.get(dbh_unit or "")
+    if unit is None:
         what = f"column {name!r} does not say its unit"
         raise SourceError(what, where=table.where, remedy="Give --dbh-unit m, cm or mm")
-    diameter = table.numbers(name, required=False)
-    return np.where(diameter > 0.0, diameter, np.nan) * _DBH[unit]
+    diameter = table.numbers(name, required=False) * unit
+    known = diameter[diameter > 0.0]
+    median = float(np.median(known)) if len(known) else 1.0
+    if not _MEDIAN_DBH[0] <= median <= _MEDIAN_DBH[1]:
+        what = (
+            f"the median diameter is {median:.1f} m"
+            if median > 1.0
+            else f"the median diameter is {1000 * median:.2f} mm"
+        )
+        raise SourceError(
+            what,
+            where=table.where,
+            remedy=f"Check the unit of the column {name}: a name that ends in _cm, _m or _mm states it",
+        )
+    return np.where(diameter > 0.0, diameter, np.nan)
 
 
 def _kinds(table: CsvTable) -> tuple[str, ...]:

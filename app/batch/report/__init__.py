@@ -292,6 +292,12 @@ def _step(length: float) -> float:
     return max(k * power for k in (1.0, 2.0, 5.0) if k * power <= length * (1 + 1e-9))
 
 
+def _map_scale(least: float) -> float:
+    """Return the denominator of a map scale that scale rulers have, the next from `least` > 0 on."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(k * power for k in (1.0, 1.25, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5, 10.0) if k * power >= least)
+
+
 def stand_map(
     run: ExportedRun, whole: StandResult, plots: Sequence[SamplePlot], texts: dict[str, str], number: Numbers
 ) -> dict[str, Any]:
@@ -318,7 +324,7 @@ def stand_map(
     every = np.concatenate([np.reshape(p, (-1, 2)) for p in points])
     low, high = every.min(axis=0) - 1.0, every.max(axis=0) + 1.0
     size = high - low
-    scale = min(180.0 / size[0], 190.0 / size[1])  # mm per metre
+    scale = 1000.0 / _map_scale(max(size[0] / 0.18, size[1] / 0.19))  # mm per metre
     thin = run.path[:: max(1, len(run.path) // _PATH_POINTS)]
 
     def paper(xy: Float) -> Float:
@@ -364,7 +370,7 @@ def stand_map(
         ],
         "bar": bar * scale,
         "bar_text": f"{number(bar, 0 if bar >= 1 else 1)} m",
-        "scale": f"1 : {number(1000.0 / scale, 0)}",
+        "scale": f"1 : {number(1000.0 / scale, 0 if scale <= 20.0 else 2)}",
         "up": texts["north"] if run.frame.crs else "y",
     }
 

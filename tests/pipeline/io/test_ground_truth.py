@@ -69,12 +69,27 @@ def test_azimuths_run_clockwise_from_north(tmp_path, azimuth, x, y):
     np.testing.assert_allclose([told.x[0], told.y[0]], [x, y], atol=1e-12)
 
 
-@pytest.mark.parametrize(("unit", "metres"), [("m", 25.0), ("cm", 0.25), ("mm", 0.025)])
-def test_a_diameter_without_a_unit_is_asked_for(tmp_path, unit, metres):
-    text = "x,y,DBH\n0,0,25\n"
+@pytest.mark.parametrize(("unit", "dbh"), [("m", "0.25"), ("cm", "25"), ("mm", "250")])
+@pytest.mark.parametrize("name", ["DBH", "BHD"])
+def test_a_diameter_without_a_unit_is_asked_for(tmp_path, name, unit, dbh):
+    text = f"x,y,{name}\n0,0,{dbh}\n"
     with pytest.raises(SourceError, match="--dbh-unit"):
         read(tmp_path, text)
-    assert read(tmp_path, text, dbh_unit=unit).dbh[0] == pytest.approx(metres)
+    assert read(tmp_path, text, dbh_unit=unit).dbh[0] == pytest.approx(0.25)
+    assert read(tmp_path, text.replace(name, f"{name}_{unit}")).dbh[0] == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize(("name", "dbh"), [("dbh_m", 25), ("dbh_cm", 0.25), ("dbh_cm", 2500)])
+def test_diameters_in_another_unit_than_the_column_states_are_refused(tmp_path, name, dbh):
+    with pytest.raises(SourceError, match="median diameter") as caught:
+        read(tmp_path, f"x,y,{name}\n0,0,{dbh}\n1,1,{dbh}\n")
+    assert name in caught.value.remedy
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "cp1252", "utf-16"])
+def test_the_encodings_of_spreadsheets(tmp_path, encoding):
+    told = read(tmp_path, "x_m;y_m;Höhe;bhd_cm\r\n1,5;2;größer;30\r\n".encode(encoding))
+    assert (told.x[0], told.y[0], told.dbh[0]) == (1.5, 2.0, pytest.approx(0.3))
 
 
 def test_a_column_that_says_its_unit_is_not_overruled(tmp_path):
@@ -115,8 +130,9 @@ def test_a_header_alone_is_a_table_of_nothing(tmp_path):
         ("x_m,y_m,class\n1,2,tree\n1,2,cow\n", "line 3: class 'cow'"),
         ("x_m,y_m\n1,2\n\n\n3,abc\n", "line 5: y_m = 'abc'"),
         ("x_m,y_m,class\n\n1,2,cow\n", "line 3: class 'cow'"),
-        (b"x_m,y_m\n\xff\xfe,2\n", "not text"),
-        (b"x_m,y_m\n\x00,2\n", "line 2"),
+        (b"x_m,y_m\n\xff\xfe,2\n", "line 2: x_m"),
+        (b"x_m,y_m\n\x81,2\n", "not text"),
+        (b"x_m,y_m\n\x00,2\n", "not text"),
     ],
     ids=lambda v: repr(v)[:40],
 )
