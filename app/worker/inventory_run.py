@@ -7,7 +7,7 @@ begin another inventory; until it is complete, the map of the one before is show
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -102,7 +102,6 @@ class InventoryRun:
     start_ns = 0
     path: Path = NO_PATH
     cache_notice = ""
-    preview: Trees | None = None
 
     def __init__(self, source: CloudSource, parameters: Parameters) -> None:
         self.source = source
@@ -208,7 +207,7 @@ class InventoryRun:
             self._begin()
         return False
 
-    def remap(self, parameters: Parameters) -> None:
+    def remap(self, parameters: Parameters, on_preview: Callable[[Trees], None]) -> None:
         """Do nothing: `use` maps the whole cloud."""
 
     def cancel_remapping(self) -> None:

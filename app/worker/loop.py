@@ -46,9 +46,9 @@ _REPORT_S = 0.25
 # The supervisor replaces a worker that plays and is silent for long.
 _HEARTBEAT_S = 1.0
 _GLIMPSE_S = 0.5
-# The mapper follows to a scan that is shown from stored results this time after the last command, so that the
-# next step of a person, and drawing in the other processes, do not wait for it.
-_RESTORE_S = 0.3
+# The mapper follows to a scan that is shown from stored results, and a rerun begins or continues, this time
+# after the last command, so that the next command, and drawing in the other processes, do not wait for it.
+_QUIET_S = 0.3
 _COMPILING = COMPILING.capitalize()
 _COMPILES_ON_S = 60.0  # kernels compiled within this time of one another count as one wait
 # Interval at which messages of a live source are taken; it costs less than 1 % of a core.
@@ -93,7 +93,7 @@ class WorkerLoop:
         self._prepared = False
         self._reported: tuple[protocol.Status, float] | None = None
         self._glimpse_at = 0.0
-        self._long_way_at = self._restore_at = 0.0
+        self._long_way_at = self._quiet_until = 0.0
         self._compiling_since_s, self._compiled_at = 0.0, -math.inf
         self._compiled_share, self._progress_at = compiled_share, -math.inf
         self._mapped = 0  # scans since a scan was mapped again
@@ -118,7 +118,8 @@ class WorkerLoop:
 
     def _work(self) -> None:
         """Do the next piece of work: a part of a rerun, live messages, the preparation, or a scan."""
-        if self._session.is_remapping and (self._mapped >= _SCANS_A_REMAP or self._due_in() != 0.0):
+        is_remapping = self._session.is_remapping and self._quiet_s() == 0.0
+        if is_remapping and (self._mapped >= _SCANS_A_REMAP or self._due_in() != 0.0):
             self._mapped = 0
             self._remap()
         elif self._session.pace == "live" and self._session.next_ns() is None:
@@ -191,18 +192,25 @@ class WorkerLoop:
         return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
-        """Return the time until work is due [s]: 0 while a rerun works, else as `_due_in`; None if only a
-        command can start work."""
-        return 0.0 if self._session.is_remapping else self._due_in()
+        """Return the time until work is due [s], the shorter one of that for a rerun and `_due_in`; None if
+        only a command can start work."""
+        due_s, quiet_s = self._due_in(), self._quiet_s()
+        if not self._session.is_remapping:
+            return due_s
+        return quiet_s if due_s is None else min(due_s, quiet_s)
+
+    def _quiet_s(self) -> float:
+        """Return the time left of `_QUIET_S` after the last command [s]."""
+        return max(0.0, self._quiet_until - self._clock())
 
     def _due_in(self) -> float | None:
         """Return the time until the next scan is due [s]: 0 if it is overdue, during a seek, and as long as
-        nothing is prepared; that until `_RESTORE_S` after a command if a sought scan is shown from stored
+        nothing is prepared; that until `_QUIET_S` after a command if a sought scan is shown from stored
         results; the interval `_LISTEN_S` for a live run without a queued scan; None if only a command can
         start work. An error of the source sets the state to "failed" and is reported."""
         pace = self._session.pace
         if self._session.is_shown:
-            return max(0.0, self._restore_at - self._clock())
+            return self._quiet_s()
         if pace == "idle":
             return None
         if pace == "live":
@@ -244,7 +252,7 @@ class WorkerLoop:
         """Execute a command and send the status. An error sets the state "failed"."""
         self._replay.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
-        self._restore_at = self._clock() + _RESTORE_S
+        self._quiet_until = self._clock() + _QUIET_S
         self._guarded(lambda: self._carry_out(command))
         self._report()
 

@@ -8,7 +8,7 @@ import contextlib
 import math
 from bisect import bisect_right
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Generic, Literal, TypeVar
@@ -317,18 +317,21 @@ class Remapping:
     Args:
         rerun: The rerun, with the mapper of the new map.
         new_map: The new map, before its first scan.
+        preview: Computes the preview in steps.
     """
 
-    def __init__(self, rerun: Rerun, new_map: RunMap) -> None:
-        self.rerun, self.map = rerun, new_map
+    def __init__(self, rerun: Rerun, new_map: RunMap, preview: Generator[None, None, None]) -> None:
+        self.rerun, self.map, self._preview = rerun, new_map, preview
 
     def map_next(self, until: int) -> bool:
-        """Map the next scan; return whether `until` scans are mapped. If the run went back meanwhile, the
-        rerun goes back as well.
+        """Take the next step of the preview; map the next scan if there is none. Return whether `until` scans
+        are mapped. If the run went back meanwhile, the rerun goes back as well.
 
         Raises:
             StemmapError: The scan cannot be read again.
         """
+        for _ in self._preview:
+            return False
         rerun, snapshots = self.rerun, self.map.snapshots
         if rerun.done > until:
             rerun.go_back(*snapshots.newest(until))
@@ -343,6 +346,12 @@ class Remapping:
         self.rerun.close()
         self.map.before = self.rerun.mapper.snapshot()
         return self.map
+
+    def close(self) -> None:
+        """Leave the rerun, and delete what is stored of the new map."""
+        self._preview.close()
+        self.rerun.close()
+        self.map.close()
 
 
 @dataclass(slots=True)
@@ -496,14 +505,16 @@ class ParameterHistory:
 AHEAD = 4  # scans that are segmented ahead of the mapping; more only take memory
 
 
-def segment_ahead(segment: Segment, steps: Iterator[Step]) -> Iterator[tuple[Step, SegmentedScan]]:
+def segment_ahead(
+    segment: Segment, steps: Iterator[Step], threads: int = 1
+) -> Iterator[tuple[Step, SegmentedScan]]:
     """Yield each step with its segmented scan, in order.
 
-    The caller's thread reads the steps; another thread segments up to `AHEAD` scans ahead. An exception of
+    The caller's thread reads the steps; other threads segment up to `AHEAD` scans ahead. An exception of
     `segment` is raised when its scan is due. If the caller stops early, scans that are not begun are dropped.
     """
     waiting: deque[tuple[Step, Future[SegmentedScan]]] = deque()
-    pool = ThreadPoolExecutor(1, thread_name_prefix="segment")
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="segment")
     try:
         for step in steps:
             waiting.append((step, pool.submit(segment, step)))

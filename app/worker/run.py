@@ -7,8 +7,7 @@ mapped. It does not depend on pauses, jumps, or which states of the mapper are k
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import msgspec
@@ -34,7 +33,7 @@ from pipeline.front_end import SegmentedScan, StageTimer
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.remapping import KnownMap, Rerun, ScanCaches, preview_trees, sample_scans
+from pipeline.remapping import KnownMap, Rerun, ScanCaches, needs_sample, preview_trees, sample_scans
 from pipeline.stand.seen_area import ViewSelection
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
@@ -100,7 +99,6 @@ class Run:
         self._newest_ns = -1  # of the scans that were asked for a view
         self._view_selection = ViewSelection()
         self._remapping: Remapping | None = None
-        self._preview: Trees | None = None
 
     def _new_map(self, mapper: Mapper) -> RunMap:
         """Return an empty map of a mapper before its first scan."""
@@ -264,42 +262,57 @@ class Run:
         taken, self._views = self._views, []
         return taken
 
-    def remap(self, parameters: Parameters) -> None:
-        """Begin to map the run again from its first scan, in place of a rerun that is not complete, and
-        compute the preview. Nothing begins if the map would not change. The map changes in `remap_next`."""
+    def remap(self, parameters: Parameters, on_preview: Callable[[Trees], None]) -> None:
+        """Begin to map the run again from its first scan, in place of a rerun that is not complete. Nothing
+        begins if the map would not change. `remap_next` does the work.
+
+        Args:
+            parameters: Parameters of all scans.
+            on_preview: Called with approximate trees of the new map before a scan is mapped again, unless
+                they are unknown.
+        """
         self.cancel_remapping()
         if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
             return
         mapper = self._make_mapper(parameters)
-        self._preview = self._preview_of(parameters, mapper)
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
         reread = None if self._is_live else self._cursor.again
         rerun = Rerun(mapper, self._caches.of(parameters), reread, segment_ahead)
-        self._remapping = Remapping(rerun, self._new_map(mapper))
+        self._remapping = Remapping(
+            rerun, self._new_map(mapper), self._preview_steps(parameters, mapper, on_preview)
+        )
 
-    def _preview_of(self, parameters: Parameters, mapper: Mapper) -> Trees | None:
-        """Return approximate trees of the map with other parameters; None before the first scan or if the
-        mapper is broken."""
-        frame, present = self.frame, self._map
-        if frame is None or self._broken:
-            return None
-        known = KnownMap(present.parameters.at(0), present.clusters, self.path, frame.columns)
-        return preview_trees(known, parameters, lambda: self._sample(mapper))
+    def _preview_steps(
+        self, parameters: Parameters, mapper: Mapper, on_preview: Callable[[Trees], None]
+    ) -> Generator[None, None, None]:
+        """Segment the scans of the sample that the preview needs, one in each step, then call `on_preview`,
+        unless there is no preview. Scans that are not stored are missing in the sample.
 
-    def _sample(self, mapper: Mapper) -> dict[int, SegmentedScan]:
-        """Return some of the scans up to the current one by their numbers, segmented with the parameters of a
-        mapper by two threads; those that are not stored are missing."""
-        size = 0 if self._step is None else self._step.scan.points.nbytes
-        steps = [step for n in sample_scans(self.current + 1, size) if (step := self._cursor.stored(n))]
-        with ThreadPoolExecutor(2, thread_name_prefix="segment") as pool:
-            scans = pool.map(mapper.segmenter(), steps)
-            return {step.index: scan for step, scan in zip(steps, scans, strict=True)}
+        Args:
+            parameters, on_preview: As in `remap`.
+            mapper: A mapper with these parameters.
+        """
+        if self.frame is None or self._step is None:
+            return
+        sample: dict[int, SegmentedScan] = {}
+        if needs_sample(self._known_map(self.frame), parameters):
+            numbers = sample_scans(self.current + 1, self._step.scan.points.nbytes)
+            stored = (step for n in numbers if (step := self._cursor.stored(n)))
+            for step, scan in segment_ahead(mapper.segmenter(), stored, threads=2):
+                sample[step.index] = scan
+                yield
+        trees = preview_trees(self._known_map(self.frame), parameters, sample)
+        if trees is not None:
+            on_preview(trees)
+
+    def _known_map(self, frame: Frame) -> KnownMap:
+        """Return what a preview knows of the map up to the current scan, whose frame is given."""
+        return KnownMap(self._map.parameters.at(0), self._map.clusters, self.path, frame.columns)
 
     def cancel_remapping(self) -> None:
         """Cancel the rerun that `remap` began; the map does not change."""
         if self._remapping is not None:
-            self._remapping.rerun.close()
-            self._remapping.map.close()
+            self._remapping.close()
             self._remapping = None
 
     @property
@@ -312,11 +325,6 @@ class Run:
         return min(remapping.rerun.done / max(self.current, 1), 1.0)
 
     @property
-    def preview(self) -> Trees | None:
-        """Approximate trees of the map that is being computed; None if they are unknown."""
-        return None if self._remapping is None else self._preview
-
-    @property
     def cache_notice(self) -> str:
         """Reason why scans are not cached, or cached scans are not used; empty if they are."""
         cache = self._cache
@@ -324,8 +332,8 @@ class Run:
         return "; ".join(filter(None, (cache.refusal and first, cache.notice)))
 
     def remap_next(self) -> tuple[Frame, dict[int, float]] | None:
-        """Map the next scan of the rerun. After the last one the run continues with the new map, as if its
-        parameters had been in force from the start.
+        """Take the next step of the preview; without one, map the next scan of the rerun. After the last scan
+        the run continues with the new map, as if its parameters had been in force from the start.
 
         Returns:
             The current scan in the new map, and the time at which each tree was confirmed, by its number [s];

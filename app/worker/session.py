@@ -63,8 +63,8 @@ class Session:
         warm_up: Loads the kernels; called while a robot is already received and recorded.
 
     Attributes:
-        on_preview: Called with the revision of the parameters and the preview trees of a rerun, before any
-            scan is mapped again.
+        on_preview: Called by `remap` with the revision of the parameters and the preview trees of a rerun,
+            before any scan is mapped again.
     """
 
     def __init__(
@@ -380,8 +380,8 @@ class Session:
         return self._run is not None and self._run.remapped is not None and not self._target.sought
 
     def remap(self) -> tuple[Frame, MapChanges] | None:
-        """Map the next scan of the run again. If it cannot be read, the rerun ends with a warning and the map
-        stays.
+        """Take the next step of a rerun: of its preview, or a scan. If the scan cannot be read, the rerun
+        ends with a warning and the map stays.
 
         Returns:
             After the last scan, the frame of the current scan in the new map and the differences; before, and
@@ -481,11 +481,9 @@ class Session:
         return run.map_again() if changed or run.is_bare else run.frame
 
     def _begin_remapping(self, run: AnyRun) -> None:
-        """Begin to map a run again with the present parameters, and call `on_preview` with its preview, if
-        there is one."""
-        run.remap(self._parameters)
-        if run.preview is not None:
-            self.on_preview(self._revision, run.preview)
+        """Begin to map a run again with the present parameters, see `remap`."""
+        revision = self._revision
+        run.remap(self._parameters, lambda trees: self.on_preview(revision, trees))
 
     def _warn(self, warnings: Iterable[str]) -> None:
         """Add warnings, each once and the newest last; only the last 20 are kept."""

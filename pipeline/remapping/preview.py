@@ -11,7 +11,7 @@ tree is found in the sample, before and after, gives an estimate for all scans.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -201,10 +201,15 @@ class KnownMap:
     columns: Columns | None
 
 
+def needs_sample(known: KnownMap, parameters: Parameters) -> bool:
+    """Return whether `preview_trees` with these arguments needs a sample: whether a stage of the segmentation
+    differs, so that the clusters change. False where there is no preview with a sample either."""
+    differs = any(getattr(parameters, s) != getattr(known.parameters, s) for s in SEGMENTATION_STAGES)
+    return differs and _classifies_alike(known.parameters, parameters)
+
+
 def preview_trees(
-    known: KnownMap,
-    parameters: Parameters,
-    take_sample: Callable[[], Mapping[int, SegmentedScan]] = dict,
+    known: KnownMap, parameters: Parameters, sample: Mapping[int, SegmentedScan] | None = None
 ) -> Trees | None:
     """Return the trees that a rerun with other parameters would approximately give, without diameters,
     covariances and times (NaN or 0). All are confirmed, and their numbers (from 1) are unrelated to those of
@@ -213,8 +218,8 @@ def preview_trees(
     Args:
         known: The run as it is mapped; unchanged.
         parameters: The other parameters.
-        take_sample: Returns some scans as these parameters segment them, by their numbers, ascending. It is
-            called if the parameters change the clusters: if a stage of the segmentation differs.
+        sample: Some scans as these parameters segment them, by their numbers, ascending; used if
+            `needs_sample`.
 
     Returns:
         The trees. None if no scan is known, if the parameters classify columns in another way (apart from
@@ -225,12 +230,11 @@ def preview_trees(
     if scans == 0 or not _classifies_alike(known.parameters, parameters):
         return None
     table, path = known.clusters.of(range(scans)), path[:scans]
-    same = {stage: getattr(known.parameters, stage) for stage in SEGMENTATION_STAGES}
-    if all(getattr(parameters, stage) == before for stage, before in same.items()):
+    if not needs_sample(known, parameters):
         return _trees(_all_places(known, table, path, parameters))
-    sample = take_sample()
     if not sample:
         return None
+    same = {stage: getattr(known.parameters, stage) for stage in SEGMENTATION_STAGES}
     before = _all_places(known, table, path, parameters.model_copy(update=same))
     return _trees(_with_sample(before, known, table, path, parameters, sample))
 

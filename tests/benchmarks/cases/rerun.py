@@ -140,7 +140,7 @@ def _preview(
     trees, spent = None, 0.0
     for _ in range(2):
         start = time.perf_counter()
-        trees = preview_trees(known, parameters, lambda: {n: segment(held[n]) for n in numbers})
+        trees = preview_trees(known, parameters, {n: segment(held[n]) for n in numbers})
         spent = time.perf_counter() - start
     if trees is None:
         return (words, "none", "", PREVIEW_S, "")

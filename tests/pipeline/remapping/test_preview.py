@@ -127,9 +127,9 @@ SEGMENTATIONS = [
 
 
 def sampled(parameters):
-    """Takes a sample of the run as segmented with these parameters."""
+    """A sample of the run as segmented with these parameters."""
     steps, segment = run()[0], mapper(parameters).segmenter()
-    return lambda: {n: segment(steps[n]) for n in sample_scans(len(steps), steps[0].scan.points.nbytes)}
+    return {n: segment(steps[n]) for n in sample_scans(len(steps), steps[0].scan.points.nbytes)}
 
 
 @pytest.mark.parametrize("method", ["columns", "none"])
