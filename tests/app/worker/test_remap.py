@@ -17,8 +17,9 @@ from app.worker.run import Run
 from app.worker.session import Session
 from pipeline.config import Parameters
 from pipeline.errors import SourceError
+from pipeline.front_end import SegmentedScan
 from pipeline.mapper import Mapper
-from pipeline.types.records import Frame, Trees
+from pipeline.types.records import Frame, Step, Trees
 
 URI = "sim:paper?duration=2.4&odometry=poor"
 LAST = 23
@@ -195,7 +196,12 @@ def test_the_standing_scan_comes_first_then_the_preview_then_the_map(session, mo
     segmented: list[int] = []
     session.on_preview = lambda revision, trees: heard.append((revision, len(trees.number)))
     segment = Mapper.segment
-    monkeypatch.setattr(Mapper, "segment", lambda m, step: segmented.append(step.index) or segment(m, step))
+
+    def segment_and_note(mapper: Mapper, step: Step) -> SegmentedScan:
+        segmented.append(step.index)
+        return segment(mapper, step)
+
+    monkeypatch.setattr(Mapper, "segment", segment_and_note)
     for revision, change in enumerate([{"clustering.eps": 0.25}, {"detection.e_max": 12.0}], 1):
         frame = session.set_parameters(BASE.replace(change), revision, whole=True)
         assert frame is not None
