@@ -171,7 +171,9 @@ def _fingerprint(step: Step) -> int:
     return hash((scan.stamp_ns, scan.points.shape[0], step.T_odom_base, step.roll, step.pitch, step.turn))
 
 
-def live_steps(source: LiveSource, chosen: ChosenOdometry, moving: Source) -> Iterator[Step | None]:
+def live_steps(
+    source: LiveSource, chosen: ChosenOdometry, moving: Source, losses: Counter[str]
+) -> Iterator[Step | None]:
     """Yield the steps of a live robot as they arrive, and None while no message waits, without end. An
     unreadable message raises SourceError.
 
@@ -179,9 +181,10 @@ def live_steps(source: LiveSource, chosen: ChosenOdometry, moving: Source) -> It
         source: The robot.
         chosen: Selected source of the motion.
         moving: The source with that motion, see `with_odometry`.
+        losses: Counts what the synchroniser leaves out, by reason.
     """
     override = moving if isinstance(moving, OdometryOverride) else None
-    synchroniser = Synchroniser(use_odometry=chosen.steps != "static", losses=Counter())
+    synchroniser = Synchroniser(use_odometry=chosen.steps != "static", losses=losses)
     while True:
         records = source.take()
         if not records:

@@ -63,6 +63,7 @@ class Run:
             trees that never were; None before the first scan.
         current: Index of the current scan; -1 before the first.
         is_bare: Whether the frame has no points, see `map_next`.
+        warnings: Warnings about the source, to which those of a robot are added.
     """
 
     def __init__(
@@ -80,7 +81,8 @@ class Run:
         left_out: Mapping[str, int] | None = None,
     ) -> None:
         self.source = source
-        self._warnings, self._left_out = warnings, left_out or {}
+        self.warnings = list(warnings)
+        self._left_out = {} if left_out is None else left_out  # an empty one is filled later
         self.odometry = odometry
         self.stopwatch = stopwatch
         self.frame: Frame | None = None
@@ -112,7 +114,7 @@ class Run:
     def counts(self, index: int) -> RunCounts:
         """Return the counts of the map up to a scan that was mapped."""
         losses = Counter(self._left_out) + Counter(self.source.losses)
-        return self._map.counts.totals(index, self._warnings, losses)
+        return self._map.counts.totals(index, self.warnings, losses)
 
     @property
     def start_ns(self) -> int:
@@ -468,7 +470,7 @@ def open_run(
 
         cursor = Cursor(read, description.uri, StepStore())
     else:
-        cursor = Cursor(lambda: live_steps(live, chosen, moving), description.uri)
+        cursor = Cursor(lambda: live_steps(live, chosen, moving, left_out), description.uri)
     warnings = (*([chosen.warning] if chosen.warning else []), *description.warnings)
     run = Run(
         moving,

@@ -203,8 +203,12 @@ class Session:
         if self._robot is None or self._requested is None:
             return None
         is_heard = self._run is None and self._robot.listen()
-        self._warn(self._robot.notices())
-        return self._begin(self._robot, *self._requested[1:]) if is_heard else None
+        notices = self._robot.notices()
+        self._warn(notices)
+        opened = self._begin(self._robot, *self._requested[1:]) if is_heard else None
+        if isinstance(self._run, Run):
+            self._run.warnings += notices
+        return opened
 
     def _begin(self, source: Source, odometry: str, seed: int) -> Opened:
         """Open a run of a source, paused before its first scan, and return its message.

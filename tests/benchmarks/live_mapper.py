@@ -10,6 +10,7 @@ import json
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -78,7 +79,8 @@ def main(port: str, robot: str, place: str = "") -> None:
             preset("forest"), sensor=description.sensor, T_base_lidar=description.T_base_lidar, seed=0
         )
         moving, chosen = with_odometry(source, "auto")
-        cursor, mapped = Cursor(lambda: live_steps(source, chosen, moving), description.uri), []
+        left_out = Counter[str]()
+        cursor, mapped = Cursor(lambda: live_steps(source, chosen, moving, left_out), description.uri), []
         while not source._ending.is_set() or source.scans_waiting:
             step = cursor.take()
             if step is None:
