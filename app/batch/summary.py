@@ -202,6 +202,16 @@ class RunTotals:
         return warning_texts(self.warned)
 
 
+def lost_share(health: Mapping[str, int]) -> float | None:
+    """Return the share of scans in which the pose was lost, from 0 to 1; None without scans.
+
+    Args:
+        health: Number of scans by state of the pose, see `Health`.
+    """
+    scans = sum(health.values())
+    return health.get("lost", 0) / scans if scans else None
+
+
 def warning_texts(warned: Mapping[str, int]) -> list[str]:
     """Return each warning once, with the number of times that it was given if that is not 1."""
     return [text if n == 1 else f"{text} ({n:,} times)" for text, n in warned.items()]

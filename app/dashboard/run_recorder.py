@@ -16,6 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from app.batch.summary import lost_share
 from app.dashboard.payload import trees_payload, truth_payload
 from app.sources.request import SourceRequest
 from app.store.async_store import AsyncStore
@@ -272,6 +273,7 @@ def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
         all_scans=all_scans,
         time_s=round(shown.time_s, 3),
         distance_m=round(float(np.hypot(*np.diff(state.path_xy, axis=0).T).sum()), 3),
+        lost=None if shown.counts is None else lost_share(shown.counts.health),
         trees=len(trees),
         preset=state.preset,
         parameters=state.parameters,

@@ -81,9 +81,9 @@ def inside(question: dict[str, Any]) -> dict[str, Any]:
 
 def finished(question: dict[str, Any]) -> dict[str, Any]:
     """Return a folder that `stemmap map` wrote as the page shows a run: `uri`, `kind`, `source` (digest),
-    `odometry`, `seed`, `chosen`, `scans`, `time_s`, `distance_m`, `trees` (their number), `preset`,
-    `parameters` by dotted name, `scores` (see `score_payload`; None without), and `map` with `trees` (see
-    `trees_payload`), thinned `path` and `truth` (None). Long texts are cut.
+    `odometry`, `seed`, `chosen`, `scans`, `time_s`, `distance_m`, `lost` (see `lost_share`), `trees` (their
+    number), `preset`, `parameters` by dotted name, `scores` (see `score_payload`; None without), and `map`
+    with `trees` (see `trees_payload`), thinned `path` and `truth` (None). Long texts are cut.
 
     Args:
         question: The key "path" has the folder.
@@ -94,6 +94,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     import numpy as np
 
     from app.batch.run_folder import read_run
+    from app.batch.summary import lost_share
     from app.dashboard.payload import trees_payload
     from app.dashboard.run_recorder import thinned
 
@@ -111,6 +112,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "scans": int(record.get("scans") or 0),
         "time_s": float(record.get("duration_s") or 0.0),
         "distance_m": float(np.hypot(*np.diff(path_xy, axis=0).T).sum()) if len(path_xy) else 0.0,
+        "lost": lost_share(record.get("health", {}).get("scans", {})),
         "trees": len(trees),
         "preset": str(record.get("preset", ""))[:100],
         "parameters": run.parameters.flat(),

@@ -12,17 +12,20 @@ from sqlalchemy.exc import SQLAlchemyError
 from pipeline.errors import StemmapError
 
 # Version of the tables, in a table that keeps the name under which Alembic reads it.
-VERSION = "0006"
-# Columns that the version before does not have; they are added to its databases.
-_BEFORE, _ADDED = "0005", ("annotations ADD COLUMN plot JSON", "run_maps ADD COLUMN files BLOB")
+VERSION = "0007"
+# Columns that earlier versions do not have yet, by their version; they are added to their databases.
+_ADDED = {
+    "0005": ("annotations ADD COLUMN plot JSON", "run_maps ADD COLUMN files BLOB"),
+    "0006": ("run_records ADD COLUMN lost FLOAT",),
+}
 _version = sa.Table(
     "alembic_version", sa.MetaData(), sa.Column("version_num", sa.String(32), primary_key=True)
 )
 
 
 def _prepare_tables(connection: sa.Connection) -> None:
-    """Create the tables of a new database, or check the version of an existing one and bring that of the
-    version before up to date.
+    """Create the tables of a new database, or check the version of an existing one and bring those of
+    `_ADDED` up to date.
 
     Raises:
         StemmapError: The tables are of another version or of another program.
@@ -36,9 +39,10 @@ def _prepare_tables(connection: sa.Connection) -> None:
     if _version.name not in names:
         raise StemmapError("this database belongs to another program")
     version = str(connection.execute(sa.select(_version.c.version_num)).scalar())
-    if version == _BEFORE:
-        for column in _ADDED:
-            connection.execute(sa.text(f"ALTER TABLE {column}"))
+    if version in _ADDED:
+        for since, columns in _ADDED.items():
+            for column in columns if since >= version else ():
+                connection.execute(sa.text(f"ALTER TABLE {column}"))
         connection.execute(sa.update(_version).values(version_num=VERSION))
         return
     if version != VERSION:
@@ -234,6 +238,7 @@ records = sa.Table(
     sa.Column("all_scans", sa.Integer),
     sa.Column("time_s", sa.Float, nullable=False),
     sa.Column("distance_m", sa.Float, nullable=False),
+    sa.Column("lost", sa.Float, comment="share of the scans, from 0 to 1"),
     sa.Column("trees", sa.Integer, nullable=False),
     sa.Column("preset", sa.String(100), nullable=False),
     sa.Column("parameters", sa.JSON(none_as_null=True), nullable=False),

@@ -142,6 +142,7 @@ class RunFigures:
         all_scans: Number of scans of the source, None if unknown.
         time_s: Time of the last mapped scan since the first [s].
         distance_m: Driven distance [m].
+        lost: Share of the scans in which the pose was lost, from 0 to 1; None for a whole cloud.
         trees: Number of confirmed trees.
         preset: Name of the preset.
         parameters: All values by dotted name.
@@ -153,6 +154,7 @@ class RunFigures:
     all_scans: int | None
     time_s: float
     distance_m: float
+    lost: float | None
     trees: int
     preset: str
     parameters: dict[str, Any]

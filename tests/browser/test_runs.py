@@ -49,6 +49,7 @@ def test_runs_are_stored_compared_renamed_deleted_and_replayed(own: Dashboard, t
     older = own.ask("/api/runs")["runs"][1]
     rows.nth(1).get_by_role("button").click()
     expect(page.locator("[data-figure=trees] dd")).to_have_text(str(older["trees"]))
+    expect(page.locator("[data-figure=lost] dd")).to_have_text("0 %")
     expect(page.locator(".run-map canvas")).to_be_visible()
 
     for row in rows.all():

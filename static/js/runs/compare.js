@@ -79,7 +79,7 @@ const COLUMNS = [["A", (row) => String(row.tree_a ?? NONE)], ["B", (row) => Stri
 
 function more(both, map) {
   const { a, b } = both;
-  const scores = [...FIGURES.slice(0, 3).map(([name, text]) => [name, text(a), text(b)]),
+  const scores = [...FIGURES.slice(0, -1).map(([name, text]) => [name, text(a), text(b)]),
     ...SCORES.map(([name, text]) => [name, a.scores ? text(a.scores) : NONE, b.scores ? text(b.scores) : NONE])];
   const rows = [...both.rows].sort((one, other) => ORDER.indexOf(one.status) - ORDER.indexOf(other.status) || (other.growth_cm ?? -Infinity) - (one.growth_cm ?? -Infinity));
   const trees = map ? [

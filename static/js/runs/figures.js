@@ -10,9 +10,11 @@ export const scans = (run) => (run.all_scans && run.scans < run.all_scans ? `${r
 const centimetres = (metres) => (typeof metres === "number" ? `${figure(100 * metres)} cm` : NONE);
 const rate = (of) => (of?.of ? `${percent(of.rate)} (${of.count} of ${of.of})` : NONE);
 
+// lost: share of the scans in which the pose was lost.
 export const FIGURES = [
   ["scans", scans],
   ["driven", (run) => `${figure(run.distance_m)} m`],
+  ["lost", (run) => percent(run.lost)],
   ["trees", (run) => String(run.trees)],
   ["F1", (run) => figure(run.scores?.f1)],
 ];

@@ -2,7 +2,7 @@
 
 import { get, open, patch, post, remove as removeAt } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { count, figure, NONE } from "../core/format.js";
+import { count, figure, NONE, percent } from "../core/format.js";
 import { startAccess } from "../core/permissions.js";
 import { on } from "../core/store.js";
 import { startTheme } from "../core/theme.js";
@@ -11,7 +11,7 @@ import { showTwo } from "./compare.js";
 import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
-const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor"], ["trees", ""], ["F1", ""], ["annotated", "minor"], ["preset", "minor"]];
+const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor"], ["lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"], ["preset", "minor"]];
 let known = { runs: [], folders: [], open: null };
 const ticked = new Set();
 let deleted = null; // the run that Undo brings back
@@ -54,8 +54,8 @@ function row(run) {
   const name = el("td", {}, el("button", { text: run.name, onclick: (event) => { event.stopPropagation(); go(addressOf(run)); } }),
     el("small", {}, ...(run.id === known.open && run.id !== undefined ? [el("span", { class: "badge", text: "open now" })] : []),
       run.uri && shortSource(run.uri) !== run.name ? shortSource(run.uri) : run.kind ?? ""));
-  const texts = run.id === undefined ? [when(run.changed_s), "", "", "", "", "", ""]
-    : [when(run.begun_s), scans(run), figure(run.distance_m), String(run.trees), figure(run.scores?.f1), run.annotated ? String(run.annotated) : NONE, run.preset];
+  const texts = run.id === undefined ? [when(run.changed_s), "", "", "", "", "", "", ""]
+    : [when(run.begun_s), scans(run), figure(run.distance_m), percent(run.lost), String(run.trees), figure(run.scores?.f1), run.annotated ? String(run.annotated) : NONE, run.preset];
   return el("tr", { "data-run": run.key, onclick: () => go(addressOf(run)) },
     el("td", { onclick: (event) => event.stopPropagation() }, el("input", { type: "checkbox", "aria-label": `Compare ${run.name}`, checked: ticked.has(run.key), onchange: (event) => tick(run.key, event.target.checked) })),
     name, ...texts.map((text, k) => el("td", { class: HEADS[k + 2][1], text })));
@@ -129,7 +129,7 @@ async function undo() {
   go(addressOf(run));
 }
 
-byId("runs").tHead.replaceChildren(el("tr", {}, ...HEADS.map(([text, cls]) => (text ? el("th", { scope: "col", class: cls, text }) : el("td", { class: cls })))));
+byId("runs").tHead.replaceChildren(el("tr", {}, ...HEADS.map(([text, cls, title = ""]) => (text ? el("th", { scope: "col", class: cls, title, text }) : el("td", { class: cls })))));
 byId("runs-find").addEventListener("input", fill);
 // The earlier run is A.
 const begun = (key) => {
