@@ -18,9 +18,7 @@ from pipeline.classification.voxel_map import (
     TILE,
     PackedVoxelMap,
     VoxelMap,
-    index,
-    keys_of,
-    tiles_of,
+    corrected_voxels,
 )
 from pipeline.config.stages import Classification as Classification
 from pipeline.geometry.pose_arrays import PathCorrection
@@ -116,54 +114,6 @@ def too_few(figures: Float) -> Bool:
 
 
 LOW, HIGH = 0.6, 1.6  # m above the ground; voxels in this band decide when a column was last seen
-
-
-def corrected_voxels(memory: VoxelMap, correction: PathCorrection) -> VoxelMap:
-    """Return the voxels after a correction of the path: each moves with the last scan that saw it, and voxels
-    in the same cell are joined: returns are added, the mean is weighted by them, and the largest `scans` and
-    `latest` are kept. All tiles become due for classification.
-
-    Voxels that leave the limits of the map (1,000 km) are removed; heights do not change. The argument is not
-    changed.
-    """
-    n = memory.used
-    mean = memory.mean[:n].copy()
-    latest = memory.latest[:n].astype(np.int64)
-    mean[:, :2], _ = correction.moved(memory.mean[:n, :2].astype(np.float64), latest)
-    key = keys_of(mean)
-    kept = np.flatnonzero(key >= 0)  # coordinates within 1,000 km have a key
-    names, first, of = np.unique(key[kept], return_index=True, return_inverse=True)
-    order = np.argsort(first)  # in the previous order
-    rank = np.empty(len(order), np.int64)
-    rank[order] = np.arange(len(order))
-    of = rank[of.ravel()]
-    fresh = VoxelMap.empty(len(memory.key), _room(len(memory.tile_key), names))
-    rows = len(names)
-    weight = memory.returns[kept].astype(np.float64)
-    total = np.bincount(of, weight, rows)
-    fresh.key[:rows] = names[order]
-    for axis in range(3):
-        fresh.mean[:rows, axis] = np.bincount(of, weight * mean[kept, axis], rows) / total
-    fresh.returns[:rows] = total
-    np.maximum.at(fresh.scans, of, memory.scans[kept])
-    np.maximum.at(fresh.latest, of, memory.latest[kept])
-    fresh.added = memory.added
-    index(fresh, rows)
-    return fresh
-
-
-def _room(room: int, keys: Int) -> int:
-    """Return the number of rows for the tiles of some voxels: `room`, doubled until it exceeds the number of
-    tiles. A rotated tile covers up to four tiles.
-
-    Args:
-        room: Rows so far, a power of two.
-        keys: Keys of the voxels (`keys_of`), not negative, int64, shape (N,).
-    """
-    tiles = len(np.unique(tiles_of(keys)))
-    while room <= tiles:
-        room *= 2
-    return room
 
 
 def corrected_columns(columns: Columns, memory: VoxelMap, correction: PathCorrection) -> Columns:

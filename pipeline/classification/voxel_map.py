@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from pipeline.geometry.hash_grid import SPREAD
+from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.jit import compiled
 from pipeline.types.records import Float32, Int, Int32
 
@@ -330,6 +331,70 @@ def _index(used: int, tables: _Tables) -> int:
         tiles = _link(row, tables, tiles)
         tables.tile_returns[tables.home[row]] += tables.returns[row]
     return tiles
+
+
+def corrected_voxels(memory: VoxelMap, correction: PathCorrection) -> VoxelMap:
+    """Return the voxels after a correction of the path: each moves with the last scan that saw it, and voxels
+    in the same cell are joined: returns are added, the mean is weighted by them, and the largest `scans` and
+    `latest` are kept. All tiles become due for classification.
+
+    Voxels that leave the limits of the map (1,000 km) are removed; heights do not change. The argument is not
+    changed.
+    """
+    n = memory.used
+    mean = memory.mean[:n].copy()
+    latest = memory.latest[:n].astype(np.int64)
+    mean[:, :2], _ = correction.moved(memory.mean[:n, :2].astype(np.float64), latest)
+    key = keys_of(mean)
+    fresh = VoxelMap.empty(len(memory.key), _room(len(memory.tile_key), key[key >= 0]))
+    fresh.added = memory.added
+    index(fresh, _join(key, mean, memory._tables(), fresh._tables()))
+    return fresh
+
+
+def _room(room: int, keys: Int) -> int:
+    """Return the number of rows for the tiles of some voxels: `room`, doubled until it exceeds the number of
+    tiles. A rotated tile covers up to four tiles.
+
+    Args:
+        room: Rows so far, a power of two.
+        keys: Keys of the voxels (`keys_of`), not negative, int64, shape (N,).
+    """
+    tiles = len(np.unique(tiles_of(keys)))
+    while room <= tiles:
+        room *= 2
+    return room
+
+
+@compiled
+def _join(key: Int, mean: Float32, old: _Tables, fresh: _Tables) -> int:
+    """Write the voxels of a map with new positions to an empty map, those of one cell as one voxel, in the
+    order of their first; return the number of voxels. Voxels with a negative key are left out.
+
+    Args:
+        key, mean: New cells, shape (N,), and positions, shape (N, 3) [m], of the first N rows of `old`.
+        old: Tables of the map.
+        fresh: Tables of the empty map, whose columns KEPT and hash table of the voxels are filled.
+    """
+    total, rows = np.zeros((key.shape[0], 3)), 0
+    for i in range(key.shape[0]):
+        if key[i] < 0:
+            continue
+        at = _find(key[i], fresh.key, fresh.slot)
+        if fresh.slot[at] == 0:
+            fresh.key[rows] = key[i]
+            rows += 1
+            fresh.slot[at] = rows
+        row = fresh.slot[at] - 1
+        for a in range(3):
+            total[row, a] += np.float64(old.returns[i]) * mean[i, a]
+        fresh.returns[row] += old.returns[i]
+        fresh.scans[row] = max(fresh.scans[row], old.scans[i])
+        fresh.latest[row] = max(fresh.latest[row], old.latest[i])
+    for row in range(rows):
+        for a in range(3):
+            fresh.mean[row, a] = total[row, a] / fresh.returns[row]
+    return rows
 
 
 @compiled

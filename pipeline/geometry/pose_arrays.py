@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.poses import Float, wrap_angle
+from pipeline.jit import compiled
 
 Int = NDArray[np.int64]
 
@@ -74,7 +75,6 @@ def rotated_rows(covariance: Float, turn: Float) -> Float:
 
 SPACING = 1.0  # m of path between two poses that move objects; the correction changes little in between
 NEAR = 20.0  # m of path before and after the scan of an object; other passes have other corrections
-ROWS = 4096  # objects that are moved at once, which bounds the memory
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,19 +115,9 @@ class PathCorrection:
             return place.copy(), np.zeros(len(place))
         step = np.hypot(*np.diff(self.before[:, :2], axis=0, prepend=self.before[:1, :2]).T)
         distance = np.cumsum(step)
-        # First scan of each SPACING, and the part of them within NEAR of each object's scan.
         _, anchors = np.unique((distance / SPACING).astype(np.int64), return_index=True)
         at = distance[np.minimum(scan, len(distance) - 1)]
-        low = np.searchsorted(distance[anchors], at - NEAR)
-        high = np.searchsorted(distance[anchors], at + NEAR, side="right")
-        width = np.arange(int((high - low).max(initial=0)))
-        row = np.empty(len(place), np.int64)
-        for k in range(0, len(place), ROWS):
-            part = slice(k, k + ROWS)
-            candidate = np.minimum(low[part, None] + width, high[part, None] - 1)
-            away = self.before[anchors[candidate], :2] - place[part, None]
-            nearest = np.argmin((away * away).sum(axis=2), axis=1)
-            row[part] = anchors[candidate[np.arange(len(nearest)), nearest]]
+        row = anchors[_nearest_poses(place, at, self.before[anchors], distance[anchors])]
         before, after = self.before[row], self.after[row]
         turn = wrap_angle(after[:, 2] - before[:, 2])
         return after[:, :2] + _rotated(place - before[:, :2], turn), turn
@@ -143,6 +133,29 @@ class PathCorrection:
         turn = after[:, 2] - before[:, 2]
         position = after[:, :2] + _rotated((pose - before)[:, :2], turn)
         return np.column_stack([position, wrap_angle(pose[:, 2] + turn)])
+
+
+@compiled
+def _nearest_poses(place: Float, at: Float, pose: Float, distance: Float) -> Int:
+    """Return the row of the pose nearest to each object, int64, shape (N,), the first of equal ones, among
+    those within NEAR of the object along the path.
+
+    Args:
+        place: Positions, shape (N, 2) [m].
+        at: Distance along the path of each object, shape (N,) [m]; a pose is within NEAR of it.
+        pose: Poses, x, y first, shape (A, 3) [m].
+        distance: Distance along the path of each pose, ascending, shape (A,) [m].
+    """
+    nearest = np.empty(place.shape[0], np.int64)
+    for k in range(place.shape[0]):
+        a, least = int(np.searchsorted(distance, at[k] - NEAR)), np.inf
+        nearest[k] = a
+        while a < distance.shape[0] and distance[a] <= at[k] + NEAR:
+            dx, dy = pose[a, 0] - place[k, 0], pose[a, 1] - place[k, 1]
+            if dx * dx + dy * dy < least:
+                nearest[k], least = a, dx * dx + dy * dy
+            a += 1
+    return nearest
 
 
 def _rotated(v: Float, angle: Float) -> Float:

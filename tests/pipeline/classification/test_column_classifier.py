@@ -13,12 +13,11 @@ from pipeline.classification.column_classifier import (
     GONE_SCANS,
     HIGHER,
     MOST_STALE,
-    corrected_voxels,
     seen_higher,
 )
 from pipeline.classification.features import NAMES
 from pipeline.classification.forest import CLASSES, DecisionTrees
-from pipeline.classification.voxel_map import TILE, VoxelMap, keys_of, tiles_of
+from pipeline.classification.voxel_map import TILE, VoxelMap, corrected_voxels, keys_of, tiles_of
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
 from pipeline.geometry.pose_arrays import PathCorrection

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.classification.column_classifier import corrected_columns, corrected_voxels, no_columns
-from pipeline.classification.voxel_map import SIDE, VoxelMap
+from pipeline.classification.column_classifier import corrected_columns, no_columns
+from pipeline.classification.voxel_map import SIDE, VoxelMap, corrected_voxels
 from pipeline.config import preset
 from pipeline.geometry.pose_arrays import PathCorrection, composed, inverse
 from pipeline.geometry.poses import Pose2, Pose3
