@@ -9,9 +9,10 @@ import secrets
 import shutil
 import time
 from collections.abc import AsyncIterator, Callable
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
+import msgspec
 from fastapi import APIRouter, Query, Request
 from starlette.requests import ClientDisconnect
 from starlette.responses import Response
@@ -31,6 +32,9 @@ _STALLED_S = 60.0
 _ABANDONED_S = 3600.0
 _PART = ".upload-"
 _SUFFIX = re.compile(r"\.[a-z0-9]{1,8}\Z")
+# A drive of KITTI has 4,541 scans; their list takes 0.2 MB.
+_MOST_FILES, _LONGEST_LIST, _DEEPEST = 20_000, 4 << 20, 4
+_LONGEST_NAME = 60  # 240 bytes in UTF-8, below the 255 of file systems
 
 
 class UploadError(StemmapError):
@@ -64,14 +68,18 @@ class Uploads:
         """
         return self._room(self._free())
 
-    async def take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Receive a file, check it in a child process, and return its path (`uri`), name, format (`kind`) and
-        size (`bytes`). The file gets a generated name; a refused one is removed.
+    async def take(
+        self, name: str, size: int, stream: AsyncIterator[bytes], *, many: bool = False
+    ) -> dict[str, Any]:
+        """Receive a file, or the files of one recording as a folder, check it in a child process, and return
+        its path (`uri`), name, format (`kind`) and size (`bytes`). It gets a generated name; what is refused
+        is removed.
 
         Args:
-            name: Original name of the file.
+            name: Original name of the file or folder.
             size: Announced size [bytes].
             stream: Yields the bytes.
+            many: Whether they are those of several files, after a line with their list, see `_file_list`.
 
         Raises:
             UploadError: MOST_AT_ONCE uploads are in progress; or the file is empty, too large, incomplete,
@@ -81,12 +89,13 @@ class Uploads:
             raise UploadError(409, f"{MOST_AT_ONCE} uploads are under way", remedy="Wait until one is done")
         self._under_way += 1
         try:
-            return await self._take(name, size, stream)
+            return await self._take(name, size, stream, many)
         finally:
             self._under_way -= 1
 
-    async def _take(self, name: str, size: int, stream: AsyncIterator[bytes]) -> dict[str, Any]:
-        """Receive a file; results and errors as in `take`, without the limit of simultaneous uploads."""
+    async def _take(self, name: str, size: int, stream: AsyncIterator[bytes], many: bool) -> dict[str, Any]:
+        """Receive a file or a folder; results and errors as in `take`, without the limit of simultaneous
+        uploads."""
         free = await asyncio.to_thread(self._free)
         room = self._room(free)  # without an await in between, other uploads cannot take the same space
         if size > room:
@@ -98,10 +107,10 @@ class Uploads:
             raise UploadError(422, "the file is empty", where=name)
         # Readers inspect the contents first, but a file of plain floats is recognised only by its name.
         suffix = Path(name).suffix.lower()
-        suffix = suffix if _SUFFIX.match(suffix) else ""
+        suffix = suffix if _SUFFIX.match(suffix) and not many else ""
         part = self._place() / f"{_PART}{secrets.token_hex(8)}{suffix}"
         try:
-            await self._write(part, size, stream)
+            await self._write(part, size, stream, many)
             kind = await _look_at(part, name)
             made_up = f"upload-{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(3)}{suffix}"
             place = part.with_name(made_up)
@@ -109,7 +118,7 @@ class Uploads:
         except OSError as error:
             raise UploadError(507, f"the file cannot be kept: {error.strerror}", where=name) from None
         finally:
-            part.unlink(missing_ok=True)
+            _remove(part)
         with contextlib.suppress(StemmapError):  # it is then listed under its generated name
             await self._store.ask(lambda store: store.book.add_upload(made_up, _shown(name), kind, size))
         return {"uri": str(place), "name": _shown(name), "kind": kind, "bytes": size}
@@ -122,9 +131,9 @@ class Uploads:
         """Return the maximum size of an upload with a free disk space, see `_free` [bytes]."""
         return max(0, min(self.limit, free - self._awaited))
 
-    async def _write(self, part: Path, size: int, stream: AsyncIterator[bytes]) -> None:
-        """Write the file, and reserve the space that is not written yet against other uploads. Arguments and
-        errors as in `take`."""
+    async def _write(self, part: Path, size: int, stream: AsyncIterator[bytes], many: bool) -> None:
+        """Write the file or the folder, and reserve the space that is not written yet against other uploads.
+        Arguments and errors as in `take`."""
         awaited = size
 
         def wrote(length: int) -> None:
@@ -134,7 +143,7 @@ class Uploads:
 
         self._awaited += size
         try:
-            await _write(part, size, stream, wrote)
+            await (_write_folder if many else _write)(part, size, _in_time(stream), wrote)
         finally:
             self._awaited -= awaited
 
@@ -146,7 +155,7 @@ class Uploads:
         for part in self._folder.glob(f"{_PART}*"):
             with contextlib.suppress(OSError):
                 if part.stat().st_mtime < time.time() - _ABANDONED_S:
-                    part.unlink()
+                    _remove(part)
 
     def _place(self) -> Path:
         """Return the folder, which is created if necessary; raises UploadError if there is none or it cannot
@@ -162,6 +171,80 @@ class Uploads:
         return self._folder
 
 
+def _remove(part: Path) -> None:
+    """Remove an incomplete file or folder; nothing if it does not exist."""
+    if part.is_dir():
+        shutil.rmtree(part, ignore_errors=True)
+    else:
+        part.unlink(missing_ok=True)
+
+
+async def _write_folder(
+    part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]
+) -> None:
+    """Write the files of a folder, which follow one another in the stream after their list. Arguments and
+    errors as `_write`."""
+    pieces, rest = aiter(stream), b""
+    while b"\n" not in rest and len(rest) < _LONGEST_LIST and (piece := await anext(pieces, b"")):
+        rest += piece
+    line, _, rest = rest.partition(b"\n")
+    files = _file_list(line)
+    if len(line) + 1 + sum(length for _, length in files) != size:
+        raise UploadError(422, "the sizes of the files are not that of the upload")
+
+    async def next_file(length: int) -> AsyncIterator[bytes]:
+        nonlocal rest
+        while length > 0 and (piece := rest or await anext(pieces, b"")):
+            head, rest = piece[:length], piece[length:]
+            length -= len(head)
+            yield head
+
+    part.mkdir()
+    for path, length in files:
+        place = part / path
+        place.parent.mkdir(parents=True, exist_ok=True)
+        await _write(place, length, next_file(length), wrote)
+
+
+def _file_list(line: bytes) -> list[tuple[PurePosixPath, int]]:
+    """Return the paths in the folder and the sizes [bytes] of the files of an upload.
+
+    Args:
+        line: JSON, a list of [path, size].
+
+    Raises:
+        UploadError: It is no such list, has no or too many files, two of one path, or a path that leaves the
+            folder, is hidden, too deep or too long.
+    """
+    try:
+        listed = msgspec.json.decode(line, type=list[tuple[str, Annotated[int, msgspec.Meta(ge=0)]]])
+    except msgspec.DecodeError:
+        raise UploadError(422, "the list of the files cannot be read") from None
+    if not 0 < len(listed) <= _MOST_FILES:
+        raise UploadError(
+            422, f"{len(listed):,} files are not one recording", remedy=f"Upload 1 to {_MOST_FILES:,} files"
+        )
+    for name, _ in listed:
+        parts = name.split("/")
+        if len(parts) > _DEEPEST or not all(map(_is_file_name, parts)):
+            raise UploadError(422, "a file has a name that cannot be used", where=_shown(name))
+    files = {PurePosixPath(name): size for name, size in listed}
+    if len(files) != len(listed):
+        raise UploadError(422, "two files have the same name")
+    return list(files.items())
+
+
+def _is_file_name(name: str) -> bool:
+    """Return whether a file or folder of an upload may have this name: not hidden, empty, too long, or with
+    characters that are not printed or separate folders."""
+    return (
+        name.isprintable()
+        and not name.startswith(".")
+        and "\\" not in name
+        and 0 < len(name) <= _LONGEST_NAME
+    )
+
+
 async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]) -> None:
     """Write the file in large blocks, each in a thread.
 
@@ -172,14 +255,14 @@ async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Cal
         wrote: Called with the length of each block but the last.
 
     Raises:
-        UploadError: The browser disconnected, stalled, or sent another length than announced. What has been
+        UploadError: The browser disconnected, or sent another length than announced. What has been
             written remains.
     """
     written, waiting = 0, bytearray()
     # Not in a thread: a cancelled request would not notice the file that is created afterwards.
     file = part.open("xb")
     try:
-        async for piece in _in_time(stream):
+        async for piece in stream:
             waiting += piece
             if len(waiting) >= _CHUNK:
                 written += len(waiting)
@@ -255,9 +338,12 @@ async def room(request: Request) -> Response:
 
 
 @router.post(UPLOADS)
-async def upload(request: Request, name: Annotated[str, Query(min_length=1, max_length=1000)]) -> Response:
-    """POST /api/uploads: store a recording, whose bytes are the body of the request, under its name; return
-    how it is stored (see `Uploads.take`), with 201. An error, as JSON, for another type than
+async def upload(
+    request: Request, name: Annotated[str, Query(min_length=1, max_length=1000)], many: bool = False
+) -> Response:
+    """POST /api/uploads: store a recording, whose bytes are the body of the request, under its name; with
+    `many` those of several files after their list (see `_file_list`). Return how it is stored (see
+    `Uploads.take`), with 201. An error, as JSON, for another type than
     application/octet-stream (422), without a length (411), and where the file cannot be stored."""
     uploads: Uploads = request.app.state.uploads
     kind = request.headers.get("content-type", "")
@@ -268,7 +354,7 @@ async def upload(request: Request, name: Annotated[str, Query(min_length=1, max_
     size = request.headers.get("content-length", "")
     if not size.isdecimal():
         raise UploadError(411, "the length of the file is missing", where="Content-Length")
-    return json_reply(await uploads.take(name, int(size), _pieces(request)), 201)
+    return json_reply(await uploads.take(name, int(size), _pieces(request), many=many), 201)
 
 
 async def _pieces(request: Request) -> AsyncIterator[bytes]:

@@ -134,6 +134,7 @@ def survey_run(browser: Browser, link: str, folder: Path, size: str, wanted: lis
                 press.click,
                 lambda press=press: press.dispatch_event("click"),  # type: ignore[misc]
             )
+    page.locator("#trees tbody tr").nth(4).dispatch_event("click")  # all windows share the selection
     if survey.takes("runs"):
         survey_runs(survey, link)
     context.close()

@@ -23,7 +23,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
 
     Args:
         uri: A simulated scenario ("sim:stand"), a file or a folder. The format is detected by the contents
-            first, then by the name.
+            first, then by the name. A folder that is no run and has one recording in it is that recording.
         options: Choices of the user; None for the defaults.
 
     Raises:
@@ -36,6 +36,8 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         if scheme is not None and not Path(uri).exists():
             return _open_scheme(scheme.group(1).lower(), uri, chosen)
         path = Path(uri).expanduser()
+        if path.is_dir() and folder_opener(path) is None and len(names := recordings_in(path)) == 1:
+            return open_source(str(path / names[0]), chosen)
         return _find_opener(path, uri)(uri, path, chosen)
     except RuntimeError as error:  # the home folder of an unknown user
         raise SourceError("there is no such user", where=uri, remedy="Look at the path.") from error

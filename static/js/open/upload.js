@@ -1,8 +1,8 @@
-// Uploads a recording that is dropped on the page or chosen, shows the progress, then opens it.
+// Uploads a recording that is dropped on the page or chosen, a file or the files of one recording, shows the progress, then opens it.
 
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { capital, count } from "../core/format.js";
+import { capital } from "../core/format.js";
 
 const SHOWN_FOR = 8000; // [ms] of a message that is no error
 let sending = null; // request in progress
@@ -10,9 +10,8 @@ const size = (bytes) => (bytes >= 1e9 ? `${(bytes / 1e9).toFixed(2)} GB` : bytes
 
 // done(answer) is called with {uri, name, kind, bytes} after the upload.
 export function startUpload(done) {
-  const file = el("input", { type: "file", id: "upload-file", hidden: true, "aria-label": "Recording to upload", onchange: () => {
-    const [chosen] = file.files;
-    if (chosen) send(chosen, done);
+  const file = el("input", { type: "file", id: "upload-file", hidden: true, multiple: true, "aria-label": "Recording to upload", onchange: () => {
+    sendFiles([...file.files].map((each) => ({ path: each.name, file: each })), done);
     file.value = "";
   } });
   // Inside the dialog if there is one: nothing outside of an open dialog can be used.
@@ -35,12 +34,48 @@ function listenForDrops(done) {
     depth = 0;
     here.hidden = true;
     if (document.body.classList.contains("viewer")) return;
-    const entries = [...event.dataTransfer.items].map((each) => each.webkitGetAsEntry?.());
-    const files = [...event.dataTransfer.files];
-    if (entries.some((entry) => entry?.isDirectory)) say("A folder cannot be uploaded. Copy it to the machine where stemmap runs and open it by its path.");
-    else if (files.length > 1) say(`${count(files.length, "file")} were dropped. Drop one recording at a time.`);
-    else if (files.length) send(files[0], done);
+    sendDropped(event.dataTransfer, done);
   });
+}
+
+// Entries must be taken before the first await, when the browser empties the transfer.
+async function sendDropped({ items, files }, done) {
+  const entries = [...items].map((each) => each.webkitGetAsEntry?.()).filter(Boolean);
+  const dropped = [...files].map((each) => ({ path: each.name, file: each }));
+  if (!entries.some((entry) => entry.isDirectory)) return sendFiles(dropped, done);
+  try {
+    const [only] = entries;
+    if (entries.length > 1) sendFiles((await Promise.all(entries.map((entry) => filesIn(entry)))).flat(), done);
+    else sendFiles((await filesIn(only)).map(({ path, file }) => ({ path: path.slice(only.name.length + 1), file })), done, only.name);
+  } catch (error) {
+    say(`The folder could not be read: ${error.message}`);
+  }
+}
+
+const settled = (start) => new Promise(start);
+
+// The files of an entry with their paths, without hidden ones. A reader returns at most 100 entries at a time, and none at its end.
+async function filesIn(entry, folder = "") {
+  if (entry.name.startsWith(".")) return [];
+  const path = `${folder}${entry.name}`;
+  if (entry.isFile) return [{ path, file: await settled((found, failed) => entry.file(found, failed)) }];
+  const reader = entry.createReader();
+  const all = [];
+  let some;
+  do {
+    some = await settled((found, failed) => reader.readEntries(found, failed));
+    all.push(...some);
+  } while (some.length);
+  return (await Promise.all(all.map((each) => filesIn(each, `${path}/`)))).flat();
+}
+
+// `name` is that of the folder; "" without one.
+function sendFiles(files, done, name = "") {
+  if (!name && files.length === 1) send(files[0].file, files[0].file.name, "", done);
+  else if (files.length) {
+    const list = `${JSON.stringify(files.map(({ path, file }) => [path, file.size]))}\n`;
+    send(new Blob([list, ...files.map(({ file }) => file)]), name || `${files[0].path} and ${files.length - 1} more`, "&many=true", done);
+  } else if (name) say(`The folder ${name} has no files.`);
 }
 
 function box() {
@@ -58,32 +93,32 @@ function say(text, error = true) {
   if (!error) setTimeout(() => made.remove(), SHOWN_FOR);
 }
 
-async function send(file, done) {
+async function send(body, name, query, done) {
   if (sending) return say("Another upload is in progress. Wait until it ends, or cancel it.");
   try {
     const { room } = await get("/api/uploads");
-    if (file.size > room) return say(`${file.name} is too large: ${size(file.size)}, and the server has room for ${size(room)}. Free some space there, or copy the recording to the server and open it by its path.`);
+    if (body.size > room) return say(`${name} is too large: ${size(body.size)}, and the server has room for ${size(room)}. Free some space there, or copy the recording to the server and open it by its path.`);
   } catch (error) {
     return say(error.message);
   }
   const made = box();
-  const bar = el("progress", { max: file.size, value: 0, "aria-label": "Progress of the upload" });
+  const bar = el("progress", { max: body.size, value: 0, "aria-label": "Progress of the upload" });
   const note = el("span", { class: "dim", text: "" });
   const request = new XMLHttpRequest();
-  made.append(el("p", { text: `Uploading ${file.name}` }), bar, el("div", { class: "row" }, note,
+  made.append(el("p", { text: `Uploading ${name}` }), bar, el("div", { class: "row" }, note,
     el("button", { type: "button", class: "small", text: "Cancel", onclick: () => request.abort() })));
   sending = request;
   request.upload.onprogress = ({ loaded }) => {
     bar.value = loaded;
-    setText(note, loaded < file.size ? `${size(loaded)} of ${size(file.size)}` : "Detecting the format …");
+    setText(note, loaded < body.size ? `${size(loaded)} of ${size(body.size)}` : "Detecting the format …");
   };
-  request.onloadend = () => { sending = null; finish(request, file, made, done); };
-  request.open("POST", `/api/uploads?name=${encodeURIComponent(file.name)}`);
+  request.onloadend = () => { sending = null; finish(request, name, made, done); };
+  request.open("POST", `/api/uploads?name=${encodeURIComponent(name)}${query}`);
   request.setRequestHeader("Content-Type", "application/octet-stream");
-  request.send(file);
+  request.send(body);
 }
 
-async function finish(request, file, made, done) {
+async function finish(request, name, made, done) {
   made.remove();
   if (request.status === 201) {
     const answer = JSON.parse(request.responseText);
@@ -94,8 +129,8 @@ async function finish(request, file, made, done) {
       say(error.message);
     }
   } else if (request.status) say(wording(request));
-  else if (request.readyState === XMLHttpRequest.UNSENT) say(`The upload of ${file.name} was cancelled.`, false);
-  else say(`The connection was lost during the upload of ${file.name}. Try again.`);
+  else if (request.readyState === XMLHttpRequest.UNSENT) say(`The upload of ${name} was cancelled.`, false);
+  else say(`The connection was lost during the upload of ${name}. Try again.`);
 }
 
 function wording(request) {

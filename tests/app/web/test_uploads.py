@@ -31,6 +31,8 @@ def recordings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
     async def look(question: dict[str, Any], **_options: object) -> dict[str, Any]:
         path = Path(question["path"])
+        if path.is_dir():
+            path = next(file for file in sorted(path.rglob("*")) if file.is_file())
         if path.read_bytes().startswith(b"good"):
             return {"kind": "fake recording", "scans": 3}
         raise SourceError("unknown format", where=str(path), remedy="Readable are: good ones.")
@@ -66,6 +68,65 @@ async def test_a_recording_is_kept_under_a_made_up_name_and_offered(recordings: 
         assert kept(recordings) == [place.name]
         offered = (await client.get("/api/sources", headers=BEARER)).json()["recordings"]
         assert offered == [{"uri": str(place), "name": "north stand.MCAP", "doc": "fake recording, uploaded"}]
+
+
+def folder_of(files: dict[str, bytes]) -> bytes:
+    """The body of an upload of several files."""
+    return (
+        json.dumps([[name, len(content)] for name, content in files.items()]).encode()
+        + b"\n"
+        + b"".join(files.values())
+    )
+
+
+async def send_many(client: httpx.AsyncClient, content: bytes, name: str = "drive 00") -> httpx.Response:
+    return await client.post(
+        "/api/uploads", params={"name": name, "many": True}, headers=FILE, content=content
+    )
+
+
+async def test_the_files_of_one_recording_are_kept_as_a_folder(recordings: Path) -> None:
+    scans = {f"velodyne/{k:06d}.bin": b"good" + bytes(k * 300_000) for k in range(12)}
+    files = {"calib.txt": b"good", "times.txt": b"", **scans}
+    async with running(Settings(folder=recordings.parent)) as (client, _):
+        answer = await send_many(client, folder_of(files))
+        assert answer.status_code == 201
+        told = answer.json()
+        place = Path(told["uri"])
+        assert (told["name"], told["kind"], place.parent) == ("drive 00", "fake recording", recordings)
+        assert kept(recordings) == [place.name]
+        found = {str(path.relative_to(place)): path for path in place.rglob("*") if path.is_file()}
+        assert {name: path.read_bytes() for name, path in found.items()} == files
+        offered = (await client.get("/api/sources", headers=BEARER)).json()["recordings"]
+        assert offered == [{"uri": str(place), "name": "drive 00", "doc": "fake recording, uploaded"}]
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (folder_of({"holiday.jpg": b"\xff\xd8", "more.jpg": b"\xff\xd8"}), "unknown format"),
+        (folder_of({"a/../../b": b"good"}), "cannot be used"),
+        (folder_of({"/etc/b": b"good"}), "cannot be used"),
+        (folder_of({"a\\b": b"good"}), "cannot be used"),
+        (folder_of({".ssh/keys": b"good"}), "cannot be used"),
+        (folder_of({"a/b/c/d/e": b"good"}), "cannot be used"),
+        (folder_of({"x" * 61: b"good"}), "cannot be used"),
+        (folder_of({}), "0 files"),
+        (b'[["a", 4], ["a", 4]]\ngoodgood', "the same name"),
+        (b'[["a", 4], ["a/b", 4]]\ngoodgood', "cannot be kept"),
+        (b'[["a", -4], ["b", 8]]\ngood', "cannot be read"),
+        (folder_of({"a": b"good"}) + b"more", "sizes of the files"),
+        (b"good", "cannot be read"),
+    ],
+)
+async def test_what_is_no_folder_of_a_recording_is_refused(
+    recordings: Path, content: bytes, words: str
+) -> None:
+    async with running(Settings(folder=recordings.parent)) as (client, _):
+        answer = await send_many(client, content)
+        assert answer.status_code in (422, 507)
+        assert words in answer.json()["error"]["what"]
+    assert kept(recordings) == []
 
 
 async def test_what_is_no_recording_is_refused_by_its_own_name(recordings: Path) -> None:

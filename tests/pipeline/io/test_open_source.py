@@ -74,3 +74,14 @@ def test_recordings_beside_scans_are_said_to_be_left_aside(tmp_path: Path, opene
     assert opened(tmp_path).description.warnings == (
         "not part of this run are run.bag: open each of them by its name",
     )
+
+
+def test_a_folder_with_one_recording_that_is_no_run_is_that_recording(tmp_path: Path):
+    capture = tmp_path / "run.pcap"
+    capture.write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(100))
+    (tmp_path / "calibration.xml").write_text("<boost/>")
+    with pytest.raises(SourceError) as of_file:
+        open_source(str(capture))
+    with pytest.raises(SourceError) as of_folder:
+        open_source(str(tmp_path))
+    assert str(of_folder.value) == str(of_file.value)
