@@ -37,6 +37,7 @@ _START = "import sys; from app.cli import main; sys.exit(main())"
 _MARK = "STEMMAP_CAMPAIGN"
 Edits = list[tuple[int, float]]  # numbers and x of acknowledged annotations
 SHORT_RUN = "sim:stand?duration=5"
+_OTHER_RUN = "sim:stand?duration=1"
 
 
 class Service:
@@ -166,6 +167,9 @@ class Service:
         """Return the trees of a run that is opened with the default parameters and played to its end."""
         self.ask("POST", "/api/parameters/preset", {"name": "forest"})
         self.ask("POST", "/api/loop", {"from_s": None, "to_s": None})
+        # If the run is open already, its status is "finished" until the worker opens it again.
+        self.ask("POST", "/api/open", {"uri": _OTHER_RUN})
+        self.until(lambda: self.status().get("source") == _OTHER_RUN, "opened another run", _PATIENCE_S)
         self.ask("POST", "/api/open", {"uri": uri})
         self.ask("POST", "/api/command", {"type": "set_speed", "factor": 0.0})
         ended: dict[str, Any] = {}
