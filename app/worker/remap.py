@@ -304,6 +304,16 @@ class RunMap:
                 self.frames.forget_from(index)
         return changes
 
+    def return_to(self, parameters: Parameters) -> bool:
+        """Return to the state before the current scan, and use these parameters from there on. Return whether
+        all earlier scans have them too, so that the map is that of a rerun; False leaves the map unusable."""
+        self.use(parameters, self.before.path_length)
+        if not self.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
+            return False
+        self.mapper.parameters = parameters
+        self.mapper.restore(self.before)
+        return True
+
     def close(self) -> None:
         """Delete the stored states and frames."""
         self.snapshots.close()

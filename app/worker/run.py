@@ -101,6 +101,7 @@ class Run:
         self._newest_ns = -1  # of the scans that were asked for a view
         self._view_selection = ViewSelection()
         self._remapping: Remapping | None = None
+        self._previous: RunMap | None = None  # the map before the last change of parameters, for undo
 
     def _new_map(self, mapper: Mapper) -> RunMap:
         """Return an empty map of a mapper before its first scan."""
@@ -265,8 +266,9 @@ class Run:
         return taken
 
     def remap(self, parameters: Parameters, on_preview: Callable[[Trees], None]) -> None:
-        """Begin to map the run again from its first scan, in place of a rerun that is not complete. Nothing
-        begins if the map would not change. `remap_next` does the work.
+        """Begin to map the run again from its first scan, in place of a rerun that is not complete. The map
+        before the last change is continued if it has these parameters, as after an undo. Nothing begins if
+        the map would not change. `remap_next` does the work.
 
         Args:
             parameters: Parameters of all scans.
@@ -276,13 +278,20 @@ class Run:
         self.cancel_remapping()
         if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
             return
-        mapper = self._make_mapper(parameters)
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
-        reread = None if self._is_live else self._cursor.again
-        rerun = Rerun(mapper, self._caches.of(parameters), reread, segment_ahead)
-        self._remapping = Remapping(
-            rerun, self._new_map(mapper), self._preview_steps(parameters, mapper, on_preview)
-        )
+        reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
+        previous, self._previous = self._previous, None
+        if previous is not None and previous.return_to(parameters):
+            done = previous.before.path_length
+            rerun = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
+            self._remapping = Remapping(rerun, previous, (None for _ in ()))
+            return
+        if previous is not None:
+            previous.close()
+        mapper = self._make_mapper(parameters)
+        rerun = Rerun(mapper, cache, reread, segment_ahead)
+        preview = self._preview_steps(parameters, mapper, on_preview)
+        self._remapping = Remapping(rerun, self._new_map(mapper), preview)
 
     def _preview_steps(
         self, parameters: Parameters, mapper: Mapper, on_preview: Callable[[Trees], None]
@@ -356,7 +365,7 @@ class Run:
             raise
         if not finished:
             return None
-        self._map.close()
+        self._previous = self._map
         self._remapping, self._map = None, remapping.finish()
         self._cache = self._caches.of(self._map.parameters.at(self.current))
         frame = self._map_step(self._step, new_map=True)
@@ -430,6 +439,8 @@ class Run:
         """Cancel a rerun, close the source and the scan caches, and delete the stored frames and steps."""
         self.cancel_remapping()
         self._map.close()
+        if self._previous is not None:
+            self._previous.close()
         self._caches.close()
         self._cursor.close()
         self.source.close()

@@ -170,10 +170,11 @@ class Rerun:
     """Maps the scans of a run in turn. The map is the same as that of a first run with the same parameters.
 
     Args:
-        mapper: A fresh mapper with the new parameters.
+        mapper: A mapper with the new parameters, after `done` scans.
         cache: Cache for scans that are segmented with these parameters; missing scans are added to it.
         reread: Returns the steps of the run from the one with an index on; None for a live run.
         segment_steps: Segments the scans that are read again: in turn, or ahead of the mapping.
+        done: Number of scans that the mapper has mapped with these parameters.
 
     Attributes:
         done: Number of scans that are mapped.
@@ -185,10 +186,12 @@ class Rerun:
         cache: ScanCache,
         reread: Reread | None = None,
         segment_steps: SegmentSteps = segment_in_turn,
+        *,
+        done: int = 0,
     ) -> None:
         """Prepare a rerun; nothing is read."""
         self.mapper = mapper
-        self.done = 0
+        self.done = done
         self._cache, self._reread, self._segment_steps = cache, reread, segment_steps
         self._segmented: Iterator[tuple[Step, SegmentedScan]] | None = None
 

@@ -127,6 +127,26 @@ def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parame
             assert maps[id(wanted)] == (told(other.frame), told(other.path), since)
 
 
+@pytest.mark.parametrize("parameters", [FEWER, WIDER])
+def test_undo_and_redo_of_the_last_change_map_only_the_current_scan_again(session, parameters, monkeypatch):
+    mapped: list[int] = []
+    process = Mapper.process
+
+    def process_and_note(mapper: Mapper, step: Step, scan: SegmentedScan | None = None) -> Frame:
+        mapped.append(step.index)
+        return process(mapper, step, scan)
+
+    session.set_parameters(parameters, 1, whole=True)
+    remapped(session)
+    monkeypatch.setattr(Mapper, "process", process_and_note)
+    for revision, wanted in enumerate([BASE, parameters, BASE], 2):
+        mapped.clear()
+        session.set_parameters(wanted, revision, whole=True)
+        frame, _ = remapped(session)
+        assert set(mapped) == {frame.index}
+        assert (told(frame), told(session.path)) == mapped_with(wanted, frame.index)
+
+
 def places(frame: Frame) -> dict[int, tuple[float, float]]:
     """Where the confirmed trees stand, by their numbers."""
     rows = np.flatnonzero(frame.trees.confirmed)
