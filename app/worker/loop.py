@@ -444,7 +444,7 @@ def answer(session: Session, recent: RecentScans, question: protocol.Question, r
     """
     try:
         if question.run != run:
-            raise StemmapError("the run was left")
+            raise StemmapError("another run was opened")
         return _answer(session, recent, question)
     except StemmapError as error:
         return protocol.Answer(question.ticket, missing=str(error))

@@ -16,7 +16,7 @@ def test_single_keys_are_switched_off(dashboard: Dashboard):
     page = dashboard.page
     measure = page.locator("#map-measure")
     page.locator("body").press("?")
-    page.get_by_label("Keys without Ctrl").uncheck()
+    page.get_by_label("Keyboard shortcuts without Ctrl").uncheck()
     page.keyboard.press("Escape")
     page.locator("body").press("m")
     expect(measure).to_have_attribute("aria-pressed", "false")
@@ -24,7 +24,7 @@ def test_single_keys_are_switched_off(dashboard: Dashboard):
     expect(page.locator("#palette")).to_be_visible()
     page.keyboard.press("Escape")
     page.locator("#keys-button").click()
-    page.get_by_label("Keys without Ctrl").check()
+    page.get_by_label("Keyboard shortcuts without Ctrl").check()
     page.keyboard.press("Escape")
     page.locator("body").press("m")
     expect(measure).to_have_attribute("aria-pressed", "true")

@@ -138,7 +138,7 @@ async def use_learned(learning: Trainer, dashboard: Dash) -> Response:
     progress of the training. 409 if there are none."""
     learned = learning.learned
     if learned is None:
-        raise StemmapError("no decision trees were grown", remedy="Grow them first")
+        raise StemmapError("no decision trees were trained", remedy="Train them first")
     await dashboard.change_parameters({"classification.forest": learned["name"]})
     return json_reply(learning.as_plain())
 

@@ -267,7 +267,7 @@ export function truthText() {
   const number = rows().length;
   return {
     source: `Scored against the ground truth of this run${number ? "; annotations do not count" : ""}.`,
-    annotations: reviewProgress() ? `Scored against the annotations; ${reviewProgress()}. The other figures follow when all are.` : "Scored against the annotations.",
+    annotations: reviewProgress() ? `Scored against the annotations; ${reviewProgress()}. The other scores are shown once all found trees are reviewed.` : "Scored against the annotations.",
     both: `Scored against the ground truth of this run, corrected by ${count(number, "annotation")}.`,
   }[state.annotations?.used] ?? "";
 }

@@ -159,7 +159,7 @@ function hint() {
   return `Trees of the map at the shown time.${trees} ± is the standard error: 0 where all of a plot was observed; of the mean, by the variation between plots.`;
 }
 
-const NO_ERROR = " ± 0 of N/ha: all of the area was observed, no diameter is near the minimum, and every tree in view counts as found; trees that were missed are not in it.";
+const NO_ERROR = " ± 0 of N/ha: all of the area was observed, no diameter is near the minimum, and every tree in view counts as found; missed trees are not included.";
 
 // Which of the figures with and without correction to use, as `stemmap stand` prints it, and what an error of 0 means.
 function detectionText() {

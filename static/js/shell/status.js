@@ -25,7 +25,7 @@ const FIGURES = {
   behind: ["scans behind", "", (s) => [String(s.scans_behind), s.scans_behind > 20 ? "warn" : ""], "minor"],
   driven: ["driven", "m", (s) => [figure(s.distance_m)]],
   sigma: ["pose sigma", "cm", (s) => [state.map && TESTED.includes(s.health) ? figure(100 * state.map.sigma_xy) : NONE], "minor"],
-  f1: ["F1 to truth", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
+  f1: ["F1 of the map", "", () => [state.evaluation && !reviewProgress() ? figure(state.evaluation.f1) : NONE, state.evaluation?.warning ? "warn" : "", ofScan()]],
 };
 const OF_DRIVES = ["health", "rate", "mapping", "behind", "driven", "sigma"];
 const cells = {};
@@ -48,7 +48,7 @@ function ofScan() {
   if (reviewProgress()) return `F1: ${reviewProgress()}`;
   if (state.evaluation?.warning) return "F1 doubtful, see Scores";
   const { right, wrong } = state.map ?? {};
-  return right === null || right === undefined ? "F1 to truth" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
+  return right === null || right === undefined ? "F1 of the map" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
 }
 
 // Explanations of the first states.
@@ -168,7 +168,7 @@ function compilingFor({ compiling_since_s: since, compiled }) {
   compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
-  const done = compiled < 1 ? `. ${Math.floor(100 * compiled)} % of the kernels are compiled` : "";
+  const done = compiled < 1 ? `. ${Math.floor(100 * compiled)} % are done` : "";
   return passed >= 10 ? `${done}. ${passed} s so far; a slow or busy machine takes longer.` : done && `${done}.`;
 }
 

@@ -90,7 +90,7 @@ def test_the_worker_answers_with_pictures_without_raw_points():
     answers = {message.ticket: message for message in said if isinstance(message, Answer)}
     assert [(len(f.raw), f.index) for f in answers[1].frames or []] == [(0, 1)]
     assert "slam.particles" in answers[2].missing
-    assert "the run was left" in answers[3].missing
+    assert "another run was opened" in answers[3].missing
 
 
 def test_a_block_is_read_as_it_was_packed():

@@ -429,7 +429,7 @@ def test_who_asks_is_answered_and_the_run_goes_on_as_it_did() -> None:
     assert set(answers) == {1, 2, 3}
     assert "tree 9 is not known" in answers[1].missing
     assert "shown too long ago" in answers[2].missing  # nothing was sent to anybody
-    assert "the run was left" in answers[3].missing
+    assert "another run was opened" in answers[3].missing
     assert all(answer.tree is None and answer.cluster is None for answer in answers.values())
 
 
