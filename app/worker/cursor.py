@@ -29,18 +29,19 @@ MOST_STEP_BYTES = 4 << 30  # of the steps of a source; a scan of 30,000 points t
 
 
 class StepStore:
-    """The steps of a source."""
+    """The steps of a source in a temporary file of at most MOST_STEP_BYTES."""
 
     def __init__(self) -> None:
         self._blocks = BlockFile(MOST_STEP_BYTES)
 
     def put(self, step: Step) -> None:
-        """Store a step, unless one of its index is stored or no more can be stored."""
+        """Store a step, unless one of its index is stored. Nothing is raised if the file or the disk is
+        full."""
         if step.index not in self._blocks:
             self._blocks.put_block(step.index, record_bytes(step))
 
     def read(self, index: int) -> Step | None:
-        """Return the step with an index; None if it is not stored."""
+        """Return the step with an index; None if it is not stored or damaged."""
         return self._blocks.read_block(index, lambda block: record_of(Step, block))
 
     def close(self) -> None:
@@ -75,19 +76,21 @@ class Cursor:
         return len(self._stamps)
 
     def stamp_ns(self, index: int) -> int:
-        """Return the time of a step that was taken before [ns]; IndexError for other steps."""
+        """Return the time [ns] of a step that was taken before; IndexError for an index of `known` or
+        more."""
         return self._stamps[index]
 
     def index_at(self, stamp_ns: int) -> int | None:
         """Return the index of the last step not later than a time [ns], or 0 if all steps are later; None if
-        the time may belong to a step that was not taken yet."""
+        the time is later than the last step that was taken, or none was taken."""
         if not self._stamps or stamp_ns > self._stamps[-1]:
             return None
         return max(0, bisect_right(self._stamps, stamp_ns) - 1)
 
     def peek(self) -> Step | None:
         """Return the next step without advancing; None at the end of the run, or before a live step arrived.
-        After an error, every call raises it again until `go_to`.
+        A step that is read from the source is stored. After any error, every call raises it again until
+        `go_to`.
 
         Raises:
             SourceError: Nothing more can be read, or the source gives other steps than before.
@@ -99,7 +102,8 @@ class Cursor:
         return self._ahead
 
     def take(self) -> Step | None:
-        """Return the next step and advance; results and errors as `peek`."""
+        """Return the next step and advance; results and errors as `peek`. A step that is taken for the first
+        time counts as `known`."""
         step = self.peek()
         if step is None:
             return None
@@ -121,12 +125,13 @@ class Cursor:
         self._ahead, self._failure, self._next = None, None, index
 
     def stored(self, index: int) -> Step | None:
-        """Return a step that was read before; None if it is not stored."""
+        """Return a step that was read before; None if it is not stored, and for a live source."""
         return None if self._store is None else self._store.read(index)
 
     def again(self, index: int) -> Iterator[Step]:
-        """Yield the steps from an index on, from the store or else by reading the source from its start. The
-        position does not change.
+        """Yield the steps from an index on: stored ones, and from the first that is not stored all others by
+        reading the source from its start. These are neither stored nor compared with the steps read before.
+        The position does not change.
 
         Raises:
             SourceError: The source cannot be read.
@@ -139,7 +144,7 @@ class Cursor:
             yield step
 
     def close(self) -> None:
-        """Delete the stored steps."""
+        """Delete the stored steps; the source stays open."""
         if self._store is not None:
             self._store.close()
 
@@ -166,7 +171,8 @@ class Cursor:
 
 
 def _fingerprint(step: Step) -> int:
-    """Return a hash of a step, by which a step that is read again is recognised."""
+    """Return a hash of a step, by which a step that is read again is recognised: of its time, number of
+    points, odometry, tilt and turn, not of its points."""
     scan = step.scan
     return hash((scan.stamp_ns, scan.points.shape[0], step.T_odom_base, step.roll, step.pitch, step.turn))
 
@@ -174,14 +180,14 @@ def _fingerprint(step: Step) -> int:
 def live_steps(
     source: LiveSource, chosen: ChosenOdometry, moving: Source, losses: Counter[str]
 ) -> Iterator[Step | None]:
-    """Yield the steps of a live robot as they arrive, and None while no message waits, without end. An
+    """Yield the steps of a live robot as they arrive, and None whenever no message waits, without end. An
     unreadable message raises SourceError.
 
     Args:
         source: The robot.
         chosen: Selected source of the motion.
         moving: The source with that motion, see `with_odometry`.
-        losses: Counts what the synchroniser leaves out, by reason.
+        losses: Increased in place by what the synchroniser leaves out, by reason.
     """
     override = moving if isinstance(moving, OdometryOverride) else None
     synchroniser = Synchroniser(use_odometry=chosen.steps != "static", losses=losses)

@@ -73,7 +73,7 @@ class CloudSource(FileSource):
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of points left out, by reason."""
+        """Number of points left out, by reason; not a copy."""
         return self.cloud.losses
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
@@ -184,8 +184,8 @@ class InventoryRun:
         """Do nothing: the kernels are compiled by the first inventory."""
 
     def map_next(self, *, hurried: bool = False) -> Frame | None:
-        """Compute the next step of the first inventory; return the frame of the complete map, else None. The
-        map is complete if `share` is None.
+        """Compute the next step of the first inventory. Return the frame of the map if this step completed
+        it; None before, and if the map was complete already.
 
         Raises:
             StemmapError: The cloud cannot be mapped.
@@ -198,8 +198,9 @@ class InventoryRun:
         return self.frame if self._advance() else None
 
     def use(self, parameters: Parameters, index: int) -> bool:
-        """Use other parameters. If they change the map, another inventory begins in place of one that is not
-        complete. Returns False, since no scan is to be mapped again."""
+        """Use other parameters. If there is no map yet, or they change it, another inventory begins in place
+        of one that is not complete. Returns False, since no scan is to be mapped again; `index` is
+        ignored."""
         del index
         self._parameters = parameters
         before, now = self._mapped_with.flat(), parameters.flat()

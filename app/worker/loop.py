@@ -63,7 +63,7 @@ class WorkerLoop:
     """Runs a session until the commands end.
 
     Args:
-        session: The session with the run.
+        session: The session with the run. Its `on_preview` is set, so that previews are sent as `Rough`.
         commands: Queue that another thread fills; None ends the loop.
         put: Queues a message to the web process; must not block.
         clock: Returns the time [s] from any origin.
@@ -117,7 +117,9 @@ class WorkerLoop:
                 self._execute(command)
 
     def _work(self) -> None:
-        """Do the next piece of work: a part of a rerun, live messages, the preparation, or a scan."""
+        """Do the next piece of work, the first of these that applies: a part of a rerun, if `_QUIET_S` passed
+        since the last command and no scan is due or `_SCANS_A_REMAP` scans were mapped; live messages, if no
+        live scan waits; the preparation, once for each run; a scan. Errors of the session pass through."""
         is_remapping = self._session.is_remapping and self._quiet_s() == 0.0
         if is_remapping and (self._mapped >= _SCANS_A_REMAP or self._due_in() != 0.0):
             self._mapped = 0
@@ -131,7 +133,9 @@ class WorkerLoop:
             self._map_next()
 
     def _map_next(self) -> None:
-        """Map the next scan and show it. Frames of a seek are shown at most every `_GLIMPSE_S`."""
+        """Map the next scan and show it, with a status when due. Frames of a seek are shown at most every
+        `_GLIMPSE_S`, and not at all while the sought scan is shown from stored results. Errors of the session
+        pass through."""
         session = self._session
         hurried = session.pace == "hurry"
         frame = session.work()
@@ -204,10 +208,15 @@ class WorkerLoop:
         return max(0.0, self._quiet_until - self._clock())
 
     def _due_in(self) -> float | None:
-        """Return the time until the next scan is due [s]: 0 if it is overdue, during a seek, and as long as
-        nothing is prepared; that until `_QUIET_S` after a command if a sought scan is shown from stored
-        results; the interval `_LISTEN_S` for a live run without a queued scan; None if only a command can
-        start work. An error of the source sets the state to "failed" and is reported."""
+        """Return the time until the next scan is due [s].
+
+        - 0 if it is overdue, during a seek, while nothing is prepared, and at the end of the run;
+        - the time left of `_QUIET_S` after a command, if a sought scan is shown from stored results;
+        - `_LISTEN_S` for a live run without a queued scan;
+        - None if only a command can start work.
+
+        An error of the source sets the state to "failed" and is reported.
+        """
         pace = self._session.pace
         if self._session.is_shown:
             return self._quiet_s()
@@ -242,14 +251,15 @@ class WorkerLoop:
 
     def _listen(self) -> None:
         """Process the messages of a live source while no scan is queued. The run is opened with the first
-        ones."""
+        ones. Raises SourceError if they cannot be read."""
         opened = self._session.listen()
         if opened is not None:
             self._send_opened(opened)
         self._report_when_due(self._clock())
 
     def _execute(self, command: protocol.Command | protocol.Begin) -> None:
-        """Execute a command and send the status. An error sets the state "failed"."""
+        """Execute a command and send the status. The next scan becomes the anchor of the replay clock. An
+        error sets the state "failed"."""
         self._replay.release()
         self._glimpse_at = self._long_way_at = self._clock() + _GLIMPSE_S
         self._quiet_until = self._clock() + _QUIET_S
@@ -257,7 +267,8 @@ class WorkerLoop:
         self._report()
 
     def _carry_out(self, command: protocol.Command | protocol.Begin) -> None:
-        """Execute a command; raises the errors of the session."""
+        """Execute a command and show the frame that it returns, if any. Errors of the session pass through,
+        and ParameterError for invalid values."""
         session = self._session
         match command:
             case protocol.Play():
@@ -280,8 +291,9 @@ class WorkerLoop:
                 self._begin(command)
 
     def _open(self, command: protocol.Open) -> None:
-        """Open a source as the next run, and send `Opened` once it is open. A live source is opened by its
-        first messages, see `_listen`."""
+        """Open a source as the next run: send the status "starting" before, and `Opened` once it is open. A
+        live source is opened by its first messages, see `_listen`. Raises SourceError if it cannot be
+        read."""
         self._run, self._requested = self._run + 1, command.uri
         opening = f"Opening {command.uri}"
         self._put(protocol.Report(protocol.Status(state="starting", detail=opening, source=command.uri)))
@@ -311,8 +323,9 @@ class WorkerLoop:
         self._put(msgspec.structs.replace(opened, run=self._run, requested=self._requested))
 
     def _begin(self, command: protocol.Begin) -> None:
-        """Set the parameters and play or show the first scan; ignored for another run. If a person has paused
-        or an error occurred since the opening, only the parameters are set."""
+        """Set the parameters of the open run and show its scan, if it has one; then play, or seek the first
+        scan. Nothing for another run. If a person has paused or an error occurred since the opening, only the
+        parameters are set. Raises ParameterError for invalid values."""
         if command.run != self._run:  # another run was opened since
             return
         self._show(self._session.set_parameters(validated(command.values), command.revision))
@@ -324,7 +337,9 @@ class WorkerLoop:
             self._session.advance(1)
 
     def _prepare(self) -> None:
-        """Compile kernels before the first scan. At opening, the parameters are not known yet."""
+        """Compile kernels before the first scan, once for each run, also after an error; the status is sent
+        before and after. This is not done at opening, when the parameters are not known. Raises SourceError
+        if there is no scan or it cannot be read."""
         self._send_status(self._preparing(), self._clock())
         self._prepared = True
         self._session.prepare()
@@ -455,7 +470,8 @@ def answer(session: Session, recent: RecentScans, question: protocol.Question, r
 
 
 def _answer(session: Session, recent: RecentScans, question: protocol.Question) -> protocol.Answer:
-    """Return the answer to a question; raises StemmapError if there is none. Arguments as in `answer`."""
+    """Return the answer to a question; raises StemmapError if there is none, or if values of parameters are
+    invalid. Arguments as in `answer`."""
     ticket, run = question.ticket, session.run
     match question:
         case protocol.AskCompare(sets=sets):
@@ -502,7 +518,8 @@ class ReplayClock:
 
     @property
     def speed(self) -> float:
-        """Factor of real time, at least `SLOWEST`; 0 is the maximum speed."""
+        """Factor of real time, at least `SLOWEST`, to which smaller values are raised; 0 is the maximum
+        speed. Call `release` after a change."""
         return self._speed
 
     @speed.setter

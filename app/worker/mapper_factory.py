@@ -12,7 +12,7 @@ from pipeline.mapper import Mapper
 def mapper_of(
     source: SourceDescription, parameters: Parameters, seed: int, timer: StageTimer = no_timer
 ) -> Mapper:
-    """Return a mapper before the first scan of a source.
+    """Return a mapper before the first scan of a source, with the forests that are kept on this machine.
 
     Args:
         source: Description with the sensor and its extrinsics.

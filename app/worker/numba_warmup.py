@@ -46,7 +46,8 @@ def compile_ahead() -> None:
 
 
 def is_compiled() -> bool:
-    """Return whether the kernels of both programs are cached for the current sources."""
+    """Return whether the kernels of both programs are cached for the current sources, by the kernel that each
+    program compiles last."""
     from pipeline.jit import is_kept
     from pipeline.tracking.track_classification import classify, nearest_other
 
@@ -54,7 +55,8 @@ def is_compiled() -> bool:
 
 
 def compiled_share() -> float:
-    """Return the share of the kernels of both programs that are cached for the current sources, 0 to 1."""
+    """Return the share of the kernels of both programs that are cached for the current sources, 0 to 1. It is
+    an estimate: the number of cached kernels divided by `_KERNELS`."""
     from pipeline.jit import count_kept
 
     return min(1.0, count_kept() / _KERNELS)
@@ -71,8 +73,8 @@ def _start(program: str) -> BlockingChildProcess:
 
 
 def _compile() -> None:
-    """Run both programs in processes of their own and wait for them, at most PATIENCE_S; then they are
-    ended."""
+    """Run both programs in processes of their own and wait for them, at most PATIENCE_S; then they are ended.
+    Their errors are ignored. The functions of `on_compiling` are called meanwhile."""
     from pipeline.jit import others_compile
 
     with contextlib.ExitStack() as stack:
@@ -91,7 +93,8 @@ def _one_at_a_time() -> Iterator[None]:
     """Hold the lock with which only one process of a user compiles at a time; the next one then finds the
     cache.
 
-    Without a folder for the lock, or without file locks on this system, no process waits.
+    A process that waited for PATIENCE_S continues without the lock. Without a folder for the lock, or without
+    file locks on this system, no process waits.
     """
     from pipeline.jit import others_compile
 

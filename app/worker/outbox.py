@@ -72,7 +72,7 @@ class Outbox:
             self._changed.notify()
 
     def close(self, timeout_s: float = 0.3) -> None:
-        """Send the waiting messages and end the thread.
+        """Send the waiting messages and end the thread. What the reader does not take in time is not sent.
 
         Args:
             timeout_s: Maximum time to wait for the thread [s].
@@ -93,8 +93,8 @@ class Outbox:
             return  # the web process is gone; the reader of commands ends the worker
 
     def _packed(self, message: FromWorker) -> list[bytes]:
-        """Return the encoded message; if it cannot be encoded, the encoded status with a warning, or nothing
-        before the first status."""
+        """Return the encoded message; if it is too large or has an array that cannot be sent, the last status
+        with a warning, encoded, or nothing before the first status."""
         try:
             return [self._codec.encode(self._made_ready(message))]
         except WireError as error:
@@ -104,8 +104,8 @@ class Outbox:
             return [] if self._report is None else [self._codec.encode(self._with_refusal(self._report))]
 
     def _made_ready(self, message: FromWorker) -> FromWorker:
-        """Return a message as it is sent: a frame with only what was not sent before, a status with its
-        warning."""
+        """Return a message as it is sent: a frame with only what was not sent before, a status with the
+        warning about dropped messages. A frame is stored in `recent`; `Opened` clears the warning."""
         if isinstance(message, Shown):
             self._sent_at = time.monotonic()
             self._recent.keep(message.run, message.frame)

@@ -49,8 +49,8 @@ def new_session() -> Session:
 
 
 def open_any_or_cloud(uri: str, options: SourceOptions) -> Source | LiveSource:
-    """Open a source by its URI: a whole cloud to be mapped as a whole, else as `open_any`. A drive through a
-    cloud has the URI sim:cloud?file=PATH.
+    """Open a source by its URI: a file with a whole cloud to be mapped as a whole, for which the options are
+    ignored; else as `open_any`. A drive through a cloud has the URI sim:cloud?file=PATH.
 
     Raises:
         SourceError: The source does not exist, has an unknown format, or is damaged.
@@ -63,10 +63,11 @@ def open_any_or_cloud(uri: str, options: SourceOptions) -> Source | LiveSource:
 
 
 def work(session: Session, incoming: BinaryIO, outgoing: BinaryIO) -> None:
-    """Execute the commands of a stream with a session until the stream ends.
+    """Execute the commands of a stream with a session until the stream ends or has a damaged message, and
+    send the waiting messages. The process ends if the loop does not end soon after the stream, see `_read`.
 
     Args:
-        session: The session.
+        session: The session; it is closed.
         incoming: Stream of encoded commands.
         outgoing: Stream for encoded messages.
     """
@@ -94,8 +95,9 @@ def _notify_compilation() -> None:
 def _read(
     incoming: BinaryIO, commands: queue.Queue[ToWorker | None], finished: threading.Event, session: Session
 ) -> None:
-    """Read commands into the queue until the stream ends; then queue None, finish a recording, and end the
-    process if the loop does not end within the grace period. Runs in a thread.
+    """Read commands into the queue until the stream ends or has a damaged message, which is printed; then
+    queue None, finish a recording, and end the process if the loop does not end within the grace period. Runs
+    in a thread.
 
     Args:
         incoming: Stream of encoded commands.

@@ -117,7 +117,7 @@ class FrameStore:
 
     def read(self, index: int) -> Shown | None:
         """Return the results of a scan without points, with the path up to it and the run number 0; None if
-        they are not stored."""
+        they are not stored or damaged."""
         scan = self._read(index)
         path = None if scan is None else self._path_at(index)
         if scan is None or path is None:
@@ -203,7 +203,8 @@ class ScanCounts:
             self._warnings[index] = tuple(frame.warnings)
 
     def totals(self, index: int, warnings: Sequence[str], losses: Mapping[str, int]) -> RunCounts:
-        """Return the totals up to a scan.
+        """Return the totals up to a scan that was recorded. `health` has all states, `verdicts` and `losses`
+        only what was counted; `covered` is None. At most 200 different warnings are returned.
 
         Args:
             index: Index of the scan.
@@ -479,7 +480,7 @@ class ParameterHistory:
         self._sets = [parameters]
 
     def at(self, index: int) -> Parameters:
-        """Return the parameters with which the scan with this index was or will be mapped."""
+        """Return the parameters with which the scan with this index (0 or more) was or will be mapped."""
         return self._sets[bisect_right(self._starts, index) - 1]
 
     def apply_to_all(self, parameters: Parameters, aside: set[str]) -> bool:
@@ -521,7 +522,8 @@ def segment_ahead(
     """Yield each step with its segmented scan, in order.
 
     The caller's thread reads the steps; other threads segment up to `AHEAD` scans ahead. An exception of
-    `segment` is raised when its scan is due. If the caller stops early, scans that are not begun are dropped.
+    `segment` is raised when its scan is due, one of `steps` when it is read. If the caller stops early, scans
+    that are not begun are dropped.
     """
     waiting: deque[tuple[Step, Future[SegmentedScan]]] = deque()
     pool = ThreadPoolExecutor(threads, thread_name_prefix="segment")
@@ -549,6 +551,9 @@ def changes_between(
 ) -> MapChanges:
     """Return the differences between the confirmed trees of two maps of the same scans. Trees within SAME are
     the same one; it has moved if its positions differ by more than MOVED.
+
+    `changes` has the trees that appeared, then those that vanished, then those that moved. `ghost` has the
+    confirmed trees of the old map. Positions and diameters are rounded to 1 mm.
 
     Args:
         before: Last scan in the old map.
@@ -627,7 +632,8 @@ def _why_not(frame: Frame, place: Float) -> str:
 
 
 def _column(columns: Columns, row: int) -> str:
-    """Return the verdict of a column as text, with its share of votes for a tree; "" for a tree."""
+    """Return the verdict of a column as text, with its share of votes for a tree unless it has too few points
+    or moves; "" for a tree."""
     verdict = Verdict(int(columns.verdict[row]))
     if verdict is Verdict.TREE:
         return ""
@@ -638,8 +644,8 @@ def _column(columns: Columns, row: int) -> str:
 
 
 def _nearest(places: Float, place: Float) -> int:
-    """Return the row of the nearest of some positions, shape (K, 2), to a position, shape (2,); -1 if none is
-    within SAME."""
+    """Return the row of the nearest of some positions, shape (K, 2), to a position, shape (2,), the first of
+    equals; -1 if none is within SAME."""
     if not len(places):
         return -1
     distance = np.hypot(*(places - place).T)

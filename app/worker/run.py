@@ -168,7 +168,11 @@ class Run:
 
     def map_again(self) -> Frame | None:
         """Map the current scan again, from the state before it and with the parameters in force for it, and
-        return its result; None without a scan, or after an error or a step back that is not complete."""
+        return its result; None without a scan, or after an error or a step back that is not complete.
+
+        Raises:
+            StemmapError: The scan cannot be mapped; the mapper is broken until `approach`.
+        """
         if self._step is None or self._broken:
             return None
         self._map.mapper.restore(self._map.before)
@@ -240,7 +244,8 @@ class Run:
         return msgspec.structs.replace(shown, frame=frame, confirmed_s=confirmed_s)
 
     def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> Frame:
-        """Return the result of a step, and cache its segmented scan.
+        """Return the result of a step, cache its segmented scan, and add its view if one is due (see
+        `take_views`).
 
         Args:
             mapper: The mapper.
@@ -373,7 +378,7 @@ class Run:
         return frame, {number: at for number, at in confirmed_s.items() if number is not None}
 
     def parameters_at(self, index: int) -> Parameters:
-        """Return the parameters with which the scan with this index was or will be mapped."""
+        """Return the parameters with which the scan with this index (0 or more) was or will be mapped."""
         return self._map.parameters.at(index)
 
     def prepare(self) -> None:
@@ -398,7 +403,7 @@ class Run:
         return self._cursor.index_at(stamp_ns)
 
     def stamp_ns(self, index: int) -> int:
-        """Return the time of a scan that was read before [ns]."""
+        """Return the time of a scan that was read before [ns]; IndexError for another one."""
         return self._cursor.stamp_ns(index)
 
     @property

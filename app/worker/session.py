@@ -358,7 +358,10 @@ class Session:
 
         Returns:
             The current scan, mapped again; None if the run plays, has failed or has no scan yet, and during a
-                seek.
+            seek.
+
+        Raises:
+            StemmapError: The current scan cannot be mapped again.
         """
         self._parameters, self._revision = parameters, revision
         self._comparison.begin(step)
@@ -591,7 +594,7 @@ class SeekTarget:
 
     @property
     def index(self) -> int | None:
-        """Index of the sought scan; None if a time is sought."""
+        """Index of the sought scan; None if a time or nothing is sought."""
         return self._index
 
     def to_scan(self, index: int) -> None:
@@ -629,7 +632,7 @@ class SeekTarget:
 
     def is_at_end(self, run: AnyRun) -> bool:
         """Return whether the run has reached the sought scan; False without one. For a time, the following
-        scan must be known."""
+        scan must be known; SourceError if it cannot be read."""
         if self._index is not None:
             return run.current >= self._index
         if self._stamp_ns is None or run.current < 0:

@@ -60,12 +60,13 @@ class TreeNumbers:
         self._name(ended)
 
     def known(self, number: int) -> int | None:
-        """Return the number of a tree by its number in the present map; None for a tree that was never
-        numbered."""
+        """Return the number of a tree by its number in the present map, which is the same in the first map;
+        None for a tree of another map that was never numbered."""
         return number if self._number_of is None else self._number_of.get(number)
 
     def in_map(self, number: int) -> int | None:
-        """Return the number of a tree in the present map; None if the map has no such tree."""
+        """Return the number of a tree in the present map; None if the map has no such tree. In the first map
+        it is `number` itself, which is not checked."""
         if self._number_of is None:
             return number
         return next((in_map for in_map, known in self._number_of.items() if known == number), None)
