@@ -141,9 +141,10 @@ def loop_to(
     run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
     """Return the loop from the scan at which known trees were left to the newest scan, at which they are
-    found again; its anchor is the nearest scan to the found pose, up to the one at which they were left. None
-    if they were seen until the map last changed, if the error is too small and no earlier loop contradicts
-    the map, or if it is larger than the drift of the path can be.
+    found again; its anchor is the nearest scan to the found pose, up to the one at which they were left. The
+    trees count as left at `placed` or `closed` of the run at the earliest. None if they were left at
+    `last_mapped` or later, if the error of the position is below LEAST_GAP and the run is not `contradicted`,
+    or if the error is larger than the drift of the path can be.
 
     Args:
         run: Path and map; unchanged.
@@ -153,6 +154,9 @@ def loop_to(
         last_mapped: Last scan that changed the map.
         spread: Covariance of the pose, shape (3, 3); None uses the drift of the odometry since the trees were
             left.
+
+    Raises:
+        LinAlgError: The sum of the covariances is singular.
     """
     trees, path = run.trees, run.path
     rows = np.flatnonzero(np.isin(trees.number, numbers))

@@ -497,8 +497,8 @@ def find_constellation(
     local: MapStems, reference: MapStems, parameters: Relocalisation, *, hypotheses: int = 300_000
 ) -> Match:
     """Return the pose of local stems in a reference map, without an initial pose, or the reason of a refusal.
-    Stems whose position or sigma is not finite are ignored; either side may be empty.
-
+    Stems whose position or sigma is not finite are ignored; either side may be empty. The rows of the result
+    refer to the tables as given; they are filled for a refused pose as well, and empty if no pose is found.
     Args:
         local: Stems in their own frame, for example of the map since the robot was lost.
         reference: Stems in the frame of the map.

@@ -80,7 +80,7 @@ class FastSlam:
         self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
     ) -> PoseEstimate:
         """Predict the particles by the odometry, weigh them by the detections, and resample when it is due;
-        replaces `state`.
+        replaces `state`, and changes the arrays of the former state in place.
 
         Detections are used in the first scan (index 0), after `update_distance`, when the motion is due, and
         when trees contradict the odometry or the last used scan was strange. In other scans the particles
@@ -96,7 +96,8 @@ class FastSlam:
 
         Returns:
             Pose after the scan with its health. `landmarks` contains only those of the best particle with
-            `hits_to_weigh` hits.
+            `hits_to_weigh` hits. `landmark_of` is the birth number of the landmark of each detection, -1 for
+            none; after a used scan each detection has one.
         """
         p = self.parameters
         noise, offset = draws(self.seed, index, p.particles)
@@ -312,7 +313,8 @@ class FastSlam:
 
     @property
     def is_led_by_trees(self) -> bool:
-        """Whether trees determined the motion in the last scan with a doubted odometry."""
+        """Whether `RunningStatistics.led` is above 0: trees determined the motion in the last scan with a
+        doubted odometry, and fewer than `led` scans without doubt followed."""
         return self.state.recent.led > 0
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:

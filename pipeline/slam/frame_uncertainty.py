@@ -67,7 +67,8 @@ class FrameUncertainty:
         With landmarks of reference poses in reach, the result is `at_least(spread, C)`, where C is the mean
         of the covariances of their reference poses, transported to the pose and weighted by the numbers of
         landmarks. Otherwise it is `spread` plus the transported `hidden`. Landmarks that precede all
-        reference poses do not count.
+        reference poses do not count. In the state after it, `hidden` is the result less `spread`, and `at` is
+        the pose.
 
         Args:
             pose: x, y [m], yaw [rad], shape (3,).
@@ -100,7 +101,8 @@ class FrameUncertainty:
         """Return the covariance of a pose that another source measures, shape (3, 3), and the state after it.
 
         The result is `at_least(spread, least)`, or `by_landmarks` if its position variance is smaller: with
-        two independent ways to find the pose, it is known at least as well as by the better one.
+        two independent ways to find the pose, it is known at least as well as by the better one. In the state
+        after it, `hidden` is the result less `spread`; `at` is unchanged.
 
         Args:
             spread: Covariance of the particles, shape (3, 3).

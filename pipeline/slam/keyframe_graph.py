@@ -87,8 +87,8 @@ class ScanDetections:
 
 
 def combined(scans: Sequence[ScanDetections | Keyframe], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
-    """Return the weighted means of detections of the same landmark over several scans.
-
+    """Return the means of detections of the same landmark over several scans, weighted by the inverse traces
+    of their covariances.
     Of more than STEMS_MAX landmarks those with the smallest value of a hash are taken. All keyframes use the
     same hash, so that a stem which one keyframe takes is taken by the others as well, as far as they see it
     (bottom-k sampling; Broder 1997), near and far.
@@ -183,8 +183,8 @@ class KeyframeGraph:
 
     def with_keyframe(self, keyframe: Keyframe, pose: Float) -> KeyframeGraph:
         """Return the graph with one more keyframe, at a pose x, y [m], yaw [rad] by the filter, shape (3,).
-        It replaces the newest keyframe if that has the same scan. With more than KEYFRAMES_MAX keyframes the
-        result is thinned."""
+        It replaces the newest keyframe if that has the same scan. `revisits` grows by 1 if the keyframe is a
+        revisit. With more than KEYFRAMES_MAX keyframes the result is thinned."""
         kept = len(self.keyframes) - (self.newest_scan == keyframe.scan)
         graph = replace(
             self,
@@ -311,6 +311,9 @@ class KeyframeGraph:
         Args:
             new_loop: Whether the last loop was just added. The Cauchy kernel has no slope far from the
                 minimum, so the problem is first solved with the full weight of this loop.
+
+        Raises:
+            LinAlgError: The covariance of a detection, a motion or a loop is not positive definite.
         """
         if len(self.keyframes) < 2:
             return None
@@ -348,7 +351,11 @@ class _Problem:
 
     def __init__(self, graph: KeyframeGraph) -> None:
         """Convert a graph with at least two keyframes. Stems with a single detection are omitted, and so are
-        motions with infinite covariance."""
+        motions with infinite covariance.
+
+        Raises:
+            LinAlgError: A covariance is not positive definite.
+        """
         keyframes = graph.keyframes
         birth = np.concatenate([k.birth for k in keyframes])
         row = np.repeat(np.arange(len(keyframes)), [len(k.birth) for k in keyframes])

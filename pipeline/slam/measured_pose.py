@@ -95,8 +95,8 @@ class SharedErrors:
 
     @classmethod
     def begun_at(cls, particles: int, pose: Float, covariance: Float) -> SharedErrors:
-        """Return the estimates before the first measured pose: errors N(0, I), independent of the pose.
-
+        """Return the estimates before the first measured pose: errors N(0, I), independent of the pose, and
+        no `by_trees`.
         Args:
             particles: Number of particles.
             pose: Estimated pose, shape (3,).
@@ -232,7 +232,8 @@ def update_shared_errors(x: Float, measured: MeasuredPose, p: int) -> None:
 
     Args:
         x: Poses of the particles after sampling, shape (P, 3).
-        measured: The measured pose; row p of its `mean` and `covariance` is changed.
+        measured: The measured pose, with shared errors (P > 0); row p of its `mean` and `covariance` is
+            changed.
         p: Row of the particle.
     """
     y, S = measured.z.copy(), measured.own.copy()

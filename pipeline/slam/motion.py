@@ -183,8 +183,8 @@ def accumulated(
 
     Returns:
         Motion, shape (3,); its covariance, shape (3, 3); and the distance that the step counts towards
-        `update_distance` [m], with TURN_AS_DISTANCE per radian. None if the step is zero and brings neither
-        slack nor a measured pose.
+        `update_distance` [m], with TURN_AS_DISTANCE per radian; at least `update_distance` for a step with
+        slack, distrust or a measured pose. None if the step is zero and has none of these.
     """
     step = motion.step
     news = motion.measured is not None
@@ -225,6 +225,7 @@ def advanced(
 
     Returns:
         Whether there is anything to add; motion, shape (3,); covariance, shape (3, 3); and the distance [m].
+        If there is nothing, copies of the arguments and 0.
     """
     slack += distrust * DISTRUST[0]
     if turn_sigma < 0.0:

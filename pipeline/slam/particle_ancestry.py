@@ -111,7 +111,8 @@ def are_apart(pose: Float, weights: Float, distance: float) -> bool:
 
 @compiled
 def select_best(weights: Float, before: int, pose: Float, distance: float) -> int:
-    """Return the row of the best particle: the heaviest one, or the previous one if the particles are apart.
+    """Return the row of the best particle: the heaviest one (the first of equal ones), or the previous one if
+    the particles are apart.
 
     Particles that are farther apart than trees can be distinguished are hypotheses with different maps. The
     weights of a few scans would select another hypothesis in each scan, and the mapped trees would agree with
@@ -243,8 +244,8 @@ class Genealogy:
         return BLOCK * len(self.settled) + len(self.recent)
 
     def with_scan(self, pose: Float, ancestors: Int | None, leaf: int) -> Genealogy:
-        """Return the ancestry with one more scan. When more than RECENT_POSES poses are kept, the oldest
-        BLOCK scans are reduced to the path of `leaf`.
+        """Return the ancestry with one more scan. When a whole BLOCK of scans is older than the newest
+        RECENT_POSES poses (and than the newest BLOCK scans), it is reduced to the path of `leaf`.
 
         Args:
             pose: Poses x, y [m], yaw [rad] before resampling, shape (P, 3); stored as float32.

@@ -204,7 +204,7 @@ def taken(maps: Maps, rows: Int) -> Maps:
 
 def is_sound(maps: Maps, particles: int) -> bool:
     """Return whether maps from a file are consistent: shapes, number of particles, indices, numbers of owners
-    and free rows. Positions, covariances, hits and scores are not checked."""
+    and free rows. Data types, positions, covariances, hits and scores are not checked."""
     template = _with_pool(maps.block, maps.places, len(maps.owners))
     if any(getattr(maps, name).shape != getattr(template, name).shape for name in Maps._fields):
         return False
@@ -271,8 +271,7 @@ def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Fl
 
 @compiled
 def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[Int32, Int32, int]:
-    """Return the blocks of each particle that may contain landmarks in reach of its pose.
-
+    """Return the blocks of each particle whose bounding box is at most `reach` from its pose.
     Args:
         maps: Maps.
         pose: Poses, shape (P, 3).

@@ -544,8 +544,8 @@ def use_scan(
     rules: Rules,
     measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, float, Int]:
-    """Update poses, log weights and maps of all particles in place; the greatest log weight is 0 then.
-
+    """Update poses, log weights, maps and shared errors (of `measured`) of all particles in place; the
+    greatest log weight is 0 then.
     The arguments are those of `particle_update.observe`; there may be no detections.
 
     Returns:

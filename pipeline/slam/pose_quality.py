@@ -52,8 +52,8 @@ class ScanStatistics:
 
 
 def named_statistics(mean: Float, odometry: float, detections: int) -> ScanStatistics:
-    """Return the results of `mean_statistics` as a record. The innovation becomes NaN below 0.5 recognised
-    landmarks.
+    """Return the results of `mean_statistics` as a record. The sum of innovations is divided by two degrees
+    of freedom per recognised landmark; it becomes NaN with 0.5 recognised landmarks or fewer.
 
     Args:
         mean: Mean columns, shape (STATISTICS,).
@@ -75,7 +75,7 @@ def named_statistics(mean: Float, odometry: float, detections: int) -> ScanStati
 @compiled
 def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float) -> tuple[Float, float]:
     """Return the weighted mean of the columns, shape (STATISTICS,), and the Mahalanobis norm of its SHIFT
-    [sigma].
+    [sigma], with SIGMA_FLOOR squared added to the variances of the motion.
 
     Args:
         statistics: Statistics by particle, shape (P, STATISTICS).
@@ -91,8 +91,7 @@ def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float)
 
 @compiled
 def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> float:
-    """Return the Mahalanobis distance of two motions [sigma].
-
+    """Return the Mahalanobis distance of two motions [sigma]. The yaw difference is wrapped.
     Args:
         by_trees, by_odometry: x, y [m], yaw [rad], shape (3,).
         covariance: Covariance of the odometry, shape (3, 3); SIGMA_FLOOR squared is added to its diagonal.
@@ -188,7 +187,7 @@ class RunningStatistics:
         return self.led >= TREE_MOTION_STEP * TREE_MOTION_SCANS
 
     def odometry_trust(self, noise: Noise) -> OdometryTrust:
-        """Return the trust in an odometry with this noise."""
+        """Return the trust in an odometry with this noise, by `distrust`, `alone` and `familiar`."""
         return OdometryTrust(noise, self.distrust, self.alone, self.familiar)
 
 
@@ -211,6 +210,10 @@ def update_statistics(
     recent: RunningStatistics, scan: ScanStatistics, driven: float, doubted: OdometryDoubt = NO_DOUBT
 ) -> RunningStatistics:
     """Return the running statistics after one more scan.
+
+    A mean is unchanged by a scan that does not measure it: `innovation` by NaN, `found` without well-known
+    landmarks in free view, `ambiguous` and `familiar` below FEWEST detections. `distrust` only decays here;
+    the caller sets it to 1 when the trees contradict the odometry.
 
     Args:
         recent: Statistics before the scan.
@@ -275,9 +278,11 @@ def updated_familiar(familiar: float, recognised: float, detections: int) -> flo
 
 
 def _tree_motion_count(before: int, scan: ScanStatistics, doubted: OdometryDoubt) -> int:
-    """Return `RunningStatistics.led` after a scan. A doubted scan with too few recognised trees resets it to
-    0. `before` is its value before; without doubt it decreases by 1, at least to 0, and otherwise grows to at
-    most TREE_MOTION_MAX."""
+    """Return `RunningStatistics.led` after a scan; `before` is its value before.
+
+    Without doubt it decreases by 1, at least to 0. A doubted scan with TREES_WITHOUT_ODOMETRY recognised
+    trees, or MANY if the doubt is not reported, increases it by TREE_MOTION_STEP, at most to TREE_MOTION_MAX;
+    with fewer trees it becomes 0."""
     if not any(doubted):
         return max(before - 1, 0)
     leading = TREES_WITHOUT_ODOMETRY if doubted.reported else MANY
@@ -287,10 +292,11 @@ def _tree_motion_count(before: int, scan: ScanStatistics, doubted: OdometryDoubt
 def _strange_scans(recent: RunningStatistics, scan: ScanStatistics, here: bool) -> int:
     """Return the number of strange scans in a row after a scan.
 
-    A scan is strange if it misses enough known trees (STRANGE_MISSED) and finds none. A scan that misses none
-    in free view, or detects too little, leaves the number unchanged. In a known place, a scan that finds a
-    few of many known trees (see BY_CHANCE) is strange as well; later scans of such a row may also find young
-    trees, which were begun after its start. Any other scan that finds known trees resets the number to 0.
+    A scan is strange if it has FEWEST detections, misses enough known trees (STRANGE_MISSED) and finds none.
+    A scan that finds none, but misses too few or detects too few, leaves the number unchanged. In a known
+    place, a scan that finds a few of many known trees (see BY_CHANCE) is strange as well; later scans of such
+    a row may also find young trees, which were begun after its start. Any other scan that finds known trees
+    resets the number to 0.
 
     Args:
         recent: Statistics before the scan.

@@ -275,7 +275,8 @@ def recognise(
         hits_to_weigh: Minimum hits of a landmark that affects pose and likelihood.
         room: Work arrays; `landmark_of` is filled with the row of the landmark of each detection, -1 for
             none.
-        statistics: Statistics of the scan by particle; row p is filled, except MISSED and SHIFT.
+        statistics: Statistics of the scan by particle; the values of the scan are added to row p, except
+            MISSED and SHIFT. INNOVATION is the sum of squared Mahalanobis distances of well-known landmarks.
         p: Row of the particle.
     """
     gate2 = gate * gate

@@ -192,7 +192,7 @@ def _missed(place: Float, centre: Float, known: Float, votes: Bool, owner: Int, 
 def _standing(
     lever: Float, off: Float, variance: Float, position: float, heading: float, shifted: Float, kept: Bool
 ) -> int:
-    """Count the pairs that agree with the odometry and fit it better than the shifted pose.
+    """Return the number of pairs that agree with the odometry and fit it better than the shifted pose.
 
     A pair that also agrees with the shifted pose counts only if it prefers the odometry by CLEARLY: near
     people who walk slowly, a tree is within the gate of their motion as well.
@@ -215,7 +215,8 @@ def _standing(
 @compiled
 def _pairs(pose: Float, centre: Float, known: Float) -> Int:
     """Return the detection of each landmark, -1 for none, int64, shape (L,): the nearest one of the
-    detections whose nearest landmark it is, up to NEAR. See `estimate_rigid_shift` for the arguments."""
+    detections whose nearest landmark it is, at a distance below NEAR. Of equal distances the first row
+    counts. See `estimate_rigid_shift` for the arguments."""
     found, c, s = centre.shape[0], np.cos(pose[2]), np.sin(pose[2])
     owner = np.full(known.shape[0], -1, np.int64)
     least = np.full(known.shape[0], np.inf)

@@ -194,8 +194,9 @@ def search_offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) ->
         pose, centre, sigma, landmarks: See `count_matches`.
 
     Returns:
-        Number of matches; whether the pose is unambiguous (FEWEST, CONVINCING, MARGIN); and the pose x, y
-        [m], yaw [rad], shape (3,), which is `pose` without any match.
+        Number of matches; whether the pose is unambiguous (FEWEST, CONVINCING, and MARGIN over positions more
+        than 1 m away); and the pose x, y [m], yaw [rad], shape (3,), which is `pose` without any match. Of
+        poses with equal matches the first one in the order of TURNS counts.
     """
     found = centre.shape[0]
     best, second = 0, 0

@@ -108,10 +108,11 @@ class SlamState:
         """Return a state with the particles at new poses, all with the map and the path of the best particle.
 
         Weights, the motion since the last used scan, running statistics (except `mapped`), shared errors and
-        the hidden covariance of the frame are reset. The graph and the places remain.
+        the hidden covariance of the frame are reset. All other attributes remain, also `since_update`,
+        `path`, the graph, the motion since the last keyframe and the places.
 
         Args:
-            pose: New poses, shape (P, 3); P may differ from the present number.
+            pose: New poses, shape (P, 3), not copied; P may differ from the present number.
         """
         rows = np.full(len(pose), self.best)
         return replace(
@@ -130,7 +131,8 @@ class SlamState:
 
     def with_particles(self, particles: int) -> SlamState:
         """Return the state resampled to another number of particles, systematically by their weights with the
-        offset 1/2, with equal weights; the state itself if the number is unchanged."""
+        offset 1/2, with equal weights; the state itself if the number is unchanged. `best` is the first copy
+        of the best particle, or the next drawn particle if it is not drawn."""
         if particles == len(self.pose):
             return self
         weights = normalised(self.log_weight)

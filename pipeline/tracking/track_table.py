@@ -117,8 +117,8 @@ class TrackTable:
         shared: Float,
         velocity_sigma: float,
     ) -> TrackTable:
-        """Return K new tracks without observations (hits 0), landmark and class, with consecutive numbers.
-
+        """Return K new tracks without observations (hits 0), landmark and class, with the score 1 and
+        consecutive numbers.
         Args:
             number: Number of the first one.
             stamp_ns: Time of the scan.
@@ -188,7 +188,8 @@ def join(rows: Rows, old: int, young: int) -> None:
 
     Positions are fused by split covariance intersection, counts and sums are added (a last scan that observed
     both counts once), and the larger score is kept. The class is tree if one is a tree; a track without class
-    gets that of the other one. The row `young` stays unchanged; the caller removes it.
+    gets that of the other one. The row `old` keeps its number and its landmark. The row `young` stays
+    unchanged; the caller removes it.
     """
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, sides, verdict = rows.hits, rows.sides, rows.verdict

@@ -377,8 +377,9 @@ def take_better_landmarks(
     radius: float,
 ) -> None:
     """Give a tree that is not detected, and began within SAME_VISIT_NS, the landmark of a detection without
-    tree next to it, in place, if this landmark has the higher score. Both landmarks are of one trunk: the
-    first views of a distant trunk can be wrong by more than the gate of later ones.
+    tree next to it, in place, if this landmark has the higher score or the tree has no landmark. Both
+    landmarks are of one trunk: the first views of a distant trunk can be wrong by more than the gate of later
+    ones.
 
     Args:
         rows: Tracks; landmark and score are changed.
