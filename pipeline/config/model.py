@@ -61,8 +61,8 @@ class Parameters(BaseModel):
     def replace(self, changes: Mapping[str, Any]) -> Parameters:
         """Return a copy with values changed by their dotted names, validated as a whole.
 
-        Names of earlier versions are accepted with a RenamedParameterWarning; removed parameters are ignored
-        with one.
+        Names and choices of earlier versions are accepted with a RenamedParameterWarning; removed parameters
+        are ignored with one.
 
         Raises:
             ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
@@ -133,14 +133,12 @@ def _warn(message: str) -> None:
 
 def validated(tree: Mapping[str, Any]) -> Parameters:
     """Return parameters from nested mappings (stage, parameter). Stages and parameters that are missing have
-    their defaults, those of the preset `forest`.
-
-    Names of earlier versions are accepted with a RenamedParameterWarning.
+    their defaults, those of the preset `forest`. Names and choices of earlier versions are accepted with a
+    RenamedParameterWarning; removed parameters are ignored with one.
 
     Raises:
         ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
-            contradict each other. The message has one line and names the first such parameter, its bound and
-            the value given.
+            contradict each other. The message describes the first error in one line.
     """
     try:
         return Parameters.model_validate(_current_tree(tree))
@@ -162,7 +160,9 @@ def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _first_message(error: ValidationError) -> str:
-    """Return the first error of a validation as one line with the dotted name of the parameter."""
+    """Return the first error of a validation as one line: the dotted name, the value given and the reason.
+    For an unknown name it gives the nearest known one, for a rule across parameters only the message of the
+    rule."""
     first = error.errors()[0]
     name = ".".join(str(part) for part in first["loc"])
     if first["type"] == "value_error":  # a rule across fields, whose message names them

@@ -129,7 +129,7 @@ class Acquisition(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        """Return the parameters; ValueError if the range limits are not in order."""
+        """Return the parameters; ValueError if `range_min` is not less than `range_max`."""
         _require_less(self, "acquisition", ("range_min", "range_max"))
         return self
 
@@ -160,7 +160,8 @@ class Filters(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        """Return the parameters; ValueError if two faces of the box are not in order."""
+        """Return the parameters; ValueError if a lower face of the box is not less than the upper one, also
+        if both are equal."""
         _require_less(self, "filters", ("x_min", "x_max"), ("y_min", "y_max"), ("z_min", "z_max"))
         return self
 
@@ -182,7 +183,7 @@ class Ground(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        """Return the parameters; ValueError if the height limits are not in order."""
+        """Return the parameters; ValueError if `height_min` is not less than `height_max`."""
         _require_less(self, "ground", ("height_min", "height_max"))
         return self
 
@@ -264,7 +265,8 @@ class Detection(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        """Return the parameters; ValueError if the limits of eccentricity or radius are not in order."""
+        """Return the parameters; ValueError if a lower limit of eccentricity or radius is not less than the
+        upper one, also if both are equal."""
         _require_less(self, "detection", ("e_min", "e_max"), ("radius_min", "radius_max"))
         return self
 
@@ -428,7 +430,8 @@ class Obstacles(Stage):
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
-        """Return the parameters; ValueError if the height limits or the zones are not in order."""
+        """Return the parameters; ValueError if `height_min` is not less than `height_max`, or `stop_distance`
+        not less than `slow_distance`."""
         _require_less(self, "obstacles", ("height_min", "height_max"), ("stop_distance", "slow_distance"))
         return self
 
@@ -471,7 +474,7 @@ class Stand(Stage):
     @field_validator("volume")
     @classmethod
     def _readable(cls, text: str) -> str:
-        """Return the formula, which may be empty; ValueError if it is not one."""
+        """Return the text, which may be empty; FormulaError (a ValueError) if it is not a volume formula."""
         from pipeline.stand.volume import VolumeFormula
 
         if text:

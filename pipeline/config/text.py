@@ -15,8 +15,9 @@ _DEEP_NAME = re.compile(r"(?:\.[^.,=\n]{0,100}){20}")
 
 
 def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
-    """Return parameters changed by `stage.name=value` texts of the command line; of two texts with one name
-    the later one counts. Names of earlier versions give a RenamedParameterWarning.
+    """Return parameters changed by `stage.name=value` texts of the command line. Spaces around name and value
+    are ignored; of two texts with one name the later one counts. Names of earlier versions give a
+    RenamedParameterWarning.
 
     Raises:
         ParameterError: A text has no "=", a name is unknown, or a value is not valid.
@@ -65,7 +66,8 @@ def parsed(spec: FieldSpec, text: str) -> Value:
 
 
 def to_toml(parameters: Parameters) -> str:
-    """Return all values as TOML text with one table per stage, in the order of the stages."""
+    """Return all values, also those equal to a default, as TOML text with one table per stage, in the order
+    of the stages."""
     import tomli_w
 
     return tomli_w.dumps(parameters.model_dump())

@@ -292,8 +292,8 @@ def ground_steps(
 
 
 def _trees(stems: Stems, arc_min: float, crowns: Crowns) -> Trees:
-    """Return the tree table of stems, numbered from 1 in their order, all confirmed; velocities are 0,
-    eccentricities NaN, times NEVER, and the observations are the slices.
+    """Return the tree table of stems, numbered from 1 in their order, all confirmed; eccentricities are NaN,
+    times NEVER, and the observations are the slices.
 
     Args:
         stems: Models of the trees, shape (T,).

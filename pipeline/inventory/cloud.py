@@ -127,8 +127,8 @@ class ExtentFinder:
             raise SourceError("the points are spread too widely for a plot", where=where)
 
     def extent(self, where: str) -> Extent:
-        """Return the extent of the squares with LEAST points and those next to them (of all without such a
-        square), and the numbers of all points and of those in other squares.
+        """Return the bounds of the points in squares with at least LEAST points and those next to them (of
+        all points without such a square), and the numbers of all points and of those in other squares.
 
         Raises:
             SourceError: There are no points; `where` is the name of the cloud.

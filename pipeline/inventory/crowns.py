@@ -177,7 +177,7 @@ def _nearest_stems(voxels: Voxels, stems: Stems) -> Int32:
 
 
 def _cut_off(points: Float, column: int) -> float:
-    """Return the value of a column above which the cloud is cut off; infinite if it is not.
+    """Return the largest value of a column if the cloud is cut off there; infinite if it is not.
 
     The cloud is cut off if a share of more than CUT of its vertical columns of voxels ends in its uppermost
     CELL; without a cut this layer has the tip of a single tree.

@@ -71,8 +71,9 @@ class BlockFile:
 
     def put_block(self, index: int, content: bytes) -> bool:
         """Store a block at the end of the file, unless its number is stored already or the file is closed. If
-        it is larger than LARGEST, the file or the disk is full, or writing fails, it is not stored and
-        `refusal` contains the reason; nothing is raised.
+        it is larger than LARGEST, the file would exceed its limit, the disk would have less than SPARE_BYTES
+        left (checked for every BLOCKS_BETWEEN_CHECKS-th number), or writing fails, it is not stored and
+        `refusal` contains the reason of the first such block; nothing is raised.
 
         Returns:
             Whether a block with this number is stored.

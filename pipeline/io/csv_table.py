@@ -85,7 +85,7 @@ class CsvTable:
         return cls(text, what, str(path))
 
     def find(self, names: Iterable[str]) -> str | None:
-        """Return the first of some names that is a column; None if none is."""
+        """Return the first of some names, in lower case, that is a column; None if none is."""
         return next((name for name in names if name in self.column), None)
 
     def text(self, name: str) -> list[str]:
@@ -94,13 +94,13 @@ class CsvTable:
         return [row[k].strip() if 0 <= k < len(row) else "" for row in self.rows]
 
     def numbers(self, name: str, *, required: bool = True) -> Float:
-        """Return the numbers of a column, shape (N,). Without `required`, empty cells, "nan" and "na" give
-        NaN. A column that the table does not have counts as empty cells. In a column of a table with
-        semicolons in which a cell has a comma, the comma is the decimal sign and a point is an error, because
-        it may separate thousands.
+        """Return the numbers of a column, shape (N,). Without `required`, empty cells, "nan" and "na" (also
+        in capitals) give NaN. A column that the table does not have counts as empty cells. In a column of a
+        table with semicolons in which a cell has a comma, the comma is the decimal sign and a point is an
+        error, because it may separate thousands.
 
         Raises:
-            SourceError: A cell is not a finite number, or is beyond COORDINATE_LIMIT.
+            SourceError: A cell is not a finite number, or its magnitude is not less than COORDINATE_LIMIT.
         """
         texts = self.text(name)
         has_commas = self._has_semicolons and any("," in text for text in texts)

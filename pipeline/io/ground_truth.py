@@ -37,15 +37,16 @@ def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
 
     Diameters are in metres in the result, NaN where they are unknown, 0 or negative. Positions are x and y
     (or easting and northing) in metres, or azimuth in degrees from north (y), clockwise, with a distance in
-    metres. The class of a row is one of KINDS; without such a column all rows are trees.
+    metres from the origin. A table with both uses x and y. The class of a row is one of KINDS, in any case;
+    rows with an empty class, and all rows without such a column, are trees.
 
     Args:
         path: A CSV with a header line; commas, semicolons or tabs. See `CsvTable` for decimal commas.
         dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit; None refuses such a column.
 
     Raises:
-        SourceError: It cannot be read, is larger than 8 MB, is not such a table, or a coordinate is beyond
-            COORDINATE_LIMIT; the message names line and column.
+        SourceError: It cannot be read, is larger than 8 MB, is not such a table, a number is beyond
+            COORDINATE_LIMIT, or the median diameter is outside of 5 mm to 3 m, which is another unit.
     """
     return _trees_of(CsvTable.read(path, "table of trees", LARGEST_FILE), dbh_unit)
 
@@ -60,8 +61,7 @@ def parse_truth_trees(text: str, *, where: str, dbh_unit: str | None = None) -> 
         dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit; None refuses such a column.
 
     Raises:
-        SourceError: It is not such a table, or a coordinate is beyond COORDINATE_LIMIT; the message names
-            line and column.
+        SourceError: As in `read_truth_trees`, except that no file is read.
     """
     return _trees_of(CsvTable(text, "table of trees", where), dbh_unit)
 
@@ -208,7 +208,8 @@ def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
         where: Name of the recording in errors.
 
     Raises:
-        SourceError: It is not JSON of this form, a number is beyond 1e8, or columns differ in length.
+        SourceError: It is not JSON of this form and version, a coordinate is beyond 1e8, a property of the
+            sensor is out of bounds, or columns differ in length.
     """
     try:
         file = msgspec.json.decode(content, type=_TruthFile)
@@ -244,7 +245,8 @@ def truth_json(sensor: Sensor, truth: Truth | None) -> bytes:
 
     Args:
         sensor: The LiDAR.
-        truth: Ground truth; None, or missing parts of it, are left out.
+        truth: Ground truth; None, or missing parts of it, are left out. Positions must be finite (else
+            ValueError).
     """
     content: dict[str, Any] = {"version": 1, "sensor": asdict(sensor)}
     if truth is not None and truth.trees is not None:

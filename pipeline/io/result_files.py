@@ -111,7 +111,8 @@ def tree_rows(trees: Trees, start_ns: int, reviews: Mapping[int, str] | None = N
 
 
 def path_rows(path: Path, start_ns: int) -> list[tuple[str, ...]]:
-    """Return the path as rows of PATH_COLUMNS, one per scan; seconds count from `start_ns`."""
+    """Return the path as rows of PATH_COLUMNS, one per scan; seconds count from `start_ns` [ns], and are
+    empty for a stamp below 0."""
     return list(zip(*(column(path, start_ns) for column in _PATH.values()), strict=True))
 
 
@@ -143,8 +144,8 @@ def terrain_text(ground: HeightMap) -> str:
 
 
 def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
-    """Yield the known cells of the height map as rows of TERRAIN_COLUMNS, from west to east; x and y are
-    their centres."""
+    """Yield the known cells of the height map as rows of TERRAIN_COLUMNS, from west to east, equal x from
+    south to north; x and y are their centres."""
     order = np.lexsort((ground.place[:, 1], ground.place[:, 0]))
     middle = (ground.place[order] + 0.5) * ground.cell
     columns = (middle, ground.height[order], ground.sigma[order], ground.views[order])
@@ -153,7 +154,7 @@ def terrain_rows(ground: HeightMap) -> Iterator[list[str]]:
 
 
 def seen_text(area: SeenArea) -> str:
-    """Return the text of seen.csv: the observed cells from west to east; x and y are their centres. The
+    """Return the text of seen.csv: the observed cells in the order of `area`; x and y are their centres. The
     distance of the nearest free view and the number of views are empty where unknown."""
     return csv_text(
         SEEN_COLUMNS,
@@ -176,7 +177,8 @@ def geojson(
     reviews: Mapping[int, str] | None = None,
 ) -> str:
     """Return the text of a GeoJSON FeatureCollection with the confirmed trees. The properties are named as
-    TREE_COLUMNS, with null for unknown values; x and y are the geometry. Positions must be finite.
+    TREE_COLUMNS, with null for unknown values; x and y are the geometry. Positions must be finite (else
+    ValueError).
 
     RFC 7946 requires WGS84; a map without `lon_lat` has a member `coordinateFrame`.
 

@@ -75,7 +75,7 @@ class ClusterTable:
     def put(self, index: int, clusters: Clusters, offset: Float, *, lost: bool = False) -> None:
         """Store the clusters of a scan. Those of this and later scans are removed first. A scan beyond the
         next one is ignored. While there are more than MOST_ROWS clusters or MOST_SCANS scans, every second
-        scan is removed and `spacing` doubled.
+        scan is removed and `spacing` doubled, until one scan is left.
 
         Args:
             index: Number of the scan; one that is no multiple of `spacing` is counted, not stored.
@@ -113,8 +113,8 @@ class ClusterTable:
         self.put(frame.index, frame.clusters, frame.sensor_offset, lost=lost)
 
     def of(self, scans: Sequence[int]) -> ClusterTable:
-        """Return the table of some scans, in the given order, as a copy. Scans that are not stored have no
-        clusters in it.
+        """Return a table of some scans as a copy: its scan k is the k-th of `scans`, its `spacing` 1. Scans
+        that are not stored have no clusters in it.
 
         Raises:
             IndexError: A scan is not in the table.
@@ -155,7 +155,7 @@ class ClusterTable:
         MOST_PLACES groups are returned.
 
         Args:
-            path: x, y [m], yaw [rad] of the base at each scan of the table, shape (N, 3).
+            path: x, y [m], yaw [rad] of the base at each stored scan, shape (N, 3).
             p: Parameters of the verdicts, and of the distance between two trees.
         """
         start = np.array(self.start)
@@ -171,7 +171,8 @@ class ClusterTable:
 
 def sample_scans(scans: int, size: int) -> range:
     """Return the numbers of the scans that a sample of a run has: every n-th one, where n is the smallest
-    power of two with at most SAMPLE_SCANS scans and SAMPLE_BYTES; at least the first scan.
+    power of two with at most SAMPLE_SCANS scans and SAMPLE_BYTES; at least the first scan of a run that has
+    one.
 
     Args:
         scans: Number of scans of the run.
@@ -271,8 +272,8 @@ def _reach(p: Parameters) -> float:
 
 
 def _columns(known: KnownMap, p: Parameters) -> Columns | None:
-    """Return the voxel columns with the verdicts of other parameters, as a copy; None without columns or if
-    the parameter `classification.method` is "none"."""
+    """Return the voxel columns with the verdicts of other parameters; the other arrays are shared. None
+    without columns or if the parameter `classification.method` is "none"."""
     if known.columns is None or p.classification.method == "none":
         return None
     return replace(known.columns, verdict=column_votes(known.columns).verdict(p.classification.tree_share))
@@ -280,7 +281,7 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
 
 def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:
     """Return the trees of all scans. At a voxel column its class decides; elsewhere, trees have at least
-    `hits_to_confirm` clusters.
+    `hits_to_confirm` clusters. Those of one stored scan count for all `spacing` scans of the run.
 
     Args:
         known: The run, for its columns.
@@ -363,7 +364,7 @@ def _sums(row: Int, hits: Int, rows: int) -> Int:
 
 def _trees(known: _Places) -> Trees:
     """Return places as confirmed trees with the numbers 1 to T and their hits as observations; diameters,
-    eccentricities and covariances are NaN, times, velocities and coverage 0."""
+    eccentricities and covariances are NaN, times and coverage 0."""
     place, hits, n = known.place, known.hits, len(known.place)
     unknown, none = np.full(n, np.nan), np.zeros(n, np.int64)
     return Trees(

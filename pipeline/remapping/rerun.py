@@ -150,7 +150,7 @@ class ScanCaches:
         return self._open[key]
 
     def close(self) -> None:
-        """Close all caches."""
+        """Close all caches, which deletes their files; a later `of` opens empty ones."""
         for each in self._open.values():
             each.close()
         self._open.clear()

@@ -52,11 +52,13 @@ def fit_control_points(
         local: Positions in the map, shape (N, 2) [m].
         known: The same points in the reference system: east, north, shape (N, 2) [m].
         names: Names of the points, for messages; by default their numbers.
-        point_sigma: Expected standard deviation of a coordinate [m]. Larger residuals are refused.
+        point_sigma: Expected standard deviation of a coordinate [m]. A fit whose `sigma_point` is more than
+            CONTRADICTION times this is refused.
 
     Raises:
-        StemmapError: There are fewer than two points, they are at one place, or they contradict one another:
-            in their scale, the order of their axes, or their residuals. The message names the cause.
+        StemmapError: There are fewer than two points, they are at one place in either frame (RMS distance
+            from their mean below SPREAD_MIN), or they contradict one another: in their scale, the order of
+            their axes, or their residuals. The message names the cause.
     """
     n = len(local)
     if n < 2:
@@ -105,7 +107,8 @@ def fit_control_points(
 
 
 def _residual_words(residuals: Float, names: Sequence[str]) -> str:
-    """Return the lengths of the largest residuals for people, with the names of their points."""
+    """Return a text with the lengths [m] of the six largest residuals, shape (N, 2) [m], and the names of
+    their points."""
     shown = 6  # points in a message
     lengths = np.hypot(*residuals.T)
     largest = np.argsort(-lengths, kind="stable")[:shown]

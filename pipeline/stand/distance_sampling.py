@@ -31,7 +31,8 @@ class DetectionFunction:
     trees: int
 
     def at(self, distance: Float) -> Float:
-        """Return the probability at distances [m], in their shape; 1 for an infinite `sigma`."""
+        """Return the probability at distances [m], in their shape; 1 for an infinite `sigma`, NaN for a
+        distance of NaN."""
         return (
             np.exp(-0.5 * np.square(distance / self.sigma)) if math.isfinite(self.sigma) else distance * 0 + 1
         )
@@ -60,16 +61,16 @@ def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | No
     """Fit the half-normal function by maximum likelihood, given the distances that the area offers.
 
     The likelihood of a distance is g(r) A(r) / sum g A, where A(r) is the number of cells at that distance,
-    so it holds for plots of any shape. With A(r) proportional to r (one position) the estimate is
-    sigma^2 = sum r^2 / (2 n); with constant A(r) (a straight path) it is sum r^2 / n.
+    so it holds for plots of any shape. With A(r) proportional to r (one position) the estimate is sigma^2 =
+    sum r^2 / (2 n); with constant A(r) (a straight path) it is sum r^2 / n.
 
     Args:
         distance: Distance of each tree found [m], shape (N,).
         available: Distance of each cell of the area [m], shape (K,).
 
     Returns:
-        The function; sigma is inf if constant detection explains the distances as well. None with fewer than
-        LEAST_TREES trees or without area.
+        The function; sigma is inf if constant detection explains the distances as well, else from 1/20 to 20
+        times the largest distance of the area. None with fewer than LEAST_TREES trees or without area.
     """
     from scipy.optimize import minimize_scalar
 

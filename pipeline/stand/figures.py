@@ -134,7 +134,7 @@ def stand_figures(
     Returns:
         The figures. Those that are unknown are NaN: all but `_plain` ones without observed area, corrected
         ones without a probability above 0, those of diameters without a diameter, those of volumes without a
-        volume.
+        volume. `_plain` figures have no standard error. In `v_ha`, trees without a volume count as 0.
 
     Raises:
         ValueError: The plot has no area.

@@ -178,8 +178,8 @@ def seen_plot(name: str, seen: SeenArea) -> SamplePlot:
 
 
 def within_reach(seen: SeenArea, parameters: Stand) -> SeenArea:
-    """Return the cells that count as observed: nearest view within `reach`, and at least `views_min` views.
-    An unknown distance (NaN) or number of views (0), as for a whole cloud, excludes no cell."""
+    """Return the cells that count as observed: nearest view at most `reach` away, and at least `views_min`
+    views. An unknown distance (NaN) or number of views (0), as for a whole cloud, excludes no cell."""
     near = ~(seen.nearest > parameters.reach)
     return seen.where(near & ((seen.views >= parameters.views_min) | (seen.views == 0)))
 
@@ -197,8 +197,8 @@ def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> D
 def figures_of(
     plots: Sequence[SamplePlot], trees: PlotTrees, seen: SeenArea, parameters: Stand
 ) -> dict[str, StandFigures]:
-    """Return the figures of each plot by its name, see `StandFigures`. A part of a plot that was observed to
-    99.5 % counts as observed completely.
+    """Return the figures of each plot by its name, see `StandFigures`. A plot of which more than 99.5 % was
+    observed counts as observed completely. Detection is certain in a plot with a cell of unknown distance.
 
     Args:
         plots: Plots with unique names.

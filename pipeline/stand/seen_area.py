@@ -176,7 +176,8 @@ class SeenRecorder:
         self._free[stamp_ns] = np.minimum(free, RANGE).astype(np.float32)
 
     def area(self, path: Path) -> SeenArea:
-        """Return the observed area; without cells if no scan was recorded.
+        """Return the observed area: a scan observes the cells whose centres are at most RANGE away and at
+        most INTO behind the end of its free range. Without scans it has no cells.
 
         Args:
             path: Final path; recorded scans whose stamps it does not have are left out.

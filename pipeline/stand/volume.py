@@ -63,8 +63,8 @@ class VolumeFormula:
         return cls(text, tree)
 
     def __call__(self, dbh: Float, height: Float) -> Float:
-        """Return volumes, shape (T,) [m^3]; NaN where the formula has no value of at least 0, as for an
-        unknown diameter or height that it contains.
+        """Return volumes, shape (T,) [m^3]; NaN where the formula has no finite value of at least 0, where
+        the diameter is unknown, and where it contains a height that is unknown.
 
         Args:
             dbh, height: Diameters at breast height and heights, shape (T,) [m]; NaN where unknown.

@@ -70,7 +70,8 @@ def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: 
     become texts; fields with NOT_SAVED are omitted.
 
     Args:
-        record: A record of arrays, numbers, texts, tuples and other records.
+        record: A record of arrays, numbers, texts, None, tuples, lists, dicts and other records; keys of
+            dicts become texts.
         planes: Whether the first bytes of all numbers of an array come first, then the second ones, and so
             on, which compresses better.
 
@@ -294,7 +295,7 @@ def write_archive(tree: Any, blob: bytes) -> bytes:  # noqa: ANN401 - any JSON
     """Return the bytes of a zip with `tree.json` and `arrays.bin`; the same state gives the same bytes.
 
     Args:
-        tree: JSON without NaN.
+        tree: JSON without NaN and infinity (else ValueError).
         blob: The arrays to which it refers.
     """
     text = json.dumps(tree, allow_nan=False, separators=(",", ":")).encode()

@@ -47,9 +47,10 @@ class MergedMap:
 def merge_maps(
     a: SavedMap, b: SavedMap, T_a_b: Pose2, covariance: Float, stamp_shift_ns: int, parameters: Parameters
 ) -> MergedMap:
-    """Merge map b into map a; both are unchanged. Trees of both at one place (`associate`) become one with
-    the number in a; other trees of b get new numbers. The run continues at the end of b, in the frame of a,
-    without graph and places. The height map is that of a.
+    """Merge map b into map a; both are unchanged. Trees that `associate` pairs within GATE sigma (with
+    `relocalisation.slack` added) and `slam.distance_max` become one with the number in a; other trees of b
+    get new numbers. The run continues at the end of b, in the frame of a, without graph and places. The
+    height map is that of a.
 
     Args:
         a, b: The maps.
@@ -142,8 +143,8 @@ def _moved_path(b: SavedMap, T: Pose2) -> Float:
 
 
 def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, reach: float) -> SlamState:
-    """Return the state of SLAM of the merged map: particles with the best maps of both runs, at the end of
-    the second run.
+    """Return the state of SLAM of the merged map: all particles have the best map of a with the landmarks of
+    the best map of b that are at none of its own, at the end of the second run.
 
     Args:
         a, b: States of SLAM of the two maps.

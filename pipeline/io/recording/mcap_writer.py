@@ -155,7 +155,8 @@ def write_recording(
         camera: Camera of the pictures among the records; without it pictures are left out.
 
     Returns:
-        Number of messages. Records of other kinds than scan, odometry, IMU and picture are left out.
+        Number of messages: two for an odometry or a picture, one for a scan or an IMU reading, and the static
+        transforms. Other records are left out.
 
     Raises:
         StemmapError: ROS cannot represent a time, or writing fails.
@@ -277,7 +278,8 @@ class LiveWriter(_RosWriter):
             self._write(self._outputs[topic], self._last_ns, payload)
 
     def add_parameters(self, revision: int, from_scan: int, values: Mapping[str, Any]) -> None:
-        """Write the parameters that apply from a mapped scan onwards.
+        """Write the parameters that apply from a mapped scan onwards, at the time of the last message of the
+        robot.
 
         Args:
             revision: Number of the change.
@@ -323,8 +325,9 @@ class Mended:
 
 
 def mend(path: Path, out: Path) -> Mended:
-    """Write all complete messages of a recording to a new file, which appears when it is complete; return
-    what was written and lost.
+    """Write all complete messages, attachments and metadata of a recording to a new file, which appears when
+    it is complete; return what was written and lost. Messages of a channel without a definition count as
+    lost.
 
     Args:
         path: The recording, which does not change.

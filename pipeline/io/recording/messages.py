@@ -261,7 +261,8 @@ _GREEN, _WHITE = (0.0, 0.62, 0.45, 0.9), (1.0, 1.0, 1.0, 1.0)
 
 
 def type_hash(topic: str) -> str:
-    """Return the hash of the type of a topic (REP 2016), by which ROS 2 nodes match topics."""
+    """Return the hash of the type of a topic (REP 2016), by which ROS 2 nodes match topics; KeyError for one
+    that is not in TYPES."""
     return str(standard_types("cdr").hash_rihs01(TYPES[topic]))
 
 
@@ -306,7 +307,7 @@ def pose_messages(frame: Frame) -> dict[str, bytes]:
 
 def map_messages(frame: Frame, path: Path) -> dict[str, bytes]:
     """Return the map at a scan by topic, in CDR: PATH (at most MOST_POSES poses), and the confirmed trees as
-    TREES and DETECTIONS."""
+    TREES and DETECTIONS. A time that ROS cannot represent is limited."""
     head = _header(frame.stamp_ns)
     return {PATH: encode(_path(path, head)), **tree_messages(frame.trees, head)}
 

@@ -57,7 +57,8 @@ def with_pictures(
 
 def rendered(trees: TruthTrees, pose: tuple[float, float, float]) -> bytes:
     """Return a JPEG of WIDTH x HEIGHT pixels with the objects as rectangles before ground and sky, near ones
-    last. Objects behind the camera are omitted; one without diameter gets a default width.
+    last. Objects less than 0.4 m in front of the camera or behind it are omitted; one without diameter gets a
+    default width.
 
     Args:
         trees: Trees and other objects.
