@@ -50,7 +50,7 @@ class RunSource:
         start: How its first pose was found: "origin", "resume", "last", "given" or "constellation".
         pose: T_map_start: x, y [m], yaw [rad] of its first pose.
         stems: Number of stems that agreed with that pose; 0 where it was not found by stems.
-        stamp_shift_ns: Offset that was added to its times, so that they follow the earlier sources.
+        stamp_shift_ns: Offset that was added to its times, so that they follow the earlier sources [ns].
     """
 
     uri: str
@@ -161,8 +161,8 @@ class RunStart:
         scans: Number of scans of the earlier runs.
         sources: All sources, the present one last.
         start_ns: Time of the first scan of all; None before it.
-        after_ns: Scans up to this time are in the map already.
-        stamp_shift_ns: Offset that is added to the times of this source.
+        after_ns: Scans up to this time (included) are in the map already [ns]; None for none.
+        stamp_shift_ns: Offset that is added to the times of this source [ns].
         truth: Ground truth in the frame of the map, where the source's own truth is in another frame.
     """
 
@@ -182,7 +182,10 @@ class RunStart:
         Args:
             source: Source of the run.
             odometry: Choice of the odometry.
-            left_out: Counts the scans that are left out, by reason.
+            left_out: Is increased by the number of scans that are left out, by reason.
+
+        Raises:
+            SourceError: The source cannot be read.
         """
         index = self.scans
         for step in steps(source.records(), odometry=odometry, losses=left_out):
@@ -226,7 +229,7 @@ def continue_map(
         warnings: Messages for the user that are added to the totals, except with "resume".
 
     Raises:
-        StemmapError: The start had to be found by the stems and was not.
+        StemmapError: The start had to be found by the stems and was not, or the source cannot be read.
     """
     saved, start = continued.saved, continued.start
     path = saved.map.stamp_ns
@@ -254,8 +257,9 @@ def continue_map(
 
 
 def _resumed(begin: RunStart, source: Source) -> RunStart:
-    """Return the start of a run that continues the same drive. If the source is the last one of the map, its
-    losses are cleared, because it is read from its start; another source is added to the sources."""
+    """Return `begin`, changed to the start of a run that continues the same drive: with the offset of the
+    last source. If the source is that one, the losses are cleared, because it is read from its start; another
+    source is added to the sources."""
     known, last = source.description, begin.sources[-1]
     begin.stamp_shift_ns = last.stamp_shift_ns
     if known.digest == last.digest:
@@ -269,10 +273,12 @@ def _resumed(begin: RunStart, source: Source) -> RunStart:
 def _in_another_run(
     begin: RunStart, source: Source, start: Start, pose: Pose2, found: Match | None, warnings: list[str]
 ) -> RunStart:  # fmt: skip
-    """Return the start of another drive; its times follow those of the map by PAUSE_NS where they overlap.
+    """Return `begin`, changed to the start of another drive; the source is added to its sources, and its
+    times follow those of the map by PAUSE_NS where they overlap. A source that is part of the map already is
+    a warning.
 
     Args:
-        begin: The start so far, which is changed.
+        begin: The start so far.
         source: Source of the new run.
         start: Where the user starts it.
         pose: Pose of its first scan in the map.
@@ -310,7 +316,8 @@ def localise(
         seed: Random seed.
 
     Raises:
-        StemmapError: No match was found up to the last scan; the message has the last reason.
+        StemmapError: No match was found up to the last scan (the message has the last reason), or the source
+            cannot be read.
     """
     mapper = mapper_of(source.description, parameters, seed)
     due, match = float(FIRST_TRY), None

@@ -168,7 +168,7 @@ def read_for_export(folder: FilePath, of_plots: StandResult | None) -> ExportedR
         of_plots: Stand figures of the run on plots, which are exported with them; None for no plots.
 
     Raises:
-        StemmapError: The run is damaged.
+        StemmapError: A file of the run is missing or damaged.
     """
     run, frame = read_run(folder), read_map_frame(folder)
     shapes: list[tuple[str, Any, dict[str, float]]] = []
@@ -211,10 +211,10 @@ def read_for_export(folder: FilePath, of_plots: StandResult | None) -> ExportedR
 
 
 def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
-    """Write a run to a file whose suffix gives the format; return all files that were written. Existing files
-    are replaced.
+    """Write a run to a file whose suffix gives the format; return all files that were written, ordered by
+    name. Existing files are replaced.
 
-    Files are complete or absent: they are written elsewhere first.
+    Files are complete or absent: they are written elsewhere first. Threads write one after the other.
 
     Args:
         run: The run.
@@ -222,8 +222,9 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
             folder.
 
     Raises:
-        StemmapError: The suffix is unknown, a package is missing, or the run lacks what the format shows: a
-            GeoTIFF needs terrain and an EPSG code.
+        StemmapError: The suffix is unknown, a package is missing, the terrain covers too large an area, or
+            the run lacks what the format shows: a GeoTIFF needs terrain and, unless the map is local, an EPSG
+            code.
         OSError: The file cannot be written.
     """
     writer = WRITERS.get(file.suffix.lower())
@@ -242,15 +243,15 @@ def export_run(run: ExportedRun, file: FilePath) -> list[FilePath]:
 
 
 def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
-    """Return the bytes of an exported file and its name. Several files, as of a Shapefile, are one zip
-    archive with the same bytes as the files of `export_run`.
+    """Return the bytes of an exported file and its name, such as trees.gpkg. Several files, as of a
+    Shapefile, are one zip archive (trees_shp.zip) of the files of `export_run`.
 
     Args:
         run: The run.
         suffix: One of WRITERS.
 
     Raises:
-        StemmapError: See `export_run`.
+        StemmapError, OSError: See `export_run`.
     """
     with TemporaryDirectory(prefix="stemmap-export-") as folder:
         written = export_run(run, FilePath(folder) / f"trees{suffix}")
@@ -265,8 +266,8 @@ def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
 
 def _layers(run: ExportedRun) -> dict[str, Any]:
     """Return the layers as GeoDataFrames by name, in the coordinates of the files: `trees`, and where
-    there are any `path`, `plots` and `contours`; their columns are LAYER_FIELDS. Raises StemmapError if a
-    package is not installed."""
+    there are any `path`, `plots` and `contours`; their columns are LAYER_FIELDS and the geometry. Raises
+    StemmapError if a package is not installed or the terrain covers too large an area."""
     geopandas = needed("geopandas", "gis", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -297,7 +298,7 @@ def _layers(run: ExportedRun) -> dict[str, Any]:
 
 
 def _plot_table(run: ExportedRun) -> dict[str, Any]:
-    """Return the values of PLOT_FIELDS of the plots by name."""
+    """Return the columns PLOT_FIELDS by name, a value per plot, rounded to four decimals; NaN if unknown."""
     table: dict[str, Any] = {"plot": [name for name, _, _ in run.plots]}
     for field in PLOT_FIELDS[1:]:
         table[field.name] = np.array([round(figures[field.name], 4) for _, _, figures in run.plots])

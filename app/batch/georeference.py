@@ -198,9 +198,9 @@ def reproject(points: Float, source: str, target: str) -> Float:
 
 
 def check_area(crs: str, points: Float) -> None:
-    """Check that positions are in the area for which a reference system is defined, with a margin of 3
-    degrees, and that its metres are those of the ground within SCALE_ERROR; for a system without an area
-    only that they have a longitude and latitude.
+    """Check that positions have a longitude and latitude, that these are in the area for which a reference
+    system is defined, if it states one, with a margin of 3 degrees, and that its metres are those of the
+    ground within SCALE_ERROR.
 
     Args:
         crs: The reference system.
@@ -241,10 +241,11 @@ def check_area(crs: str, points: Float) -> None:
 
 
 def map_centre(folder: FilePath) -> Float:
-    """Return the middle of the trees of a run in the map, shape (1, 2) [m]; the origin without trees.
+    """Return the mean position of the trees of a run in the map, also of rejected ones, shape (1, 2) [m]; the
+    origin without trees.
 
     Raises:
-        StemmapError: The folder is not that of a run, or a file is damaged.
+        SourceError: trees.csv is missing or damaged.
     """
     places = read_tree_places(folder)
     centre: Float = np.array(list(places.values()) or [(0.0, 0.0)]).mean(axis=0, keepdims=True)
@@ -350,8 +351,8 @@ def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
         crs: Reference system, see `projected`, to which longitudes and latitudes are converted.
 
     Raises:
-        SourceError: It cannot be read, is larger than 1 MB, has an incomplete header or row, a name of more
-            than NAME_MAX characters, no rows or more than POINTS_MAX.
+        SourceError: It cannot be read, is larger than 1 MB, has an incomplete header or row, a cell that is
+            not a number, a name of more than NAME_MAX characters, no rows or more than POINTS_MAX.
     """
     table = CsvTable.read(file, "table of control points", _LARGEST_FILE)
     if len(table.rows) > POINTS_MAX:
@@ -412,8 +413,9 @@ def by_control_points(
         point_sigma: See `fit_control_points`.
 
     Raises:
-        StemmapError: A tree is unknown, the points are not in the area of the reference system or contradict
-            one another, or the run has no terrain at a point with a height.
+        StemmapError: The folder is not that of a run, a tree is unknown, the points are not in the area of
+            the reference system, are fewer than two, at one place or contradict one another, or the run has
+            no terrain at a point with a height.
     """
     read_run_record(folder)
     trees = read_tree_places(folder)
@@ -485,7 +487,8 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
         start_ns: Time of the first scan [ns]; None for that of the saved state of the run.
 
     Raises:
-        StemmapError: The recording or the saved state cannot be read, the recording has no fixes, or they do
+        StemmapError: The run, its recording or its saved state cannot be read, the recording has no fixes (as
+            that of a live run or a whole cloud), or they are not in the area of the reference system or do
             not fit the path.
     """
     from app.batch.continue_map import read_saved_run
@@ -560,8 +563,8 @@ def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
 
 
 def frame_lines(frame: MapFrame) -> list[str]:
-    """Return a frame as lines for people: where known the place of the map; position, and where known its
-    standard deviation and the residuals of the control points."""
+    """Return a frame as lines for people: where known the place of the map; position and method; where known
+    its standard deviation and the residuals of the control points. A local frame is one line."""
     if not frame.crs:
         return ["local coordinates: the map has no reference system"]
     lines = [f"the map is at {frame.place}"] if frame.place else []

@@ -367,10 +367,12 @@ def _run_record(
     error: PathError | None,
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """Return the contents of run.json: `source` (that of the first drive), `continued` (further drives) and
-    `chosen` where there are any, preset and parameters with their revisions, counts, pose quality (`health`),
-    scores (`evaluation`, `path_error`; None without), warnings and losses. Without the time of the
-    mapping and computing times, so that the same run gives the same bytes.
+    """Return the contents of run.json but `odometry_used`: `stemmap` (version), `source` (of the first drive;
+    its `kind` and `sensor` are those of the present one), `recorded` (see `recorded_time`), `continued`
+    (further drives) and `chosen` where there are any, `seed`, `odometry`, `preset`, `changed`, `parameters`,
+    `revisions`, the counts `scans`, `duration_s`, `distance_m`, `trees`, `points` and `verdicts`, the pose
+    quality `health`, the scores `evaluation` and `path_error` (None without), `warnings` and `losses`.
+    Without the time of the mapping and computing times, so that the same run gives the same bytes.
 
     Args:
         plan: The run with its parameters.

@@ -32,16 +32,18 @@ UNCLASSIFIED, GROUND_CLASS, HIGH_VEGETATION = 1, 2, 5
 def write_cloud(folder: FilePath, file: FilePath) -> int:
     """Write the cloud of a run; return the number of points.
 
-    A whole cloud keeps its points and coordinates. The scans of a drive are read again from the source,
-    placed by the path of the run, and thinned. Points within the radius of a trunk and MARGIN have the number
-    of the tree in the field `tree` (0 for none) and class 5; ground has class 2, the rest class 1.
+    A whole cloud keeps its points and coordinates. Every EVERY-th scan of a drive is read again from the
+    source, placed by the path of the run, and thinned. Points within GROUND of the terrain have class 2.
+    Others within the radius of the nearest trunk and MARGIN, at any height, have class 5 and the number of
+    the tree in the field `tree`, which is 0 for all other points; the rest has class 1.
 
     Args:
         folder: Folder of the run.
-        file: File .las or .laz.
+        file: File .las or .laz, which is replaced; after an error it may be incomplete.
 
     Raises:
-        StemmapError: The source cannot be read any more, is live, or the run continues another one.
+        StemmapError: The run or its source cannot be read, it is live or continues another run, or no point
+            is near known ground.
         OSError: The file cannot be written.
     """
     import laspy

@@ -31,7 +31,8 @@ HYPOTHESES = 3_000_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MergeResult:
-    """Numbers of trees of run a, of run b and in both, and the match of the two maps."""
+    """Numbers of confirmed trees of the merged map: in run a, in run b and in both; and the match of the two
+    maps."""
 
     a: int
     b: int

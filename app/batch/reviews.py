@@ -35,8 +35,9 @@ _FILES = ("path.csv", "terrain.csv", "seen.csv", "run.json", "georeference.json"
 def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> dict[int, str]:
     """Return CONFIRMED or REJECTED for each tree that a person reviewed, by its number.
 
-    An annotation belongs to the tree that is nearest to it, within SAME_THING. Of several annotations of a
-    tree the nearest one counts. The page has the same rule (`paired` in static/js/annotate/annotations.js).
+    An annotation belongs to the tree that is nearest to it, if it is nearer than SAME_THING. Of several
+    annotations of a tree the nearest one counts, of equally near ones the last. The page has the same rule
+    (`paired` in static/js/annotate/annotations.js).
 
     Args:
         numbers, position: Numbers of the trees, and their positions in the map, shape (T, 2) [m].
@@ -77,7 +78,7 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content]) -> Iterator[File
         contents: Annotations in the frame of the map.
 
     Raises:
-        StemmapError: The run cannot be read.
+        StemmapError: A file of the run is missing or damaged.
     """
     run = read_run(folder)  # checks the files
     if not (contents or run.rejected or CONFIRMED in run.reviews.values()):

@@ -66,7 +66,8 @@ class Visit:
     frame: MapFrame
 
     def observed(self, points: Float) -> Bool:
-        """Return whether the visit looked at each position, shape (N, 2)."""
+        """Return whether the visit looked at each position in its frame, shape (N, 2) [m]: inside the
+        observed area, or without one inside the convex hull of its trees with BORDER around it."""
         if self.seen is not None:
             return self.seen.rows(points) >= 0
         hull = shapely.MultiPoint(self.trees.position).convex_hull.buffer(BORDER)
@@ -129,7 +130,7 @@ def compare(
 
     Args:
         a, b: The earlier and the later visit.
-        same_frame: Whether their coordinates are taken as equal, without any alignment.
+        same_frame: Whether their coordinates are taken as equal, without any alignment; no error then.
         reach: Largest distance of the two positions of a tree [m].
         dbh_sigma: Standard deviation of a diameter that has none [m].
 
@@ -156,7 +157,8 @@ def _other_unit(a: VisitTrees, b: VisitTrees) -> str:
 
 
 def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
-    """Return one row of COLUMNS per tree, with None for unknown values; positions are in the frame of a.
+    """Return one row of COLUMNS per tree, with None for unknown values: first the trees of a in their order,
+    each with its pair in b, then the others of b. Positions are in the frame of a.
 
     The status is `same`, `moved`, `missing` (only in a, at a place that b observed), `new` (only in b, at a
     place that a observed), `not seen in a` and `not seen in b` where the other visit did not look, or
@@ -195,7 +197,8 @@ def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
 
 def _status_in(visit: Visit, name: str, observed: str, points: Float, reach: float) -> list[str]:
     """Return the status of each position, shape (N, 2) in the frame of a visit, at which the visit has no
-    tree: `observed` if it looked there, else "not seen in" or "rejected in" with the name of the visit."""
+    tree: "rejected in NAME" within `reach` [m] of a rejected tree; else the word `observed` if it looked
+    there, or "not seen in NAME"."""
     near = np.hypot(*(points[:, None, :] - visit.rejected[None]).transpose(2, 0, 1)) <= reach
     rejected, seen = near.any(axis=1), visit.observed(points)
     return [
@@ -238,9 +241,14 @@ def _row(
 
 
 def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, Any]:
-    """Return the figures of a comparison as JSON values, with None where there is none: `alignment`, the
-    `counts` of COLUMNS' status, the number of `pairs`, RMS of their shifts, and mean, weighted mean, standard
-    error and RMS of the growth of those `with_dbh` in both, and `warnings` for people."""
+    """Return the figures of a comparison as JSON values, with None where there is none.
+
+    Keys: `stemmap` (version), the names `a` and `b`; `alignment` with the pose of b in a as `x_m`, `y_m` and
+    `turn_deg`, `shift_of_centre_m` (of the mean tree of b, [x, y]) and `stems`; `trees_a`, `trees_b`;
+    `counts`, the number of rows of each status, also 0; `pairs` and `shift_rms_m`; of the pairs `with_dbh`
+    (number) in both visits `growth_mean_cm`, `growth_weighted_cm`, `growth_se_cm` (from two on),
+    `dbh_rms_difference_cm` and the number `significant`; and `warnings` for people.
+    """
     rows = rows_of(a, b, found)
     growth = found.growth[np.isfinite(found.growth)]
     weight = 1.0 / np.square(found.growth_sigma[np.isfinite(found.growth)])
@@ -275,7 +283,8 @@ def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, A
 
 
 def _unit_warnings(a: Visit, b: Visit, found: VisitComparison) -> list[str]:
-    """Return a warning if the median ratio of the diameters of pairs cannot be growth."""
+    """Return a warning if the median ratio of the diameters of at least FEWEST_RATIOS pairs cannot be growth;
+    else []."""
     pairs = np.flatnonzero(found.b_of >= 0)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = b.trees.dbh[found.b_of[pairs]] / a.trees.dbh[pairs]
@@ -325,10 +334,11 @@ def comparison_csv(rows: list[dict[str, Any]]) -> str:
 
 def write_comparison(a: Visit, b: Visit, found: VisitComparison, folder: FilePath) -> None:
     """Write comparison.csv, comparison.json, comparison.svg (a map) and comparison.geojson to a folder, which
-    is created if necessary.
+    is created if necessary. The visits have at least one tree.
 
     Raises:
-        OSError: The folder cannot be written.
+        OSError: The folder cannot be created.
+        StemmapError: A file cannot be written.
     """
     rows = rows_of(a, b, found)
     texts = {

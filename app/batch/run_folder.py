@@ -210,7 +210,8 @@ NO_PATH = Path(_NOTHING.astype(np.int64), _NOTHING, _NOTHING, _NOTHING, _NOTHING
 
 
 def score_map(trees: Trees, path: Path, truth: TruthTrees, parameters: Parameters) -> MapScores:
-    """Return the scores of a map. With an empty path, as that of a whole cloud, all true trees count.
+    """Return the scores of a map, see `evaluate`. With an empty path, as that of a whole cloud, all true
+    trees count, else those within `evaluation.reach` of it.
 
     Args:
         trees, path: The map, see `as_written`.

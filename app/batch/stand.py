@@ -41,7 +41,8 @@ class StandResult:
         figures: Figures of each plot by name.
         total: Mean over the plots, or the figures of the one plot.
         left_out: Number of trees of the map that no plot counts, by reason: `rejected` (in the review),
-            `outside_of_plots`, `outside_of_observed_area` or `below_minimum_dbh`, whichever comes first.
+            `outside_of_plots` (only with plots), `outside_of_observed_area` or `below_minimum_dbh`, whichever
+            comes first. A tree without a diameter is not below the minimum.
         detection_sigma: Scale of the half-normal function [m]; inf for certain detection.
         warnings: Messages, those of plots with the name of the plot.
     """
@@ -70,8 +71,8 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         plots: Plots in the frame of the map; without any, the whole observed area is one plot.
 
     Raises:
-        StemmapError: The folder is not that of a run, nothing was observed, two plots have the same name, or
-            no plot touches the observed area.
+        StemmapError: The folder is not that of a run, a file is damaged, nothing was observed, two plots have
+            the same name, no plot touches the observed area, or the volume formula is not valid.
     """
     run, frame = read_run(folder), read_map_frame(folder)
     warnings = []
@@ -134,8 +135,8 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
 def _left_out(
     trees: PlotTrees, plots: Sequence[SamplePlot], seen: SeenArea, dbh_min: float
 ) -> dict[str, int]:
-    """Return the number of trees that no plot counts by reason, see `StandResult.left_out`, without the
-    rejected ones, which `trees` does not have. Without plots, the plot is the observed area."""
+    """Return the number of trees that no plot counts by reason, see `StandResult.left_out`, without
+    `rejected`, which `trees` does not have, and without `outside_of_plots` if there are no plots."""
     reasons = {
         "outside_of_observed_area": seen.rows(trees.position) < 0,
         "below_minimum_dbh": trees.dbh < dbh_min,
@@ -152,7 +153,8 @@ def _left_out(
 
 
 def _plot_trees(trees: Trees, formula: str) -> PlotTrees:
-    """Return trees for stand figures, with volumes by a formula if it is not empty."""
+    """Return trees for stand figures, with volumes by a formula if it is not empty; raises StemmapError if it
+    is not valid."""
     if not formula:
         return PlotTrees(trees.position, trees.dbh, trees.dbh_sigma)
     unknown = np.full(len(trees.number), np.nan)
@@ -182,8 +184,9 @@ CLASS_COLUMNS = ("plot", "from_cm", "to_cm", "trees", "n_ha", "n_ha_se", "g_ha",
 
 
 def stand_files(result: StandResult) -> dict[str, str]:
-    """Return the texts of stand.csv (one row per plot, and `mean` for several), classes.csv and stand.json by
-    name. Unknown values are empty cells or null."""
+    """Return the texts of three files by name. stand.csv has PLOT_COLUMNS, then each figure of FIGURES and
+    its `_se`, one row per plot, and for several a row `mean` with only figures. classes.csv has
+    CLASS_COLUMNS. stand.json is `stand_record`. Unknown values are empty cells or null."""
     header = (*PLOT_COLUMNS, *(f"{name}{end}" for name in FIGURES for end in ("", "_se")))
     rows = []
     for name, f in result.figures.items():
@@ -209,10 +212,11 @@ def stand_record(result: StandResult) -> dict[str, Any]:
 
     Each figure is a list [value, standard error]; an unknown number in it is None, so that an unknown figure
     is [None, None]. `trees_in_map` counts all trees, also rejected ones; `trees_left_out` has the number of
-    those that no plot counts, by reason. `plots` has by the name of the plot `area_m2`, `seen_m2`, `trees`,
-    `trees_without_dbh`, `trees_with_volume` (None if unknown), the figure `detection`, the other figures by
-    name, and `classes`, a list of `from_cm`, `to_cm`, `trees` and the figures `n_ha` and `g_ha`. `mean` has
-    the figures over all plots, and `units` the unit of each figure.
+    those that no plot counts, by reason; `detection_sigma_m` is None for certain detection. `plots` has by
+    the name of the plot `area_m2`, `seen_m2`, `trees`, `trees_without_dbh`, `trees_with_volume` (None if
+    unknown), the figure `detection`, the other figures by name, and `classes`, a list of `from_cm`, `to_cm`,
+    `trees` and the figures `n_ha` and `g_ha`. `mean` has the figures over all plots, and `units` the unit of
+    each figure. Further keys: `stemmap` (version), `source`, `crs`, `parameters` and `warnings`.
     """
     return {
         "stemmap": version(),
@@ -271,7 +275,9 @@ def _numbers(values: Sequence[float]) -> list[str]:
 
 
 def stand_summary(result: StandResult) -> list[str]:
-    """Return the figures over all plots as lines for people; figures without a value are omitted."""
+    """Return the figures over all plots as lines for people: the number of trees and the area, trees that are
+    not counted if there are any, the figures that have a value, detection, and the meaning of the standard
+    errors. Warnings are not included."""
     seen = sum(f.seen for f in result.figures.values())
     area = sum(f.area for f in result.figures.values())
     trees = sum(f.trees for f in result.figures.values())
@@ -305,5 +311,5 @@ def stand_summary(result: StandResult) -> list[str]:
 
 
 def _digits(value: float) -> str:
-    """Return a number with three significant digits or, from 100 on, as a whole number."""
+    """Return a number with two decimals below 10, one below 100, and else none."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"

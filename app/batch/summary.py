@@ -99,8 +99,8 @@ class RunHealth:
             self._spans_left_out += 1
 
     def _remember_worst(self, health: Health) -> None:
-        """Update the worst values: the least of n_eff and ancestors, else the largest; values that are not
-        finite are ignored."""
+        """Update the worst values: the least of n_eff and ancestors; of the others the largest, at least 0,
+        where values that are not finite are ignored."""
         found = {
             "sigma_xy_m": health.sigma_xy,
             "sigma_yaw_deg": math.degrees(health.sigma_yaw),
@@ -115,9 +115,11 @@ class RunHealth:
             self._worst[name] = min(value, self._worst.get(name, math.inf))
 
     def record(self, start_ns: int) -> dict[str, Any]:
-        """Return the record for run.json: `scans`, the number by state; `worst`, the worst value by name;
-        `spans`, at most MOST_SPANS, each with `state`, `reason`, `scans` [first, last] and `time_s` [first,
-        last], seconds after `start_ns`; and `spans_left_out`, the number of further ones."""
+        """Return the record for run.json: `scans`, the number by state; `worst`, the worst value by name
+        (`sigma_xy_m`, `sigma_yaw_deg`, `innovation`, `odometry_sigmas`, `ambiguous`, `n_eff`, `ancestors`),
+        where there was one; `spans`, at most MOST_SPANS, each with `state`, `reason`, `scans` [first, last]
+        and `time_s` [first, last], seconds after `start_ns`; and `spans_left_out`, the number of further
+        ones."""
         return {
             "scans": {state: self._scans[state] for state in ("good", "weak", "lost")},
             "worst": {name: round(value, 4) for name, value in sorted(self._worst.items())},

@@ -112,7 +112,8 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
         folder: Folder of the run.
 
     Returns:
-        Number of pictures, and a warning; 0 and "" for a source without a camera.
+        Number of written pictures, and a warning; 0 and "" for a source without a camera. A picture that
+        cannot be decoded is left out and counted in the warning.
 
     Raises:
         OSError: An old picture cannot be deleted, or the folder cannot be created.

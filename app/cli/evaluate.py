@@ -51,7 +51,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Score the runs and print the scores, with one set of parameters or, with --param-grid, with many. A run
     that cannot be scored is reported on standard error if there are several. With --json several runs become
-    one object by their names.
+    one object by their names. `arguments` gets `files`, the file of true trees by run.
 
     Returns:
         Exit code: 0; 3 if some runs could not be scored; 1 if none could.
@@ -233,8 +233,8 @@ def run_grid(arguments: argparse.Namespace) -> int:
         Exit code: 0; 3 if results or runs are missing; 1 if no run can be used or all results failed.
 
     Raises:
-        StemmapError: An argument is wrong, every set contradicts itself, or more than MOST_JOBS results are
-            requested.
+        StemmapError: An argument is wrong, every set contradicts itself, more than MOST_JOBS results are
+            requested, or a file cannot be written.
     """
     from app.tuning.grid import combinations, read_axes
 
@@ -295,7 +295,8 @@ def _base(arguments: argparse.Namespace, run: PreparedRun, changes: dict[str, Va
 
 def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
     """Compute all jobs of a plan with a progress bar, in --jobs processes (default: one per usable core, at
-    most one per job). Return their results, and print warnings to standard error."""
+    most one per job). Return their results in the order of `plan.jobs`; print the number of stored results
+    that were used and warnings to standard error."""
     from app.common.text import count
     from app.tuning.jobs import ResultStore, ScoringProcesses
     from app.tuning.report import sweep

@@ -150,7 +150,8 @@ def add_keep_flag(parser: argparse._ActionsContainer) -> None:
 
 
 def kept_results(arguments: argparse.Namespace) -> Path | None:
-    """Return the folder of stored results: --keep, else that in the data folder; None without both."""
+    """Return the folder of stored results: --keep, else that in the data folder; None without both. Raises
+    StemmapError if an environment variable of `app.common.settings` is invalid, also with --keep."""
     from app.common.settings import RESULTS, from_environment
 
     folder = from_environment().folder
@@ -205,6 +206,8 @@ def recording_place(arguments: argparse.Namespace, *sources: str) -> str:
     Raises:
         ParameterError: With --record or --publish a source is not live, or with --publish is not reached over
             Zenoh.
+        StemmapError: --record has no file name, and there is no data folder or an environment variable of
+            `app.common.settings` is invalid.
     """
     import time
 

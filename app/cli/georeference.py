@@ -58,10 +58,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Find the frame of the map, write it and print its residuals, by the first method given of --from-page,
-    --control, --gnss, --in-file and --by-hand (turn in degrees). --remove deletes
-    georeference.json; without a method the present frame is printed and nothing is written. All but
-    --from-page need --crs.
+    """Find the frame of the map by the given method (--from-page, --control, --gnss, --in-file or --by-hand),
+    write it and print it, see `frame_lines`. All methods but --from-page need --crs. --remove deletes
+    georeference.json, also if there is none; without a method the present frame is printed and nothing is
+    written.
 
     Returns:
         0.

@@ -55,8 +55,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _record(opened: Source) -> dict[str, Any]:
-    """Return the description of a source, its `topics`, number of true `trees` and `others` (in `truth`) and
-    `losses` as JSON values; times are nanoseconds, lengths metres, unknown values None."""
+    """Return the description of a source as JSON values: `uri`, `kind`, `digest`, `scans`, `start_ns`,
+    `end_ns`, `sensor`, `T_base_lidar` (`R` and `t` [m]), `odometry` and `imu` (whether there is one),
+    `preset`, `topics`, `truth` (numbers of `trees` and `others`, and whether there is a `path`), `losses` and
+    `warnings`. Unknown values are None."""
     from dataclasses import asdict
 
     d, truth = opened.description, opened.truth()
@@ -170,8 +172,9 @@ SQUARE_M = 1.0  # smallest area for the point density [m^2]
 
 
 def _cloud_record(d: CloudDescription) -> dict[str, Any]:
-    """Return the description of a cloud as JSON values: its corners `low_m` and `high_m` (None without a
-    valid extent), `offset_m`, `crs` (None without) and its other fields."""
+    """Return the description of a cloud as JSON values: `uri`, `kind`, `digest`, number of `points`, the
+    corners `low_m` and `high_m` (None without a valid extent), `offset_m`, `crs` (None without), `attributes`
+    and `warnings`."""
     extent = _extent(d)
     return {
         "uri": d.uri,

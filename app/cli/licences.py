@@ -16,14 +16,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(_arguments: argparse.Namespace) -> int:
-    """Print a line per package: those that stemmap and its installed extras need, directly or not."""
+    """Print a line per package, ordered by name: stemmap and those that it and its installed extras need,
+    directly or not; return 0."""
     for found in sorted(_used("stemmap").values(), key=lambda each: each.name.lower()):
         print(found.name, found.version, _licence(found), sep="\t")
     return 0
 
 
 def _used(name: str) -> dict[str, Distribution]:
-    """Return the installed packages that a package needs, by normalised name, and the package itself."""
+    """Return a package and the installed packages that it needs, directly or not, by normalised name. Extras
+    count only for stemmap itself."""
     used: dict[str, Distribution] = {}
     waiting = [name]
     while waiting:

@@ -108,9 +108,9 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _watched(sources: list[Open]) -> tuple[ZenohAddress, Open] | None:
-    """Return the router whose robots are all shown and how they are opened, if an address has robot=*,
-    or names no robot and several are found; else None. In the last case it asks the router, which takes up to
-    3 s."""
+    """Return the router whose robots are all shown and how they are opened, if the only source is a Zenoh
+    address with robot=*, or one that names neither a robot nor topics and several robots are found; else
+    None. To find them the router is asked, which takes up to 3 s."""
     from app.robot.address import ALL_ROBOTS, ZenohAddress, is_live, parse_address
 
     if len(sources) != 1 or not is_live(sources[0].uri):

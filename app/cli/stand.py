@@ -189,7 +189,8 @@ def stored_on_page(run: Path, read: Callable[[Store, dict[str, Any]], T]) -> T |
 @contextmanager
 def reviewed(run: Path) -> Iterator[Path]:
     """Yield the folder of a run, or a temporary one in which trees.csv has the reviews that people made on
-    the page (see `reviewed_run`); the number of rejected trees is then printed to standard error.
+    the page (see `reviewed_run`); the number of rejected trees is then printed to standard error. A path that
+    is not a folder is yielded unchecked.
 
     Raises:
         StemmapError: The run or the database cannot be read.

@@ -88,7 +88,7 @@ class ChildProcess:
 
     @classmethod
     async def start(cls, command: Sequence[str], *, line_limit: int = LINE_LIMIT) -> ChildProcess:
-        """Start a process.
+        """Start a process; its standard error is that of this process.
 
         Args:
             command: Program and arguments, see `python_module`.
@@ -117,7 +117,11 @@ class ChildProcess:
 
     async def send(self, message: object) -> None:
         """Send a message as a line of JSON; waits while the pipe is full. If the child has ended, nothing is
-        raised; `receive` then returns None."""
+        raised; `receive` then returns None.
+
+        Raises:
+            NotImplementedError: The message has a value without a form in JSON; nothing is sent.
+        """
         with contextlib.suppress(ConnectionError):
             self._stdin.write(_encoded(message))
             await self._stdin.drain()
@@ -127,11 +131,11 @@ class ChildProcess:
 
         Args:
             kind: Type that the message must have.
-            timeout_s: Longest wait; None for no limit.
+            timeout_s: Longest wait [s]; None for no limit.
 
         Raises:
             ProtocolError: The line is too long or is not of this type; the child is to be ended.
-            TimeoutError: No line came in time.
+            TimeoutError: No line came in time; the child still runs.
         """
         try:
             async with asyncio.timeout(timeout_s):
@@ -170,12 +174,16 @@ class ChildProcess:
 
 
 class BlockingChildProcess:
-    """A child process, used from a thread that may wait.
+    """A child process, used from a thread that may wait. It starts at once; its standard error is that of
+    this process. The caller ends it with `end`.
 
     Args:
         command: Program and arguments, see `python_module`.
         line_limit: Longest line that is accepted [bytes].
         one_thread: Whether its numerical libraries use one thread each, unless the environment sets a number.
+
+    Attributes:
+        pid: Process number.
 
     Raises:
         StemmapError: The system cannot start it.
@@ -207,7 +215,11 @@ class BlockingChildProcess:
 
     def send(self, message: object) -> None:
         """Send a message as a line of JSON; waits while the pipe is full. If the child has ended, nothing is
-        raised; `receive` then returns None."""
+        raised; `receive` then returns None.
+
+        Raises:
+            NotImplementedError: The message has a value without a form in JSON; nothing is sent.
+        """
         with contextlib.suppress(ConnectionError):
             self._stdin.write(_encoded(message))
             self._stdin.flush()
@@ -253,7 +265,8 @@ class BlockingChildProcess:
 
 
 class ParentConnection:
-    """The child's end: messages from and to the parent.
+    """The child's end: messages from and to the parent. A thread reads from the parent from now on; it ends
+    this process with code 1 when the parent closes the connection or ends.
 
     Args:
         incoming, outgoing: Streams of lines from and to the parent.
@@ -266,12 +279,11 @@ class ParentConnection:
 
     @property
     def has_message(self) -> bool:
-        """Whether a message waits to be received."""
+        """Whether `receive` would return at once."""
         return not self._lines.empty()
 
     def receive(self, kind: type[T]) -> T:
-        """Wait for the next message, without a time limit. If the parent closes the connection or ends, this
-        process ends.
+        """Return the next message, of type `kind`; waits for it without a time limit.
 
         Raises:
             ProtocolError: It is not of this type.
@@ -281,7 +293,12 @@ class ParentConnection:
         return message
 
     def send(self, message: object) -> None:
-        """Send a message, encoded as a line of JSON, to the parent."""
+        """Send a message as a line of JSON to the parent.
+
+        Raises:
+            NotImplementedError: The message has a value without a form in JSON.
+            BrokenPipeError: The parent has ended.
+        """
         self._outgoing.write(_encoded(message))
         self._outgoing.flush()
 
@@ -300,10 +317,12 @@ def run_child(
     memory_limit: int | None = None,
     low_priority: bool = False,
 ) -> NoReturn:
-    """Run the program of a child process, then end the process with code 0, or 1 after an exception, which is
-    printed, or at once when the parent closes the connection or ends. It never returns.
+    """Run the program of a child process, then end the process: with code 0; with 1 after an exception, whose
+    traceback is printed; after SystemExit with its code, or 1 and no message if that is not an integer; with
+    1 at once when the parent closes the connection or ends. It never returns.
 
-    What libraries print goes to standard error. Ctrl-C is ignored: the parent ends its children.
+    Standard input is empty for the program, and what it prints goes to standard error. Ctrl-C is ignored: the
+    parent ends its children.
 
     Args:
         main: The program.
@@ -358,14 +377,15 @@ def _encoded(message: object) -> bytes:
 
 
 def _number(value: object) -> object:
-    """Convert a NumPy scalar to a number for JSON."""
+    """Return a NumPy scalar, or another value with `__float__`, as a number for JSON; raises
+    NotImplementedError for other values."""
     if isinstance(value, SupportsFloat):
         return value.item() if hasattr(value, "item") else float(value)
     raise NotImplementedError(f"{type(value).__name__} cannot be sent")
 
 
 def _decoded(line: bytes, kind: type[T]) -> T | None:
-    """Return the message of a line; None for an incomplete line.
+    """Return the message of a line; None for an incomplete or empty line.
 
     Raises:
         ProtocolError: The line is not JSON of this type.

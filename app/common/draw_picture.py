@@ -75,7 +75,8 @@ class Drawing(msgspec.Struct, frozen=True):
 
 
 def draw_safely(drawing: Drawing) -> bytes | None:
-    """Return a picture as JPEG, or None if the child process fails, takes more than 60 s or returns too much.
+    """Return a picture as JPEG, see `draw`, made in a child process; None if that fails, takes more than 60 s
+    or returns more than 2 MB.
 
     Raises:
         StemmapError: No process can be started.
@@ -91,12 +92,14 @@ def draw_safely(drawing: Drawing) -> bytes | None:
 
 
 def draw(drawing: Drawing) -> bytes:
-    """Return a picture as JPEG, at most `LARGEST_SIDE` pixels wide and high, with its box and label if it has
-    them.
+    """Return a picture as JPEG, never enlarged and at most `LARGEST_SIDE` pixels wide and high, with its box
+    and the first 60 characters of its label if it has a box. Pillow's limit of pixels is changed for the
+    whole process.
 
     Raises:
-        ValueError: The picture is too large or has an unknown encoding.
-        OSError: The picture is damaged.
+        ValueError: The encoding is unknown, raw data are too short, or an encoded picture has more than
+            PIXEL_LIMIT pixels.
+        OSError: The picture is damaged. A damaged picture can raise any other exception of Pillow as well.
     """
     from PIL import Image, ImageDraw
 
@@ -136,7 +139,7 @@ def draw(drawing: Drawing) -> bytes:
 
 
 def _answer(parent: ParentConnection) -> None:
-    """Draw one picture and send it; ends the process with an error if it cannot be drawn."""
+    """Draw one picture and send it; raises SystemExit if it cannot be drawn."""
     try:
         picture = draw(parent.receive(Drawing))
     except Exception as error:  # a decoder may raise any exception on damaged data

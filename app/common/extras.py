@@ -9,15 +9,15 @@ from pipeline.errors import StemmapError
 
 
 def needed(module: str, extra: str, purpose: str) -> Any:  # noqa: ANN401 - a module
-    """Return an optional module.
+    """Import an optional module and return it.
 
     Args:
         module: Its name.
         extra: The extra of this package that installs it.
-        purpose: What needs it, for the message.
+        purpose: What needs it, a plural for the message, such as "GIS files".
 
     Raises:
-        StemmapError: It is not installed.
+        StemmapError: It, or a module that it needs, is not installed.
     """
     try:
         return importlib.import_module(module)

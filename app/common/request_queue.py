@@ -20,7 +20,8 @@ class RequestQueue:
 
     Args:
         pause_s: Pause between two requests [s].
-        most_waiting: Maximum length of the queue.
+        most_waiting: Maximum number of requests that wait for a turn. One that waits only for the end of the
+            pause has the turn already.
     """
 
     def __init__(self, pause_s: float = 0.0, most_waiting: int = _MOST_WAITING) -> None:
@@ -31,8 +32,8 @@ class RequestQueue:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
-        """Wait for a turn, which lasts as long as the context. Turns follow each other with the pause of the
-        queue in between.
+        """Wait for a turn, which lasts as long as the context. Turns are in the order of the calls, with the
+        pause of the queue after each, also after one that raises.
 
         Raises:
             TooManyRequestsError: `most_waiting` other requests wait already.

@@ -113,10 +113,12 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
 
 
 def data_folder(given: Mapping[str, str]) -> Path | None:
-    """Return the data folder: STEMMAP_FOLDER, or the default of the system; None if neither is known.
+    """Return the data folder: STEMMAP_FOLDER, else `stemmap` in XDG_DATA_HOME, LOCALAPPDATA or
+    ~/.local/share, whichever is known first; None without any. Empty variables count as unknown; the folder
+    need not exist.
 
     Args:
-        given: The environment variables.
+        given: The environment variables, from which the home folder is taken too.
     """
     if named := given.get("STEMMAP_FOLDER"):
         return Path(named).expanduser()
@@ -138,8 +140,8 @@ class Environment(msgspec.Struct, frozen=True, rename=lambda name: f"STEMMAP_{na
 
 
 def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
-    """Return the settings from the environment variables STEMMAP_*, with defaults for those that are not set.
-    No folder is created.
+    """Return the settings from the environment variables of VARIABLES, with defaults for those that are not
+    set; the limits of bodies and messages are always the defaults. No folder is created.
 
     Args:
         environment: The variables; None for those of this process.

@@ -44,11 +44,11 @@ def changed_values(name: str, parameters: Parameters) -> dict[str, Value]:
 
 def preset_words(name: str, parameters: Parameters) -> str:
     """Return a description such as "preset forest" or "preset forest with clustering.eps = 0.2", with at most
-    six values.
+    six values and the number of the others.
 
     Args:
         name: Name of the preset.
-        parameters: Parameters; those that differ from the preset are named.
+        parameters: Parameters; those of `changed_values` are named.
     """
     changed = changed_values(name, parameters)
     if not changed:

@@ -23,7 +23,7 @@ class Throttle(Generic[P]):
 
     Args:
         function: Function that is called on the event loop.
-        pause_s: Minimum time between two calls [s].
+        pause_s: Minimum time between the starts of two calls [s].
     """
 
     def __init__(self, function: Callable[P, None], *, pause_s: float) -> None:
@@ -35,7 +35,7 @@ class Throttle(Generic[P]):
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> None:
         """Call the function now, or later with the newest arguments if it was called too recently. Exceptions
-        of the function are raised only by a call that happens now."""
+        of a call now are raised here, those of a later call go to the event loop."""
         self._call = lambda: self._function(*args, **kwargs)
         loop = asyncio.get_running_loop()
         if self._timer is None and loop.time() >= self._free_at:
@@ -66,7 +66,8 @@ class Throttle(Generic[P]):
 
 
 async def cancel(task: asyncio.Task[Any] | None) -> None:
-    """Cancel a task and wait for its end; nothing for None. An error of the task is logged."""
+    """Cancel a task and wait for its end; nothing for None. An error of the task, also of one that had ended
+    before, is logged. If the caller is cancelled meanwhile, the function returns and does not raise."""
     if task is None:
         return
     task.cancel()
@@ -79,7 +80,7 @@ async def cancel(task: asyncio.Task[Any] | None) -> None:
 
 
 class Stopwatch:
-    """Median times of the stages over the last scans; the `StageTimer` of a mapper.
+    """Median times of the stages and of whole scans over the last scans; the `StageTimer` of a mapper.
 
     Measurements during which `disturb` is called are discarded.
 
@@ -102,8 +103,8 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Measure one stage inside the context, unless measurements are disabled by `aside` or it is
-        disturbed."""
+        """Measure one stage inside the context, also one that raises; the time is discarded if measurements
+        are disabled by `aside` or the stage is disturbed."""
         start, disturbances = self._clock(), self._disturbances
         try:
             yield
@@ -145,5 +146,6 @@ class Stopwatch:
 
     @property
     def stage_ms(self) -> dict[str, float]:
-        """Return the median time of each stage [ms], in the order of their first run."""
+        """Return the median time of each stage [ms] by name, in the order of their first run; stages without
+        a measurement are left out."""
         return {stage: 1e3 * median(times) for stage, times in self._stages.items() if times}

@@ -19,7 +19,8 @@ current_user: ContextVar[str] = ContextVar("current_user", default="")
 
 
 def user_of_cookies(cookies: list[str]) -> str:
-    """Return the name of the person in the Cookie headers of a request; SOMEBODY without a valid name.
+    """Return the name of the person in the Cookie headers of a request: the first valid value of COOKIE;
+    SOMEBODY without one.
 
     Args:
         cookies: Values of the headers.
@@ -33,6 +34,6 @@ def user_of_cookies(cookies: list[str]) -> str:
 
 
 def is_user_name(name: str) -> bool:
-    """Return whether a name has 1 to 40 letters, digits, spaces and . @ - _ and begins with a letter or
-    digit."""
+    """Return whether a name has 1 to 40 letters (of any script), digits, spaces and . @ - _ and begins with a
+    letter, a digit or _."""
     return re.match(USER_NAME, name) is not None

@@ -98,8 +98,8 @@ def offer_of(topic: str, type_name: str, robot: str, *, reliable: bool, latched:
 
 
 def common_offer(alive: Iterable[Publisher], topic: str, msgtype: str) -> Offer | None:
-    """Return what all writers of a topic offer: reliable or latched only if all of them are; None if there is
-    no writer."""
+    """Return what all writers of a topic offer: reliable if all of them are, latched if all of them are both;
+    None if there is no writer of this topic and type."""
     there = [o for o in alive if isinstance(o, Offer) and (o.topic, o.msgtype) == (topic, msgtype)]
     if not there:
         return None
@@ -118,7 +118,7 @@ OWN_CONFIGURATION = "CYCLONEDDS_URI"
 
 def configuration(address: DdsAddress) -> str:
     """Return the configuration of CycloneDDS as XML: one interface, by default the loopback of this machine,
-    and the peers."""
+    and the peers, by default none or, on the loopback, this machine."""
     named = address.interface or "127.0.0.1"
     by = "address" if named[0].isdigit() else "name"
     peers = address.peers or (() if address.interface else ("127.0.0.1",))
@@ -136,7 +136,7 @@ def configuration(address: DdsAddress) -> str:
 
 
 class DdsLink(Link):
-    """Participant in a DDS domain.
+    """Participant in a DDS domain. It begins to join in a thread at once.
 
     Args:
         address: Address of the domain.
@@ -164,7 +164,7 @@ class DdsLink(Link):
         return f"no scans{wanted} are announced{there}{elsewhere}"
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these channels from now on, in place of earlier ones."""
+        """Receive the messages of these channels from now on, see `Link.subscribe`."""
         self._channels = tuple(channels)
 
     def failure(self, error: Exception) -> str:
@@ -172,7 +172,8 @@ class DdsLink(Link):
         return f"cannot take part in DDS domain {self._address.domain}: {first_line(error)}"
 
     def receive(self) -> None:
-        """Join the domain and receive messages until `close`; the errors of cyclonedds are raised."""
+        """Join the domain and receive messages until `close`; the errors of cyclonedds are raised. If the
+        environment has OWN_CONFIGURATION and the address no interface, that replaces `configuration`."""
         from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
         from cyclonedds.core import WaitSet
         from cyclonedds.domain import Domain, DomainParticipant

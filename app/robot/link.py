@@ -205,7 +205,8 @@ class Heard:
 
     @property
     def rate_hz(self) -> float | None:
-        """Mean rate from the first to the last message; None with fewer than two."""
+        """Mean rate from the first to the last message [Hz], one decimal; None with fewer than two messages
+        or without time between them."""
         seconds = 1e-9 * (self.last_ns - self.first_ns)
         return round((self.messages - 1) / seconds, 1) if self.messages > 1 and seconds > 0.0 else None
 
@@ -225,12 +226,12 @@ class CountingInbox(Inbox):
             return Heard(known.messages, known.first_ns, known.last_ns)
 
     def wants_picture(self, arrival_ns: int, size: int) -> bool:
-        """Accept all pictures."""
+        """Return True; the arguments are not used."""
         del arrival_ns, size
         return True
 
     def put_picture(self, message: Message) -> None:
-        """Count the message."""
+        """Count the message, as `put`."""
         self.put(message, is_scan=False)
 
     def put(self, message: Message, *, is_scan: bool) -> None:
@@ -298,7 +299,8 @@ class Link(ABC):
 
     @abstractmethod
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these channels from now on, also after each new connection."""
+        """Receive the messages of these channels from now on, also after each new connection. It is called
+        once."""
 
     @abstractmethod
     def receive(self) -> None:
@@ -343,17 +345,18 @@ class Link(ABC):
         return [Publisher(*each) for each in sorted(found)]
 
     def robots(self) -> list[str]:
-        """The namespaces from which scans are published, sorted."""
+        """Return the namespaces from which scans are published now, sorted; "" for topics without one."""
         return sorted({p.robot for p in self.publishers() if p.msgtype in SCAN_TYPES})
 
     def close(self) -> None:
-        """Disconnect; waits at most 5 s for the thread."""
+        """End the thread, which disconnects; waits at most 5 s for it."""
         self.closing.set()
         self.thread.join(timeout=_CLOSE_S)
 
     def take(self, channel: Channel, payload: Any, size: int) -> None:  # noqa: ANN401 - bytes of a library
-        """Count a message and put it into the inbox; bytes are copied only if the inbox accepts them. A
-        message larger than MESSAGE_LIMIT is dropped and counted in `losses`.
+        """Put a message into the inbox with its time of arrival; bytes are copied only if the inbox accepts
+        them. A message larger than MESSAGE_LIMIT is dropped and counted in `losses`. Scans, also dropped
+        ones, are counted in `scans`.
 
         Args:
             channel: Channel of the message.

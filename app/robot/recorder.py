@@ -37,7 +37,8 @@ class Recorder:
     except `close`.
 
     Args:
-        path: The file. If it exists, a number is appended to the name.
+        path: The file, which is created at once, with its folder. If it exists, a number is appended to the
+            name.
 
     Attributes:
         path: The file that is written.
@@ -107,7 +108,8 @@ class Recorder:
             self._skipped.setdefault(message.channel, []).append(message.log_ns)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Record results of the mapping, see `pipeline.io.recording.messages`."""
+        """Record results of the mapping by topic, see `pipeline.io.recording.messages`; dropped as by
+        `add`."""
         size = sum(map(len, messages_by_topic.values()))
         self._put(size, lambda writer: writer.add_outputs(messages_by_topic))
 
@@ -227,7 +229,7 @@ class RawFile:
         return len(data)
 
     def tell(self) -> int:
-        """Number of bytes written."""
+        """Return the number of bytes written."""
         return self._length
 
     def close(self) -> None:

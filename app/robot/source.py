@@ -92,8 +92,8 @@ class PictureStore:
         return sorted(self._kept)
 
     def at(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `stamps`, each once, in the order of their times; other times are
-        ignored."""
+        """Yield the pictures of some of `stamps`, each once, in the order of their times. Other times are
+        ignored; a picture that cannot be read is left out and counted in `losses`."""
         numbers = {stamp_ns: number for number, stamp_ns in enumerate(self._kept)}
         for stamp_ns in sorted(set(wanted_ns) & self._kept.keys()):
             data = self._file.read_block(numbers[stamp_ns], bytes)
@@ -262,7 +262,8 @@ class LiveSource:
         return [] if self._kept is None else self._kept.stamps()
 
     def pictures(self, wanted_ns: Collection[int]) -> Iterator[Picture]:
-        """Yield the pictures of some of `picture_stamps`, each once."""
+        """Yield the pictures of some of `picture_stamps`, see `PictureStore.at`; none without stored
+        pictures."""
         return iter(()) if self._kept is None else self._kept.at(wanted_ns)
 
     @property
@@ -277,7 +278,7 @@ class LiveSource:
         )
 
     def keep_pictures(self) -> None:
-        """Store pictures during the run, for the pictures of trees at its end."""
+        """Store pictures from now on, for the pictures of trees at the end of the run; call it once."""
         self._kept = PictureStore()
 
     # --- live -----------------------------------------------------------------------
@@ -396,7 +397,8 @@ class LiveSource:
         return []
 
     def notices(self) -> list[str]:
-        """Return the messages for the user since the last call, for example about a lost robot."""
+        """Return the messages for the user since the last call, for example about a lost robot, and forget
+        them."""
         notices, self._notices = self._notices, []
         return notices
 
@@ -516,9 +518,10 @@ def open_live(uri: str, options: SourceOptions | None = None) -> LiveSource:
 
 
 def open_any(uri: str, options: SourceOptions) -> Source | LiveSource:
-    """Open a source by its URI: recorded, simulated or live.
+    """Open a source by its URI: recorded, simulated or live (see `open_live`).
 
     Raises:
-        SourceError: The source does not exist, has an unknown format, or is damaged.
+        SourceError: The source does not exist, has an unknown format, or is damaged; or the address of a live
+            source is invalid.
     """
     return open_live(uri, options) if is_live(uri) else open_source(uri, options)

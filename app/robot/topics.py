@@ -73,7 +73,8 @@ class Choice:
 
 def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], where: str) -> Choice | None:
     """Return the topics of one robot that are read; None while no such robot publishes scans. A role without
-    a topic has no channel.
+    a topic has no channel, and "pose" only has one if the user named it. Topics without a namespace belong to
+    every robot; those below a namespace `stemmap` are ignored.
 
     Args:
         publishers: Present publishers.

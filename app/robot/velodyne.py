@@ -88,7 +88,8 @@ OTHER_SENSOR = "packets of other sensors"
 
 
 class VelodyneLink(Link):
-    """Receiver of the packets of a sensor, with the interface of a robot with one topic.
+    """Receiver of the packets of a sensor, with the interface of a robot with one topic. It begins to listen
+    in a thread at once.
 
     Args:
         address: Address on which it listens, and address of the sender.
@@ -126,7 +127,7 @@ class VelodyneLink(Link):
         return f"cannot listen on {self._address.host}:{self._address.port}: {reason}"
 
     def receive(self) -> None:
-        """Receive packets until `close`."""
+        """Receive packets until `close`; raises OSError if the address or port cannot be used."""
         with self._bound() as listening:
             self.problem = ""
             while not self.closing.is_set():

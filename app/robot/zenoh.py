@@ -47,7 +47,7 @@ def data_key(domain: int, topic: str, msgtype: str, type_hash: str = "*") -> str
 
     Args:
         domain: ROS_DOMAIN_ID.
-        topic: Name of the topic.
+        topic: Name of the topic; its leading slash is not part of the key.
         msgtype: In the ROS 2 spelling.
         type_hash: Hash of the type; "*" for any.
     """
@@ -90,7 +90,7 @@ def configuration(endpoint: str, files: Mapping[str, str] | None = None) -> str:
 
 
 class ZenohLink(Link):
-    """Connection to a router.
+    """Connection to a router. It begins to connect in a thread at once.
 
     Args:
         address: Address of the router.
@@ -122,7 +122,7 @@ class ZenohLink(Link):
         return f"no scans of {wanted} are announced in ROS domain {self._address.domain}{there}"
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of further channels, as soon as there is a connection. Of fixed transforms
+        """Receive the messages of these channels, as soon as there is a connection. Of fixed transforms
         (tf_static), the last messages before the subscription are received too."""
         self._channels = (*self._channels, *channels)
         if self.session is not None:
@@ -230,7 +230,8 @@ _VOLATILE, _LATCHED = "::,10:,:,:,,", ":1:,1:,:,:,,"
 
 
 class RosPublisher:
-    """Publishes pose, path and trees below `/<robot>/stemmap/`.
+    """Publishes pose, path and trees below `/<robot>/stemmap/`; the topics are announced at once, as long as
+    this object exists.
 
     Args:
         session: Session of zenoh with the router of the robot.
@@ -256,7 +257,8 @@ class RosPublisher:
             self._publishers[topic] = _Topic(session, key, token, latched=topic in LATCHED)
 
     def name(self, topic: str) -> str:
-        """Return the full name of a topic."""
+        """Return the full name of a topic: `/<robot>/stemmap/<topic>`, or `/stemmap/<topic>` without a
+        namespace."""
         return f"{self._prefix}/{topic}"
 
     def publish(self, messages_by_topic: Mapping[str, bytes]) -> None:

@@ -56,7 +56,8 @@ async def ask(
         command: Program and arguments of the child process.
 
     Raises:
-        SourceError: The source cannot be read; the error gives the reason.
+        SourceError: The path does not exist, the child reports an error, whatever its kind, or it ends
+            without a valid answer.
         TookTooLongError: There was no answer in time.
         StemmapError: The process cannot be started.
     """

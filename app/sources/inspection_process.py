@@ -123,7 +123,8 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
 
 def plots(question: dict[str, Any]) -> dict[str, Any]:
     """Return {"plots": [{"name", "polygons"}]} of a GIS file in the frame of the map of a run; `polygons` are
-    the coordinates of a GeoJSON MultiPolygon, in millimetres of resolution.
+    the coordinates of a GeoJSON MultiPolygon [m], rounded to millimetres, but without the last corner of each
+    ring, which repeats the first.
 
     Args:
         question: The key "path" has the file, "run" the folder of the run, and "crs" the reference system of
@@ -183,7 +184,7 @@ def cloud(question: dict[str, Any]) -> dict[str, Any]:
         question: The key "path" has the folder of the run, and "file" the .laz file.
 
     Raises:
-        StemmapError: See `app.batch.mapped_cloud.write_cloud`.
+        StemmapError, OSError: See `app.batch.mapped_cloud.write_cloud`.
     """
     from app.batch.mapped_cloud import write_cloud
 
@@ -200,7 +201,7 @@ def report(question: dict[str, Any]) -> dict[str, Any]:
             "parameters" those of the stand figures.
 
     Raises:
-        StemmapError: See `app.batch.report`.
+        StemmapError, OSError: See `app.batch.report`.
     """
     import shapely
 
@@ -229,8 +230,8 @@ def visits(question: dict[str, Any]) -> dict[str, Any]:
     Returns:
         `how` they were aligned, or why they were not; whether they are `aligned`; `pose` [x, y, yaw] of the
         later in the earlier; `rows` (see `app.batch.revisit.rows_of`) and the same as `csv`; `places_b`, the
-        places of the trees of the later in the frame of the earlier by their numbers; and `record`, see
-        `comparison_record`.
+        places [x, y] of the trees of the later in the frame of the earlier by their number as text; and
+        `record`, see `comparison_record`.
 
     Raises:
         StemmapError: The files of a visit cannot be read.
@@ -313,7 +314,7 @@ QUESTIONS: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 def answer(parent: ParentConnection) -> None:
     """Receive one question of the parent process and send an `Answer`. A StemmapError or lack of memory is
-    sent as an error; other exceptions are raised and end the process."""
+    sent as an error; other exceptions, as for an unknown question, are raised and end the process."""
     question = parent.receive(dict)
     try:
         reply = Answer(QUESTIONS[question["ask"]](question))

@@ -72,8 +72,8 @@ class SourceRequest(msgspec.Struct, frozen=True):
         return {"topics": dict(self.topics), "mount": None if self.mount is None else list(self.mount)}
 
     def for_page(self) -> dict[str, Any]:
-        """Return `uri`, `odometry`, `seed`, `topics` and `mount` as `POST /api/open` takes them: the mounting
-        angles are degrees. Preset and parameters are left out."""
+        """Return `uri`, `odometry`, `seed`, `topics` and `mount` (None if not chosen) as `POST /api/open`
+        takes them: the mounting angles are degrees. Preset and parameters are left out."""
         mount = None if self.mount is None else [*self.mount[:3], *map(degrees, self.mount[3:])]
         return {
             "uri": self.uri,
@@ -161,7 +161,7 @@ class ChosenOdometry:
 
     @property
     def steps(self) -> OdometryChoice:
-        """The choice in the form that the synchroniser needs."""
+        """The choice for the synchroniser: "static" for the method "static", else "auto"."""
         return "static" if self.method == "static" else "auto"
 
 
@@ -177,7 +177,8 @@ def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
         choice: "auto", "wheels", "kiss-icp", "static", or "file:" and a path.
 
     Raises:
-        SourceError: The choice is not available for this source.
+        SourceError: "wheels" is chosen and the source has no odometry, or "kiss-icp" and its scans cannot be
+            registered.
     """
     if choice.startswith(FILE):
         return ChosenOdometry("file", f"poses from {choice.removeprefix(FILE)}, as requested")

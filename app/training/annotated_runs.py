@@ -40,7 +40,7 @@ class ExampleCollector:
     """Collects the features of the columns at annotations, scan by scan.
 
     Args:
-        annotations: Annotations of the run, in the frame of its map.
+        annotations: Annotations of the run, in the frame of its map; their kinds are keys of REACH.
     """
 
     def __init__(self, annotations: Sequence[Content]) -> None:
@@ -136,9 +136,9 @@ class AnnotatedRun:
 
 
 def annotated_run(source: AnnotatedSource) -> AnnotatedRun:
-    """Return the run of an annotated source, with its parameters. Names that this version does not know are
-    dropped; values that it does not accept let all parameters be those of the preset. An unknown preset
-    becomes "forest"."""
+    """Return the run of an annotated source, with its parameters: those of its preset ("forest" for an
+    unknown one) with the changes of its request. Names that this version does not know are dropped; if it
+    does not accept a value, all changes are dropped."""
     request = source.request
     start = preset(request.preset if request.preset in PRESETS else "forest")
     known = {name: value for name, value in request.parameters.items() if name in start.flat()}
@@ -159,7 +159,8 @@ def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Exa
 
     Raises:
         SourceError: The run cannot be read, is live, or is another recording.
-        StemmapError: The stored examples are damaged.
+        StemmapError: The stored examples are damaged, or the examples cannot be written.
+        OSError: The folder cannot be created.
     """
     (found,) = stored_or_computed(kept, _key(run), partial(_map_again, run, progress))
     return found
@@ -182,7 +183,8 @@ def _key(run: AnnotatedRun) -> str:
 
 
 def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
-    """Map a run from its source, by columns whatever its method was, and return its examples, as one set.
+    """Map a run from its source, classified by columns whatever its method was, and return its examples as a
+    list of one set.
 
     Args:
         run: The run.

@@ -73,7 +73,8 @@ def stored_or_computed(
         make: Computes the examples; only called if none are stored.
 
     Raises:
-        StemmapError: The stored examples are damaged, or cannot be written.
+        StemmapError: The stored examples are damaged, or the new ones cannot be written.
+        OSError: The folder cannot be created.
     """
     file = None if folder is None else folder / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}{SUFFIX}"
     if file is not None and file.is_file():
@@ -87,7 +88,8 @@ def stored_or_computed(
 
 
 def read_examples(file: Path) -> list[Examples]:
-    """Return the examples of a file that `stored_or_computed` wrote; raises StemmapError if it is damaged."""
+    """Return the examples of a file that `stored_or_computed` wrote; raises StemmapError if it is missing or
+    damaged."""
     try:
         return list(record_of(_StoredExamples, file.read_bytes()).sets)
     except (OSError, ValueError, KeyError, TypeError, RuntimeError) as error:

@@ -73,9 +73,9 @@ def of_free_end(figures: Float, label: Int) -> Bool:
 
 
 def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
-    """Return the JSON of a node of a tree of scikit-learn with all nodes below it: `share` of a leaf, the
-    list of its class shares; `figure`, `at_most`, `yes` and `no` of a split. A split whose two leaves are
-    equal becomes a leaf.
+    """Return the JSON of a node of a tree of scikit-learn with all nodes below it. A leaf has `share`, the
+    list of its class shares. A split has `figure`, the name of a feature, `at_most`, rounded to four
+    decimals, and the nodes `yes` and `no`. A split whose two leaves are equal becomes a leaf.
 
     Args:
         tree: The tree.
@@ -113,8 +113,8 @@ def all_expanded(
 def expanded(
     trees: list[dict[str, Any]], settings: ForestSettings, figures: Float, label: Int, thing: Int, seed: int
 ) -> list[dict[str, Any]]:
-    """Return the extended trees of a forest; the given ones remain unchanged. Leaves that no example reaches,
-    and all leaves without examples, stay as they are.
+    """Return the extended trees of a forest; the given ones remain unchanged. Leaves that no example reaches
+    stay as they are.
 
     Args:
         trees: Trees as in the JSON.

@@ -58,7 +58,12 @@ class Rates:
 
     @classmethod
     def of(cls, accepted: Bool, tree: Bool) -> Rates:
-        """Return the rates of accepted objects and true trees, shape (N,) each."""
+        """Return the rates of N objects.
+
+        Args:
+            accepted: Whether an object is accepted as a tree, shape (N,).
+            tree: Whether it is a tree, shape (N,).
+        """
         trees, others = int(tree.sum()), int((~tree).sum())
         ta, fa = int((accepted & tree).sum()), int((accepted & ~tree).sum())
         return cls(Rate(ta, trees), Rate(others - fa, others), Rate(fa, others), Rate(trees - ta, trees))
@@ -87,7 +92,8 @@ def validate(
     the last example of each object counts.
 
     Args:
-        examples: Examples of one kind of sensor, from at least two places.
+        examples: Examples of one kind of sensor, from at least two groups of `groups_of`; those of an object
+            follow one another, the newest last.
         base: JSON of the forest that is extended.
         kind: Kind of the sensor.
         old: The present forest.
@@ -218,8 +224,8 @@ def learn(
         progress: Called with progress messages.
 
     Raises:
-        StemmapError: There are too few examples for every kind of sensor (the message names the numbers), or
-            the present forest or stored examples cannot be read.
+        StemmapError: There are too few annotations or, for every kind of sensor, examples (the message names
+            the numbers); or the present forest or stored examples cannot be read, or examples not be written.
     """
     if lacking := too_few(each.kind for run in runs for each in run.annotations):
         raise StemmapError(f"too few annotations: {lacking}")
@@ -275,7 +281,8 @@ def seen_by(data: dict[str, Any]) -> tuple[str, ...]:
 
 
 def things_by_class(examples: Sequence[Examples]) -> Counter[str]:
-    """Return the number of objects of each class, by the label of the class."""
+    """Return the number of objects of each class, by the label of the class; classes without any are
+    missing."""
     label = [int(k) for e in examples for k in e.label]
     of_thing = dict(zip(object_numbers(examples).tolist(), label, strict=True))
     return Counter(CLASSES[k].label for k in of_thing.values())
@@ -309,7 +316,8 @@ def what_lacks(examples: Sequence[Examples]) -> str:
 def _examples(
     runs: Sequence[AnnotatedRun], kept: Path | None, progress: Progress, warnings: list[str]
 ) -> list[tuple[AnnotatedRun, Examples]]:
-    """Return the examples of each run that can be mapped; the others are left out with a warning.
+    """Return the examples of each run that can be mapped; the others are left out with a warning, and there
+    is one for annotations without a column. Damaged stored examples raise StemmapError.
 
     Args:
         runs: The runs.
@@ -416,8 +424,8 @@ def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
 
 
 def serve(parent: ParentConnection) -> None:
-    """Receive one `LearningRequest`, send progress and then the result or the error; the program of the child
-    process."""
+    """Receive one `LearningRequest`, send progress and then the result or the error, see the module; the
+    program of the child process. Other exceptions than StemmapError and MemoryError are raised."""
     try:
         request = parent.receive(LearningRequest)
         parent.send({"learned": train(request, lambda text: parent.send({"progress": text}))})

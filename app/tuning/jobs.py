@@ -196,7 +196,7 @@ class ResultStore:
         return [*([unread] if self.damaged else []), *([self.refusal] if self.refusal else [])]
 
     def _tidy(self, folder: Path) -> None:
-        """Delete all but the MOST_FILES results used last, once."""
+        """Delete all but the MOST_FILES results used last; only the first call does so."""
         if not self._is_tidy:
             self._is_tidy = True
             for file in sorted(folder.glob("??/*.json"), key=_used_at, reverse=True)[MOST_FILES:]:
@@ -282,8 +282,9 @@ class ScoringProcesses(Generic[T]):
         return [(self._doing.pop(future)[1], _result(future)) for future in done]
 
     def submit(self, job: Job, worker: int = 0) -> Future[JobResult]:
-        """Start a job on a process that is free. The result raises LostError after `MOST_LOSSES` lost
-        processes, and StemmapError if no process can be started."""
+        """Start a job on the process with the number `worker`, which must be free, unless its result is
+        stored; returns at once. The result of the future raises LostError after `MOST_LOSSES` lost processes,
+        and StemmapError if no process can be started."""
         return self._threads.submit(self._known_or_computed, worker, job)
 
     def warnings(self) -> list[str]:
@@ -295,7 +296,7 @@ class ScoringProcesses(Generic[T]):
         return [*self.kept.warnings(), *lost]
 
     def close(self) -> None:
-        """End all processes and wait for their threads."""
+        """End all processes at once and wait for their threads; jobs in progress fail with LostError."""
         with self._lock:
             self._is_closed = True
             for child in self._children.values():

@@ -53,8 +53,8 @@ def plan_jobs(
     sets: Sequence[dict[str, Value]],
     base: Callable[[PreparedRun, dict[str, Value]], Parameters],
 ) -> SweepPlan:
-    """Return the jobs of all sets and runs. Combinations that contradict themselves are left out, with the
-    reason.
+    """Return the jobs of all sets and runs, by set and then by run. Combinations that contradict themselves
+    are left out, with the reason.
 
     Args:
         runs, sets: What is combined.
@@ -205,7 +205,8 @@ def _least(name: str) -> Criterion:
 
 
 def _careful(f: Figures) -> tuple[float, ...] | None:
-    """Criterion function: fewest false trees (FA and spurious), then most true ones; never None."""
+    """Return (-(FA + spurious), TA), so that few false trees are preferred, then many true ones; never
+    None."""
     wrong = float(f["FA"] or 0) + float(f["spurious"] or 0)
     return (-wrong, float(f["TA"] or 0))
 
@@ -409,7 +410,8 @@ def _record(row: Row) -> dict[str, Any]:
 
 
 def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
-    """Return rows as CSV text: set, parameters, run and source (not for means), COLUMNS and error."""
+    """Return rows as CSV text: set, a column per parameter, run and source (not for means), COLUMNS and
+    error; unknown values are empty cells."""
     plan = comparison.plan
     axes = list(plan.sets[0]) if plan.sets else []
     of_runs = any(row.run for row in rows)
@@ -428,7 +430,8 @@ def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
 
 
 def _times(comparison: Comparison) -> str:
-    """Return the computing times as CSV text, without rows that failed."""
+    """Return the computing times as CSV text: set, run, seconds and scans_looked_at (whether the front end
+    ran); rows that failed are left out."""
     rows = [
         [str(r.set_number), str(r.run), f"{r.seconds:.3f}", str(r.looked).lower()]
         for r in comparison.rows

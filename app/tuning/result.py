@@ -62,7 +62,8 @@ class SearchMessage(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def result_of(search: Search) -> Result:
-    """Return the result of the trials so far; the best is the start if no trial is better.
+    """Return the result of the trials so far; the best is the start if no trial is better. It is called after
+    the last trial, see `Search.importances`.
 
     Raises:
         StemmapError: The search was stopped before its start was scored.
@@ -104,9 +105,12 @@ def best_parameters(plan: Plan, result: Result) -> Parameters:
 
 
 def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
-    """Return the provenance of the best set: `tuned`, a dict with goal, numbers of trials, searched
-    parameters and their importance; and `run`, a list with URI, digest and scores before and after of each
-    run. Unknown values are left out, because TOML has no null.
+    """Return the provenance of the best set. Unknown values are left out, because TOML has no null.
+
+    `tuned` has `stemmap` (version), `date`, `goal` (and `false_max` of "ta"), the numbers `trials` and
+    `refused`, `seed`, `odometry`, `better_than_start`, the axes `over` as text, and `importance` by name.
+    `run` is a list with `uri`, `sha256`, `held_out`, `truth` (name of a file) and the scores `start` and
+    `best` of each run, see `_file_scores`.
 
     Args:
         plan: The search.
@@ -202,8 +206,8 @@ _LABELS = {
 
 
 def _file_scores(scores: Sequence[MapScores]) -> dict[str, float]:
-    """Return the pooled scores for a file, rounded to 6 decimals. Unknown ones are omitted, because TOML has
-    no null."""
+    """Return the pooled scores for a file, rounded to 6 decimals: `f1`, `ta`, `false_share`,
+    `position_rmse_m` and `mean_pair_error_percent`. Unknown ones are omitted, because TOML has no null."""
     pooled = pool(scores)
     values = {
         "f1": pooled.f1,
@@ -355,6 +359,6 @@ def _held_points(goal: Goal, trials: Sequence[Trial]) -> list[tuple[int, float |
 
 
 def _changes(plan: Plan, result: Result) -> list[list[Any]]:
-    """Return [name, value at the start, best value] of each searched parameter."""
+    """Return [name, value at the start, best value] of each searched parameter, also of unchanged ones."""
     before = plan.parameters.flat()
     return [[name, before[name], value] for name, value in result.best.values.items()]

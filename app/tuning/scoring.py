@@ -279,7 +279,8 @@ class Scorer:
         self._open: dict[bytes, OpenRun] = {}
 
     def score(self, job: Job) -> JobResult:
-        """Return the result of a job; every exception becomes its `error`."""
+        """Return the result of a job. Every exception becomes its `error`, also that of another recording at
+        the same path, or of an unknown forest."""
         begun = time.perf_counter()
         try:
             parameters = validated(job.parameters)
@@ -301,7 +302,8 @@ class Scorer:
             self._open.popitem()[1].close()
 
     def _run(self, requested: RunWithTruth) -> OpenRun:
-        """Return an open run, from memory or newly opened.
+        """Return the run, still open or newly opened; then the run that was opened first is closed if there
+        are too many.
 
         Raises:
             StemmapError: It cannot be opened, or is another recording than that of the job.
@@ -319,7 +321,8 @@ class Scorer:
 
 
 def main(words: list[str]) -> None:
-    """Receive jobs and send their results until the parent ends; the program of a child process.
+    """Receive jobs and send their results until the parent ends, which ends this process; the program of a
+    child process. It never returns.
 
     Args:
         words: Arguments of the command line: --low-priority, --runs N.

@@ -149,10 +149,10 @@ class Search:
                 in progress.
 
         Returns:
-            The trials that were completed in this call.
+            The trials that were completed in this call, by number; the start is none of them.
 
         Raises:
-            StemmapError: A run cannot be mapped or scored.
+            StemmapError: No process can be started, or a run cannot be mapped or scored.
         """
         before = len(self._trials)
         for (attempt, run), result in self._processes.advance(self._next_job, wait_s):
@@ -186,7 +186,8 @@ class Search:
         return self.start is not None and is_left and in_progress < self._processes.count
 
     def _suggested(self) -> _Attempt:
-        """Return the next set to score; one whose values contradict one another needs no scoring."""
+        """Return the next set to score; one whose values contradict one another has no parameters and no
+        runs."""
         values = self._suggestion()
         try:
             parameters = self._parameters.replace(dict(values))
@@ -270,7 +271,7 @@ class Search:
     def importances(self) -> dict[str, float]:
         """Return the share of the variance of the loss that each parameter explains (fANOVA, Hutter et al.
         2014), by name, the largest first. Shares that are not finite are omitted. Empty if there are too few
-        trials or all have the same loss."""
+        trials or all have the same loss. Suggestions after this call depend on all trials so far."""
         from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 
         self._learn(len(self._trials))

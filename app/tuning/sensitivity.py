@@ -110,8 +110,8 @@ class Sensitivity:
             self._task = asyncio.create_task(self._work(), name="sensitivity")
 
     async def leave(self) -> None:
-        """Cancel the curve, wait until the process has ended, and send {}, because the run
-        or the curve is closed. Without a curve only {} is sent."""
+        """Cancel the curve, wait until the process has ended, and send {}, because the run or the curve is
+        closed. Without a curve only {} is sent."""
         task, self._task, self._question = self._task, None, None
         await cancel(task)
         self._tell({})
@@ -170,8 +170,8 @@ class Sensitivity:
 
 
 def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
-    """Return a curve for the page: name, all parameters (`asked_with`), number of values (`of`), points and
-    error.
+    """Return a curve for the page: `name`, all parameters in force by dotted name (`asked_with`), number of
+    values (`of`), `points` and `error`.
 
     Args:
         question: Parameter, its values, and the other parameters.

@@ -115,7 +115,8 @@ def report_page(
         parameters: Parameters of the stand figures; None for the defaults.
 
     Raises:
-        StemmapError: The run cannot be read, a plot is not valid, or the language is unknown.
+        StemmapError: The language is unknown, a file of the run is missing or damaged, or stand figures are
+            not possible, see `stand_of`.
     """
     from jinja2 import Environment, PackageLoader
 
@@ -170,8 +171,8 @@ def report_page(
 
 
 def map_date(folder: FilePath) -> datetime.date:
-    """Return the date on which the map of a run was written: that of its run.json, in local time. Copies of a
-    run keep it."""
+    """Return the date on which the map of a run was written: that of its run.json, in local time; raises
+    OSError without this file. Copies by `reviewed_run` keep it."""
     return datetime.datetime.fromtimestamp((folder / "run.json").stat().st_mtime).astimezone().date()
 
 
@@ -311,9 +312,10 @@ def stand_map(
         number: Format of the language.
 
     Returns:
-        width, height; `seen` and `path` (SVG path data; `path` is "" for a whole cloud), plots (name, path
-            data, place of the name), trees (x, y, radius, number or "" if there are more than 400, whether
-            the diameter is known), the scale bar (length, text), and the factor 1 : scale.
+        `width`, `height`; `seen` and `path` (SVG path data; `path` is "" for a whole cloud); `plots` (name,
+            path data, x and y of the name); `trees` (x, y, radius, number or "" if there are more than 400,
+            whether the diameter is known; else it is drawn as 15 cm); the scale bar, `bar` (length) and
+            `bar_text`; `scale` as text, such as "1 : 200"; and `up`, the word at the axis that points up.
     """
     import shapely
 
