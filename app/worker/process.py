@@ -15,6 +15,7 @@ from functools import cache
 from typing import BinaryIO
 
 from app.common.child_process import private_streams
+from app.common.heap import trim_regularly
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
 from app.robot.source import LiveSource
@@ -121,6 +122,7 @@ def run_as_worker(session: Session) -> None:
     """Run this process as the worker of the web process that started it, until stdin ends; does not
     return."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
+    trim_regularly()
     incoming, outgoing = private_streams()
     work(session, incoming, outgoing)
     sys.stderr.flush()
