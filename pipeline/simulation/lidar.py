@@ -75,7 +75,7 @@ def echo(
 
     At the edge of a shape a part of the beam passes and meets the shape behind. Echoes nearer to one another
     than `Optics.pulse` are reported as one range in between; else the stronger one is reported, or the last
-    one if `last`.
+    one if `last`. Beams at the edge of foliage are not divided.
 
     Args:
         c, k: Column and beam.

@@ -91,7 +91,8 @@ class Solids(NamedTuple):
 
     def placed(self, offset: Float, yaw: float) -> Solids:
         """Return the shapes turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]; these
-        shapes are not changed. Capsules and axes turn with the shapes."""
+        shapes are not changed, and share the other columns with the result. Capsules and axes turn with the
+        shapes."""
         c, s = np.cos(yaw), np.sin(yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         shape, capsule = self.shape.copy(), self.capsule.copy()

@@ -96,7 +96,8 @@ class SimulatedRun:
         return Odometry(START_NS + t_ns, Pose3.from_euler(np.array([x, y, 0.0]), 0.0, 0.0, yaw))
 
     def imu_record(self, n: int) -> Imu:
-        """Return reading n of the IMU (100 Hz, from 0), with its orientation."""
+        """Return reading n of the IMU (100 Hz, from 0), with its orientation. IndexError for a reading after
+        the motion."""
         stamp = START_NS + n * (1_000_000_000 // IMU_HZ)
         unit = self.inertial
         return Imu(stamp, unit.angular_velocity[n], unit.linear_acceleration[n], unit.orientation(n))

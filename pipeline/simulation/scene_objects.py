@@ -299,7 +299,7 @@ def add_motorcycle(scene: SceneBuilder, x: float, y: float) -> None:
 
 def add_hedge(scene: SceneBuilder, start: Float, end: Float) -> None:
     """Add a row of dense foliage from `start` to `end`, shape (2,) each [m], with a rough or a flat top, kind
-    "foliage"; not to the ground truth. Nothing is added for equal places."""
+    "foliage"; not to the ground truth. No shape is added for equal places."""
     rng, owner = scene.rng, scene.owner("foliage")
     height, half = scene.uniform(0.6, 2.6), scene.uniform(0.25, 0.6)
     free_path, rough = scene.uniform(0.05, 0.25), scene.uniform(0.02, 0.3)

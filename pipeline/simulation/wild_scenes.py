@@ -113,7 +113,7 @@ SENSORS = (
 def build_wild_scene(
     scenario: Scenario, course: Course, range_sigma: float, rng: np.random.Generator
 ) -> tuple[SpinningLidar, SimulatedScene]:
-    """Draw the sensor (one of SENSORS) and the scene.
+    """Return the sensor, drawn from SENSORS, and the scene.
 
     Args:
         scenario: Number of trees and size of the plot.

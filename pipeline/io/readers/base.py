@@ -180,12 +180,12 @@ def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:
 
 
 def digest_of(paths: Sequence[Path], *, whole_limit: int = WHOLE_LIMIT) -> str:
-    """Return the SHA-256 (hex) of one file's contents, or of the names and contents of several files.
+    """Return the SHA-256 (hex) of one file's contents, or of the names, sizes and contents of several files.
 
     Args:
         paths: One file, or the files of a folder in the order in which they are read.
-        whole_limit: Above this many bytes in total, only the sizes and the first and last 16 MB of each
-            file are hashed, and the digest begins with "partial:".
+        whole_limit: Above this many bytes in total, only the names, sizes and the first and last 16 MB of
+            each file are hashed, and the digest begins with "partial:".
 
     Raises:
         OSError: A file cannot be read.

@@ -222,7 +222,7 @@ class MessageSource(FileSource):
     _offset_ns: int  # time minus time of recording, roughly
 
     def __init__(self, container: Container) -> None:
-        """Begin with the damage of the recording as losses."""
+        """Begin with the damage of the recording, which is shared, as losses."""
         super().__init__()
         self._container = container
         self._damage = container.damage

@@ -100,7 +100,7 @@ class Container:
         Args:
             numbers: Numbers of the channels that are read.
             start_ns: Earlier times of recording [ns] are left out; None for none.
-            losses: Counts the messages that are left out, by reason; changed in place.
+            losses: Counts the messages that cannot be read, by reason; changed in place.
         """
         raise NotImplementedError
 
@@ -125,7 +125,8 @@ class IndexedContainer(Container):
     unreadable: str
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of the last message but two of some channels [ns]; 0 without one."""
+        """Return the time of the last message but two of some channels [ns], of the first one if there are
+        fewer; 0 without any."""
         rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
         return int(self.index[rows[-TAIL:][0], 1]) if len(rows) else 0
 
@@ -134,7 +135,7 @@ class IndexedContainer(Container):
     ) -> Iterator[Message]:
         """Yield the messages of some channels in the order of their times of recording, from `start_ns` [ns]
         on (None: all). Those that cannot be read are counted in `losses` as `unreadable`; a payload that
-        cannot be unpacked is b""."""
+        cannot be unpacked is b"". SourceError if the disk refuses."""
         first = 0 if start_ns is None else int(np.searchsorted(self.index[:, 1], start_ns))
         for row in first + np.flatnonzero(np.isin(self.index[first:, 0], list(numbers))):
             number, log_ns, place = self.index[row].tolist()
@@ -145,7 +146,7 @@ class IndexedContainer(Container):
                 yield replace(message, payload=plain(message.payload))
 
     def _set_index(self, channels: Iterable[Channel], index: Int) -> None:
-        """Store the channels, with their numbers of messages, and the index.
+        """Store the channels, with their numbers of messages, and the index, sorted by time.
 
         Args:
             channels: All channels.
@@ -315,7 +316,7 @@ class ChunkedFile(IndexedContainer):
         """Open the file and read its index; chunks without a valid index are unpacked.
 
         Raises:
-            SourceError: The file cannot be opened, has another format, or holds no messages that can be read.
+            SourceError: The file cannot be opened, has another format, or defines no channel.
         """
         self.damage = {}
         self._path = path
@@ -394,6 +395,7 @@ class ChunkedFile(IndexedContainer):
 
         Raises:
             BrokenChunkError: It is damaged.
+            SourceError: The disk refuses.
         """
         if chunk.offset in self._unpacked:
             raw = self._unpacked.pop(chunk.offset)
@@ -411,7 +413,7 @@ class ChunkedFile(IndexedContainer):
         return sum(len(raw or b"") for raw in self._unpacked.values())
 
     def _unpack(self, chunk: Chunk) -> bytes | None:
-        """Return the unpacked bytes of a chunk, None if it is damaged."""
+        """Return the unpacked bytes of a chunk, None if it is damaged; SourceError if the disk refuses."""
         try:
             packed = self._read(chunk.offset, chunk.length) if chunk.length <= BLOCK_LIMIT else b""
             raw = unpack(packed, chunk.compression, chunk.size)
@@ -422,7 +424,7 @@ class ChunkedFile(IndexedContainer):
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
         """Return the message at a place, with its payload as it is stored; None if it cannot be read or is
         not of the channel `number`. Its time is that of its own record, shifted behind steps of the clock,
-        because the time in the index may be damaged."""
+        because the time in the index may be damaged. SourceError if the disk refuses."""
         del log_ns
         try:
             message, _ = self._record(self._bytes_of(self._chunks[place >> 32]), place & 0xFFFFFFFF)
@@ -436,7 +438,8 @@ class ChunkedFile(IndexedContainer):
     def _rows_of(self, chunk: Chunk) -> Int:
         """Return the index of a chunk in the order of the file, int64, shape (N, 3); it is built from the
         messages of the chunk if the file has no complete one, or an impossible one. Then it ends at the first
-        damaged record, which is counted in `damage`."""
+        damaged record, or after MOST_IN_CHUNK messages, which is counted in `damage`. SourceError if the disk
+        refuses."""
         if chunk.index and chunk.index_is_whole:
             rows = np.concatenate(chunk.index)
             rows = rows[np.argsort(rows[:, 2], kind="stable")]

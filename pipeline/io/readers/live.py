@@ -122,9 +122,9 @@ class ArrivalReader:
         return "" if self._source is None else self._source.base
 
     def add(self, message: Message) -> list[Record]:
-        """Process the next message; return the records that it completes. Until the source is described by
-        its first OPENING_SCANS scans, or for OPENING_NS after the first one, messages are stored and [] is
-        returned; then the stored ones follow at once.
+        """Process the next message; return the records that it completes, after notices of the source. Until
+        the source is described by its first OPENING_SCANS scans, or for OPENING_NS after the first one,
+        messages are stored and [] is returned; then the stored ones follow at once.
 
         Raises:
             SourceError: There are scans, and none could be read in five attempts of OPENING_NS.
@@ -320,7 +320,7 @@ class LiveRunHeader(msgspec.Struct, frozen=True):
 
 def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
     """Return the settings of a live run; None if the file is not the recording of a live run, or the settings
-    are damaged, which is counted.
+    are damaged, which is counted in `container.damage`.
 
     Args:
         container: The file.
@@ -503,7 +503,7 @@ def camera_topics(channels: Iterable[Channel]) -> tuple[RecordedTopic, ...]:
 
 
 def _channels(container: Container, run: LiveRunHeader, where: str) -> list[Channel]:
-    """Return the channels of the robot in the order of the live run.
+    """Return the channels of the robot in the order of the live run, with the count 0.
 
     Args:
         container: The recording.

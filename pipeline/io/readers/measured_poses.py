@@ -114,8 +114,8 @@ def fit_rigid(
 
     Returns:
         The fit and "", or None and the reason why there is none: fewer than FEWEST positions within the time
-        of the odometry, a path shorter than `shortest` or than three sigmas, or too large residuals (WORST).
-        Positions that are not finite are ignored.
+        of the odometry, a path shorter than `shortest` or than three sigmas, or an RMS residual above WORST
+        times the larger of the median sigma and 2 % of the path. Positions that are not finite are ignored.
     """
     if len(positions) < FEWEST or len(stamp_ns) < 2:
         return None, f"{len(positions)} {what} are too few"
@@ -177,7 +177,8 @@ class Fix:
     def of(
         cls, stamp_ns: int, latitude: float, longitude: float, covariance: Sequence[float], kind: int
     ) -> Fix:
-        """Return a fix from the fields of its message.
+        """Return a fix from the fields of its message. Its sigma is at least BEST_SIGMA, and UNKNOWN_SIGMA
+        without a covariance; the height is ignored.
 
         Args:
             stamp_ns: Time [ns].
@@ -251,7 +252,8 @@ class GnssFrame:
 
     def measurement(self, fix: Fix) -> PoseMeasurement:
         """Return a fix as measurement of the position of the base in the map, with the errors of the fix, the
-        lever and the plane. Its heading is unknown: yaw 0 with the variance NO_HEADING."""
+        lever and the plane; those of the fixes of one second count as one. Its heading is unknown: yaw 0 with
+        the variance NO_HEADING."""
         T = self.fit.T_map_other
         c, s = math.cos(T.yaw), math.sin(T.yaw)
         east, north = self.plane.place(fix)
@@ -388,8 +390,9 @@ class OtherFrame:
         )
 
     def measurement(self, pose: OtherPose) -> PoseMeasurement | None:
-        """Return the pose in the map with the errors of the pose and of the frame; None for poses up to
-        `from_ns`, which do not count. Without `turn` the heading is unknown (variance NO_HEADING)."""
+        """Return the pose in the map with the errors of the pose and of the frame, and the gate GATE; those
+        of the poses of one second count as one. None for poses up to and at `from_ns`, which do not count.
+        Without `turn` the heading is unknown: yaw 0 with the variance NO_HEADING."""
         if pose.stamp_ns <= self.from_ns:
             return None
         T, rate = self.fit.T_map_other, max(self.fit.rate_hz, 1.0)

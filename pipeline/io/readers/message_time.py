@@ -58,8 +58,8 @@ class Clock:
     """
 
     def __init__(self, offsets_ns: list[int | None]) -> None:
-        """Choose the clock: stamps are used if all topics have one and their offsets differ by 10 s at
-        most."""
+        """Choose the clock: stamps are used if there are topics, all have a stamp, and their offsets differ
+        by 10 s at most; `offset_ns` is that of the first topic, 0 if stamps are not used."""
         known = [offset for offset in offsets_ns if offset is not None]
         self.by_stamp = (
             bool(known) and len(known) == len(offsets_ns) and max(known) - min(known) <= _SAME_CLOCK_NS

@@ -153,7 +153,8 @@ def _lines(path: Path) -> list[list[str]]:
 
 
 def read_table(path: Path, columns: int) -> Float:
-    """Read rows of finite numbers below 1e10, shape (rows, columns); lines that begin with # are skipped.
+    """Read rows of finite numbers with a magnitude below 1e10, shape (rows, columns), at least one row; empty
+    lines and lines that begin with # are skipped.
 
     Raises:
         TextError: It has another format.

@@ -95,8 +95,9 @@ class RosSource(MessageSource):
             self._clock = ClockStepFilter(offsets_ns, self.notices)
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of time; messages before `start_ns` [ns] are not decoded. Messages that
-        cannot be used, or come too late, are counted in `losses`."""
+        """Yield records in the order of time, scans after other records of the same time; messages before
+        `start_ns` [ns] (None: all) are not decoded. Messages that cannot be used, or come too late, are
+        counted in `losses`."""
         losses: dict[str, int] = {}
         self._losses = losses
         for stamped in by_stamp(self._arrivals(start_ns, losses), losses):
@@ -277,7 +278,8 @@ class RosSource(MessageSource):
             return None, None
 
     def _odometry_base(self) -> str:
-        """Return the base frame named by the odometry topic, "" when there is none."""
+        """Return the base frame named by the first message of the odometry topic, "" if there is none or it
+        is damaged."""
         numbers = self._topics.numbers("odometry")
         for message in islice(self._container.messages(numbers, None, {}), 1 if numbers else 0):
             try:

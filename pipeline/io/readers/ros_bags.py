@@ -130,8 +130,8 @@ class Db3File(IndexedContainer):
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """Return the .mcap and .db3 files of a folder in the order of the numbers at the end of their names; may
-    be empty.
+    """Return the .mcap and .db3 files (suffix in lower case) of a folder in the order of the numbers at the
+    end of their names; may be empty.
 
     Raises:
         SourceError: The files themselves are compressed, or there are several without metadata.yaml.
@@ -174,8 +174,8 @@ class BagFolder(IndexedContainer):
     unreadable = "messages in damaged parts of the recording"
 
     def __init__(self, files: list[Path]) -> None:
-        """Open all files; one that cannot be read is counted in `damage`. Channels of the n-th file (from 0)
-        are numbered from n times _STRIDE.
+        """Open all files; one of several that cannot be read is counted in `damage`. Channels of the n-th
+        file that can be read (from 0) are numbered from n times _STRIDE.
 
         Raises:
             SourceError: None of the files can be read.

@@ -26,8 +26,9 @@ def clean_scan(
     offset_ns: NDArray[np.generic] | None = None,
     dropped: int = 0,
 ) -> Scan:
-    """Return a scan without invalid returns: rows that are not finite, with a coordinate beyond RANGE_LIMIT,
-    or at the origin (all coordinates up to NEAR_LIMIT).
+    """Return a scan without invalid returns: rows that are not finite, with a coordinate of RANGE_LIMIT or
+    more, or at the origin (all coordinates up to NEAR_LIMIT). If none is left out, arrays that have the type
+    of `Scan` already are shared with it.
 
     Args:
         stamp_ns: Time of the scan [ns].
@@ -62,7 +63,8 @@ def clean_scan(
 
 
 def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
-    """Return a column as float32, with NaN as 0 and infinite numbers limited; None for None."""
+    """Return a column as float32, with NaN as 0 and infinite numbers limited; None for None. A contiguous
+    float32 column is not copied but changed in place."""
     if values is None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -71,7 +73,7 @@ def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
 
 
 def _as_int(values: NDArray[np.generic] | None) -> Int32 | None:
-    """Return a column as int32; None for None."""
+    """Return a column as int32, not copied if it is contiguous int32; None for None."""
     return None if values is None else np.ascontiguousarray(values, dtype=np.int32)
 
 
@@ -105,9 +107,10 @@ def is_ring(ring: NDArray[np.generic]) -> bool:
 def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
     """Return the times of points relative to the stamp [ns], shape (N,), or None when they are impossible.
 
-    Integers are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit
-    inferred from their size. If one time is farther than 2 s from the stamp, all are impossible; so is an
-    empty column. A floating number that is not finite counts as the time of the stamp.
+    Integers are nanoseconds after the stamp, or since 1970 if the first one is above 1e15; floating numbers
+    are seconds after the stamp, or times since 1970 in a unit inferred from their size. If one time is
+    farther than 2 s from the stamp, all are impossible; so is an empty column. A floating number that is not
+    finite counts as the time of the stamp.
     """
     if not len(time):
         return None

@@ -95,8 +95,8 @@ class ScanFolder(FileSource):
         )
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield odometry (if there are poses) and scans from `start_ns` [ns] on; earlier files are not
-        opened. Files that cannot be read, and scans without points, are counted in `losses`."""
+        """Yield scans from `start_ns` [ns] on (None: all), each after its odometry if it has a pose; earlier
+        files are not opened. Files that cannot be read, and scans without points, are counted in `losses`."""
         self._losses = losses = dict[str, int]()
         begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
         for index in range(begin, len(self._files)):
@@ -226,8 +226,9 @@ class ScanFolder(FileSource):
 
 def _scan_files(path: Path) -> tuple[str, list[Path]]:
     """Return the suffix of the scans in a folder, or in its folder `velodyne` if it has no .bin file itself,
-    and the files with this suffix by number or time; only `path` if that is a file. Without .bin files it is
-    .pcd, or else the most frequent suffix of a scan; there may be no files. OSError if it cannot be read."""
+    and the files with this suffix by number or time; if `path` is a file, only this one, with the suffix .bin
+    or else .pcd. Without .bin files it is .pcd, or else the most frequent suffix of a scan; there may be no
+    files. OSError if it cannot be read."""
     if path.is_file():
         return path.suffix.lower() if path.suffix.lower() == ".bin" else ".pcd", [path]
     inside = path / "velodyne"

@@ -65,7 +65,7 @@ class SimulatedSource(FileSource):
 
         Args:
             start_ns: Earlier times [ns] are left out; None for none.
-            every: Only every n-th scan is simulated.
+            every: Only every n-th scan is simulated and yielded, with all other readings.
         """
         period = self.run.lidar.period_ns
         per_odometry, per_scan = IMU_HZ // ODOMETRY_HZ, period // _TICK_NS
@@ -90,7 +90,8 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
     simulated LiDAR. `sim:cloud?file=&truth=` is a drive through the real cloud of a plot.
 
     Raises:
-        SourceError: No such scenario or option, a value out of bounds, or a file that cannot be read.
+        UsageError: No such scenario or option, or a value out of bounds.
+        SourceError: A file cannot be read, or an object has no place in the scene.
     """
     chosen = SourceOptions() if options is None else options
     request = parse_uri(uri, chosen.seed)

@@ -165,8 +165,9 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
     Args:
         channels: Channels of the recording.
         wanted: Topic by role ("scan", "odometry", "imu", "gnss", "pose", "camera") chosen by the user; other
-            roles get the topic of their type with most messages, except "pose", which is read only if it is
-            chosen.
+            roles get the topic of their type with most messages. Exceptions: "pose" is read only if it is
+            chosen, its topic is not odometry, and a planar laser gives scans only without another topic of
+            scans.
         where: Name of the recording in errors.
 
     Raises:
@@ -230,8 +231,9 @@ def _group(channels: Iterable[Channel]) -> list[Topic]:
 
 
 def _choose(topics: list[Topic], role: str, wanted: Mapping[str, str], where: str) -> Topic | None:
-    """Return the topic of a role; None if there is none with messages. A planar laser is chosen only without
-    another scan topic, and the pose of another SLAM is not odometry.
+    """Return the topic of a role with the most messages, of equal ones that of the type named first in
+    TYPES_BY_ROLE, then the first by name; None if there is none with messages. A planar laser is chosen only
+    without another scan topic, and the pose of another SLAM is not odometry.
 
     Args:
         topics: Topics of the recording.

@@ -62,7 +62,7 @@ def trajectory_text(stamp_ns: Int, poses: Iterable[Pose3]) -> str:
 
 
 def write_tree_manager(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
-    """Write a mapped run to a folder, which appears when it is complete.
+    """Write a mapped run to a folder, which appears when it is complete; parent folders are created.
 
     A frame has the trees that were seen until then and are within `reach` of its pose, at their positions in
     the final map. The map is planar: poses have no tilt, and stems are vertical at height 0.
@@ -156,7 +156,7 @@ class TreeManagerSource(FileSource):
         options: Extrinsics; the trajectory is that of the sensor.
 
     Raises:
-        SourceError: The trajectory is missing, damaged or too short, or no file has stems.
+        SourceError: See `__init__`.
         OSError: The folder cannot be read.
     """
 
@@ -200,8 +200,8 @@ class TreeManagerSource(FileSource):
         )
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield odometry for each row of the trajectory, and scans, from `start_ns` [ns] on; earlier files
-        are not opened. Files and rows that cannot be read are counted in `losses`."""
+        """Yield odometry for each row of the trajectory, then the scan of the same time, from `start_ns` [ns]
+        on; earlier files are not opened. Files and rows that cannot be read are counted in `losses`."""
         self._losses = losses = dict[str, int]()
         file_of = dict(zip(self._row.tolist(), self._files, strict=True))
         begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
@@ -243,7 +243,7 @@ def _read_frame(file: Path, uri: str) -> tuple[Float, dict[str, int], int]:
     column by name; and the number of damaged rows.
 
     Raises:
-        SourceError: It is too large, or its header lacks a column.
+        SourceError: It is too large, or its header lacks a column of PLACE.
         OSError: It cannot be read.
     """
     with file.open("rb") as opened:

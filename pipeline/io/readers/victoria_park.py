@@ -127,8 +127,8 @@ class VictoriaParkSource(FileSource):
         )
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Return the odometry and the scans in the order of time, from `start_ns` [ns] on. Scans without
-        points are counted in `losses`."""
+        """Return the odometry and the scans in the order of time, odometry first at equal times, from
+        `start_ns` [ns] on (None: all). Scans without points are counted in `losses`."""
         self._losses = losses = dict[str, int]()
         streams: list[Iterator[Record]] = [self._odometry(start_ns), self._scans(start_ns, losses)]
         return heapq.merge(*streams, key=attrgetter("stamp_ns"))
