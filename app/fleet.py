@@ -102,7 +102,8 @@ class Frames:
         need no computation (the first with enough trees, the same recording) get their pose in passing.
 
         A map is tried only with at least LEAST_TREES trees, and after a failure again with MORE_TREES more.
-        Poses of runs that are not in `maps` any more are removed.
+        Poses of runs that are not in `maps` any more are removed; without the run of the common frame, all
+        are.
 
         Args:
             maps: By name: digest of the run, and the map with a list of trees as on the page.
@@ -196,8 +197,8 @@ def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
 
 def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
     """Return `trees` (see `trees_payload`), `path` ([x, y] of each point) and `pose` ([x, y, yaw]) of a
-    dashboard in the frame of its map; None before the first scan. The path has at most about 400 points, the
-    newest among them."""
+    dashboard in the frame of its map; None before the first scan. The path is thinned to at most about 400
+    points; the last one is the newest."""
     shown = dashboard.shown
     if shown is None:
         return None
@@ -325,6 +326,7 @@ class Fleet:
 
     Attributes:
         live: Broadcast of states and maps to the connected pages.
+        pages: Limit of the number of connected pages.
         members: Dashboard by name.
         notice: Message for the page, "" for none.
     """
@@ -353,8 +355,8 @@ class Fleet:
 
     def add(self, name: str, source: Open) -> bool:
         """Add a robot and start its dashboard (or let it start after `warm`). Return whether the robot is in
-        the fleet: True also if it was there before; False with more than MOST_ROBOTS or without a free port,
-        which `notice` then reports.
+        the fleet: True also if it was there before; False with MOST_ROBOTS others or without a free port,
+        which `notice` then reports. Without `warm`, or after it, an event loop must run.
 
         Args:
             name: Name of the robot on the page.
@@ -401,7 +403,8 @@ class Fleet:
         await asyncio.gather(*(member.close() for member in self.members.values()))
 
     async def _begin_when_warm(self, warming: Awaitable[None]) -> None:
-        """Await the compilation and start all dashboards; an error of the compilation is only logged."""
+        """Await the compilation and start all dashboards; a StemmapError of the compilation is only
+        logged."""
         try:
             await warming
         except StemmapError:  # the workers compile then
@@ -524,7 +527,8 @@ def recorded_apart(source: Open, name: str, taken: Iterable[str]) -> Open:
 
 
 def address_of(address: ZenohAddress, robot: str) -> str:
-    """Return the address of one robot at a router; an empty `robot` is the robot without a namespace."""
+    """Return the address of one robot at a router, with the topics and files of `address`, and its domain
+    unless that is 0; an empty `robot` is the robot without a namespace."""
     options = {"robot": robot or ROOT, "domain": str(address.domain) if address.domain else ""}
     options |= address.topics | address.files
     query = urlencode({name: value for name, value in options.items() if value}, safe="/")
@@ -562,7 +566,7 @@ class RobotWatch:
 
     async def _watch(self) -> None:
         """Add the robots of the router every 0.5 s until the task is cancelled. While the fleet is empty,
-        `notice` has the problem or that no robot is announced."""
+        `notice` has the problem or that no robot is announced; with the first robot it is cleared."""
         while True:
             for robot in self._link.robots():
                 self.take(robot)
@@ -574,7 +578,8 @@ class RobotWatch:
             await asyncio.sleep(_LOOK_S)
 
     def take(self, robot: str) -> None:
-        """Add the robot of a namespace, "" for none, unless it is in the fleet already."""
+        """Add the robot of a namespace, "" for none, unless it is in the fleet already. One that the fleet
+        refuses is tried again with the next call."""
         source, name = self._source, robot or NAMELESS
         if name in self._fleet.members:
             return

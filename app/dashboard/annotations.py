@@ -58,12 +58,12 @@ def counted(own: TruthTrees | None, rows: Sequence[Annotation], against: Against
 
 
 def laid_over(own: TruthTrees | None, contents: Sequence[Content]) -> TruthTrees | None:
-    """Return the ground truth of the source with the annotations applied; None if there are neither.
-    Annotations without an object of the source near them are added.
+    """Return the ground truth of the source with the annotations applied; None if there are neither. The
+    objects of the source without an annotation come first, then all annotations.
 
     An annotation replaces the object within SAME_THING that has another class. One of the same class keeps
     the position of the source, and its diameter unless one was typed, because a person who confirms a mapped
-    tree has not measured its position.
+    tree has not measured its position. One without such an object is added.
 
     Args:
         own: Ground truth of the source, if any; it is not changed.
@@ -166,8 +166,9 @@ class AnnotationEditor:
         self._generation = 0  # grows whenever another run is opened or the run is left
 
     async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
-        """Read the annotations of a run that was opened; it is added to the store if necessary. An error of
-        the store is stored in `problem` and logged. If another run is opened meanwhile, nothing changes.
+        """Read the annotations of a run that was opened; it is added to the store if necessary. Until they
+        are read, `truth` is that of the source. An error of the store is stored in `problem` and logged. If
+        another run is opened meanwhile, the result is ignored.
 
         Args:
             source: Digest of the recording, or its URI if it has no digest.
@@ -223,7 +224,7 @@ class AnnotationEditor:
 
     async def edit(self, run: int, function: Callable[[Store], T]) -> T:
         """Run an edit in the thread of the store, update the annotations, call `changed` (and `edited` if any
-        annotation differs), and return the result of the edit.
+        of `rows` differs), and return the result of the edit.
 
         Args:
             run: Number of the run that is edited.
@@ -231,8 +232,8 @@ class AnnotationEditor:
 
         Raises:
             StaleError: Another run was opened meanwhile, or another person has changed the annotation; in the
-                second case the annotations are updated.
-            StemmapError: Nothing can be annotated.
+                second case the annotations are updated, as after an edit.
+            StemmapError: Nothing can be annotated, or the store refuses the edit; nothing changes.
         """
         if self.problem:
             raise StemmapError(self.problem)
@@ -296,7 +297,7 @@ class AnnotationEditor:
 
 def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[str, int]:
     """Return the author of the newest edit ("" if annotations were only deleted) and the number of
-    annotations that were added, changed or deleted between two states."""
+    annotations that were added, changed or deleted between two states, by id and version."""
     old = {row.id: row.version for row in before}
     new = {row.id: row.version for row in after}
     edited = [row for row in after if old.get(row.id) != row.version]

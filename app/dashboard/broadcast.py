@@ -38,7 +38,7 @@ class Broadcast:
         Args:
             kind: Kind of the message; it becomes its field `type`.
             content: A dict or record, whose fields become those of the message; other values, also None,
-                become the field `value`.
+                become the field `value`. NaN becomes null.
         """
         plain = msgspec.to_builtins(content) if content is not None else None
         # Without content, the page shows the empty state.
@@ -50,10 +50,10 @@ class Broadcast:
         self._wake()
 
     def show(self, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> None:
-        """Replace the map and wake the listeners.
+        """Replace the map and wake the listeners, also if it is the same.
 
         Args:
-            payload: Message "map" without its path.
+            payload: Message "map" without its path; not empty.
             path_xy: Path, shape (N, 2) [m]; it must not be modified afterwards.
         """
         self._map = (self._next(), _encode(payload), path_xy)  # once for all listeners

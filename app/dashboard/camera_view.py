@@ -67,6 +67,7 @@ class CameraView:
                 has the reason.
             WorkerBusyError: The worker did not answer in time.
             TooManyRequestsError: Too many calls wait.
+            StemmapError: No process that decodes it can be started.
         """
         async with self._queue.turn():
             of = self._of
@@ -107,6 +108,7 @@ class CameraView:
             NoStoryError: No picture shows the tree, or it cannot be decoded.
             WorkerBusyError: The worker did not answer in time.
             TooManyRequestsError: Too many calls wait.
+            StemmapError: No process that decodes it can be started.
         """
         async with self._queue.turn():
             found = await self._client.tree_picture(number)
@@ -185,8 +187,8 @@ def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]
 
 
 def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each confirmed tree in view between NEAREST and FARTHEST. Arguments as in
-    `marks_of`."""
+    """Return a box for each confirmed tree in view at more than NEAREST and less than FARTHEST. Arguments and
+    keys as in `marks_of`."""
     trees = frame.trees
     marks = []
     places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)
@@ -203,8 +205,8 @@ def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
 
 
 def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each cluster of which all points are in view, at any distance; arguments as in
-    `marks_of`."""
+    """Return a box for each cluster with points of which none is behind or close to the camera plane, at any
+    distance; arguments and keys as in `marks_of`."""
     verdicts = clusters_payload(frame)["verdict"]
     points = frame.filtered.astype(np.float64) + frame.sensor_offset
     points[:, :2] = moved.inverse().apply(points[:, :2])
@@ -225,8 +227,8 @@ def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]
 
 def _box(camera: Camera, points: Float) -> dict[str, float] | None:
     """Return the box around points of the base frame, shape (N, 3), N >= 1 [m], as "left", "top", "width" and
-    "height", shares of the size of the picture, clipped to it; None if it is not in view or a point is nearer
-    than NEAREST to the camera plane."""
+    "height", shares of the size of the picture, clipped to it; None if it is not in view or a point is at
+    most NEAREST in front of the camera plane."""
     pixels, depth = camera.project(points)
     if not (depth > NEAREST).all():
         return None

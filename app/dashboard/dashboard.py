@@ -310,7 +310,8 @@ class Dashboard:
         self.selector.tree(number)
 
     async def select_cluster(self, scan: int, cluster: int) -> None:
-        """Select a cluster of a recently shown scan, with its tree, in all views.
+        """Select a cluster of a recently shown scan, with its tree, in all views; nothing if another run was
+        opened meanwhile.
 
         Args:
             scan: Index of the scan.

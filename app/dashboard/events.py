@@ -60,7 +60,9 @@ class Events:
     def shown(self, frame: Frame, time_s: float, confirmed_s: Float | None = None) -> bool:
         """Add the events of a shown scan; return whether the list of events changed.
 
-        A tree that is confirmed again after stepping back keeps the event of its first confirmation.
+        A tree that is confirmed again after stepping back keeps the event of its first confirmation. Flagged
+        events up to this time are removed. The pose quality has an event when its state changes; a run begins
+        as "good".
 
         Args:
             frame: Shown frame; while seeking, not every frame is shown.
@@ -84,8 +86,8 @@ class Events:
         return self._events.keys() != known or bool(passed)
 
     def remapped(self, confirmed: list[tuple[int, float]], time_s: float) -> None:
-        """Replace the events of trees and pose quality after the run was mapped again. Those later than the
-        current scan are flagged as from before the change.
+        """Replace the events of trees by those of `confirmed`, and remove those of the pose quality, after
+        the run was mapped again. Old ones later than the current scan are flagged as from before the change.
 
         Args:
             confirmed: Number and confirmation time [s] of each tree.
@@ -147,8 +149,9 @@ class Events:
         self._note(key, Event(time_s, "annotation", f"{who or 'Somebody'} edited {edits}"[:_LONGEST]))
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the events for the page, ordered by time [s]; `before` flags events from before a change of
-        parameters. Of these only so many are returned that the total is at most _MOST."""
+        """Return {"events": [...]} for the page, ordered by time, each with `t` [s], `kind` and `text`, and
+        `before` (True) if it is from before a change of parameters. Of these only so many are returned that
+        the total is at most _MOST."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]

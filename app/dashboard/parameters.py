@@ -304,18 +304,19 @@ class ParameterSets:
     async def save(
         self, name: str, preset_name: str, parameters: Parameters, who: str, text: str = ""
     ) -> None:
-        """Save parameters under a name; a set of that name is replaced.
+        """Save parameters under a name, replacing a set of that name, and `load` all sets.
 
         Args:
             name: Name of the set.
             preset_name: Name of their preset.
             parameters: The values.
             who: Name of the person.
-            text: Text of the file with further comments; empty for `file_of`.
+            text: Text of the file with further comments, stored unchecked in place of `parameters`; empty for
+                `file_of`.
 
         Raises:
             ParameterError: A preset has this name.
-            StemmapError: The set cannot be stored.
+            StemmapError: The set cannot be stored, or there are too many.
         """
         if name in PRESETS:
             raise ParameterError("a preset has this name", where=name, remedy="Choose another")
@@ -324,7 +325,7 @@ class ParameterSets:
         await self.load()
 
     async def delete(self, name: str) -> None:
-        """Delete the saved set of this name.
+        """Delete the saved set of this name, and `load` the others.
 
         Raises:
             UnknownError: There is no set of this name.
@@ -355,8 +356,8 @@ class ParameterSets:
         return read_file(self.text(name), name)
 
     def name_of(self, preset_name: str, parameters: Parameters) -> str:
-        """Return the name of the saved set with these values and preset; empty if there is none. Presets are
-        not considered.
+        """Return the name of the saved set with these values and preset, the first by name of equal ones;
+        empty if there is none. Presets are not considered.
 
         Args:
             preset_name: Name of the preset.

@@ -48,8 +48,8 @@ def map_payload(shown: Shown) -> dict[str, Any]:
 
 
 def layer_counts(frame: Frame) -> dict[str, int]:
-    """Return the number of objects of a frame by layer of the scene: raw, filtered, clusters, fits,
-    particles and (confirmed) trees."""
+    """Return the number of objects of a frame by layer of the scene: `raw`, `filtered`, `clusters`, `fits`
+    (detected trees with a radius), `particles` and `trees` (confirmed)."""
     return {
         "raw": len(frame.raw),
         "filtered": len(frame.filtered),
@@ -88,9 +88,9 @@ def health_payload(health: Health) -> dict[str, Any]:
 
 
 def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
-    """Return the clusters of the scan as columns of equal length: x, y in the map [m], distance from the
-    sensor [m], label of the verdict, number of points, eccentricity and radius [cm]; unknown or infinite
-    values are None."""
+    """Return the clusters of the scan as columns of equal length: `x`, `y` in the map [m], `distance` from
+    the sensor [m], `verdict` (its label), `size` (number of points), `eccentricity` and `radius_cm`. Unknown
+    or infinite eccentricities and radii are None."""
     clusters = frame.clusters
     base = clusters.centre + frame.sensor_offset[:2]
     place = frame.estimate.T_map_base.apply(base)
@@ -145,7 +145,8 @@ def ellipses(covariance: Float) -> list[list[float]]:
 
 
 def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:
-    """Return the number of clusters by verdict, most frequent first."""
+    """Return the number of clusters by label of the verdict, most frequent first, equally frequent ones in
+    the order of `Verdict`."""
     values, counts = np.unique(verdicts, return_counts=True)
     order = np.argsort(-counts, kind="stable")
     return {Verdict(int(values[k])).label: int(counts[k]) for k in order}
@@ -209,8 +210,9 @@ class BeforeAfter:
         self._before = self._now
 
     def shown(self, index: int, counts: dict[str, Any]) -> dict[str, Any]:
-        """Set the counts of the displayed scan, by its index, and return the message for the page; `before`
-        is None if another scan was displayed since the change."""
+        """Set the counts of the displayed scan, by its index, and return `right` and `wrong` of them and
+        `before`, the counts of this scan before the change, for the page; `before` is None without a change,
+        and if another scan was displayed since it."""
         self._now = (index, counts)
         if self._before[0] != index:
             self._before = (-1, None)
@@ -221,12 +223,13 @@ REACH = 0.45  # m; maximum distance between a tree and its column
 
 
 def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
-    """Return a dict for each confirmed tree, the most uncertain first: its number (`tree`), the share of
+    """Return a dict for each confirmed tree, the most uncertain first (share of votes nearest to
+    `tree_share`), of equal ones the least observed, then the lowest number: its number (`tree`), the share of
     `votes` for a tree, and the class with most votes besides "tree" (`next`, `next_votes`). [] without
     confirmed trees.
 
-    Trees without a voxel column within REACH have no votes (None) and come last. Without any columns, `next`
-    is "" and `next_votes` 0.
+    Trees without a voxel column within REACH have no votes (`votes` and `next_votes` are None) and come last.
+    Without any columns, `next` is "" and `next_votes` 0.
 
     Args:
         frame: Results of the newest scan, with its voxel columns; None for these gives no votes.
@@ -280,13 +283,14 @@ def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
 
 
 def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Return points of shape (N, 3) [m] in whole centimetres, int16, clipped to 327.67 m."""
+    """Return points of shape (N, 3) [m] in whole centimetres, int16, clipped to -327.67 m to 327.67 m."""
     return np.clip(np.round(100.0 * points), -_FARTHEST_CM, _FARTHEST_CM).astype(np.int16)
 
 
 def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the description of the clusters of a frame for the header of a binary block: index of the scan,
-    clusters, verdict counts, and numbers of points by stage. Arguments as in `counts_of`."""
+    """Return the description of the clusters of a frame for the header of a binary block: `index` of the
+    scan, `clusters` (see `clusters_payload`), the result of `counts_of`, and `counts`, numbers of points by
+    stage. Arguments as in `counts_of`."""
     return {
         "index": frame.index,
         "clusters": clusters_payload(frame),
@@ -296,8 +300,8 @@ def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> 
 
 
 def stages_payload(frame: Frame) -> bytes:
-    """Return the stages of Fig. 3 as a binary block: raw scan, filtered scan with the cluster of each point,
-    and circles of the clusters; no ground truth."""
+    """Return the stages of Fig. 3 as a binary block: the header of `described` without ground truth, and the
+    arrays `raw`, int16, shape (N, 3) [cm], and those of `_clustered`."""
     arrays = {"raw": in_centimetres(frame.raw), **_clustered(frame)}
     return packed(described(frame, None, 0.0), arrays)
 
@@ -305,8 +309,9 @@ def stages_payload(frame: Frame) -> bytes:
 def comparison_payload(
     frames: list[Frame], header: dict[str, Any], truth: TruthTrees | None, match_distance: float
 ) -> bytes:
-    """Return one scan under several parameter sets as a binary block; array names end with the number of the
-    set.
+    """Return one scan under several parameter sets as a binary block. The arrays are those of `_clustered`
+    for each set; their names end with the number of the set, from 0. The header has `pictures`, see
+    `described`.
 
     Args:
         frames: Results of the scan with each set.

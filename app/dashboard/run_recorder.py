@@ -108,7 +108,7 @@ class RunRecorder:
         Args:
             run: Number of its source in the store; None if the store cannot be used, then nothing is
                 recorded.
-            source, opened: Requested source and the opened run.
+            source, opened: Requested source and the opened run, whose URI is recorded.
             again: The worker was restarted and opened the same run again; its record continues.
         """
         if again and self._page is not None and self._page.beginning.request.uri == opened.uri:

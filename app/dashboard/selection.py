@@ -244,15 +244,15 @@ class Selector:
         self._task = asyncio.create_task(self._if_known(scan, cluster), name="select")
 
     async def story(self, scan: int | None, cluster: int) -> ClusterStory:
-        """Return the explanation of a cluster of a recent scan. For the selected cluster it is the
-        explanation at the time of its selection.
+        """Return the explanation of a cluster of a recent scan. For the selected cluster, given by its scan,
+        it is the explanation at the time of its selection.
 
         Args:
             scan: Index of the scan; None for the newest.
             cluster: Row of the cluster.
 
         Raises:
-            NoStoryError: The cluster is not available.
+            NoStoryError: The cluster is not available, or no run is shown.
             WorkerBusyError: The worker did not answer in time.
         """
         kept = self.selection.cluster
@@ -283,7 +283,8 @@ class Selector:
             self._live.publish("missing", {"detail": str(error), "scan": scan, "cluster": cluster})
 
     def _select(self, selection: Selection) -> None:
-        """Set the selection, highlight it in the scene and broadcast it."""
+        """Set the selection, highlight it in the scene, broadcast it with its `place`, and clear the message
+        "missing"."""
         self.selection = selection
         place = self._mark(selection.tree, selection.ring)
         self._live.publish("selection", {**selection.as_plain(), "place": place})

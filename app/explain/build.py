@@ -70,7 +70,7 @@ def warm_up(sensor: Sensor) -> None:
 
 
 def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStory:
-    """Return the explanation of a cluster of a recent scan.
+    """Return the explanation of a cluster of a recent scan; for a whole cloud see `cloud_cluster_story`.
 
     Args:
         run: The open run, or None.
@@ -78,7 +78,7 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
         cluster: Row of the cluster in the frame.
 
     Raises:
-        StemmapError: `run` is None, or the scan has no such cluster.
+        StemmapError: `run` is None, the scan has no such cluster, or the forest in force cannot be read.
     """
     if run is None or not 0 <= cluster < len(frame.clusters.size):
         raise StemmapError(f"there is no cluster {cluster}", where=f"scan {frame.index}")
@@ -114,7 +114,7 @@ def cluster_story(run: AnyRun | None, frame: Frame, cluster: int) -> ClusterStor
 
 
 def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStory:
-    """Return the explanation of a tree after a scan.
+    """Return the explanation of a tree after a scan; for a whole cloud see `cloud_tree_story`.
 
     Args:
         run: The open run, or None.
@@ -122,7 +122,8 @@ def tree_story(run: AnyRun | None, frame: Frame | None, number: int) -> TreeStor
         number: Number of the tree.
 
     Raises:
-        StemmapError: No run is open, no scan was mapped, or there is no such tree at this time.
+        StemmapError: No run is open, no scan was mapped, there is no such tree at this time, or the forest in
+            force cannot be read.
     """
     if isinstance(run, InventoryRun):
         return cloud_tree_story(run, number)
@@ -173,7 +174,8 @@ def checks_of(clusters: Clusters, row: int, parameters: Parameters) -> list[Chec
 
 
 def _is_seen_all_around(run: Run) -> bool:
-    """Return which forest classifies the columns of a run up to its current scan."""
+    """Return whether the forest for sensors that see all around classifies the columns of a run up to its
+    current scan."""
     path = run.path
     return is_seen_all_around(run.source.description.sensor.rings, np.column_stack([path.x, path.y]))
 
@@ -187,6 +189,9 @@ def column_story(frame: Frame, place: Float, parameters: Parameters, all_around:
         place: x, y in the map [m].
         parameters: Parameters with which the scan was mapped.
         all_around: Which forest classified them, see `is_seen_all_around`.
+
+    Raises:
+        StemmapError: The forest of the parameters cannot be read.
     """
     columns = frame.columns
     if columns is None or not len(columns.verdict):
@@ -308,8 +313,8 @@ def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
 
 
 def _axes(points: Float, to_picture: Float) -> list[tuple[float, float]]:
-    """Return one standard deviation along the major and the minor principal axis of points, as (right, up) in
-    the picture [m]; [] without points.
+    """Return one standard deviation along the major and the minor principal axis of points, in this order, as
+    (right, up) in the picture [m], with arbitrary sign; [] without points.
 
     Args:
         points: x, y in level sensor coordinates, shape (N, 2) [m].
@@ -331,8 +336,8 @@ _MOST_CELLS = 20_000  # 160 kB
 
 
 def points_around(voxels: VoxelMap, place: NDArray[np.float64]) -> list[tuple[float, float, float]]:
-    """Return the voxels within REACH of a place: x, y from it and height above the ground, in whole
-    centimetres [m]; at most 1,500, of which those at breast height come first.
+    """Return the voxels within REACH of a place: x, y from it and height above the ground [m], rounded to
+    centimetres. First come those at breast height, at most 600, then the others, at most 900.
 
     Args:
         voxels: Voxels of all scans.
@@ -368,7 +373,7 @@ def section(accumulated: NDArray[np.floating]) -> MapSection:
 
 
 def _at_breast(height: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return which heights above the ground [m] are between BREAST_LOW and BREAST_HIGH."""
+    """Return which heights above the ground [m] are at least BREAST_LOW and less than BREAST_HIGH."""
     return (height >= BREAST_LOW) & (height < BREAST_HIGH)
 
 
@@ -502,7 +507,8 @@ def cross_sections(plot: PlotMap, row: int) -> list[CrossSection]:
 
 
 def _points_around(plot: PlotMap, height: float, centre: Float, radius: float) -> list[tuple[float, float]]:
-    """Return points of a slice around a circle relative to its centre, at most _MOST_SECTION_POINTS, in mm.
+    """Return points of a slice around a circle relative to its centre, at most _MOST_SECTION_POINTS, rounded
+    to millimetres [m].
 
     Args:
         plot: The map.

@@ -34,12 +34,13 @@ class TreeHistory:
         self._spacing = 1
 
     def record(self, frame: Frame, start_ns: int) -> None:
-        """Add a row for each tree that the scan detected. Rows of this scan and of later ones are removed
-        first, because the run went back.
+        """Add a row for each tree that the scan detected, confirmed or not. Rows of this scan and of later
+        ones are removed first, because the run went back. Once rows were dropped, scans between the kept ones
+        add only the first ten estimates of a tree.
 
         Args:
             frame: Result of the scan.
-            start_ns: Time of the first scan of the run.
+            start_ns: Time of the first scan of the run [ns].
         """
         rows = _rows_of(frame, start_ns)
         self._count = int(np.searchsorted(self._rows[: self._count, _SCAN], frame.index))
@@ -48,13 +49,14 @@ class TreeHistory:
         self._append(rows)
 
     def last_places(self) -> dict[int, tuple[float, float]]:
-        """Return the newest position of each tree by its number [m]."""
+        """Return the newest stored position of each tree by its number [m], also of trees that ended."""
         known = self._rows[: self._count]
         return {int(number): (float(x), float(y)) for number, x, y in known[:, [_NUMBER, 4, 5]]}
 
     def of(self, number: int, scan: int) -> History:
-        """Return the estimates of the tree with this number up to a scan: at most 200 rows, the first and the
-        last among them; empty columns for an unknown tree."""
+        """Return the estimates of the tree with this number up to a scan (inclusive), in order of time: at
+        most 200 rows, denser at the beginning, the first and the last among them; empty columns for an
+        unknown tree."""
         known = self._rows[: self._count]
         mine = known[(known[:, _NUMBER] == number) & (known[:, _SCAN] <= scan)]
         if len(mine) > _MOST_RETURNED:  # denser for the first observations, where the ellipse changes fastest
@@ -91,7 +93,7 @@ class TreeHistory:
 
 def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return major and minor half axis [m] and direction of the major axis [rad] of 1-sigma ellipses, shape
-    (T, 3).
+    (T, 3). Either of the two opposite directions may be returned.
 
     Args:
         covariance: shape (T, 2, 2) [m^2].

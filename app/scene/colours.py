@@ -196,7 +196,7 @@ class ViewSettings:
             value: Visibility or following as bool; for CHOICES one of their values.
 
         Raises:
-            ParameterError: There is no such choice, or the value is not one of it.
+            ParameterError: There is no such choice, or the value is not one of it; nothing changes.
         """
         if name in CHOICES:
             if value not in CHOICES[name]:

@@ -83,15 +83,15 @@ Place = tuple[float, float, float]
 def cluster_labels(
     frame: Frame, numbers: np.ndarray, label_by: str, taken: Sequence[Place] = ()
 ) -> list[Label]:
-    """Return labels for the clusters of a scan: trees first, then the nearest, at most MOST_LABELS. Clusters
-    without a text, such as those without a circle by "DBH", have none; [] by "none". The page hides the
-    labels that overlap in its view.
+    """Return labels for the clusters of a scan above their tops in the frame of the map: trees first, then
+    the nearest, at most MOST_LABELS. Clusters without a text, such as those without a circle by "DBH", have
+    none; [] by "none". The page hides the labels that overlap in its view.
 
     Args:
         frame: Results of the scan.
-        numbers: Persistent number of each cluster, shape (K,).
+        numbers: Persistent number of each cluster, shape (K,), the keys of the labels.
         label_by: One of colours.LABEL_BY.
-        taken: Places of the labels of trees; a cluster at one of these trees has no label.
+        taken: Places of the labels of trees; a cluster less than OWN_TREE from one of them has no label.
     """
     if label_by == "none":
         return []

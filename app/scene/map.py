@@ -76,7 +76,7 @@ class MapNodes:
 
     def place_of(self, frame: Frame, tree: int | None, ring: Ring) -> tuple[float, float, float] | None:
         """Return x, y and height of the ground of the selected cluster, else of the selected tree [m]; None
-        without them. Arguments as in `show`."""
+        without them, also if the tree is not confirmed. Arguments as in `show`."""
         places = frame.trees.position[frame.trees.confirmed & (frame.trees.number == tree)]
         if ring is not None:
             places = np.array([ring[:2]])
@@ -87,7 +87,8 @@ class MapNodes:
 
     def show_truth(self, trees: TruthTrees | None, view: ViewSettings) -> None:
         """Show rings at the objects of the ground truth, on the known ground, 12 cm outside their trunks;
-        hidden for None and while the layer is off."""
+        hidden for None, without objects, and while the layer is off. They are drawn again only for another
+        table or another ground."""
         on = view.layers["truth"] and trees is not None and len(trees.x) > 0
         drawn = (trees, self.ground.shown)
         if trees is None or not on or (drawn[0] is self._drawn[0] and drawn[1] is self._drawn[1]):
@@ -153,11 +154,11 @@ class MapNodes:
 def tree_labels(
     trees: Trees, robot: NDArray[np.float64], selected: int | None, foot: NDArray[np.float64]
 ) -> list[Label]:
-    """Return labels for the selected tree and the trees nearest to the robot, at most MOST_LABELS. The page
-    hides the labels that overlap in its view.
+    """Return labels for the selected tree, first, and the trees nearest to the robot, at most MOST_LABELS.
+    The page hides the labels that overlap in its view.
 
     Args:
-        trees: Trees of the map.
+        trees: Trees of the map, which may all get labels.
         robot: Position of the robot, shape (2,) [m].
         selected: Number of the selected tree, or None.
         foot: Height of the ground at each tree, shape (T,) [m].
@@ -326,8 +327,9 @@ class Accumulated:
         """Add the filtered points of a scan; if the run went back, remove those of this and later scans
         first.
 
-        Nothing is added if the robot moved less than STEP and turned less than TURN since the last added
-        scan. Only the first point of each cell is kept; above MOST_POINTS points are counted in `left_out`.
+        Nothing is added to `points` if the robot moved less than STEP and turned less than TURN since the
+        last added scan. Only the first point of each cell is kept; above MOST_POINTS points are counted in
+        `left_out`. The time windows of `points_of` do not depend on the motion.
 
         Returns:
             Whether `points` changed.
@@ -355,7 +357,7 @@ class Accumulated:
 
     def points_of(self, window: str) -> NDArray[np.float32]:
         """Return the points that the layer shows, float32, shape (N, 3) [m], one per cell: those of the whole
-        run or, by the poses of the time, of the scans shortly before the last one.
+        run, which are not copied, or, by the poses of the time, of the scans shortly before the last one.
 
         Args:
             window: One of colours.WINDOWS.
@@ -419,7 +421,8 @@ class MapCloud:
         self._blocks: list[CloudNode] = []
 
     def show(self, on: bool, points: NDArray[np.float32]) -> None:
-        """Show points, shape (N, 3) [m]; only blocks that changed are sent."""
+        """Show points, shape (N, 3) [m], coloured by height, or hide them (`on` False); only blocks that
+        changed are sent."""
         while on and len(self._blocks) * BLOCK < len(points):
             self._blocks.append(CloudNode(self._scene, f"/world/gathered/{len(self._blocks)}", 0.05))
         for number, block in enumerate(self._blocks):

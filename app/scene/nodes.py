@@ -85,7 +85,7 @@ def circles(
 
 def polyline(points: NDArray[np.floating]) -> NDArray[np.float32]:
     """Return the segments between consecutive points (N, 3), float32, shape (N - 1, 2, 3); shape (0, 2, 3)
-    for one point."""
+    for less than two points."""
     xyz = points.astype(np.float32)
     return np.stack([xyz[:-1], xyz[1:]], axis=1)
 
@@ -104,7 +104,8 @@ class Node(Generic[N]):
 
         Args:
             on: Whether it is visible.
-            content: Properties by name; those that are unchanged are not sent.
+            content: The same properties in each call, by name; those that are unchanged are not sent. Arrays
+                are kept and must not be modified.
         """
         changed = [
             name

@@ -169,10 +169,11 @@ class SceneCommands(Protocol):
         """
 
     async def use_preset(self, name: str) -> None:
-        """Use all values of a preset."""
+        """Use all values of a preset; raises ParameterError if there is none of this name."""
 
     async def reset_parameters(self, names: list[str]) -> None:
-        """Reset parameters to the preset; an empty list means all."""
+        """Reset parameters to the preset; an empty list means all. Raises ParameterError for an unknown
+        name."""
 
     async def choose_view(self, name: str, value: str | bool) -> None:
         """Set one choice of the view.
@@ -190,6 +191,10 @@ class SceneCommands(Protocol):
 
     async def select_cluster(self, scan: int, cluster: int) -> None:
         """Select a cluster of a scan in all views.
+
+        Args:
+            scan: Index of the scan.
+            cluster: Row of the cluster in it.
 
         Raises:
             StemmapError: The scan is not stored any more.
@@ -238,8 +243,8 @@ class PanelCommands:
             self._start(self._send_waiting())
 
     def ask(self, command: Awaitable[None], client: viser.ClientHandle | None) -> None:
-        """Run another command in the background; a refusal is shown in the browser of `client`, if it is
-        known."""
+        """Run another command in the background. A refusal resets the widgets and is shown in the browser of
+        `client`, if it is known."""
         self._start(self._run_command(command, client))
 
     def stop(self) -> None:

@@ -285,7 +285,8 @@ def meant(
     cylinders.
 
     While a run plays, the browser shows an older scan, in which the numbers belong to other clusters. If the
-    ray misses the cylinder with the reported number, the cylinder nearest to the ray is returned.
+    ray passes the cylinder with the reported number by more than 5 cm, the cylinder nearest to the ray is
+    returned.
 
     Args:
         origin, direction: Ray, shape (3,) each; the direction may have any length.
@@ -302,7 +303,8 @@ def meant(
 
 
 def distances(origin: Float, direction: Float, low: Float, high: Float) -> Float:
-    """Return the distances between a ray and vertical or inclined segments, shape (K,) [m].
+    """Return the distances between a ray, which begins at `origin`, and vertical or inclined segments, shape
+    (K,) [m].
 
     Args:
         origin, direction: Ray, shape (3,) each; the direction may have any length.

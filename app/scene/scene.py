@@ -107,13 +107,13 @@ class Scene:
         """Highlight the selection in place of the one before. It is drawn with the next scan if none is
         shown.
 
-        Returns:
-            x, y and height of the ground of the selection in the frame of the map [m]; None if it is not in
-            the shown map.
-
         Args:
             tree: Number of the selected tree, or None; an unknown number highlights nothing.
             ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
+
+        Returns:
+            x, y and height of the ground of the selected cluster, else of the tree, in the frame of the map
+            [m]; None if it is not in the shown map.
         """
         self._selected, self._ring = tree, ring
         self._draw()
@@ -121,7 +121,8 @@ class Scene:
 
     def suit(self, *, cloud: bool) -> None:
         """Choose how points are coloured when a run begins: a whole cloud by height, a scan by verdict. Other
-        choices of a person stay. The sliders are hidden for a whole cloud, which does not depend on them."""
+        choices of a person stay. The sliders are hidden for a whole cloud, which does not depend on them. The
+        shown scan is not drawn again."""
         self._tune.suit(cloud=cloud)
         usual = COLOUR_BY[0]
         if self._view.colour_by in (usual, "height"):
@@ -134,7 +135,8 @@ class Scene:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of elements of the layers that only the scene counts."""
+        """Number of elements of the layers that only the scene counts: `ground` (triangles), `voxels`,
+        `gathered` (points) and `errors` (missed and false trees)."""
         return {
             "ground": self._map.ground.faces,
             "voxels": self._voxels.count,
@@ -326,7 +328,8 @@ class Follower:
         self._set_initial_camera()
 
     def frame_plot(self, extent: float) -> None:
-        """Move all cameras so that they show a plot, or the surroundings of a robot.
+        """Move all cameras so that they show a plot, or the surroundings of a robot. Nothing if the scale of
+        the view does not change.
 
         Args:
             extent: Width of the plot [m]; 0 for a robot.

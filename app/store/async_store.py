@@ -39,8 +39,9 @@ class AsyncStore:
         self._waiting = 0
 
     async def ask(self, function: Callable[[Store], T]) -> T:
-        """Return the result of a function, which is called with the store in the thread of the store; its
-        exceptions are raised here.
+        """Return the result of a function, which is called with the store in the thread of the store. Its
+        exceptions are raised here, those of the database as StemmapError. If the store cannot be opened, the
+        next request tries again.
 
         Raises:
             StoreBusyError: LARGEST_QUEUE requests wait.
@@ -55,7 +56,7 @@ class AsyncStore:
             self._waiting -= 1
 
     async def close(self) -> None:
-        """Finish the requests that wait, and close the database. No request may follow."""
+        """Finish the requests that wait, and close the database; errors as `ask`. No request may follow."""
         if self._store is not None:
             await self.ask(lambda store: store.close())
         self._thread.shutdown()

@@ -55,7 +55,8 @@ class Forests:
         self._provenance: dict[str, dict[str, Any]] = {}
 
     def __call__(self, name: str, all_around: bool) -> Forest:
-        """Return a forest by its name, for sensors that see all around or for sensors that look one way.
+        """Return a forest by its name, for sensors that see all around or for sensors that look one way. A
+        file is read once; later changes of it have no effect.
 
         Raises:
             StemmapError: There is no such forest, or its file is damaged.
@@ -88,7 +89,8 @@ class Forests:
 
     def provenance(self, name: str) -> dict[str, Any] | None:
         """Return `name`, `date`, `things` (number of objects by class) and `runs` (their number) of a learned
-        forest; None for the forest of the package and for files that are missing or have no provenance."""
+        forest; None for the forest of the package and for files that are missing, damaged or without
+        provenance. Found values are stored and shared."""
         if name == PACKAGE:
             return None
         if name not in self._provenance:
@@ -149,7 +151,8 @@ class Forests:
         return name
 
     def _file(self, name: str) -> Path | None:
-        """Return the file of a forest; None without a data folder or for an invalid name."""
+        """Return the path of a forest, which may not exist; None without a data folder or for an invalid
+        name."""
         return None if self._folder is None or not _NAME.fullmatch(name) else self._folder / f"{name}.json"
 
 

@@ -134,8 +134,9 @@ class RunRecords:
         self._clock = clock
 
     def begin(self, run: NewRun, figures: RunFigures) -> int:
-        """Store the record of a new run and return its number. Runs that were deleted more than 30 days ago
-        are removed for good."""
+        """Store the record of a new run and return its number. For an uploaded file the record gets its
+        original name; names are cut to 200 characters. Runs that were deleted more than 30 days ago are
+        removed for good."""
         now = self._clock()
         with self._engine.begin() as connection:
             _forget_deleted(connection, now - _KEPT_NS)
@@ -171,8 +172,9 @@ class RunRecords:
             connection.execute(update(_maps).where(_maps.c.record == record).values(map=figures.map))
 
     def revise_all(self, record: int, changes: Sequence[Change]) -> None:
-        """Store changes of parameters in one transaction, the oldest first. Changes of the same parameters by
-        one person within 3 s become one revision."""
+        """Store changes of parameters of an existing record in one transaction, the oldest first. Successive
+        changes of the same parameters by one person within 3 s become one revision, which is removed if all
+        values are as before it."""
         now = self._clock()
         with self._engine.begin() as connection:
             for change in changes:
@@ -264,12 +266,13 @@ class RunRecords:
     # --- uploads ---------------------------------------------------------------------------------
 
     def add_upload(self, file: str, name: str, kind: str, size: int) -> None:
-        """Store the original name of an uploaded file.
+        """Store the original name of an uploaded file. An error of the database is raised if `file` has a
+        record.
 
         Args:
             file: Name of the file in the folder of uploads.
-            name: Original name.
-            kind: Name of its format.
+            name: Original name; 200 characters are stored.
+            kind: Name of its format; 200 characters are stored.
             size: Number of bytes.
         """
         values = {"name": name[:200], "kind": kind[:200], "bytes": size, "at_ns": self._clock()}
@@ -284,7 +287,8 @@ class RunRecords:
 
 
 def _revise(connection: Connection, record: int, change: Change, now: int) -> None:
-    """Store a change of parameters, or extend the last revision of the record if both are one move.
+    """Store a change of parameters, or extend the last revision of the record if both are one move. The
+    revision is deleted if all its values are then as before it.
 
     Args:
         connection: Connection with an open transaction.
@@ -446,7 +450,7 @@ class Store:
             ]
 
     def add(self, run: int, author: Author, contents: Sequence[Content]) -> list[int]:
-        """Add annotations in one step and return their ids.
+        """Add annotations in one step and return their ids, in the order of `contents`.
 
         Args:
             run: Number of the source, see `open_run`.
@@ -455,7 +459,8 @@ class Store:
 
         Raises:
             StemmapError: There would be more than MOST_ANNOTATIONS annotations; none is added.
-            StaleError: The run has a reference system (FRAME) already, and the contents have one.
+            StaleError: The run has a reference system (FRAME) already, and the contents have one; none is
+                added.
         """
         with self._engine.begin() as connection:
             counted = select(func.count()).where(_annotations.c.run == run, _annotations.c.deleted.is_(False))
@@ -504,8 +509,8 @@ class Store:
 
         Raises:
             StemmapError: There is no step to undo.
-            StaleError: Another person has changed an annotation of the step since; nothing is undone, and the
-                step is skipped from now on.
+            StaleError: An annotation of the step was changed since, or the run would get a second reference
+                system; nothing is undone, and the step is skipped from now on.
         """
         self._turn(run, author, "undone")
 
@@ -681,7 +686,7 @@ def _next_step(connection: Connection, run: int, author: Author, to: str) -> int
 
 
 def _row(connection: Connection, id_: int) -> Row[Any]:
-    """Return the row of an existing annotation, also of a deleted one."""
+    """Return the row of an annotation, also of a deleted one. It must exist."""
     return connection.execute(select(_annotations).where(_annotations.c.id == id_)).one()
 
 
