@@ -99,14 +99,14 @@ def build(
     fleet: FleetLink | None = None,
 ) -> FastAPI:
     """Return the application of one dashboard. Worker, scene and source are started when the application
-    starts, and ended with it.
+    starts, and ended with it; abandoned uploads are removed then.
 
     Args:
         settings: Settings of the deployment.
         port: Port on which it is served, to check Host and Origin.
         token: Token of the owner's link.
         source: Source that is opened at the start.
-        parameter_state: Parameters at the start.
+        parameter_state: Parameters at the start; its `check` is set.
         make_scene: Replaces viser in tests.
         make_worker: Returns the worker, which may run already; tests replace it.
         fleet: The fleet that the dashboard belongs to, if any.
@@ -194,8 +194,8 @@ class SafeHeaders:
 
 def _answer_errors(app: FastAPI) -> None:
     """Register handlers that return errors as JSON: StemmapError with the status of its class (409 by
-    default; 429 and 503 with Retry-After), failed validation 422, and every other exception as 500, which is
-    logged."""
+    default, UploadError with its own; 429 and 503 with Retry-After), failed validation 422, HTTPException
+    with its status, and every other exception as 500, which is logged."""
     statuses = {
         BadRequestError: 422,
         NotPermittedError: 403,

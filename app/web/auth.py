@@ -77,8 +77,8 @@ def viewer_token(token: str) -> str:
 
 
 def role_of(scope: Scope) -> Role:
-    """Return the role that the guard determined for a request; "viewer" for a request that did not pass the
-    guard."""
+    """Return the role that the guard determined for a request: None for a health check without a session,
+    "viewer" for a request that did not pass the guard."""
     role: Role = scope.get("state", {}).get("role", "viewer")
     return role
 
@@ -138,7 +138,7 @@ def allowed_hosts(host: str, port: int, further: Iterable[str] = ()) -> frozense
 
     Args:
         host, port: Address on which the server listens.
-        further: Further host names.
+        further: Further host names in lower case.
     """
     names = {*_LOOPBACK_NAMES, f"[{host}]" if ":" in host else host.lower(), *further}
     if host in _ANY_ADDRESS:
@@ -234,8 +234,9 @@ class Guard:
         return bool(ends) and max(end or 0 for end in ends) < time.time() + SESSION_S / 2
 
     def _refusal(self, scope: Scope, headers: Headers) -> Response | None:
-        """Return the response to a wrong Host or Origin (403), or to an announced body that is too large
-        (413); None if all are valid. The Origin of GET and HEAD requests is not checked."""
+        """Return the response to a wrong Host or Origin (403), or to an announced body that is too large or a
+        length that is not a number (413); None if all are valid. The Origin of GET and HEAD requests is not
+        checked."""
         if not self._knows_host(headers):
             return error_reply(
                 403, "this server has another host name", remedy="Open the link that stemmap printed"
@@ -274,7 +275,8 @@ class Guard:
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
         """Return the response to a link with a valid token or ticket (see `_welcome`), 401 for a request
-        without a session, except one about the health of the server, else None. A ticket is used up."""
+        without a session, except one about the health of the server, else None. A ticket is used up. A client
+        that accepts HTML gets the 401 as a page."""
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             given = dict(query)

@@ -174,7 +174,7 @@ def run_server(
 
     Args:
         settings: Settings of the deployment; without a token a random one is used.
-        make_app: Awaited with port and token; returns the application.
+        make_app: Awaited with port and token; returns the application. Its exceptions pass through.
         open_browser: Whether to open the page in the browser of this machine.
         viewer: Whether to print the view-only link.
 
@@ -219,7 +219,8 @@ def _is_of_this_server(record: logging.LogRecord) -> bool:
 
 def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
     """Return the uvicorn configuration of the application: without access log, since the first address
-    contains the token, and without compression of websockets."""
+    contains the token, and without compression of websockets. Messages about single clients are filtered out
+    of uvicorn's log."""
     logging.getLogger("uvicorn.error").addFilter(_is_of_this_server)
     return uvicorn.Config(
         app,
@@ -240,7 +241,8 @@ def bind(settings: Settings) -> socket.socket:
     DEFAULT_PORT on; another port than the first is printed.
 
     Raises:
-        StemmapError: No port is free, or the address is not an address of this machine.
+        StemmapError: No port is free, the name of the host is unknown, or the address is not an address of
+            this machine.
     """
     first = DEFAULT_PORT if settings.port is None else settings.port
     listening = first_free(
@@ -278,10 +280,10 @@ def first_free(host: str, ports: Iterable[int]) -> socket.socket | OSError:
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """Return a listening socket on a port.
+    """Return a listening socket on a port; 0 is any free one.
 
     Raises:
-        OSError: The port is in use, or the address is not an address of this machine.
+        OSError: The port is in use, the name is unknown, or the address is not an address of this machine.
     """
     family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
     listening = socket.socket(family, kind, protocol)

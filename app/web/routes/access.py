@@ -220,7 +220,8 @@ def _permitted_path(name: str, settings: Settings) -> str | None:
 
 def _permitted_simulation(uri: str, settings: Settings) -> str | None:
     """Return the address of a simulated run. For a scan of a cloud, its files are replaced by their permitted
-    paths; None if one is not permitted. Other scenarios are permitted as they are."""
+    paths; None if one is not permitted; errors as `_permitted_path`. Other scenarios are permitted as they
+    are."""
     name, _, query = uri.removeprefix("sim:").partition("?")
     if name != "cloud":
         return uri
@@ -257,7 +258,7 @@ class Edit(Body):
 
 async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], status: int = 200) -> Response:
     """Return a response with further values, the number of edits so far (`serial`), and how many edits of
-    this browser can be undone and redone.
+    this browser can be undone (`undo`) and redone (`redo`). Raises StemmapError if the store cannot be used.
 
     Args:
         dashboard: The dashboard.

@@ -73,8 +73,9 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 @router.post("/annotations")
 async def add(body: _Add, dashboard: Dash) -> Response:
     """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
-    and not exported); return its number and the numbers of edits that can be undone and repeated, with 201.
-    409 if another run was opened meanwhile or nothing can be annotated."""
+    and not exported); return its number (`id`) and the numbers of edits that can be undone and repeated, with
+    201. 409 if another run was opened meanwhile, nothing can be annotated, or the run has
+    MOST_ANNOTATIONS."""
     (added,) = await apply_edit(dashboard, body, Store.add, [body.content])
     return await edited(dashboard, body, {"id": added}, 201)
 
@@ -113,9 +114,9 @@ async def redo(body: Edit, dashboard: Dash) -> Response:
 
 @router.post("/annotations/import")
 async def import_table(body: _Import, dashboard: Dash) -> Response:
-    """Add the rows of a CSV table in one edit. Return the number of added rows, and the number of rows that
-    were left out because they exist already. 422 if the table cannot be read, has a row out of bounds or too
-    many rows; then nothing is added."""
+    """Add the rows of a CSV table in one edit. Return the number of added rows (`added`), and the number of
+    rows that exist already as annotations (`left_out`). 422 if the table cannot be read, has a row out of
+    bounds or too many rows, 409 as in `add`; then nothing is added. Without new rows there is no edit."""
     contents = await asyncio.to_thread(_imported, body, dashboard.offset)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new = [content for content in contents if _key(content) not in existing]
@@ -134,8 +135,8 @@ async def score_against(body: _TruthChoice, dashboard: Dash) -> Response:
 
 @router.get("/annotations.csv")
 async def export_table(dashboard: Dash) -> Response:
-    """Return the annotations as a CSV table for the import and for `stemmap evaluate`; only its header
-    without annotations."""
+    """Return the annotations as a CSV table for the import and for `stemmap evaluate`, those of a whole cloud
+    in its coordinates; only its header without annotations."""
     from pipeline.io.result_files import csv_text
 
     return text_reply(csv_text(_Columns, [_row(row) for row in _rows(dashboard)]), "truth.csv")
@@ -143,8 +144,8 @@ async def export_table(dashboard: Dash) -> Response:
 
 @router.get("/annotations.geojson")
 async def export_geojson(dashboard: Dash) -> Response:
-    """Return the annotations as a FeatureCollection of points in the frame of the map, which it declares,
-    with class, DBH [cm], author and time; no features without annotations."""
+    """Return the annotations as a FeatureCollection of points in the frame of the map, or of the file of a
+    whole cloud, which it declares, with class, DBH [cm], author and time; no features without annotations."""
     from pipeline.io.result_files import ROBOTS_FRAME
 
     cloud = dashboard.status.cloud is not None

@@ -143,7 +143,8 @@ async def save_set(body: SaveSet, dashboard: Dash) -> Response:
 @router.post("/sets/use")
 async def use_set(body: _SetName, dashboard: Dash) -> Response:
     """POST /api/sets/use: use all values of a saved set or a preset, as one change that can be undone. The
-    response is empty; 404 if there is none of this name, 422 if its values are not valid in this version."""
+    response is empty; 404 if there is none of this name, 422 if its values are not valid in this version, 409
+    for a random forest that does not exist."""
     preset_name, values = dashboard.sets.named(body.name)
     await dashboard.tune(lambda state: state.use(preset_name, values))
     return json_reply({})
@@ -159,7 +160,8 @@ async def delete_set(body: _SetName, dashboard: Dash) -> Response:
 @router.post("/sets/upload")
 async def upload_set(body: _ParameterFile, dashboard: Dash) -> Response:
     """POST /api/sets/upload: use the values of a parameter file, as the flag `--config` does; nothing is
-    saved. The response is empty; 422 if the file or a value is not valid."""
+    saved. The response is empty; 422 if the file or a value is not valid, 409 for a random forest that does
+    not exist."""
     preset_name, values = await asyncio.to_thread(
         read_file, body.text, body.file, dashboard.parameters.preset
     )

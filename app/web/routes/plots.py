@@ -255,7 +255,7 @@ def _corners(plot: Mapping[str, Any]) -> int:
 
 def _written(files: Mapping[str, str], folder: FilePath) -> FilePath:
     """Write files, given in base64 by name, to a folder; return the path of the one that is read, the first
-    with a suffix of plots. Raises BadRequestError if there is none, or for other text than base64."""
+    by the order of SUFFIXES. Raises BadRequestError if there is none, or for other text than base64."""
     from app.batch.plot_files import SUFFIXES
 
     for name, text in files.items():

@@ -224,9 +224,9 @@ async def tree_picture(number: Number, dashboard: Dash, shown: NewestScan) -> Re
 
 @router.get("/section", dependencies=[ViewerTurn, Depends(newest_scan)])
 async def section(dashboard: Dash) -> Response:
-    """Return the accumulated points at breast height seen from above as a binary block: side of a cell and
-    lower left corner of cell (0, 0) [m], and the occupied cells along x and y; 409 before the first map, 503
-    if the worker is busy."""
+    """Return the accumulated points at breast height seen from above as a binary block: in the header `side`
+    of a cell and `origin`, the lower left corner of cell (0, 0) [m], and the array `cells`, the occupied
+    cells along x and y, int32, shape (N, 2); 409 before the first map, 503 if the worker is busy."""
     found = await dashboard.worker_client.section()
     return bytes_reply(packed({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
 
@@ -240,9 +240,10 @@ async def stages(shown: NewestScan) -> Response:
 
 @router.post("/compare", dependencies=[ViewerTurn])
 async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
-    """Map the current scan with each of two parameter sets. Return both frames as a binary block, with the
-    names and the differing parameters in its header. 404 for an unknown set, 409 without a scan, 429 if too
-    many comparisons wait, 503 if the worker is busy."""
+    """Map the current scan with each of two parameter sets. Return both frames as a binary block, see
+    `comparison_payload`, with the names `a` and `b` and `differences`, [name, value in a, value in b], in its
+    header. 404 for an unknown set, 409 without a scan, 429 if too many comparisons wait, 503 if the worker is
+    busy."""
     sets = [_parameters_of(dashboard, name) for name in (body.a, body.b)]
     async with bounds.comparisons.turn():
         frames = await dashboard.worker_client.compare(sets)

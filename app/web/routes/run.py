@@ -160,8 +160,8 @@ async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) ->
 
 @router.get("/sources")
 async def sources(dashboard: Dash, settings: Deployment) -> Response:
-    """GET /api/sources: return `scenarios` and `recordings` that can be opened, of the latter at most 500;
-    uploaded recordings with their original names."""
+    """GET /api/sources: return `scenarios` (`uri`, `doc`) and `recordings` (see `_listed`) that can be
+    opened, of the latter at most 500."""
     from pipeline.io.readers.simulated import scenarios
 
     try:
@@ -178,7 +178,8 @@ async def sources(dashboard: Dash, settings: Deployment) -> Response:
 
 
 def _listed(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, str]:
-    """Return the path of a recording; for an uploaded one its path, original name and format."""
+    """Return the path of a recording; for an uploaded one a dict with its path (`uri`), original `name` and
+    format (`doc`)."""
     known = uploaded.get(path.name)
     if known is None:
         return str(path)
@@ -186,8 +187,9 @@ def _listed(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, 
 
 
 def recordings(folders: Sequence[Path]) -> list[Path]:
-    """Return at most 500 files and folders directly in the data folders, without hidden ones and finished
-    maps. Their contents are not checked; folders that cannot be read are skipped."""
+    """Return at most 500 files and folders directly in the data folders, in their order and sorted in each,
+    without hidden ones and finished maps. Their contents are not checked; folders that cannot be read are
+    skipped."""
     found: list[Path] = []
     for folder in folders:
         with contextlib.suppress(OSError):

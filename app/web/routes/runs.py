@@ -71,9 +71,9 @@ class _Name(Body):
 
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
-    """GET /api/runs: return at most 500 runs without their maps (`runs`), the newest first, each with the
-    number of annotations of its recording (`annotated`), finished folders (`folders`), and the number of the
-    open run (`open`)."""
+    """GET /api/runs: return at most 500 runs without their maps (`runs`, see `_row`), the last changed first,
+    each with the number of annotations of its recording (`annotated`), finished folders (`folders`, each with
+    `key`, `name` and `changed_s`), and the number of the open run (`open`, null if it is not recorded)."""
     await dashboard.run_recorder.write_now()
     rows, annotated = await dashboard.store.ask(
         lambda store: (store.book.listed(), store.annotation_counts())
@@ -193,7 +193,7 @@ async def restore(number: Number, dashboard: Dash) -> Response:
 async def replay(key: _Key, dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
     """Open the source of a run again, with its topics, mounting and final parameters. The response is empty
     (202); the status reports the result. 403 if the file may not be opened by the caller, 404 for an unknown
-    run."""
+    run, 409 if its source cannot be opened, 422 if its parameters are not valid in this version."""
     run = await _whole(key, settings, dashboard)
     request = request_of_kept(
         run["uri"],

@@ -28,8 +28,10 @@ class _Sensitivity(Body):
 
 @router.get("/search")
 async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """GET /api/search: return the progress of the search (see `TuneSearch.as_plain`), its possible goals and
-    parameters, and the other recorded runs, which are left out if the store cannot be read."""
+    """GET /api/search: return the progress of the search (see `TuneSearch.as_plain`), its possible `goals`
+    (`name`, `words`), the parameters that are suggested with their ranges (`sensible`, "NAME=LOW..HIGH"), and
+    the other recorded `runs`, of which at most `most_runs` can be chosen; they are left out if the store
+    cannot be read."""
     try:
         runs = [run.as_plain() for run in await _others(dashboard, settings, any_file)]
     except StemmapError:  # the open run can still be searched over
