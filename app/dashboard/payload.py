@@ -179,8 +179,8 @@ def _finite(values: Float) -> list[float | None]:
 
 def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
     """Return the verdict counts of a scan: `verdicts`, the number of clusters by verdict, and `right` and
-    `wrong`, the clusters with the verdict tree that are at a true tree, and those that are not; None without
-    ground truth.
+    `wrong`, the numbers of detections that are paired with a true tree (one to one, see `match`), and that
+    are not, also because the paired object is no tree; None without ground truth.
 
     Args:
         frame: Results of the scan.

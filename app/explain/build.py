@@ -373,7 +373,8 @@ def section(accumulated: NDArray[np.floating]) -> MapSection:
 
 
 def _at_breast(height: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Return which heights above the ground [m] are at least BREAST_LOW and less than BREAST_HIGH."""
+    """Return which heights above the ground, shape (N,) [m], are at least BREAST_LOW and less than
+    BREAST_HIGH."""
     return (height >= BREAST_LOW) & (height < BREAST_HIGH)
 
 

@@ -256,8 +256,8 @@ class ClusterNumbers:
         self._next = 0
 
     def follow(self, places: Float) -> Int:
-        """Return a number for each cluster at these places: that of the cluster of the previous call within
-        REACH, else the next unused one.
+        """Return a number for each cluster at these places: that of the cluster of the previous call with
+        which it is paired within REACH (one to one, see `match`), else the next unused one, from 0 on.
 
         Args:
             places: shape (K, 2) [m] in the frame of the map.

@@ -124,7 +124,7 @@ class Uploads:
         return {"uri": str(place), "name": _shown(name), "kind": kind, "bytes": size}
 
     def _free(self) -> int:
-        """Return the free disk space without SPARE_BYTES [bytes]; may be negative."""
+        """Return the free disk space without SPARE_BYTES [bytes]; may be negative. Errors as `_place`."""
         return shutil.disk_usage(self._place()).free - SPARE_BYTES
 
     def _room(self, free: int) -> int:

@@ -327,7 +327,7 @@ class Remapping:
 
     Args:
         rerun: The rerun, with the mapper of the new map.
-        new_map: The new map, before its first scan.
+        new_map: The new map, after the scans that the rerun has done.
         preview: Computes the preview in steps.
     """
 
@@ -549,8 +549,8 @@ def changes_between(
     time_s: float,
     confirmed_s: Mapping[int, float],
 ) -> MapChanges:
-    """Return the differences between the confirmed trees of two maps of the same scans. Trees within SAME are
-    the same one; it has moved if its positions differ by more than MOVED.
+    """Return the differences between the confirmed trees of two maps of the same scans. Trees are paired one
+    to one within SAME, see `match`; a pair has moved if its positions differ by more than MOVED.
 
     `changes` has the trees that appeared, then those that vanished, then those that moved. `ghost` has the
     confirmed trees of the old map. Positions and diameters are rounded to 1 mm.

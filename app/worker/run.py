@@ -42,7 +42,8 @@ MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
 
 
 class Run:
-    """A source, mapped from its first scan to the current one.
+    """A source, mapped from its first scan to the current one. The constructor makes a mapper and raises
+    StemmapError if the forest of the parameters does not exist.
 
     Args:
         source: The source; `close` closes it.
@@ -157,7 +158,8 @@ class Run:
 
         Raises:
             SourceError: Nothing more can be read.
-            StemmapError: The scan cannot be mapped; the mapper is broken until `approach`.
+            StemmapError: The scan cannot be mapped, for example because a forest does not exist; the mapper
+                is broken until `approach`.
         """
         step = self._cursor.take()
         if step is None:
@@ -272,13 +274,16 @@ class Run:
 
     def remap(self, parameters: Parameters, on_preview: Callable[[Trees], None]) -> None:
         """Begin to map the run again from its first scan, in place of a rerun that is not complete. The map
-        before the last change is continued if it has these parameters, as after an undo. Nothing begins if
-        the map would not change. `remap_next` does the work.
+        before the last change is continued from its last scan if it has these parameters, as after an undo.
+        Nothing begins if the map would not change. `remap_next` does the work.
 
         Args:
             parameters: Parameters of all scans.
             on_preview: Called with approximate trees of the new map before a scan is mapped again, unless
-                they are unknown.
+                they are unknown or an earlier map is continued.
+
+        Raises:
+            StemmapError: The forest that the parameters name does not exist.
         """
         self.cancel_remapping()
         if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
@@ -458,7 +463,8 @@ def open_run(
     parameters: Parameters,
     make_mapper: MakeMapper,
 ) -> tuple[Run, tuple[str, ...]]:
-    """Return a run before its first scan, and warnings.
+    """Return a run before its first scan, and warnings about its odometry and its source, which the run has
+    as well.
 
     Args:
         source: The source; the run closes it.
@@ -469,6 +475,7 @@ def open_run(
 
     Raises:
         SourceError: The odometry is not available for this source; the source is closed.
+        StemmapError: The forest that the parameters name does not exist; the source stays open.
     """
     try:
         moving, chosen = with_odometry(source, odometry)

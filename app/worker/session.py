@@ -170,13 +170,14 @@ class Session:
             uri, odometry, seed: As in `SourceRequest`.
             record: File to which a live run is recorded; empty for none.
             publish: Whether the results of a live run are published on the network of the robot.
-            options: Topics and mounting.
+            options: Topics and mounting; their seed is replaced by `seed`.
 
         Returns:
             The opened run; None for a robot that has not sent scans yet, see `listen`.
 
         Raises:
             SourceError: It cannot be read.
+            StemmapError: The forest that the parameters name does not exist.
         """
         self.close()
         self._requested = uri, odometry, seed
@@ -194,8 +195,8 @@ class Session:
         return self._begin(source, odometry, seed)
 
     def listen(self) -> Opened | None:
-        """Return the opened run of a live robot once its data arrive, and collect its warnings; None before
-        and after, and without a live robot.
+        """Return the opened run of a live robot once its data arrive; None before and after, and without a
+        live robot. The notices of the robot become warnings of the session and of the run.
 
         Raises:
             SourceError: What it sends cannot be read.
@@ -214,11 +215,12 @@ class Session:
         """Open a run of a source, paused before its first scan, and return its message.
 
         Args:
-            source: The source; it is closed after an error.
+            source: The source.
             odometry, seed: As in `SourceRequest`.
 
         Raises:
-            SourceError: The odometry is not available for this source.
+            SourceError: The odometry is not available for this source; the source is closed.
+            StemmapError: The forest that the parameters name does not exist.
         """
         warnings: tuple[str, ...]
         if isinstance(source, CloudSource):
@@ -249,7 +251,8 @@ class Session:
             self._run.stopwatch.disturb()
 
     def work(self) -> Frame | None:
-        """Map the next scan and return its frame, or the frame of the seek target once it is reached.
+        """Map the next scan and return its frame, or the frame of the seek target once it is reached. A live
+        robot publishes and records the results.
 
         None if no run is open, if nothing is to be mapped (`pace` is "idle"), while a whole cloud is not
         mapped completely, before a live scan arrived, and at the end of another run, whose state then becomes
@@ -349,7 +352,7 @@ class Session:
     ) -> Frame | None:
         """Use other parameters from the next scan onwards; if the run does not play, from the current scan.
         During a seek they apply from its target onwards; without a run, to the run that is opened next. A
-        rerun that is not complete is cancelled.
+        rerun that is not complete is cancelled. The recording of a live run gets the parameters.
 
         Args:
             parameters, revision: The parameters.
@@ -361,7 +364,8 @@ class Session:
             seek.
 
         Raises:
-            StemmapError: The current scan cannot be mapped again.
+            StemmapError: The current scan cannot be mapped again, or the forest of the parameters does not
+                exist.
         """
         self._parameters, self._revision = parameters, revision
         self._comparison.begin(step)
@@ -459,7 +463,8 @@ class Session:
         self._kept = None
 
     def end_recording(self) -> bool:
-        """Finish the recording of a live run and return whether the run is live; callable from any thread."""
+        """Finish the recording of a live run, which waits up to 8 s for the disk, and return whether the run
+        is live; callable from any thread."""
         robot = self._robot
         if robot is not None:
             robot.end_recording()
@@ -478,7 +483,8 @@ class Session:
     def _arrive(self, run: AnyRun) -> Frame | None:
         """End the seek and return the frame of the current scan; None before the first scan. The scan is
         mapped again if its frame has no points. Parameters that were changed during the seek apply from this
-        scan onwards, and a rerun that was requested begins."""
+        scan onwards, and a rerun that was requested begins. Raises StemmapError if the scan cannot be mapped
+        again."""
         self._target.forget()
         self._kept = None
         changed = run.use(self._parameters, run.current)

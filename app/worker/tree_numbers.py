@@ -23,8 +23,9 @@ SAME = 0.5  # largest distance of the same tree in two maps [m]
 class TreeNumbers:
     """The numbers of the trees of a run as people see them.
 
-    Those of the first map are its own. In another map, a tree that stands within SAME of a known tree has the
-    number of that tree, also if the map in between had no tree there; other trees have new numbers.
+    Those of the first map are its own. In another map, a tree that is paired with a known tree within SAME
+    (one to one, see `match`) has the number of that tree, also if the map in between had no tree there; other
+    trees have new numbers.
     """
 
     def __init__(self) -> None:

@@ -251,7 +251,8 @@ async def _run_folder(
 async def _with_edits(
     folder: FilePath, dashboard: Dashboard
 ) -> AsyncIterator[tuple[FilePath, list[SamplePlot]]]:
-    """Yield a run with the reviews of its recording, see `reviewed_run`, and the plots of the recording."""
+    """Yield a run with the reviews of its recording, see `reviewed_run`, and the plots of the recording.
+    Raises StemmapError if run.json is damaged or the store cannot be used."""
     source = (await asyncio.to_thread(read_run_record, folder))["source"]
     contents = await dashboard.store.ask(lambda store: stored_reviews(store, source))
     plots = await dashboard.store.ask(lambda store: stored_plots(store, source))
@@ -288,7 +289,8 @@ def _number(key: str) -> int:
 
 
 async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], None]) -> Response:
-    """Run an action on the records, and return the number of the run."""
+    """Run an action on the records, and return the number of the run (`id`); errors of the action and of the
+    store pass through."""
     await dashboard.store.ask(lambda store: work(store.book))
     return json_reply({"id": number})
 
@@ -369,7 +371,8 @@ def _changed_s(folder: FilePath) -> int | None:
 
 
 def _folders(settings: Settings) -> dict[str, int | None]:
-    """Return the time of the last change of each finished folder, see `_changed_s`, by name."""
+    """Return the time of the last change [s since 1970] of each finished folder by name; None if it was
+    removed meanwhile."""
     return {name: _changed_s(path) for name, path in _finished_folders(settings).items()}
 
 
