@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 
 from pipeline.classification import depth_image, steepest_by_direction
-from pipeline.classification.voxel_map import FIRST_SCANS
 from pipeline.config import Parameters
 from pipeline.config.stages import Acquisition, Detection
 from pipeline.detection.cluster_shape import describe_stems, no_lift
@@ -118,18 +117,6 @@ class DetectionResult(NamedTuple):
     heights: Float | None
 
 
-def updates_columns(index: int, every: int) -> bool:
-    """Return whether scan `index` updates the voxel columns: each of the first FIRST_SCANS, then each
-    multiple of `every` (>= 1)."""
-    return index < FIRST_SCANS or index % every == 0
-
-
-def updates_terrain(index: int, every: int) -> bool:
-    """Return whether scan `index` updates the terrain map: each of the first FIRST_SCANS, then one of
-    `every`, midway between two scans that update the columns, so that no scan has both costs."""
-    return index < FIRST_SCANS or index % every == every // 2
-
-
 def segment(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, timer: StageTimer = no_timer
 ) -> SegmentedScan:
@@ -173,10 +160,11 @@ def _segment_points(
 ) -> SegmentedScan:
     """Return the segmented scan of a LiDAR; arguments as in `segment`.
 
-    `column_input` is None unless the scan updates the columns (see `updates_columns`) and the parameter
-    `classification.method` is "columns"; `terrain` is None unless the scan updates the terrain map (see
-    `updates_terrain`). Both are None if `ground.method` is "none".
+    `column_input` is None unless the parameter `classification.method` is "columns" and the scan is due after
+    `classification.interval`; `terrain` is None unless the scan updates the terrain map, which is due midway
+    between, so that no scan has both costs. Both are None if `ground.method` is "none".
     """
+    interval = p.classification.interval
     with timer("acquisition"):
         raw, sensor_offset = acquire(step, T_base_lidar, p.acquisition)
 
@@ -219,10 +207,10 @@ def _segment_points(
         free=free,
         sensor_offset=sensor_offset,
         column_input=_column_input(raw, boxed, height, terrain, sensor_offset, sensor)
-        if p.classification.method == "columns" and updates_columns(step.index, p.classification.every)
+        if p.classification.method == "columns" and step.is_due(interval)
         else None,
         terrain=replace(terrain, height=rounded(terrain.height, GROUND))
-        if terrain is not None and updates_terrain(step.index, p.classification.every)
+        if terrain is not None and step.is_due(interval, interval / 2.0)
         else None,
         warnings=(NO_GROUND,) if terrain is not None and len(raw) and seen is None else (),
         counts={

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.classification import ColumnClassifier, ColumnClassifierState, ForestOf, ScanView, package_alone
 from pipeline.classification.forest import is_seen_all_around
-from pipeline.classification.voxel_map import FIRST_SCANS, VoxelMap
+from pipeline.classification.voxel_map import VoxelMap
 from pipeline.config import Parameters
 from pipeline.detection.free_space import BINS
 from pipeline.front_end import DetectionResult, SegmentedScan, StageTimer, detect, no_timer, segment
@@ -165,7 +165,7 @@ class Mapper:
         if self._relocaliser.is_searching:
             self._settle_columns()
         else:
-            self._update_trees(stamp_ns, scan, found, estimate)
+            self._update_trees(step, scan, found, estimate)
             self._update_columns(step, scan, estimate)
             self._update_terrain(scan, estimate)
 
@@ -288,24 +288,17 @@ class Mapper:
         before, now = self._odometry, step.T_odom_base
         self._odometry = before if now is None else now
         driven = Pose2() if before is None or now is None else before.inverse() @ now
-        motion = Motion(driven, step.slack, step.doubt, step.measured, due=self._is_due(step))
+        interval = self._parameters.slam.update_interval
+        due = interval > 0.0 and step.is_due(interval)
+        period = step.period_ns * 1e-9
+        motion = Motion(
+            driven, step.slack, step.doubt, step.measured, due=due, is_view=step.is_view, period=period
+        )
         if before is not None and step.unreported is not None:
             if not self._slam.is_led_by_trees:
                 return self._gated(motion)
             motion = motion._replace(step=step.unreported.inverse() @ driven)
         return self._gated(self._with_gyro(step, motion))
-
-    def _is_due(self, step: Step) -> bool:
-        """Return whether the scan updates SLAM however little the robot has moved: one of the first
-        FIRST_SCANS, so that a short recording uses all its data, or the first one of an interval of
-        `slam.update_interval`, because the wheels may be stuck. False if this parameter is 0. Call it before
-        the scan is appended to the path."""
-        interval_ns = round(self._parameters.slam.update_interval * 1e9)
-        if interval_ns == 0:
-            return False
-        if step.index < FIRST_SCANS or not len(self._path):
-            return True
-        return step.scan.stamp_ns // interval_ns > int(self._path.stamp_ns[-1]) // interval_ns
 
     def _with_gyro(self, step: Step, motion: Motion) -> Motion:
         """Return the motion of a step fused with the turn by the gyroscope; unchanged if the turn or the
@@ -345,20 +338,20 @@ class Mapper:
         return self._slam.process(index, motion, found.detections, scan.free)
 
     def _update_trees(
-        self, stamp_ns: int, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate
+        self, step: Step, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate
     ) -> None:
         """Update the Kalman filters of the trees, and classify new ones by the present columns. The scan that
         finds a lost robot again has no data association, and updates no filter.
 
         Args:
-            stamp_ns: Time of the scan [ns].
+            step: The scan.
             scan: The segmented scan.
             found: Detections of the scan.
             estimate: Pose with the landmark of each detection.
         """
-        tracker = self._tracker
+        tracker, stamp_ns = self._tracker, step.scan.stamp_ns
         with self._timer("tracking"):
-            if len(estimate.landmark_of) == len(found.detections.cluster):
+            if step.is_view and len(estimate.landmark_of) == len(found.detections.cluster):
                 tracker.process(stamp_ns, estimate, found.detections, self._slam.landmarks(), found.heights)
             # A scan that updates the columns classifies all tracks by them afterwards.
             if scan.column_input is None and self._parameters.classification.method == "columns":
@@ -406,9 +399,10 @@ class Mapper:
         if self._parameters.relocalisation.method == "none":
             relocaliser.reset()
         elif not relocaliser.is_searching:
-            needs_state = relocaliser.needs_state(index)
+            views = self._slam.state.views
+            needs_state = relocaliser.needs_state(views, self._slam.is_supported)
             state = replace(self.snapshot(), recovery=RelocaliserState()) if needs_state else None
-            relocaliser.remember(index, motion, state)
+            relocaliser.remember(index, motion, views, state)
 
     def _check_lost(
         self,

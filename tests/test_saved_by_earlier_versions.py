@@ -46,7 +46,6 @@ RUN_CHANGES = {
 }
 PAGE_CHANGES = {
     "shape.split_slices": 6,
-    "classification.every": 2,
     "classification.range_max": 12.0,
     "classification.voxels_log2": 14,
     "classification.tree_share": 0.45,
@@ -54,12 +53,18 @@ PAGE_CHANGES = {
 CLI_CHANGES = {
     "detection.whole": False,
     "shape.split_slices": 6,
-    "classification.every": 2,
     "classification.range_max": 12.5,
     "classification.tree_share": 0.45,
 }
 # Parameters of 0.1.0 that no longer exist.
-REMOVED = {"shape.plane", "slam.looks", "tracking.gate", "tracking.distance_max", "tracking.misses_per_hit"}
+REMOVED = {
+    "gathering.every",
+    "shape.plane",
+    "slam.looks",
+    "tracking.gate",
+    "tracking.distance_max",
+    "tracking.misses_per_hit",
+}
 NAMES_OF_0_1_0 = {"shape.split_slices": "shape.slices"}
 
 

@@ -57,9 +57,8 @@ SLICE = 0.2  # m; its height
 SLICES = 30  # voxels up to 6 m above the ground
 TILE_CELLS = 40  # columns are classified by tiles of 4 m
 TILE = TILE_CELLS * SIDE
-MOST_TILES = 4  # classified per scan,
-# except in the first scans, which all update columns and terrain, so that a short recording uses all its data
-FIRST_SCANS = 10
+# Classified per scan after the first scans, of which a short recording may have no others.
+MOST_TILES, FIRST_SCANS = 4, 10
 _OFFSET = TILE_CELLS << 18  # cells; keys stay positive within 1,000 km of the origin
 _FARTHEST = np.float32((_OFFSET - 2 * TILE_CELLS) * SIDE)
 KEPT = ("key", "mean", "returns", "scans", "latest")  # columns from which all others follow

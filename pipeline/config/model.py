@@ -26,6 +26,7 @@ RENAMED_CHOICES = {("slam.method", "graph"): "fastslam2"}
 # Parameters of earlier versions that no longer exist; their values are ignored.
 REMOVED = frozenset(
     {
+        "classification.every",
         "shape.plane",
         "slam.independent_views_max",
         "slam.looks",

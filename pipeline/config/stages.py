@@ -330,10 +330,10 @@ class Slam(Stage):
 
 
 class Relocalisation(Stage):
-    """Relocalisation: finding the pose in a known map from the constellation of stems."""
+    """Relocalisation: finding a lost robot and closing loops from the constellation of stems."""
 
-    method: Literal["none", "constellation"] = choice("constellation", "Method")
-    """constellation: search the map for the visible stems by their pairwise distances; none: off."""
+    method: Literal["none", "constellation"] = choice("constellation", "Lost robot and loops")
+    """constellation: search the map for the visible stems by their pairwise distances; none: both off."""
 
     stems_min: int = count(6, "Minimum agreeing stems", "", 4, 100)
     """Stems that must agree with a pose before it is accepted."""
@@ -354,8 +354,8 @@ class Classification(Stage):
     range_max: float = number(25.0, "Maximum range", "m", 1.0, 100.0, 1.0)
     """Farther returns are not accumulated in the voxel map."""
 
-    every: int = count(4, "Scan interval", "", 1, 100)
-    """One of this many scans is added to the voxel map; the first ten scans are always added."""
+    interval: float = number(0.4, "Update interval", "s", 0.0, 60.0, 0.1)
+    """Time between two scans that are added to the voxel map; those of the first second are always added."""
 
     voxels_log2: int = count(19, "Memory (log2 voxels)", "", 12, 24)
     """Binary logarithm of the maximum number of voxels; the oldest half is removed when the map is full."""

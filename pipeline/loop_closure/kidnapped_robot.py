@@ -21,9 +21,10 @@ from pipeline.types.records import Detections, Int, PoseEstimate
 
 S = TypeVar("S")
 
-SPACING = 12  # scans between two stored states; losing the known trees takes about eight
+# Views between two stored states. In so many views without known trees, the running share of found trees
+# decreases from 1 to less than that of a supported pose, so that the older state precedes them.
+SPACING = 5
 PARTICLES = 30  # of the local map
-EVERY = 3  # scans between two searches
 HYPOTHESES = 100_000
 FARTHEST = 100.0  # m; after so long a search the map goes on where the odometry leads
 LOCAL_MAP = 1  # spawn key of the random numbers of the local map
@@ -34,14 +35,16 @@ class RelocaliserState(Generic[S]):
     """State of the relocaliser between two scans.
 
     Attributes:
-        kept: The last two stored states of the mapper, older first.
+        kept: The last two stored states of the mapper, older first, each with the next scan's number.
+        views: Number of views at the newer one.
         motions: Scan number and motion of every scan since the older one.
         local: Local map of a search; None while the robot knows where it is.
         driven: Distance since the search began [m].
         since: First scan that mapped nothing because the robot was lost.
     """
 
-    kept: tuple[S, ...] = ()
+    kept: tuple[tuple[int, S], ...] = ()
+    views: int = 0
     motions: tuple[tuple[int, Motion], ...] = ()
     local: SlamState | None = None
     driven: float = 0.0
@@ -80,24 +83,31 @@ class Relocaliser(Generic[S]):
         """End a search, and discard the stored states and motions: the map returns to none of them."""
         self.state = RelocaliserState()
 
-    def needs_state(self, index: int) -> bool:
-        """Return whether `remember` must get the state of the mapper before this scan: for scans whose index
-        is a multiple of SPACING, and while no state is stored."""
-        return not self.state.kept or index % SPACING == 0
+    def needs_state(self, views: int, is_supported: bool) -> bool:
+        """Return whether `remember` must get the state of the mapper before this scan: while none is stored,
+        and where trees support the pose, SPACING views after the last one.
 
-    def remember(self, index: int, motion: Motion, state: S | None) -> None:
+        Args:
+            views: Number of scans that SLAM has used so far.
+            is_supported: See `FastSlam.is_supported`.
+        """
+        return not self.state.kept or (is_supported and views - self.state.views >= SPACING)
+
+    def remember(self, index: int, motion: Motion, views: int, state: S | None) -> None:
         """Store the motion to a scan, and the state of the mapper before it where one is given; see
         `needs_state`. Only the last two states and the motions since the older one are kept.
 
         Args:
             index: Number of the scan.
             motion: Motion from the scan before.
+            views: See `needs_state`.
             state: State of the mapper before the scan, or None.
         """
         s = self.state
         if state is not None:
-            kept = (*s.kept[-1:], state)
-            s = replace(s, kept=kept, motions=s.motions[-SPACING:] if len(kept) > 1 else ())
+            kept = (*s.kept[-1:], (index, state))
+            motions = tuple(each for each in s.motions if each[0] >= kept[0][0])
+            s = replace(s, kept=kept, views=views, motions=motions)
         self.state = replace(s, motions=(*s.motions, (index, motion)))
 
     def begin(self, index: int, detections: Detections, free: Float, parameters: Parameters) -> Restart[S]:
@@ -120,7 +130,7 @@ class Relocaliser(Generic[S]):
         local = SlamState.at_origin(min(PARTICLES, parameters.slam.particles))
         self.state = RelocaliserState(local=local, since=s.motions[0][0])
         self._map_locally(local, index, Motion(Pose2()), detections, free, parameters)
-        return Restart(s.kept[0], s.motions)
+        return Restart(s.kept[0][1], s.motions)
 
     def search(
         self,
@@ -131,8 +141,8 @@ class Relocaliser(Generic[S]):
         parameters: Parameters,
         run: detection.RunHistory,
     ) -> RelocalisedPose | LoopClosure | SearchFailure | None:
-        """Map a scan in the local map, and search the local map among the confirmed trees of the map at each
-        EVERY-th scan. The search continues until `reset`, after a decision as well.
+        """Map a scan in the local map, and search the local map among the confirmed trees of the map if the
+        local map uses the scan. The search continues until `reset`, after a decision as well.
 
         Args:
             index, motion, detections, free: See `FastSlam.process`; a measured pose of the motion is ignored.
@@ -146,8 +156,9 @@ class Relocaliser(Generic[S]):
         """
         if self.state.local is None:
             return None
+        views = self.state.local.views
         slam, estimate = self._map_locally(self.state.local, index, motion, detections, free, parameters)
-        match = None if index % EVERY else _match(slam, estimate, parameters, run)
+        match = _match(slam, estimate, parameters, run) if slam.state.views > views else None
         if match is None:
             return SearchFailure() if self.state.driven > FARTHEST else None
         stems, last = len(match.numbers), self.state.since - 1

@@ -249,9 +249,9 @@ WAIT_NS = 500_000_000  # time for which a scan waits for later odometry
 MOST_WAITING = 64
 STALE_NS = 250_000_000  # readings farther in time from a scan are not used
 JUMP_SLACK = (0.2, 0.05)  # m, rad; one sigma of the motion during a jump of the odometry
+VIEW_NS = 80_000_000  # minimum time between two views: all scans of a sensor of 10 Hz with a jitter of 20 %
 PAUSE_NS = 10_000_000_000  # a longer time without a scan is reported
 WALK_SPEED, WALK_TURN = 0.5, 0.2  # m/s, rad/s; one sigma of the motion without odometry
-WALK_MOST = (3.0, 0.5)  # m, rad; upper bound of that sigma
 SETTLES_NS = 300_000_000
 AHEAD_NS = 1_000_000_000
 TILTS_NS = 90_000_000
@@ -314,6 +314,8 @@ class Synchroniser:
         self._slack = (0.0, 0.0)
         self._doubt = ""
         self._stepped_ns: int | None = None
+        self._elapsed_ns = 0  # since the first scan
+        self._viewed_ns: int | None = None
         self._last_stamp: int | None = None
         self._warnings: list[str] = []
 
@@ -461,6 +463,11 @@ class Synchroniser:
     def _join(self, scan: Scan) -> Step:
         """Return the step of a scan, with the warnings and doubts since the last step, which are reset."""
         self._report_pause(scan.stamp_ns)
+        period_ns = 0 if self._stepped_ns is None else scan.stamp_ns - self._stepped_ns
+        self._elapsed_ns += period_ns
+        is_view = self._viewed_ns is None or scan.stamp_ns - self._viewed_ns >= VIEW_NS
+        if is_view:
+            self._viewed_ns = scan.stamp_ns
         pose, twist, base_tilt = self._motion_at(scan.stamp_ns)
         tilt = self._tilt_at(scan.stamp_ns) or base_tilt
         unreported = self._unreported(scan.stamp_ns)
@@ -481,6 +488,9 @@ class Synchroniser:
             measured=self._measured.at(scan.stamp_ns, pose, odometry_at),
             turn=turn if self._gyro.proven else None,
             turn_rate=self._gyro.rate(scan.stamp_ns) if self._gyro.proven or pose is None else None,
+            elapsed_ns=self._elapsed_ns,
+            period_ns=period_ns,
+            is_view=is_view,
         )
         newest = self._odometry.newest
         self._was_bridged = newest is not None and scan.stamp_ns > newest.stamp_ns + STALE_NS
@@ -544,15 +554,12 @@ class Synchroniser:
             self._suspect(f"no scan for {seconds:.0f} s", (0.0, 0.0))
 
     def _bridge(self, stamp_ns: int) -> None:
-        """Add a warning, a doubt and the uncertainty of an unknown motion since the last step, up to
-        WALK_MOST; zero before the first step."""
+        """Add a warning, a doubt and the uncertainty of an unknown motion since the last step; zero before
+        the first step."""
         self._warn(NO_ODOMETRY)
         since = self._stepped_ns if self._stepped_ns is not None else stamp_ns
         seconds = (stamp_ns - since) * 1e-9
-        self._suspect(
-            "there is no odometry",
-            (min(WALK_SPEED * seconds, WALK_MOST[0]), min(WALK_TURN * seconds, WALK_MOST[1])),
-        )
+        self._suspect("there is no odometry", (WALK_SPEED * seconds, WALK_TURN * seconds))
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
         """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None without one, and,

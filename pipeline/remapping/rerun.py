@@ -89,7 +89,7 @@ def unpack(block: bytes) -> tuple[Step, SegmentedScan]:
 
 MOST_OPEN = 3  # files of one source
 SEGMENTATION_STAGES = ("acquisition", "filters", "ground", "clustering", "shape")
-SEGMENTATION_CLASSIFICATION = ("method", "every")  # they decide which scans have input for the columns
+SEGMENTATION_CLASSIFICATION = ("method", "interval")  # they decide which scans have input for the columns
 
 
 def segmentation_key(parameters: Parameters) -> bytes:

@@ -48,11 +48,14 @@ from pipeline.slam.particle_maps import known_near, shared_map, take_ancestors
 from pipeline.slam.particle_update import Rules, against_slip, estimated, use_scan
 from pipeline.slam.places import ODDS, PlaceStates, agreement
 from pipeline.slam.pose_quality import (
+    FEWEST,
     OdometryDoubt,
     RunningStatistics,
     ScanStatistics,
+    decayed_distrust,
     disagreement,
     is_lost,
+    is_supported,
     named_statistics,
     pose_health,
     update_statistics,
@@ -82,10 +85,11 @@ class FastSlam:
         """Predict the particles by the odometry, weigh them by the detections, and resample when it is due;
         replaces `state`, and changes the arrays of the former state in place.
 
-        Detections are used in the first scan (index 0), after `update_distance`, when the motion is due, and
-        when trees contradict the odometry or the last used scan was strange. In other scans the particles
-        only move, the map is unchanged, and `landmark_of` of the result comes from an association with the
-        unchanged map. A changed number of particles takes effect here.
+        Detections are used in the first scan, and in views and scans with a measured pose: after
+        `update_distance`, when the motion is due, and when trees contradict the odometry or the last used
+        scan was strange. In other scans the particles only move, the map is unchanged, and `landmark_of` of
+        the result comes from an association with the unchanged map. A changed number of particles takes
+        effect here.
 
         Args:
             index: Number of the scan; seeds the random numbers of the scan.
@@ -106,9 +110,14 @@ class FastSlam:
         ancestors, doubt = None, motion.doubt
         R, rules = rows_of(detections.covariance), rules_of(p)
         places = self._places_in_reach(state, detections.centre)
-        trees = self._by_trees(state, detections.centre, R, clear_range, places, rules)
+        is_view = motion.is_view or motion.measured is not None
+        if is_view:
+            trees = self._by_trees(state, detections.centre, R, clear_range, places, rules)
+        else:
+            trees = TreeMotion(False, state.motion, state.motion_covariance, False)
         moved_on = state.since_update >= p.update_distance
-        used = index == 0 or moved_on or motion.due or trees.slipped or state.recent.strange > 0
+        is_needed = moved_on or motion.due or trees.slipped or state.recent.strange > 0
+        used = not state.views or (is_view and is_needed)
         slipped = trees.slipped or state.recent.slipped
         doubted = OdometryDoubt(bool(doubt), slipped)
         doubt = doubt or slip_detection.slip_message(state.motion, slipped, trees.unsure)
@@ -312,6 +321,11 @@ class FastSlam:
         return is_lost(self.state.recent)
 
     @property
+    def is_supported(self) -> bool:
+        """Whether known trees were found where they should be visible, see `pose_quality.is_supported`."""
+        return is_supported(self.state.recent)
+
+    @property
     def is_led_by_trees(self) -> bool:
         """Whether `RunningStatistics.led` is above 0: trees determined the motion in the last scan with a
         doubted odometry, and fewer than `led` scans without doubt followed."""
@@ -381,9 +395,13 @@ class FastSlam:
 
     def _moved(self, state: SlamState, motion: Motion) -> SlamState:
         """Return the state after one more odometry step: the motion since the last used scan, its covariance
-        and `since_update` grow. The state itself if the step adds nothing, see `accumulated`."""
+        slack and `since_update` grow, and distrust decays. The state itself if nothing changes, see
+        `accumulated`."""
+        distrust = decayed_distrust(state.recent.distrust, motion.period)
+        if distrust != state.recent.distrust:
+            state = replace(state, recent=replace(state.recent, distrust=distrust))
         moved = accumulated(
-            state.motion, state.motion_covariance, motion, state.recent.distrust, self.parameters
+            state.motion, state.motion_covariance, state.slack, motion, distrust, self.parameters
         )
         if moved is None:
             return state
@@ -391,7 +409,8 @@ class FastSlam:
             state,
             motion=moved[0],
             motion_covariance=moved[1],
-            since_update=state.since_update + moved[2],
+            slack=moved[2],
+            since_update=state.since_update + moved[3],
         )
 
     def _observed(
@@ -441,16 +460,19 @@ class FastSlam:
         if trees.slipped:
             odometry = disagreement(motion, state.motion, state.motion_covariance)
         scan = named_statistics(mean, odometry, found)
+        is_determined = measured is not None or scan.recognised >= FEWEST
         state = replace(
             state,
             maps=maps,
             motion=np.zeros(3),
             motion_covariance=np.zeros((3, 3)),
+            slack=np.zeros(2) if is_determined else state.slack,
             keyframe_motion=keyframe_motion,
             keyframe_covariance=keyframe_covariance,
             distance=state.distance + state.since_update,
             since_update=0.0,
             detections=state.detections + found,
+            views=state.views + 1,
             best=select_best(weights, state.best, state.pose, rules.distance_max),
             recent=update_statistics(recent, scan, state.since_update, doubted),
             shared=shared,

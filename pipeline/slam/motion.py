@@ -147,10 +147,13 @@ class Motion(NamedTuple):
     Attributes:
         step: T_base(t-1)_base(t) by the odometry.
         slack: Standard deviations that are added where the odometry is doubtful: position [m], heading [rad].
+            Those of successive steps are of one velocity, so they add up linearly; see `advanced`.
         doubt: Message with the reason of the doubt; empty without one.
         measured: Pose that another source measured at this scan, if any.
         turn_sigma: Standard deviation of the yaw of the step [rad] if a gyroscope measured it, else None.
         due: Whether the scan updates the filter even if the robot has moved less than `update_distance`.
+        is_view: See Step.
+        period: Time since the scan before [s].
     """
 
     step: Pose2
@@ -159,10 +162,15 @@ class Motion(NamedTuple):
     measured: PoseMeasurement | None = None
     turn_sigma: float | None = None
     due: bool = False
+    is_view: bool = True
+    period: float = 0.1
 
 
-# m, rad; standard deviations added to each step at full distrust, because wheels that slipped slip again.
-DISTRUST = (0.1, 0.03)
+# m/s, rad/s; slack of each second at full distrust, because wheels that slipped slip again.
+DISTRUST = (1.0, 0.3)
+# m, rad; largest sum of the slack: stems that are farther from where they are expected are searched for by
+# their constellation.
+SLACK_MAX = (3.0, 0.5)
 UNKNOWN = -1.0  # replaces an absent sigma in compiled code
 # m/rad; distance to which a turn is equivalent, because a turn on the spot also changes the view of the
 # trees.
@@ -170,77 +178,83 @@ TURN_AS_DISTANCE = 1.0
 
 
 def accumulated(
-    before: Float, covariance: Float, motion: Motion, distrust: float, p: Slam
-) -> tuple[Float, Float, float] | None:
+    before: Float, covariance: Float, slack: Float, motion: Motion, distrust: float, p: Slam
+) -> tuple[Float, Float, Float, float] | None:
     """Return the motion since the last used scan after one more step, or None if there is nothing to add.
 
     Args:
         before: x, y [m], yaw [rad] since the last used scan, shape (3,).
         covariance: Covariance of `before`, shape (3, 3).
+        slack: Sum of the slack of position [m] and heading [rad] since trees or a measured pose last
+            determined the pose, shape (2,).
         motion: The step with its uncertainty.
-        distrust: 0 to 1, see OdometryTrust; scales DISTRUST, which is added to the noise of the step.
+        distrust: 0 to 1, see OdometryTrust; scales DISTRUST, which is added to the slack of the step.
         p: Noise of the odometry and `update_distance`.
 
     Returns:
-        Motion, shape (3,); its covariance, shape (3, 3); and the distance that the step counts towards
-        `update_distance` [m], with TURN_AS_DISTANCE per radian; at least `update_distance` for a step with
-        slack, distrust or a measured pose. None if the step is zero and has none of these.
+        Motion, shape (3,); its covariance, shape (3, 3); the sum of the slack, shape (2,); and the distance
+        that the step counts towards `update_distance` [m], with TURN_AS_DISTANCE per radian; at least
+        `update_distance` for a step with slack, distrust or a measured pose. None if the step is zero and has
+        none of these.
     """
     step = motion.step
     news = motion.measured is not None
     turn_sigma = UNKNOWN if motion.turn_sigma is None else motion.turn_sigma
-    moved, motion_after, spread, driven = advanced(
-        before, covariance, step.x, step.y, step.yaw, *motion.slack, turn_sigma, news, distrust, noise_of(p),
+    own = np.array(motion.slack) + distrust * motion.period * np.array(DISTRUST)
+    if motion.turn_sigma is not None:
+        own[1] = motion.slack[1]  # slipping wheels do not affect a gyroscope
+    moved, motion_after, spread, slack_after, driven = advanced(
+        before, covariance, slack, step.x, step.y, step.yaw, own, turn_sigma, news, noise_of(p),
         p.update_distance,
     )  # fmt: skip
-    return (motion_after, spread, driven) if moved else None
+    return (motion_after, spread, slack_after, driven) if moved else None
 
 
 @compiled
 def advanced(
     before: Float,
     covariance: Float,
+    slack: Float,
     x: float,
     y: float,
     yaw: float,
-    slack: float,
-    slack_yaw: float,
+    own: Float,
     turn_sigma: float,
     news: bool,
-    distrust: float,
     noise: Noise,
     update_distance: float,
-) -> tuple[bool, Float, Float, float]:
+) -> tuple[bool, Float, Float, Float, float]:
     """Return the same as `accumulated` in compiled code, with a flag in place of None.
 
+    A slack is the error of an unknown velocity, which is the same in successive steps: standard deviations
+    add up, up to SLACK_MAX, and the variance grows with the square of the time, however many scans there are.
+
     Args:
-        before, covariance: See `accumulated`.
+        before, covariance, slack: See `accumulated`.
         x, y, yaw: Step [m, m, rad].
-        slack, slack_yaw, turn_sigma: See Motion [m, rad, rad]; `turn_sigma` is UNKNOWN for None.
+        own: Slack of the step itself [m, rad], shape (2,).
+        turn_sigma: See Motion [rad]; UNKNOWN for None.
         news: Whether another source measured the pose.
-        distrust: See `accumulated`.
         noise: Noise of the odometry.
         update_distance: Distance after which a scan is used [m]; a doubtful step or a measured pose counts at
             least this much, so that its scan is used.
 
     Returns:
-        Whether there is anything to add; motion, shape (3,); covariance, shape (3, 3); and the distance [m].
-        If there is nothing, copies of the arguments and 0.
+        Whether there is anything to add; motion, shape (3,); covariance, shape (3, 3); sum of the slack,
+        shape (2,); and the distance [m]. If there is nothing, copies of the arguments and 0.
     """
-    slack += distrust * DISTRUST[0]
-    if turn_sigma < 0.0:
-        slack_yaw += distrust * DISTRUST[1]  # slipping wheels do not affect a gyroscope
-    news = news or slack != 0.0 or slack_yaw != 0.0
+    news = news or own[0] != 0.0 or own[1] != 0.0
     if x == 0.0 and y == 0.0 and yaw == 0.0 and not news:
-        return False, before.copy(), covariance.copy(), 0.0
+        return False, before.copy(), covariance.copy(), slack.copy(), 0.0
     position, heading = step_variances(x, y, yaw, noise)
     if turn_sigma >= 0.0:
         heading = turn_sigma * turn_sigma
-    moved, spread = stepped(
-        before, covariance, x, y, yaw, position + slack * slack, heading + slack_yaw * slack_yaw
-    )
+    total = np.array([min(slack[0] + own[0], SLACK_MAX[0]), min(slack[1] + own[1], SLACK_MAX[1])])
+    position += total[0] * total[0] - slack[0] * slack[0]
+    heading += total[1] * total[1] - slack[1] * slack[1]
+    moved, spread = stepped(before, covariance, x, y, yaw, position, heading)
     driven = np.hypot(x, y) + TURN_AS_DISTANCE * abs(wrapped(yaw))
-    return True, moved, spread, max(driven, update_distance) if news else driven
+    return True, moved, spread, total, max(driven, update_distance) if news else driven
 
 
 @compiled

@@ -127,7 +127,8 @@ def _mahalanobis2(shift: Float, covariance: Float) -> float:
 STRANGE_LOST, STRANGE_MISSED = 5, 15.0  # scans; hits
 FADING = 0.1  # weight of the newest scan in a running mean
 FADING_FOUND = 0.2  # the same for shares of recognised trees
-OVERRULED = 0.5  # distrust that remains six scans after the trees contradicted the odometry: 0.9^6
+OVERRULED = 0.5  # distrust that remains 0.7 s after the trees contradicted the odometry
+DISTRUST_TIME = 1.0  # s; in it, distrust decays to a share of 1 / e: wheels slip in the same place or mud
 FEWEST = 2.0  # minimum number of trees for a share, and for a heading from trees
 # In a known place, a scan is strange in spite of a few trees that are recognised by chance if it misses trees
 # with EXPECTED hits and finds less than the share BY_CHANCE of the hits; STILL_BY_CHANCE after a strange
@@ -155,7 +156,7 @@ class RunningStatistics:
         odometry: Largest deviation from an odometry without doubt [sigma], decaying by FADING per scan.
         alone: Distance driven since two known trees were last recognised in one scan [m].
         mapped: Whether any well-known landmark was ever recognised.
-        distrust: 1 when the trees contradict the odometry, decaying by FADING per scan.
+        distrust: 1 when the trees contradict the odometry, decaying with the time since (`decayed_distrust`).
         strange: Number of strange scans in a row, see STRANGE_LOST.
         missed: Most hits of well-known landmarks that one of these scans missed.
         familiar: Running mean of the share of detections that belong to well-known landmarks.
@@ -177,7 +178,7 @@ class RunningStatistics:
 
     @property
     def slipped(self) -> bool:
-        """Whether the trees contradicted the odometry within the last six scans."""
+        """Whether the trees contradicted the odometry within the last 0.7 s."""
         return self.distrust >= OVERRULED
 
     @property
@@ -236,7 +237,7 @@ def update_statistics(
         odometry=max(0.0 if any(doubted) else scan.odometry, (1.0 - FADING) * recent.odometry),
         alone=distance_without_trees(recent.alone, scan.recognised, driven),
         mapped=recent.mapped or scan.recognised > 0.5,
-        distrust=decayed_distrust(recent.distrust),
+        distrust=recent.distrust,
         strange=strange,
         missed=max(recent.missed, scan.missed) if strange else 0.0,
         familiar=updated_familiar(recent.familiar, scan.recognised, scan.detections),
@@ -257,10 +258,11 @@ def distance_without_trees(alone: float, recognised: float, driven: float) -> fl
     return 0.0 if recognised >= FEWEST else alone + driven
 
 
-@compiled
-def decayed_distrust(distrust: float) -> float:
-    """Return the distrust, 0 to 1, after one more scan: 90 % of it, and 0 if it was at most 0.01."""
-    return (1.0 - FADING) * distrust if distrust > 0.01 else 0.0
+def decayed_distrust(distrust: float, period: float) -> float:
+    """Return the distrust, 0 to 1, after a time [s]: it decays exponentially (DISTRUST_TIME), and is 0 below
+    0.01."""
+    left = distrust * math.exp(-period / DISTRUST_TIME)
+    return left if left > 0.01 else 0.0
 
 
 @compiled
@@ -415,3 +417,9 @@ def is_lost(recent: RunningStatistics) -> bool:
     visible, or whether nearly all of them were missed in STRANGE_LOST scans in a row. Before any tree is well
     known the result is False."""
     return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)
+
+
+def is_supported(recent: RunningStatistics) -> bool:
+    """Return whether the last scan showed trees where the map has them, and at least FOUND_WEAK of the known
+    trees (running mean) are found where they should be visible. It is True before any tree is known."""
+    return recent.strange == 0 and recent.found >= FOUND_WEAK

@@ -27,8 +27,11 @@ class SlamState:
         maps: Landmarks of all particles; the method `map_of` returns those of one.
         motion: Motion by odometry since the last used scan, shape (3,).
         motion_covariance: Covariance of `motion`, shape (3, 3).
+        slack: Sum of the slack of position [m] and heading [rad] of the odometry since trees or a measured
+            pose last determined the pose, shape (2,), see `motion.advanced`.
         since_update: Distance driven since then, with 1 m per radian of turn [m].
         detections: Number of detections in all scans so far; the next detection gets this birth number.
+        views: Number of scans whose detections were used.
         best: Row of the best particle, whose map is reported.
         genealogy: Ancestors of the particles and their paths.
         path: Estimated pose of each scan. States of an earlier version have the path of the best particle.
@@ -49,8 +52,10 @@ class SlamState:
     maps: Maps
     motion: Float
     motion_covariance: Float
+    slack: Float = field(default_factory=lambda: np.zeros(2), metadata={ADDED: None})
     since_update: float = 0.0
     detections: int = 0
+    views: int = field(default=0, metadata={ADDED: None})
     best: int = 0
     genealogy: Genealogy = field(default_factory=Genealogy)
     path: EstimatedPath = field(
@@ -122,6 +127,7 @@ class SlamState:
             maps=taken(self.maps, rows),
             motion=np.zeros(3),
             motion_covariance=np.zeros((3, 3)),
+            slack=np.zeros(2),
             best=0,
             genealogy=self.genealogy.redrawn(rows),
             recent=RunningStatistics(mapped=self.recent.mapped),

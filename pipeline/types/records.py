@@ -236,6 +236,9 @@ class Truth:
     path: TruthPath | None = None
 
 
+FIRST_NS = 1_000_000_000  # ns; so that a short recording uses all its data
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
     """Input of the mapper: a scan, and the motion and tilt at its time.
@@ -256,6 +259,10 @@ class Step:
         measured: Pose measurement of another source at this scan, or None.
         turn: Rotation by the gyroscope since the previous scan, or None.
         turn_rate: Rate of turn by the gyroscope at the scan [rad/s], or None.
+        elapsed_ns: Time since the first scan of the run [ns].
+        period_ns: Time since the previous scan [ns]; 0 for the first one.
+        is_view: Whether SLAM and the tracker may use the scan. Scans in quick succession show the
+            same errors of a trunk, so that more of them are no more evidence.
     """
 
     index: int
@@ -272,6 +279,22 @@ class Step:
     measured: PoseMeasurement | None = None
     turn: Turn | None = None
     turn_rate: float | None = None
+    elapsed_ns: int = 0
+    period_ns: int = 0
+    is_view: bool = True
+
+    def is_due(self, interval: float, delay: float = 0.0) -> bool:
+        """Return whether the scan is used by something that needs one scan per interval of time, whatever the
+        rate of the sensor: the first scan of an interval, and all scans of the first second (FIRST_NS).
+
+        Args:
+            interval: Length of the intervals [s]; 0 makes each scan due.
+            delay: Time of the run at which the first interval begins [s].
+        """
+        if self.elapsed_ns < FIRST_NS or interval == 0.0:
+            return True
+        length, since = round(interval * 1e9), self.elapsed_ns - round(delay * 1e9)
+        return since // length > (since - self.period_ns) // length
 
 
 @dataclass(frozen=True, slots=True, eq=False)

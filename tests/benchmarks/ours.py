@@ -13,6 +13,8 @@ from pipeline.types.records import Frame, Scan, Sensor, Step
 from tests.benchmarks.recorded import RecordedScan, Recording
 from tests.benchmarks.turns import StageTimes, serve
 
+PERIOD_NS = 100_000_000  # of the scans as both sides map them
+
 PEERS_NAME = {
     "clustering": "clustering",
     "shape": "shape and detection",
@@ -71,6 +73,8 @@ def step_of(scan: RecordedScan) -> Step:
         pitch=scan.pitch,
         tilt_known=scan.tilt_known,
         twist=scan.twist,
+        elapsed_ns=scan.index * PERIOD_NS,
+        period_ns=PERIOD_NS,
     )
 
 

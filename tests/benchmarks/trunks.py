@@ -88,10 +88,6 @@ def mapped(
     frame: Frame | None = None
     with closing(open_source(uri)) as source:
         about = source.description
-        if isinstance(source, SimulatedSource):  # as many scans are gathered as in a whole run
-            parameters = parameters.replace(
-                {"classification.every": max(parameters.classification.every // every, 1)}
-            )
         mapper = Mapper(
             parameters,
             sensor=about.sensor,

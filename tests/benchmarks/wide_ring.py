@@ -71,7 +71,17 @@ class WideRing:
             points = np.zeros((n, 3), np.float32)
             points[:, :2] = centre + random.normal(0.0, SIGMA, centre.shape)
             stems = Stems(np.tile([0.0, 0.0, 1.0], (n, 1)), np.full(n, 0.3))
-            yield Step(k, Scan(1 + k * NS, points, stems=stems), odometry, tilt_known=True), truth
+            yield (
+                Step(
+                    k,
+                    Scan(1 + k * NS, points, stems=stems),
+                    odometry,
+                    tilt_known=True,
+                    elapsed_ns=k * NS,
+                    period_ns=NS,
+                ),
+                truth,
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

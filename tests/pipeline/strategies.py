@@ -74,7 +74,8 @@ def scan(stamp_ns, points=(), offset_ns=None):
 
 def step(index, points=(), pose=None, **rest: Any):
     """A step at 10 Hz."""
-    return Step(index, scan(1 + index * 100_000_000, points), pose, **rest)
+    at_ns, period_ns = index * 100_000_000, 100_000_000
+    return Step(index, scan(1 + at_ns, points), pose, elapsed_ns=at_ns, period_ns=period_ns, **rest)
 
 
 def detections(centre, *, sigma=0.03, radius=0.15, arc=1.0):

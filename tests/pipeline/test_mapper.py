@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.classification.voxel_map import FIRST_SCANS
 from pipeline.config import PRESETS, preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.readers import open_source
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
-from pipeline.types.records import Frame, Scan, Sensor, Stems, Step, Verdict
+from pipeline.types.records import Frame, Odometry, Scan, Sensor, Stems, Step, Verdict
 from tests.pipeline.strategies import SENSOR, arc, scan
 
 URI = "sim:paper?duration=3"
@@ -227,9 +226,31 @@ def test_a_level_plane_alone_has_no_tree():
 def test_a_robot_that_stands_uses_its_first_scans_and_then_one_of_each_interval():
     tree, upright = np.array([[5.0, 1.0, 0.0]], np.float32), np.array([[0.0, 0.0, 1.0]])
     stems = Stems(upright, np.array([0.3]))
-    for interval, used in ((1.0, FIRST_SCANS + 2), (0.0, 1)):
+    for interval, used in ((1.0, 10 + 2), (0.0, 1)):
         parameters = preset("stems").replace({"slam.update_interval": interval})
         m = Mapper(parameters, sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
         for k in range(30):
-            m.process(Step(k, Scan(k * 100_000_000, tree, stems=stems), Pose2()))
+            shown, t_ns = Scan(k * 100_000_000, tree, stems=stems), k * 100_000_000
+            m.process(Step(k, shown, Pose2(), elapsed_ns=t_ns, period_ns=100_000_000))
         assert m.snapshot().slam.detections == used
+
+
+def observed(hz):
+    """Observations of the trees of a drive of 4 m at 1 m/s between stems, seen at a rate."""
+    x, y = np.meshgrid(np.arange(-6.0, 12.0, 3.0), np.array([-4.0, -1.5, 1.5, 4.0]))
+    records: list[Any] = []
+    for t_ns in range(0, 4_000_000_001, 10_000_000):
+        along = t_ns * 1e-9
+        if t_ns % 20_000_000 == 0:
+            records.append(Odometry(t_ns, Pose3(np.eye(3), np.array([along, 0.0, 0.0]))))
+        if t_ns % (1_000_000_000 // hz) == 0:
+            places = np.column_stack([x.ravel() - along, y.ravel(), np.zeros(x.size)]).astype(np.float32)
+            upright = np.tile([0.0, 0.0, 1.0], (x.size, 1))
+            records.append(Scan(t_ns, places, stems=Stems(upright, np.full(x.size, 0.3))))
+    m = Mapper(preset("stems"), sensor=Sensor(), T_base_lidar=Pose3.identity(), seed=0)
+    return [m.process(step) for step in steps(records)][-1].trees.observations
+
+
+def test_a_faster_sensor_is_no_more_evidence():
+    assert observed(20).tolist() == observed(10).tolist()
+    assert len(observed(5)) == len(observed(10)) == 24

@@ -127,7 +127,10 @@ def pasted_examples(folder: Path, copy: int, parameters: Parameters, reach: floa
     """
     made = paste(folder, copy)
     pose = made.pose
-    run = [Step(k, Scan(k * PERIOD_NS, points), pose) for k, (points, _) in enumerate(made.scans)]
+    run = [
+        Step(k, Scan(k * PERIOD_NS, points), pose, elapsed_ns=k * PERIOD_NS, period_ns=PERIOD_NS)
+        for k, (points, _) in enumerate(made.scans)
+    ]
     points = _to_map(np.concatenate([points for points, _ in made.scans]), pose)
     label = np.concatenate([label for _, label in made.scans])
     of_trunks = trunks(points, label, LEAST_RETURNS, np.inf), trunks(points, label, 1, np.inf)

@@ -117,7 +117,8 @@ def _scanned(scene: SceneBuilder, lidar: SpinningLidar, height: float, poses: li
         still = (np.tile(R, (lidar.columns, 1, 1)), np.tile(o, (lidar.columns, 1)))
         sweep = sweep_scene(lidar, solids, terrain, *still, k * PERIOD_NS, scene.rng)
         points, solid = sweep.scan.points, sweep.solid
-        steps.append(Step(k, Scan(k * PERIOD_NS, points), pose))
+        t_ns = k * PERIOD_NS
+        steps.append(Step(k, Scan(t_ns, points), pose, elapsed_ns=t_ns, period_ns=PERIOD_NS))
         clouds.append(points @ R.T + o)
         owners.append(np.where(solid >= 0, solids.owner[solid], -1))
     owner = np.concatenate(owners)

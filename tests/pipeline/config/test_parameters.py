@@ -328,12 +328,12 @@ def test_a_removed_choice_is_replaced_with_one_warning():
 def test_names_of_earlier_versions_are_accepted_with_one_warning_each():
     with pytest.warns(RenamedParameterWarning, match=r"gathering.range_max is now called classification"):
         by_name = Parameters().replace({"gathering.range_max": 12.0})
-    with pytest.warns(RenamedParameterWarning, match=r"gathering.every is now called classification.every"):
-        from_file = from_toml("[gathering]\nevery = 2\n", Parameters(), "old.toml")
+    with pytest.warns(RenamedParameterWarning, match=r"gathering.tree_share is now called classification"):
+        from_file = from_toml("[gathering]\ntree_share = 0.3\n", Parameters(), "old.toml")
     with pytest.warns(RenamedParameterWarning, match=r"shape.slices"):
         assigned = assign(Parameters(), ["shape.slices=6"])
     assert by_name.classification.range_max == 12.0
-    assert from_file.classification.every == 2
+    assert from_file.classification.tree_share == 0.3
     assert assigned.shape.split_slices == 6
 
 

@@ -28,7 +28,7 @@ def looks(seed, kinds):
     run = run_with(seed, kinds)
     source = SimulatedSource("sim:lane", run)
     about, truth = source.description, run.scene.truth
-    parameters = preset("forest").replace({**EXACT_POSES, "classification.every": 4 // EVERY})
+    parameters = preset("forest").replace(EXACT_POSES)
     mapper = Mapper(parameters, sensor=about.sensor, T_base_lidar=about.T_base_lidar, seed=0)
     tree = np.stack([truth.x, truth.y], axis=1)
     told, trail = [], []

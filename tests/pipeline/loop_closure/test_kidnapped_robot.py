@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import Loop, Motion, SlamState
 from pipeline.slam.particle_ancestry import draws
+from pipeline.tracking import Tracker
 from pipeline.types.records import PoseMeasurement
 from tests.pipeline.strategies import NOTHING_SEEN, detections
 from tests.pipeline.test_mapper import as_bytes
@@ -180,12 +182,12 @@ def test_measured_poses_are_of_the_map_and_not_of_the_small_one_of_a_search():
     recovery.state = RelocaliserState(local=SlamState.at_origin(20))
     far = PoseMeasurement(1, Pose2(100.0, 50.0, 1.0), np.eye(3) * 1e-4)
     seen = detections([[3.0, 1.0], [4.0, -2.0]])
-    run: Any = None  # not used before the next search in the map
-    for index in (1, 2, 4):  # none of them is one at which it is looked for in the map
-        motion = Motion(Pose2(0.1), measured=far)
+    run: Any = SimpleNamespace(trees=Tracker(preset("forest").tracking).trees())  # none, so none is found
+    for index in (1, 2, 4):
+        motion = Motion(Pose2(0.3), measured=far)
         assert recovery.search(index, motion, seen, NOTHING_SEEN, preset("forest"), run) is None
     assert recovery.state.local is not None
-    np.testing.assert_allclose(recovery.state.local.pose.mean(axis=0), [0.3, 0.0, 0.0], atol=0.1)
+    np.testing.assert_allclose(recovery.state.local.pose.mean(axis=0), [0.9, 0.0, 0.0], atol=0.1)
 
 
 def test_the_local_map_shares_no_random_numbers_with_runs_of_near_seeds():
@@ -209,3 +211,14 @@ def test_a_loop_that_the_graph_contradicts_is_not_reported(stems, monkeypatch):
     else:
         assert isinstance(applied, RelocalisedPose)
         assert estimate.T_map_base.x == pytest.approx(loop.T_map_base.x, abs=0.05)
+
+
+def test_the_map_returns_to_a_state_before_the_trees_contradicted_it():
+    relocaliser: Relocaliser[str] = Relocaliser(0)
+    for k in range(100):
+        is_supported = k < 40  # no tree is where it should be from then on, in however many scans
+        state = f"before {k}" if relocaliser.needs_state(k // 2, is_supported) else None
+        relocaliser.remember(k, Motion(Pose2(0.1 * k)), k // 2, state)
+    restart = relocaliser.begin(100, detections([[4.0, 1.0]]), NOTHING_SEEN, preset("forest"))
+    assert restart.state == "before 20"
+    assert [scan for scan, _ in restart.motions] == list(range(20, 100))

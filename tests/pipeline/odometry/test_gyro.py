@@ -156,7 +156,7 @@ def test_the_gyroscope_closes_a_gap_of_the_odometry():
 
 def test_a_known_turn_scatters_the_heading_by_its_own_sigma():
     step, p = Pose2(0.2, 0.0, 0.1), FOREST.slam
-    moved = accumulated(np.zeros(3), np.zeros((3, 3)), Motion(step, turn_sigma=0.001), 1.0, p)
+    moved = accumulated(np.zeros(3), np.zeros((3, 3)), np.zeros(2), Motion(step, turn_sigma=0.001), 1.0, p)
     assert moved is not None
     assert moved[1][2, 2] == pytest.approx(0.001**2)
 

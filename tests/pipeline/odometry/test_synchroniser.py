@@ -233,3 +233,26 @@ def test_a_gap_without_scans_has_no_unreported_motion():
     readings = [odometry(t, t * 1e-3) for t in (0, 20, 3000, 3020)]
     records = sorted([*readings, at(10), at(3010)], key=lambda r: r.stamp_ns)
     assert [step.unreported for step in steps(records)] == [None, None]
+
+
+@pytest.mark.parametrize("hz", [5, 10, 20, 40])
+@pytest.mark.parametrize("delay", [0.0, 0.2])
+def test_what_is_due_after_an_interval_does_not_depend_on_the_rate(hz, delay):
+    joined = list(steps([at(1000.0 * k / hz) for k in range(20 * hz)], odometry="static"))
+    due = [step.elapsed_ns * 1e-9 for step in joined if step.is_due(0.4, delay)]
+    first = [t for t in due if t < 1.0]
+    assert len(first) == hz, "all scans of the first second"
+    wanted = np.arange(delay, 20.0, 0.4)
+    np.testing.assert_allclose(due[len(first) :], wanted[wanted > 0.99], atol=1.0 / hz)
+
+
+@pytest.mark.parametrize(("hz", "wanted"), [(1, 1), (5, 5), (10, 10), (12, 12), (20, 10), (40, 10)])
+def test_views_are_no_more_frequent_than_the_scans_of_a_usual_sensor(hz, wanted):
+    joined = list(steps([at(1000.0 * k / hz) for k in range(10 * hz)], odometry="static"))
+    assert sum(step.is_view for step in joined) == 10 * wanted
+
+
+def test_a_jitter_of_the_stamps_loses_no_view():
+    jitter = np.random.default_rng(0).uniform(-9.0, 9.0, 50)
+    joined = steps([at(100.0 * k + jitter[k]) for k in range(50)], odometry="static")
+    assert all(step.is_view for step in joined)

@@ -114,7 +114,7 @@ def test_clusters_join_the_nearest_of_all_places(seed, reach, most):
     assert found == pytest.approx(np.array(place), abs=1e-9)
 
 
-@pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"classification.every": 2}])
+@pytest.mark.parametrize("change", [{"clustering.eps": 0.2}, {"classification.interval": 0.2}])
 def test_without_a_needed_sample_there_is_no_preview(change, known):
     assert preview_trees(known[1], BASE.replace(change)) is None
 

@@ -12,7 +12,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.odometry.synchroniser import steps
 from pipeline.slam import FastSlam, Motion
-from pipeline.slam.motion import correct_by_pose
+from pipeline.slam.motion import SLACK_MAX, accumulated, correct_by_pose
 from pipeline.types.records import Odometry, PoseMeasurement
 from tests.pipeline.strategies import ALL_FREE, NOTHING_SEEN, detections, scan
 
@@ -129,14 +129,57 @@ def test_missing_odometry_is_weak_until_trees_determined_the_motion_for_long():
     assert false_trees(slam) == 0
 
 
-@pytest.mark.parametrize("seen_trees", [0, 2])
-def test_missing_odometry_stays_weak_without_trees(seen_trees):
+@pytest.mark.parametrize(("seen_trees", "last"), [(0, "lost"), (2, "weak")])
+def test_missing_odometry_stays_weak_without_trees(seen_trees, last):
     slam, states = FastSlam(FOREST, 0), []
     for k in range(60):
         motion = Motion(Pose2(), (0.05, 0.02), "there is no odometry") if k >= 10 else Pose2()
         found = [[4.0, 1.0], [4.0, -1.0]][:seen_trees]
         states.append(slam.process(k, motion, detections(found), NOTHING_SEEN).health.state)
-    assert set(states[10:]) == {"weak"}
+    assert set(states[10:]) == {"weak", last}
+    assert states[-1] == last, "five seconds at 0.5 m/s are farther than the next tree"
+
+
+@pytest.mark.parametrize("scans", [1, 4, 40])
+def test_the_sigma_of_an_unknown_velocity_grows_with_the_time_and_not_with_its_root(scans):
+    speed, time = 0.5, 4.0
+    motion, covariance, slack = np.zeros(3), np.zeros((3, 3)), np.zeros(2)
+    for _ in range(scans):
+        part = (speed * time / scans, 0.1 * time / scans)
+        step = Motion(Pose2(), part, "there is no odometry", period=time / scans)
+        moved = accumulated(motion, covariance, slack, step, 0.0, FOREST)
+        assert moved is not None
+        motion, covariance, slack, _ = moved
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), [2.0, 2.0, 0.4])
+
+
+def test_the_sigma_of_an_unknown_motion_is_bounded():
+    moved = accumulated(
+        np.zeros(3), np.zeros((3, 3)), np.zeros(2), Motion(Pose2(), (30.0, 12.0)), 0.0, FOREST
+    )
+    assert moved is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(moved[1])), [SLACK_MAX[0], *SLACK_MAX])
+
+
+@pytest.mark.parametrize("shown", [True, False])
+def test_trees_end_the_growth_of_the_sigma_without_odometry(shown):
+    slam = FastSlam(FOREST, 0)
+    for k in range(30):
+        motion = Motion(Pose2(), (0.05, 0.02), "there is no odometry") if k >= 10 else Pose2()
+        found = detections([[4.0, 1.0], [4.0, -1.0], [-2.0, 3.0]] if shown or k < 10 else [])
+        slam.process(k, motion, found, NOTHING_SEEN)
+    assert slam.state.slack[0] == pytest.approx(0.0 if shown else 1.0)
+
+
+@pytest.mark.parametrize("hz", [10, 20])
+def test_a_doubtful_odometry_uses_as_many_views_and_as_much_slack_at_each_rate(hz):
+    records = [scan(round(k * 1000 / hz) * MS) for k in range(4 * hz)]
+    slam = FastSlam(FOREST, 0)
+    for step in steps(records):
+        motion = Motion(Pose2(), step.slack, step.doubt, is_view=step.is_view, period=step.period_ns * 1e-9)
+        slam.process(step.index, motion, detections(np.zeros((0, 2))), NOTHING_SEEN)
+    assert slam.state.views == 40
+    assert slam.state.slack[0] == pytest.approx(0.5 * (4.0 - 1.0 / hz))
 
 
 def test_a_gap_of_sixty_seconds_without_anything_is_bridged():
@@ -237,6 +280,14 @@ def test_a_measured_pose_with_an_invalid_covariance_is_skipped_and_counted(covar
     assert step.measured is None
     assert sum(losses.values()) == 1
     assert any("positive definite" in text for text in step.warnings)
+
+
+def test_a_measured_pose_is_used_between_two_views():
+    slam = FastSlam(FOREST, 0)
+    slam.process(0, Pose2(), detections([]), NOTHING_SEEN)
+    motion = Motion(Pose2(0.5), measured=measured(0.6, 0.0, sigma=(1e-3, 1e-3, 1e-3)), is_view=False)
+    told = slam.process(1, motion, detections([]), NOTHING_SEEN)
+    assert told.T_map_base.x == pytest.approx(0.6, abs=0.01)
 
 
 def test_a_measured_pose_is_used_at_the_scan_of_its_time():
