@@ -82,10 +82,9 @@ class SegmentedScan:
         clusters: Clusters without verdicts.
         heights: Mean height of each cluster above the ground, shape (K,) [m]; None if no ground is in view.
         free: Free range by direction (see `pipeline.detection.free_space`).
-        column_input: Input of the voxel columns; None for scans that do not update them, or if the parameter
-            `ground.method` is "none".
-        terrain: Ground that updates the terrain map; None for scans that do not update it, or if the
-            parameter `ground.method` is "none".
+        column_input: Input of the voxel columns; None for scans that do not update them or do not show the
+            ground.
+        terrain: Ground that updates the terrain map; None likewise.
         clearance: Free space in the path of the robot; None if obstacle detection is off.
     """
 
@@ -162,7 +161,8 @@ def _segment_points(
 
     `column_input` is None unless the parameter `classification.method` is "columns" and the scan is due after
     `classification.interval`; `terrain` is None unless the scan updates the terrain map, which is due midway
-    between, so that no scan has both costs. Both are None if `ground.method` is "none".
+    between, so that no scan has both costs. Both are None for a scan that does not show the ground, whose
+    heights are a guess.
     """
     interval = p.classification.interval
     with timer("acquisition"):
@@ -206,11 +206,11 @@ def _segment_points(
         heights=None if seen is None else heights_of_places(described.centroid, seen.height),
         free=free,
         sensor_offset=sensor_offset,
-        column_input=_column_input(raw, boxed, height, terrain, sensor_offset, sensor)
+        column_input=_column_input(raw, boxed, height, seen, sensor_offset, sensor)
         if p.classification.method == "columns" and step.is_due(interval)
         else None,
-        terrain=replace(terrain, height=rounded(terrain.height, GROUND))
-        if terrain is not None and step.is_due(interval, interval / 2.0)
+        terrain=replace(seen, height=rounded(seen.height, GROUND))
+        if seen is not None and step.is_due(interval, interval / 2.0)
         else None,
         warnings=(NO_GROUND,) if terrain is not None and len(raw) and seen is None else (),
         counts={

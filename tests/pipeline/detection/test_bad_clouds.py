@@ -69,6 +69,14 @@ def test_a_scan_without_ground_is_said_to_be_one(name):
     assert (NO_GROUND in frame.warnings) != ground
 
 
+@pytest.mark.parametrize("name", [name for name, points in CLOUDS.items() if len(points)])
+def test_only_a_scan_that_shows_the_ground_votes_by_heights_above_it(name):
+    run = mapper()
+    frame = [run.process(step) for step in _steps(CLOUDS[name], 3)][-1]
+    is_silent = run.voxels.added == 0 and len(run.height_map.height) == 0
+    assert is_silent == (NO_GROUND in frame.warnings)
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
 def test_what_is_no_number_harms_no_other_point(value):
     clean = CLOUDS["the ground alone"]
