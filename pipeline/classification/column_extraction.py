@@ -6,13 +6,12 @@ from __future__ import annotations
 import numpy as np
 
 from pipeline.classification.voxel_map import SIDE, SLICE, SLICES
-from pipeline.config.stages import Tracking
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.types.records import RING_FAR, Bool, Float32, Int, Int32
 
-BREAST = Tracking().breast_height  # m above the ground; height of the position of an axis
+BREAST = 1.3  # m above the ground; height of the position of an axis, also in the examples of the classifier
 BUCKET = RING_FAR  # m; radius of the neighbourhood of a column
 MARGIN = 1.2  # m around a tile in which neighbours are considered
 MOVES = 0.5  # m; a column outside of a tile may move into it by this distance when its axis is fitted

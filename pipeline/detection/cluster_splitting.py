@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.config.stages import Detection
 from pipeline.detection.cylinder_fit import BARK, PRIOR_LEAN_SIGMA
 from pipeline.geometry.hash_grid import group_rows
 from pipeline.geometry.poses import Float
@@ -21,14 +20,13 @@ from pipeline.types.records import Bool, Clusters, Float32, Int, Int32, Labels, 
 
 SLICE = 0.2  # m; of height
 LEAST = 3  # minimum returns of a run
-_TRUNK = Detection()  # the limits of a trunk by default, which do not depend on the parameters of a run
-# A cluster beyond one of these limits is not a single trunk: radial deviation, width and radius [m].
-ROUGH, WIDE, THICK = _TRUNK.cylindrical_stddev_thresh, _TRUNK.size_max, _TRUNK.radius_max
+ROUGH = (
+    0.06  # m; a cluster of a larger radial deviation, twice that of a trunk with bark, is not a single trunk
+)
 WIDEST = 2.5  # m; wider clusters (hedges, walls) are not split
 SHOTS = 2.6  # maximum distance between returns of a run in shots; one may be missing
 JUMP, JUMP_SIGMA = 0.06, 3.0  # m, and multiples of the range sigma: maximum range jump within a run
 BENT = 2.0  # sigma; maximum root mean square distance of a run to its circle
-RADIUS_MIN, RADIUS_MAX = _TRUNK.radius_min, 0.5  # m
 # m, and m per metre of height: maximum distance between circles of one trunk
 APART, LEAN = 0.06, PRIOR_LEAN_SIGMA
 ALIKE, ALIKE_LEAST = 0.3, 0.02  # fraction of the radius, and m: maximum difference between their radii
@@ -60,13 +58,18 @@ class Runs(NamedTuple):
 
 
 def split_trunks(
-    points: Float32, labels: Labels, clusters: Clusters, sensor: Sensor, slices: int
+    points: Float32,
+    labels: Labels,
+    clusters: Clusters,
+    sensor: Sensor,
+    slices: int,
+    radius: tuple[float, float],
 ) -> tuple[Labels, Int]:
     """Separate a trunk from each cluster that is not a single trunk but shows one in enough slices. The
     arguments are not changed.
 
-    Only clusters are examined that are too rough, wide or thick for a trunk (ROUGH, WIDE, THICK), narrower
-    than WIDEST, high enough for the slices, and not hidden at an edge.
+    Only clusters are examined that are too rough (ROUGH), wide or thick for a trunk, narrower than WIDEST,
+    high enough for the slices, and not hidden at an edge.
 
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.
@@ -74,6 +77,7 @@ def split_trunks(
         clusters: Shape of each cluster.
         sensor: Range sigma and azimuth step of the LiDAR.
         slices: Minimum number of agreeing slices, at least 1.
+        radius: Smallest and largest radius of a trunk [m].
 
     Returns:
         Labels in which a trunk keeps the number of its cluster and the remaining points form a new cluster
@@ -81,13 +85,15 @@ def split_trunks(
         and of the new clusters, int64. Without a separated trunk, equal labels and no numbers.
     """
     width = np.maximum(clusters.extent[:, 0], clusters.extent[:, 1])
-    odd = (clusters.radial_std > ROUGH) | (width > WIDE) | (clusters.radius > THICK)
+    odd = (clusters.radial_std > ROUGH) | (width > 2.0 * radius[1]) | (clusters.radius > radius[1])
     asked = odd & (width < WIDEST) & (clusters.extent[:, 2] > (slices - 1) * SLICE) & ~labels.hidden
     if not asked.any():
         return labels, np.zeros(0, np.int64)
     label = labels.label.copy()
     rows, bounds = group_rows(np.where(asked[label] & (label >= 0), label, -1).astype(np.int32), len(asked))
-    apart = _split_trunks(points, rows, bounds, sensor.azimuth_step, sensor.range_sigma, slices, label)
+    apart = _split_trunks(
+        points, rows, bounds, sensor.azimuth_step, sensor.range_sigma, slices, radius, label
+    )
     more = len(apart)
     rests = np.arange(labels.clusters, labels.clusters + more)
     hidden = np.concatenate([labels.hidden, np.zeros(more, np.bool_)])
@@ -96,7 +102,14 @@ def split_trunks(
 
 @compiled
 def _split_trunks(
-    points: Float32, rows: Int, bounds: Int, step: float, sigma: float, slices: int, label: Int32
+    points: Float32,
+    rows: Int,
+    bounds: Int,
+    step: float,
+    sigma: float,
+    slices: int,
+    radius: tuple[float, float],
+    label: Int32,
 ) -> Int:
     """Give the points that do not belong to trunks new numbers in `label`, in place: the i-th reduced cluster
     leaves a cluster with the number K + i. Return the ascending numbers of the reduced clusters, int64. A
@@ -110,6 +123,7 @@ def _split_trunks(
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
         slices: Number of slices that must agree.
+        radius: Smallest and largest radius of a trunk [m].
         label: Cluster of each point, shape (N,); changed.
     """
     clusters = bounds.shape[0] - 1
@@ -122,7 +136,7 @@ def _split_trunks(
         if own.shape[0] < slices * LEAST:
             continue
         run, level = np.full(own.shape[0], -1, np.int64), np.empty(own.shape[0], np.int64)
-        found = _find_runs(points, own, step, sigma, runs, run, level)
+        found = _find_runs(points, own, step, sigma, radius, runs, run, level)
         if found < slices or not _find_trunk(runs, found, level, slices):
             continue
         left = 0
@@ -137,7 +151,16 @@ def _split_trunks(
 
 
 @compiled
-def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs, run: Int, level: Int) -> int:
+def _find_runs(
+    points: Float32,
+    own: Int,
+    step: float,
+    sigma: float,
+    radius: tuple[float, float],
+    runs: Runs,
+    run: Int,
+    level: Int,
+) -> int:
     """Find the runs of a cluster that follow the front of a circle, and return their number, at most
     MOST_RUNS (further ones are ignored).
 
@@ -150,6 +173,7 @@ def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs,
         own: Rows of the points of the cluster, shape (n,).
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
+        radius: Smallest and largest radius of a trunk [m].
         runs: The table; the columns `agrees` and `best` are not written.
         run: Run of each return, shape (n,); must be -1; changed.
         level: Receives the slice of each return, counted from the lowest return, shape (n,).
@@ -187,7 +211,7 @@ def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs,
                 continue
         if k - begin >= LEAST and found < MOST_RUNS:
             part = order[begin:k]
-            if _follows_circle(part, across, reach, step, sigma, c, s, runs, found):
+            if _follows_circle(part, across, reach, step, sigma, radius, c, s, runs, found):
                 height = 0.0
                 for i in part:
                     run[i] = found
@@ -201,10 +225,19 @@ def _find_runs(points: Float32, own: Int, step: float, sigma: float, runs: Runs,
 
 @compiled
 def _follows_circle(
-    part: Int, across: Float, reach: Float, step: float, sigma: float, c: float, s: float, runs: Runs, at: int
+    part: Int,
+    across: Float,
+    reach: Float,
+    step: float,
+    sigma: float,
+    bounds: tuple[float, float],
+    c: float,
+    s: float,
+    runs: Runs,
+    at: int,
 ) -> bool:
-    """Return whether a run follows the front of a circle as wide as the run (radius RADIUS_MIN to RADIUS_MAX,
-    root mean square residual up to BENT sigma), and if so write x, y and radius of the circle into the table.
+    """Return whether a run follows the front of a circle as wide as the run (radius within the bounds, root
+    mean square residual up to BENT sigma), and if so write x, y and radius of the circle into the table.
 
     Args:
         part: Returns of the run, from right to left: indexes of `across` and `reach`.
@@ -212,6 +245,7 @@ def _follows_circle(
         reach: Horizontal range of each return [m], shape (n,).
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
+        bounds: Smallest and largest radius of a trunk [m].
         c, s: Cosine and sine of the azimuth of the middle of the cluster.
         runs: The table.
         at: Row that is written.
@@ -223,7 +257,7 @@ def _follows_circle(
         mean += reach[i]
     mean /= n
     radius = 0.5 * (left - right + 0.5 * step) * mean
-    if radius < RADIUS_MIN or radius > RADIUS_MAX:
+    if radius < bounds[0] or radius > bounds[1]:
         return False
     middle, quarter = 0.5 * (left + right), 0.25 * (left - right)
     front, within = 0.0, 0

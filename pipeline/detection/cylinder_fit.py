@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.config.stages import Detection
 from pipeline.geometry.gaussian import factorise, solve
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled, compiled_sums
@@ -277,7 +276,7 @@ def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
 
 
 MODEL = 0.003  # m; model error of a circular section
-RADIUS_MIN, RADIUS_MAX = 0.03, Detection().radius_max  # m; bounds of the initial radius
+RADIUS_MIN = 0.03  # m; lower bound of the initial radius
 SIGMA_MIN = 0.001  # m; lower bound of the range sigma, which keeps weights finite
 # Maximum number of points of a fit; bark and lean limit the accuracy beyond it. A prime number, because
 # points may be ordered by ring: a stride of 16 would select a single ring.
@@ -402,7 +401,7 @@ def _fit(
     # beams.
     coarse = 0.5 * max(azimuth_step - 2.0 * BEAM, 0.0) * away
     width = half.radius + coarse
-    p = np.array([half.x, half.y, 0.0, 0.0, min(max(width, RADIUS_MIN), RADIUS_MAX)])
+    p = np.array([half.x, half.y, 0.0, 0.0, max(width, RADIUS_MIN)])
     p[0] += half.c * p[4]
     p[1] += half.s * p[4]
     least = WIDTH_SIGMA_LEAST + WIDTH_SIGMA * width + 0.3 * azimuth_step * away

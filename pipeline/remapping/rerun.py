@@ -99,6 +99,7 @@ def segmentation_key(parameters: Parameters) -> bytes:
         **{stage: getattr(parameters, stage).model_dump() for stage in SEGMENTATION_STAGES},
         "classification": parameters.classification.model_dump(include=set(SEGMENTATION_CLASSIFICATION)),
         "breast_height": parameters.tracking.breast_height,  # centres of clusters refer to it
+        "radius": (parameters.detection.radius_min, parameters.detection.radius_max),  # trunks in clusters
     }
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).digest()[:16]
 

@@ -84,7 +84,8 @@ def _count(place: Place, parameters: Parameters) -> np.ndarray[tuple[int, int], 
     boxed = pass_through(raw, p.filters)
     height = height_above(boxed, scan_ground.find_terrain(raw, p.ground))
     points = voxel_grid(scan_ground.in_band(boxed, height, p.ground), p.filters)
-    _, described = describe_stems(points, cluster(points, sensor, p.clustering), sensor, p.shape)
+    radius = (p.detection.radius_min, p.detection.radius_max)
+    _, described = describe_stems(points, cluster(points, sensor, p.clustering), sensor, p.shape, radius)
     found = detections(classify_clusters(described, p.detection), offset, p.detection).centre
     here = _in_base_frame(trees, step.T_odom_base or Pose2())
     reach, away = np.hypot(*here.T), np.hypot(*found.T)

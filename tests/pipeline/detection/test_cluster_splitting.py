@@ -17,6 +17,7 @@ from tests.pipeline.strategies import SENSOR, one_cluster
 
 FOREST = preset("forest").shape.model_copy(update={"split_slices": 4})
 DETECTION = preset("forest").detection
+RADIUS = (preset("forest").detection.radius_min, preset("forest").detection.radius_max)
 SHARP = replace(SENSOR, range_sigma=0.01)
 HEIGHTS = np.arange(-1.3, 0.4, 0.05)  # of rings at a trunk, below a sensor that stands 1.6 m high
 STEP = SENSOR.azimuth_step
@@ -56,9 +57,9 @@ def rays(rng, turn, reach, heights, sigma):
     return np.concatenate(points)
 
 
-def parts_of(points, slices=4):
+def parts_of(points, slices=4, radius=RADIUS):
     shape = FOREST.model_copy(update={"split_slices": slices})
-    return describe_stems(points.astype(np.float32), one_cluster(points), SHARP, shape)
+    return describe_stems(points.astype(np.float32), one_cluster(points), SHARP, shape, radius)
 
 
 @pytest.mark.parametrize("top", [-0.8, -0.4])
@@ -76,6 +77,13 @@ def test_a_shrub_at_its_foot_does_not_hide_a_trunk(top):
     taken = labels.label == 0
     assert np.count_nonzero(taken[: len(leaves)]) < 0.1 * len(leaves)
     assert np.count_nonzero(taken[len(leaves) :]) > 0.3 * len(stem)
+
+
+def test_the_bounds_of_the_radius_decide_what_is_a_trunk():
+    rng = np.random.default_rng(1)
+    points = np.concatenate([shrub(rng, beside=0.13, top=-0.6), trunk(rng, radius=0.03)])
+    assert parts_of(points)[0].clusters == 1
+    assert parts_of(points, radius=(0.02, 0.9))[0].clusters == 2
 
 
 @pytest.mark.parametrize("what", SHAPES)
@@ -102,7 +110,7 @@ def test_other_clusters_keep_their_numbers_and_figures():
     points = np.concatenate([alone, joined, alone + np.array([0.0, -9.0, 0.0])]).astype(np.float32)
     label = np.repeat([0, 1, 2], [len(alone), len(joined), len(alone)]).astype(np.int32)
     before = Labels(label, 3, np.zeros(3, np.bool_))
-    labels, clusters = describe_stems(points, before, SHARP, FOREST)
+    labels, clusters = describe_stems(points, before, SHARP, FOREST, RADIUS)
     assert labels.clusters == 4
     assert (labels.label[label != 1] == label[label != 1]).all()
     assert set(labels.label[label == 1]) == {1, 3}
@@ -117,7 +125,7 @@ def test_no_return_is_lost_whatever_the_points(seed, slices, spread):
     label = rng.integers(-1, 3, 120).astype(np.int32)
     before = Labels(label, 3, np.zeros(3, np.bool_))
     labels, clusters = describe_stems(
-        points, before, SENSOR, FOREST.model_copy(update={"split_slices": slices})
+        points, before, SENSOR, FOREST.model_copy(update={"split_slices": slices}), RADIUS
     )
     assert ((labels.label >= 0) == (label >= 0)).all()
     assert (np.bincount(labels.label[label >= 0], minlength=labels.clusters) == clusters.size).all()

@@ -34,8 +34,8 @@ def content(frame: Frame) -> object:
 def is_later(name: str) -> bool:
     """Whether a parameter does not change the segmentation of a scan."""
     stage, _, field = name.partition(".")
-    if name == "tracking.breast_height":  # the height of the centres of clusters
-        return False
+    if name in ("tracking.breast_height", "detection.radius_min", "detection.radius_max"):
+        return False  # the height of the centres of clusters, and the radius of trunks in them
     return (
         field not in SEGMENTATION_CLASSIFICATION
         if stage == "classification"
