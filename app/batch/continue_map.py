@@ -88,7 +88,8 @@ class SavedRun:
     map: SavedMap
 
     def chosen_parameters(self) -> Parameters:
-        """Return the parameters at the end of the run; raises ParameterError if they are invalid."""
+        """Return the parameters at the end of the run; raises ParameterError if they are invalid, and
+        ValueError if they are not JSON."""
         return validated(json.loads(self.parameters))
 
     def as_bytes(self) -> bytes:

@@ -202,9 +202,10 @@ def _run_record(
     warnings: list[str],
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """Return the contents of run.json, as far as a cloud has the same as a drive, with `offset_m` and `crs`
-    in `source`, and without times of day and computing times. `ground_m` is the least and the greatest height
-    of the terrain in the coordinates of the cloud.
+    """Return the contents of run.json: `stemmap` (version), `source` with `uri`, `kind`, `sha256`, `offset_m`
+    and `crs` (None without), `seed` and `scans` (both 0), `preset`, `changed`, `parameters`, the counts
+    `trees`, `points` (by stage) and `verdicts`, `voxel_size_m`, `ground_m` (least and greatest height of the
+    terrain in the coordinates of the cloud), `evaluation` (None without), `warnings` and `losses`.
 
     Args:
         cloud, plot: The cloud and its map.

@@ -308,7 +308,8 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
 
 
 def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunStart:
-    """Return how the run begins. The warnings of source and odometry are counted in its tally.
+    """Return how the run begins. The warnings of source and odometry are counted in its tally, except if the
+    drive of a continued map is resumed.
 
     Args:
         plan: The run.
@@ -316,7 +317,7 @@ def _beginning(plan: OfflineRun, mapper: Mapper, chosen: ChosenOdometry) -> RunS
         chosen: Selected source of the motion.
 
     Raises:
-        StemmapError: The start in the continued map was not found.
+        StemmapError: The start in the continued map was not found, or the source cannot be read.
     """
     warned = (chosen.warning,) if chosen.warning else ()
     warnings = [*warned, *plan.source.description.warnings]
@@ -351,8 +352,9 @@ def _saved(
 
 
 def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
-    """Return the ground truth in the frame of the map: trees of the plan, else those of the source or, in a
-    continued map, of its first source; and the path of the same source. Both are None where unknown."""
+    """Return the ground truth in the frame of the map: the trees of the plan, else those of the source; and
+    the path of the source. For another drive in a continued map the source is the first one of the map, whose
+    path is left out. Both are None where unknown."""
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 

@@ -149,7 +149,9 @@ def _path(merged: MergedMap) -> Path:
 
 
 def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
-    """Change the record of run a to that of the merged run, in place; its scores are removed.
+    """Change the record of run a to that of the merged run, in place. Its scores become None, `continued` has
+    all sources but the first, and `merged` the match: `stems`, `second`, `log10_false_alarms` and
+    `sigma_m_m_rad`.
 
     Args:
         record: Contents of run.json of run a.
@@ -219,7 +221,8 @@ def _correspondence(
 def _moved_rows(
     file: FilePath, T: Pose2, scans: int, shift: int, a: SavedRun, b: SavedRun
 ) -> list[list[str]]:
-    """Return the detections of run b with frame, scan numbers and times of run a.
+    """Return the detections of run b as rows of DETECTION_COLUMNS with frame, scan numbers and times of run
+    a.
 
     Args:
         file: Table of the detections of run b.

@@ -30,8 +30,10 @@ _RADII = ("radius_m", "radius", "r_m")
 def read_plots(file: FilePath, run: FilePath, *, crs: str | None) -> list[SamplePlot]:
     """Return the plots of a file in the frame of the map of a run.
 
-    Polygons are plots; points are circles if a column `radius_m` (or `radius`, `r_m`) gives their radius.
-    Names are those of a column `name`, `plot`, `id` or similar, else the numbers of the rows.
+    Of several layers one is read, see `_layer_of`. Polygons are plots; points are circles if a column
+    `radius_m` (or `radius`, `r_m`) gives their radius. Names are those of the first of the columns `name`,
+    `plot`, `plot_id`, `plotid`, `id`, `nr` and `number` (upper or lower case), else the numbers of the rows
+    from 1 on; equal names are not refused.
 
     Args:
         file: A GeoPackage, Shapefile (also in a zip archive) or GeoJSON of at most 64 MB and PLOTS_MAX rows.

@@ -151,7 +151,7 @@ _FIRST_DATE_NS = 1_000_000_000_000_000_000  # 2001-09-09
 
 def recorded_time(kind: str, start_ns: int) -> dict[str, str]:
     """Return {"recorded": time of the first scan in UTC (ISO 8601, seconds)} for run.json; {} for a simulated
-    run and for times that are no date.
+    run and for times before 2001-09-09, which count from the start of a sensor.
 
     Args:
         kind: Name of the format of the source.
@@ -343,8 +343,8 @@ def check_folder(folder: FilePath, digest: str, *, force: bool) -> bool:
         Whether files in the folder will be replaced.
 
     Raises:
-        StemmapError: The folder contains the run of another source, or files of that name from elsewhere, and
-            `force` is not set.
+        StemmapError: `force` is not set, and the folder contains the run of another source, a run.json that
+            cannot be read, or without run.json files of these names.
     """
     if not (folder / "run.json").exists():
         there = [name for name in _FILES if (folder / name).exists()]

@@ -155,7 +155,7 @@ def health_word(frame: Frame | None, distance_m: float = math.inf) -> str:
 
     "good" means that nothing contradicts the pose. Without trees, and in the first `JUST_BEGUN` scans,
     nothing could contradict it; the result is then "no trees yet" or "just begun", and "no scan yet" for
-    None. The pose of a sensor that has not moved is not tested either: "static".
+    None. The pose of a sensor that has moved less than STILL_M is not tested either: "static".
 
     Args:
         frame: Results of the scan.

@@ -36,8 +36,8 @@ class StemPicture:
 
 
 def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[StemPicture]:
-    """Return the best view of each of the first MOST confirmed trees that the camera saw, ordered by time; []
-    without pictures.
+    """Return the best view of each tree that the camera saw, of the first MOST confirmed ones, ordered by
+    time and then by number; [] without pictures.
 
     Args:
         camera: The camera.
@@ -59,8 +59,9 @@ def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[St
 def _best_view(
     camera: Camera, trees: Trees, row: int, path: Path, taken: Int, there: Bool
 ) -> StemPicture | None:
-    """Return the view of a tree whose distance is nearest to BEST and that is nearest to the middle of the
-    picture; None if no picture shows it between NEAREST and FARTHEST.
+    """Return the view of a tree with the smallest |ln(depth / BEST)| + 2 |offset| / width, where the offset
+    is that from the middle of the picture; of equals the earliest. None if no picture shows its middle
+    between NEAREST and FARTHEST. The box may extend beyond the picture.
 
     Args:
         camera: The camera.
@@ -91,7 +92,8 @@ def _best_view(
 
 
 def stem_corners(x: float, y: float, dbh: float) -> Float:
-    """Return the corners of a stem between FROM_Z and TO_Z as seen from the robot, shape (4, 3) [m].
+    """Return the corners of a stem as seen from the robot, in the base frame, shape (4, 3) [m]: right and
+    left at FROM_Z, right and left at TO_Z.
 
     Args:
         x, y: Position in the base frame [m], not the origin.
@@ -103,8 +105,8 @@ def stem_corners(x: float, y: float, dbh: float) -> Float:
 
 
 def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) -> tuple[int, str]:
-    """Write a picture of each tree that the camera saw to `folder`/pictures, at most MOST; pictures of an
-    earlier run are deleted, also if there are no new ones.
+    """Write a picture of each tree of `best_views` to `folder`/pictures, as tree_0001.jpg by its number;
+    pictures of an earlier run are deleted, also if there are no new ones.
 
     Args:
         source: The source, with its camera.

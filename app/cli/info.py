@@ -141,7 +141,8 @@ def _commands(d: SourceDescription) -> list[str]:
 
 
 def _scans(d: SourceDescription) -> str:
-    """Return number, duration and rate of the scans as text, as far as they are known."""
+    """Return number, duration and rate of the scans as text: only the number if the times are unknown, and
+    "unknown number" without it."""
     if d.scans is None:
         return "unknown number"
     if d.start_ns is None or d.end_ns is None or d.end_ns <= d.start_ns:

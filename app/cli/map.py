@@ -221,7 +221,8 @@ def _tell(
 
 
 def _in_the_map(start: str | tuple[float, float, float] | None) -> Start:
-    """Return the start of --start: a pose for three numbers (m, m, rad), "auto" for None."""
+    """Return the start of --start: a pose for three numbers (m, m, rad), "last" and "resume" as they are,
+    else "auto", also for None."""
     from pipeline.geometry.poses import Pose2
 
     if isinstance(start, tuple):

@@ -78,7 +78,8 @@ def _mcap(text: str) -> Path:
 
 
 def _uri(arguments: argparse.Namespace) -> str:
-    """Return the URI of the scenario with the flags as options; sim: is added if it is missing."""
+    """Return the URI of the scenario with --seed and --duration, where given, as options at its end; sim: is
+    added if it is missing."""
     uri: str = arguments.scenario if arguments.scenario.startswith("sim:") else f"sim:{arguments.scenario}"
     for key in ("seed", "duration"):
         value = getattr(arguments, key)

@@ -126,8 +126,8 @@ def stand_parameters(arguments: argparse.Namespace) -> Stand:
 
 def chosen_plots(arguments: argparse.Namespace) -> list[SamplePlot]:
     """Return the plots that the flags define, in the frame of the map: those of --plots, then circles and
-    rectangles, then those along the path. Without such flags, those that were drawn on the page for the
-    recording, which is reported; [] with --plots none.
+    rectangles, named by their place in the result from 1 on, then those along the path. Without such flags,
+    those that were drawn on the page for the recording, which is reported; [] with only --plots none.
 
     Raises:
         StemmapError: A plot, a file or the database is not valid.

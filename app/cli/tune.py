@@ -104,8 +104,8 @@ def _plan(arguments: argparse.Namespace) -> Plan:
     """Return the plan that the arguments give; opens the first run to find its preset.
 
     Raises:
-        StemmapError: A run is live, or named twice, an argument is wrong, or the folder for --out does not
-            exist.
+        StemmapError: A run is live, or named twice, an argument is wrong, the first run or a file of true
+            trees cannot be read, or the folder for --out does not exist.
     """
     from app.robot.address import is_live
     from app.tuning.plan import SENSIBLE, Plan, axes_of
@@ -186,7 +186,7 @@ def _search(search: Search) -> bool:
 
 def _finish(search: Search, arguments: argparse.Namespace, *, stopped: bool) -> int:
     """Write the best set to --out, print the result, and print warnings to standard error; return the exit
-    code.
+    code: STOPPED if trials are missing, else 0. StemmapError if the file cannot be written.
 
     Args:
         search: The search, whose start is scored.

@@ -98,7 +98,8 @@ class VelodyneAddress(Address):
 
 
 def is_live(uri: str) -> bool:
-    """Return whether a URI is the address of a live source."""
+    """Return whether a URI is the address of a live source: whether it begins with one of the three schemes,
+    in any case. It is not checked further."""
     return uri.lower().startswith((SCHEME, VELODYNE, DDS))
 
 
@@ -115,7 +116,7 @@ def parse_address(uri: str) -> Address:
 
 
 def _dds(uri: str) -> DdsAddress:
-    """Parse an address of plain DDS; errors as in `parse_address`."""
+    """Parse an address of plain DDS; errors as in `parse_address`. The robot "/" becomes "": all topics."""
     place, _, query = uri[len(DDS) :].partition("?")
     if place:
         raise SourceError("plain DDS has no address, only options after ?", where=uri, remedy=_DDS_REMEDY)
@@ -188,7 +189,8 @@ def _zenoh(uri: str) -> ZenohAddress:
 
 
 def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
-    """Return the options of an address by name.
+    """Return the options of an address by name, also those with an empty value; of a repeated option the last
+    value.
 
     Args:
         uri: The address, for errors.

@@ -42,10 +42,11 @@ def idl_type(msgtype: str) -> Any:  # noqa: ANN401 - cyclonedds is an extra, and
 
 
 def _kind(described: Any) -> Any:  # noqa: ANN401 - as rosbags describes a field
-    """Return the type of a field in cyclonedds.
+    """Return the type of a field for `make_idl_struct`: a Python type or one of `cyclonedds.idl.types`, that
+    of `idl_type` for a message, or an array or sequence of such a type.
 
     Args:
-        described: The field as rosbags describes it.
+        described: The field as rosbags describes it: kind of node, and its details.
     """
     from cyclonedds.idl import types
 

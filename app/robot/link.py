@@ -141,7 +141,8 @@ class Inbox:
             return True
 
     def put_picture(self, message: Message) -> None:
-        """Record and queue an accepted picture; the oldest ones are skipped where there is no room."""
+        """Record and queue an accepted picture; where there is no room, the oldest ones are removed and
+        counted in `losses`, but not recorded as skipped."""
         with self._lock:
             if self._recorder is not None:
                 self._recorder.add(message)

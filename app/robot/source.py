@@ -207,7 +207,8 @@ class LiveSource:
         return {**self._link.losses, **self._inbox.losses, **recorder, **read, **kept}
 
     def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records when they arrive, until `stop`; then those that the reader still holds.
+        """Yield records when they arrive, until `stop`; then the recording of messages ends, and the records
+        that the reader still holds are yielded, but not messages that are still queued.
 
         Args:
             start_ns: Must be None, because a live run cannot be read again.
@@ -375,8 +376,8 @@ class LiveSource:
         return self.ready
 
     def take(self) -> list[Record]:
-        """Return the records of the next message that has any; [] if no message is queued. Does not wait;
-        pictures are taken over in passing.
+        """Return the records of the next queued message that has any; [] if none has. Does not wait. Messages
+        without records are processed, and pictures are passed to the camera.
 
         Raises:
             SourceError: A message cannot be read, or the topics of the robot cannot be used.

@@ -196,20 +196,23 @@ def _has_word(publisher: Publisher, words: tuple[str, ...]) -> bool:
 
 def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
     """Return the sort key of a scan topic. A planar laser comes last, because with a LiDAR it is a safety
-    sensor; before it, topics whose name suggests that their clouds are not raw sweeps."""
+    sensor; before it, topics whose name suggests that their clouds are not raw sweeps; among equals, packets
+    of a Velodyne sensor come last, then robot and name decide."""
     kind, is_derived = publisher.msgtype, _has_word(publisher, _DERIVED)
     return kind == LASER_SCAN, is_derived, kind == VELODYNE_SCAN, publisher.robot, publisher.topic
 
 
 def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:
-    """Return the sort key of an odometry topic: names of GPS, map or SLAM last, names that end in odom
-    first."""
+    """Return the sort key of an odometry topic: names with gps, map or slam last, names that end in odom
+    first, then by name."""
     name = publisher.topic.lower()
     return any(word in name for word in ("gps", "map", "slam")), not name.endswith("odom"), publisher.topic
 
 
 def _warnings(scans: list[Publisher], scan: Publisher, robot: str, named: str | None) -> list[str]:
-    """Return messages about other robots and scan topics that could have been chosen.
+    """Return messages about what could have been chosen: one about other robots unless the user named one,
+    and one about other scan topics of the chosen robot unless the user named the topic; each names at most
+    ten.
 
     Args:
         scans: All scan topics.

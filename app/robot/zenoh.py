@@ -207,7 +207,7 @@ class ZenohLink(Link):
 
     def _count_gap(self, number: int, attachment: bytes, reason: str) -> None:
         """Count lost messages. rmw_zenoh numbers the messages of a publisher, so a gap in the numbers is a
-        loss.
+        loss. Another publisher, a smaller number and a short attachment count nothing.
 
         Args:
             number: Number of the channel.

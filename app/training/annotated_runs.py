@@ -58,8 +58,9 @@ class ExampleCollector:
         """Add the columns after a scan. None, no columns, and the same object as in the last call are
         ignored.
 
-        The features at an annotation are stored when its nearest column has been observed 3, 10 and 30 times,
-        and each time as the newest.
+        The features of the nearest column within REACH of an annotation are copied as its newest ones, and
+        once more at the first calls at which the column has been observed at least 3, 10 and 30 times, at
+        most one of these numbers per call.
         """
         if columns is None or columns is self._before or self._nearest is None or not len(columns.axis):
             return

@@ -160,8 +160,9 @@ def _expanded_node(
 def _leaf(
     share: Float, figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
 ) -> dict[str, Any]:
-    """Return a leaf, or the splits in its place, at most DEEPER levels. Each new leaf mixes the previous
-    shares, with weight PRIOR, and those of its examples.
+    """Return a leaf, or the splits in its place, at most DEEPER levels, which separate trees from all other
+    classes. Each new leaf mixes the previous shares, with weight PRIOR, and those of its examples, rounded to
+    two decimals.
 
     Args:
         share: Previous class shares, shape (classes,).

@@ -169,8 +169,8 @@ def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
 
 
 def _accepted(figures: Float, forest: Forest, share: float) -> Bool:
-    """Return which examples are accepted as trees, shape (N,): their share of votes suffices and they have
-    enough observations.
+    """Return which examples are accepted as trees, shape (N,): their share of votes is at least `share`, and
+    they do not have too few voxels.
 
     Args:
         figures: Features, shape (N, features).

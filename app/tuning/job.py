@@ -94,7 +94,8 @@ class TuneSearch:
             self.show()
 
     async def stop(self) -> None:
-        """Ask the process to stop; it then sends the result. Does nothing if no search runs."""
+        """Ask the process to stop and send the state "stopping"; the process then sends the result. Does
+        nothing if no search runs."""
         if self._process is not None and self.is_under_way:
             self._state = "stopping"
             self.show()

@@ -327,8 +327,8 @@ _COMPUTED = ("=", "+", "-", "@", "\t", "\r")
 
 
 def lines(comparison: Comparison) -> list[str]:
-    """Return the comparison as text: a table with a row per set, preceded by the rows of its runs if they are
-    few, and the best sets.
+    """Return the comparison as text: a table with a row per set, preceded by the rows of its runs if there
+    are several runs and few rows, and the best sets.
 
     With more than `MOST_LINES` rows, the rows of single runs are omitted; with still more, only the
     `MOST_LINES` sets with the largest F1 are shown, sorted by F1, and a line gives the number of the others.
@@ -377,8 +377,10 @@ def files(comparison: Comparison, folder: Path) -> list[str]:
 
 
 def json_text(comparison: Comparison) -> str:
-    """Return everything but the times as JSON text that ends with a newline: `stemmap`, `runs`, `sets`,
-    `results` (a row per set and run), `means` (a row per set) and `best` (number of the set by criterion)."""
+    """Return everything but the times as JSON text that ends with a newline: `stemmap` (version), `runs`
+    (`run`, its number, `name`, `sha256`, `seed`, `odometry` and number of `true_trees`), `sets` (`set`, its
+    number, and `parameters`), `results` (a row per set and run, see `_record`), `means` (a row per set) and
+    `best` (number of the set by criterion)."""
     plan = comparison.plan
     record: dict[str, Any] = {
         "stemmap": version(),
@@ -536,7 +538,8 @@ def page(comparison: Comparison) -> str:
 
 
 def _best(rows: list[Row]) -> dict[str, float | None]:
-    """Return the best value of each score; None with fewer than two rows, or if no row has it."""
+    """Return the best value of each score of SHOWN by name: the smallest of those in `_LEAST`, else the
+    largest; None with fewer than two rows, or if no row has it."""
     best: dict[str, float | None] = {}
     for name, _, _, _ in SHOWN:
         known = [value for row in rows if not row.error and (value := row.figures[name]) is not None]

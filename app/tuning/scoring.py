@@ -247,7 +247,7 @@ def prepare_run(planned: PlannedRun) -> PreparedRun:
 def _source_of(source: SourceRequest) -> SourceRequest:
     """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with the seed,
     topics and mounting of the folder, the requested odometry, and topics and mounting of the request where
-    given.
+    given, without preset and parameters.
 
     Raises:
         SourceError: The map of the folder was made of several sources, or its files are damaged.

@@ -180,7 +180,8 @@ class Search:
         return (attempt, run), Job(self._runs[run], attempt.parameters)
 
     def _may_suggest(self) -> bool:
-        """Return whether the trials on which the next suggestion depends are made, and it is not the last."""
+        """Return whether another set may be suggested: the start is scored, fewer sets than processes are in
+        progress, and not all trials are made or in progress."""
         in_progress = len(self._attempts)
         is_left = len(self._trials) + in_progress < self.plan.trials
         return self.start is not None and is_left and in_progress < self._processes.count
@@ -197,7 +198,8 @@ class Search:
 
     def _suggestion(self) -> dict[str, Value]:
         """Return the values to try next: as the first of all those of the start, if they are within the
-        bounds; then those that Optuna suggests."""
+        bounds; then those that Optuna suggests. The trials on which they depend are first added to its
+        study."""
         from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 

@@ -95,7 +95,8 @@ class Numbers:
         return text.replace(",", "\0").replace(".", self.point).replace("\0", self.group)
 
     def short(self, value: float) -> str:
-        """Return a number with as many decimals as it has, at most six significant digits."""
+        """Return a number with at most six significant digits and no zeros at its end, without group
+        separators; from a million on in exponent form."""
         return f"{value:.6g}".replace(".", self.point)
 
 
@@ -288,7 +289,7 @@ def tree_rows(run: ExportedRun, texts: dict[str, str], number: Numbers) -> list[
 
 
 def _step(length: float) -> float:
-    """Return the largest of 1, 2, 5 times a power of ten up to a length above 0."""
+    """Return the largest of 1, 2, 5 times a power of ten that is at most a length above 0."""
     power = 10.0 ** math.floor(math.log10(length))
     return max(k * power for k in (1.0, 2.0, 5.0) if k * power <= length * (1 + 1e-9))
 
