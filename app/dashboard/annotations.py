@@ -103,7 +103,8 @@ def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
 
 
 def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
-    """Return an annotation; if the object of the source has the same class, at the position of that object.
+    """Return an annotation; if the object of the source has the same class, at the position of that object,
+    and with its DBH unless the annotation has one.
 
     Args:
         own: Ground truth of the source.
@@ -197,8 +198,8 @@ class AnnotationEditor:
             self.problem = str(error)
 
     def leave(self) -> None:
-        """Forget the annotations and the choice of the ground truth, because the run was closed; the store
-        does not change."""
+        """Forget the annotations, the ground truth and its choice, because the run was closed; the store does
+        not change, and `changed` is not called."""
         self._generation += 1
         self.run, self._own, self.against = None, None, "both"
         self._show([])

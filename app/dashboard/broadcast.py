@@ -156,7 +156,8 @@ class Listener:
         return self._map_at + MAP_PAUSE_S - time.monotonic()
 
     def _map_message(self, count: int, payload: bytes, path_xy: NDArray[np.float64]) -> bytes:
-        """Return a map with the rows of its path that this browser does not have, as JSON.
+        """Return a map with the rows of its path that this browser does not have, as JSON, and count it as
+        sent now.
 
         Args:
             count: Number of the message.

@@ -41,7 +41,7 @@ class CameraView:
         self._of = time.time_ns() // 1_000_000
 
     def forget(self) -> None:
-        """Remove the pictures, because another run begins."""
+        """Remove the pictures and use another number of the run, because another run begins."""
         self._kept.clear()
         self._of += 1
 

@@ -224,7 +224,8 @@ class Dashboard:
                 await self.command(command)
 
     async def _leave_for(self, source: SourceRequest) -> None:
-        """Close the run; from now on, `source` is the source that is expected to open."""
+        """Close the run: end its record, searches and analyses, and remove it from the page. From now on,
+        `source` is the source that is expected to open. The worker gets no command."""
         self._set_status(protocol.Status(state="starting", detail=f"Opening {source.uri}", source=source.uri))
         self._run, self.source, self.digest = None, source, ""
         self.live.publish("source", source.for_page())
@@ -247,7 +248,8 @@ class Dashboard:
         """Use all values of a preset.
 
         Raises:
-            ParameterError: There is no preset of this name.
+            StemmapError: There is no preset of this name (ParameterError), or its forest does not exist;
+                nothing changes.
         """
         await self.tune(lambda state: state.use_preset(name))
 
@@ -255,7 +257,8 @@ class Dashboard:
         """Reset the named parameters, or all if the list is empty, to the values of the preset.
 
         Raises:
-            ParameterError: A name is unknown.
+            StemmapError: A name is unknown (ParameterError), or the values are refused, see
+                `ParameterState.reset`; nothing changes.
         """
         await self.tune(lambda state: state.reset(names))
 
@@ -377,8 +380,9 @@ class Dashboard:
         self.selector.remove({change.number for change in changes.changes if change.kind == "vanished"})
 
     async def _begin(self, opened: protocol.Opened) -> None:
-        """Load the annotations of an opened source and send the worker its parameters; then it plays, except
-        after a restart of the worker. Nothing is sent if another source was requested meanwhile."""
+        """Load the annotations of an opened source, begin its record, use the preset that suits it, and send
+        the worker the parameters; then it plays, except after a restart of the worker, unless `Play` or
+        `Open` was requested meanwhile. Nothing is sent if another source was requested."""
         self._run, self.digest = opened.run, opened.digest or opened.uri
         number = self._opens
         await self.annotation_editor.begin(opened.digest or opened.uri, opened.uri, opened.truth)
@@ -547,8 +551,9 @@ class LoopPlayback:
         self._dashboard.live.publish("loop", None if span is None else {"from_s": span[0], "to_s": span[1]})
 
     async def shown(self, time_s: float, status: protocol.Status) -> None:
-        """Seek to the beginning of the part if the shown scan is at its end and the run plays or is finished;
-        a finished run plays again. Ignored while the worker is being restarted.
+        """Seek to the beginning of the part, once for each time that its end is reached or passed, if the run
+        plays or is finished; a finished run plays again. Nothing without a part, and while the worker is
+        being restarted.
 
         Args:
             time_s: Time of the shown scan [s since the first scan].

@@ -367,8 +367,8 @@ class ParameterSets:
         return next((name for name, values in self._values.items() if values == wanted), "")
 
     def as_plain(self) -> dict[str, Any]:
-        """Return {"sets": [...]} for the page, each set with `name`, `who` and `at_s`, the time of its last
-        change [s since 1970]."""
+        """Return {"sets": [...]} for the page, sorted by name, each set with `name`, `who` and `at_s`, the
+        time of its last change [s since 1970]."""
         rows = [
             {"name": row.name, "who": row.who, "at_s": row.at_ns // 1_000_000_000}
             for row in self._sets.values()

@@ -70,8 +70,9 @@ def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
 
 
 def health_payload(health: Health) -> dict[str, Any]:
-    """Return the pose quality: `state`, `reason` and the figures of `Health`, with units in the names and
-    angles in degrees; unknown figures are None."""
+    """Return the pose quality: `state`, `reason`, `n_eff`, `ancestors`, `detections`, `recognised`,
+    `ambiguous`, `innovation`, `sigma_xy_m`, `sigma_yaw_deg` and `odometry_sigmas`, see `Health`; unknown
+    figures are None."""
     return {
         "state": health.state,
         "reason": health.reason,
@@ -264,11 +265,13 @@ _FARTHEST_CM = 32_767
 
 
 def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
-    """Return a binary block: length of the header (4 bytes, little-endian), header as JSON, arrays.
+    """Return a binary block: length of the header (4 bytes, little-endian), header as JSON, arrays. The
+    header and each array are padded to a multiple of four bytes; the length includes the padding.
 
     Args:
-        header: JSON values. A list `arrays` with name, type, shape and position of each array is added.
-        arrays: Arrays by name, appended at multiples of four bytes.
+        header: JSON values. A list `arrays` is added, each with `name`, `type` (as `numpy.dtype.str`),
+            `shape` and `at`, its first byte after the header.
+        arrays: Arrays by name.
     """
     table, parts, place = [], [], 0
     for name, array in arrays.items():

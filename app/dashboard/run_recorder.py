@@ -175,7 +175,8 @@ class RunRecorder:
                 await self._write(self._page)
 
     async def close(self) -> None:
-        """Write pending changes and wait until they are stored."""
+        """End the record, write pending changes and the result files, and wait until they are stored; what
+        the store refuses is lost."""
         self.leave()
         while self._tasks:
             await asyncio.gather(*self._tasks)

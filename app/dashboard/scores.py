@@ -81,8 +81,9 @@ class Scores:
 
 
 def score_payload(score: MapScores) -> dict[str, Any]:
-    """Return scores for the page, with units in the names: the fields of `MapScores`, each rate as `count`,
-    `of` and `rate`, and `warning`, see `truth_in_doubt`. An undefined score is None."""
+    """Return scores for the page: the rates `TA`, `TR`, `FA` and `FR`, each as `count`, `of` and `rate`; the
+    other fields of `MapScores` with units in the names (`_m`, `_cm`, `_percent`); and `warning`, see
+    `truth_in_doubt`. An undefined score is None."""
     rates = {"TA": score.TA, "TR": score.TR, "FA": score.FA, "FR": score.FR}
     return {
         **{name: {"count": r.count, "of": r.of, "rate": r.rate} for name, r in rates.items()},

@@ -174,8 +174,9 @@ class Selection:
         return (*story.position, reach)
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the selection for the page: `tree`, a number or None, and `cluster`, None or its scan, row,
-        verdict and place [m]. The explanation is requested separately."""
+        """Return the selection for the page: `tree`, a number or None, and `cluster`, None or `scan`,
+        `cluster` (its row), `verdict`, `x` and `y` in the map [m]. The explanation is requested
+        separately."""
         story = self.cluster
         if story is None:
             return {"tree": self.tree, "cluster": None}

@@ -289,7 +289,8 @@ def _to_picture(centre: Float) -> Float:
 
 
 def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
-    """Return a fitted stem as it is drawn.
+    """Return a fitted stem as it is drawn. `arc_end` is `arc_start` plus the arc; neither is reduced to a
+    full turn.
 
     Args:
         fit: The fit in level sensor coordinates.
@@ -355,8 +356,8 @@ def points_around(voxels: VoxelMap, place: NDArray[np.float64]) -> list[tuple[fl
 
 
 def section(accumulated: NDArray[np.floating]) -> MapSection:
-    """Return the occupied cells between BREAST_LOW and BREAST_HIGH, seen from above. The side of a cell is
-    that of a voxel, doubled until there are at most 20,000 cells.
+    """Return the occupied cells between BREAST_LOW and BREAST_HIGH, seen from above; no cells without points
+    there. The side of a cell is that of a voxel, doubled until there are at most 20,000 cells.
 
     Args:
         accumulated: Points of all scans or of a whole cloud: x, y in the map and height above the ground,

@@ -74,7 +74,7 @@ def circles(
         z: Heights, shape (N,) [m].
 
     Returns:
-        shape (N * SIDES, 2, 3) [m].
+        float32, shape (N * SIDES, 2, 3) [m].
     """
     angle = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)

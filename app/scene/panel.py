@@ -100,7 +100,7 @@ class TunePanel:
             folder.visible = not cloud
 
     def _add_widget(self, gui: viser.GuiApi, spec: FieldSpec, value: Value) -> viser.GuiSliderHandle[Any]:
-        """Add the slider of a parameter, whose changes by people call `on_change`.
+        """Add the slider of a parameter, whose changes by people call `on_change`, and return it.
 
         Args:
             gui: Panel of viser.
@@ -122,7 +122,7 @@ class TunePanel:
 
 
 def _kind(spec: FieldSpec) -> type[int] | type[float]:
-    """Return the type of a numeric parameter."""
+    """Return the type of a numeric parameter: int for the kind "int", else float."""
     return int if spec.kind == "int" else float
 
 

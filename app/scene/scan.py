@@ -173,8 +173,8 @@ def extent(frame: Frame) -> float:
 
 
 def height_range(frame: Frame) -> tuple[float, float]:
-    """Return the heights at the ends of the colour ramp [m]: of a scan always the same, of a whole cloud
-    those of its lowest and highest points except 1 %."""
+    """Return the heights at the ends of the colour ramp [m]: of a scan, and of a cloud without points, always
+    the same; of a whole cloud the percentiles 1 and 99 of its points."""
     if not frame.of_cloud or not len(frame.filtered):
         return HEIGHT_LOW, HEIGHT_HIGH
     low, high = np.percentile(frame.filtered[:, 2], (1.0, 99.0))
@@ -185,7 +185,8 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
     """Return the colours of the filtered points, uint8, shape (M, 3).
 
     By "height", each point is coloured by its height. Otherwise it has the colour of its cluster, or FILTERED
-    without a cluster. By "stage", detections have one colour and all other clusters another.
+    without a cluster: by its number ("cluster"), the logarithm of its eccentricity from 1 to 100
+    ("eccentricity"), whether it is a detection ("stage"), or else its verdict.
 
     Args:
         frame: Results of the scan.
@@ -218,8 +219,8 @@ class VoxelNode:
         self.count = 0
 
     def show(self, on: bool, frame: Frame, size: float) -> None:
-        """Show the voxels that contain filtered points. `count` becomes their number, 0 while nothing is
-        shown; at most MOST_VOXELS are drawn.
+        """Show the voxels, in the level frame of the sensor, that contain filtered points. `count` becomes
+        their number, also of those beyond MOST_VOXELS, which are not drawn; 0 while nothing is shown.
 
         Args:
             on: Whether the layer is on; otherwise nothing is computed.

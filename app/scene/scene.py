@@ -87,7 +87,8 @@ class Scene:
             self._draw()
 
     def show_parameters(self, parameters: Parameters, preset_name: str) -> None:
-        """Set the widgets to parameters, without a callback.
+        """Set the widgets to parameters, without a callback; sliders that a person is moving are not set. The
+        parameters also apply to voxels, errors and path ahead of the next drawing.
 
         Args:
             parameters: The values.

@@ -58,7 +58,8 @@ _PATIENCE_MS = 5000
 
 
 def open_engine(folder: Path | None) -> sa.Engine:
-    """Return the engine of a database with current tables.
+    """Return the engine of a database with current tables. Tables of the versions in `_ADDED` get the new
+    columns.
 
     Args:
         folder: Folder of the SQLite file, created if necessary; None keeps the database in memory.

@@ -182,5 +182,5 @@ class Change:
 
 
 def moment(at_ns: int) -> str:
-    """Return a time [ns since 1970] as text in UTC with a resolution of one second."""
+    """Return a time [ns since 1970] as text in whole seconds, for example "2026-11-26 06:00:00 UTC"."""
     return datetime.fromtimestamp(at_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

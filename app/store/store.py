@@ -318,7 +318,8 @@ def _with_source() -> Select[Any]:
 
 
 def _figures(figures: RunFigures) -> dict[str, Any]:
-    """Return the columns of `run_records` that change while a run plays."""
+    """Return the columns of `run_records` that change while a run plays: all fields of `figures` except
+    `map`."""
     return {each.name: getattr(figures, each.name) for each in fields(figures) if each.name != "map"}
 
 

@@ -252,7 +252,8 @@ class Guard:
 
     def _restraint(self, scope: Scope, headers: Headers) -> Response | None:
         """Return 403 for a viewer who tries to change something or asks for work of minutes; None otherwise,
-        also for all websockets. Stores the role of the request in `scope`."""
+        also for all websockets and for a comparison of parameter sets. Stores the role of the request in
+        `scope`."""
         role = self._role(headers)
         scope.setdefault("state", {})["role"] = role
         if role == "owner" or scope["type"] == "websocket":
@@ -338,8 +339,8 @@ class Guard:
             return False
 
     def _fits_origin(self, scope: Scope, headers: Headers) -> bool:
-        """Return whether the Origin of a request is this server. Without an Origin, requests fit, and
-        websockets only with the token in the header Authorization."""
+        """Return whether the Origin of a request is this server, by http or https. Without an Origin,
+        requests fit, and websockets only with the token in the header Authorization."""
         origins = headers.getlist("origin")
         if not origins:
             return scope["type"] == "http" or self._role_by_bearer(headers) is not None

@@ -62,12 +62,13 @@ def json_reply(content: object, status: int = 200) -> Response:
 def error_reply(
     status: int, what: str, *, where: str = "", remedy: str = "", retry_after_s: int | None = None
 ) -> Response:
-    """Return an error as JSON for the page.
+    """Return an error as JSON for the page: {"error": {"what", "where", "remedy"}}.
 
     Args:
         status: HTTP status.
         what, where, remedy: Text of the error, see `StemmapError`.
-        retry_after_s: Time after which the same request may succeed [s]; None if it will not.
+        retry_after_s: Time after which the same request may succeed [s], as header Retry-After; None for no
+            header.
     """
     reply = json_reply({"error": {"what": what, "where": where, "remedy": remedy}}, status)
     if retry_after_s is not None:

@@ -182,8 +182,9 @@ def _remove(part: Path) -> None:
 async def _write_folder(
     part: Path, size: int, stream: AsyncIterator[bytes], wrote: Callable[[int], None]
 ) -> None:
-    """Write the files of a folder, which follow one another in the stream after their list. Arguments and
-    errors as `_write`."""
+    """Write the files of a folder, which follow one another in the stream after their list; the folder is
+    created. Arguments and errors as `_write`, and those of `_file_list`; UploadError also if the sizes do not
+    add up to `size`."""
     pieces, rest = aiter(stream), b""
     while b"\n" not in rest and len(rest) < _LONGEST_LIST and (piece := await anext(pieces, b"")):
         rest += piece

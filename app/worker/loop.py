@@ -230,7 +230,8 @@ class WorkerLoop:
         return 0.0 if stamp_ns is None else self._replay.delay(stamp_ns, self._clock())
 
     def _remap(self) -> None:
-        """Continue a rerun for up to `_REMAP_S`, and send the new map when the rerun is complete."""
+        """Continue a rerun for up to `_REMAP_S`. When it is complete, forget the recent scans, and send the
+        differences, the current scan in the new map and the status."""
         until = self._clock() + _REMAP_S
         done = self._session.remap()
         while done is None and self._session.is_remapping and self._clock() < until:
@@ -353,8 +354,9 @@ class WorkerLoop:
 
     def compiling(self) -> None:
         """Report that the mapping waits for the compilation of a kernel; called during the compilation. The
-        status "playing" becomes "waiting"; further calls report the progress at intervals of _HEARTBEAT_S.
-        Before the first status nothing is reported."""
+        time measurement of the present scan is discarded. The status "playing" becomes "waiting"; further
+        calls report the progress at intervals of _HEARTBEAT_S. Before the first status nothing is
+        reported."""
         self._session.disturb()
         now = self._clock()
         if now > self._compiled_at + _COMPILES_ON_S:
@@ -527,12 +529,13 @@ class ReplayClock:
         self._speed = 0.0 if factor == 0.0 else max(factor, SLOWEST)
 
     def anchor(self, stamp_ns: int, now: float) -> None:
-        """Make the scan of `stamp_ns`, shown at `now`, the anchor."""
+        """Make the scan of `stamp_ns`, shown at `now`, the anchor; `rate_hz` and `behind` begin again."""
         self._anchor = (stamp_ns, now)
         self._mapped.clear()
 
     def release(self) -> None:
-        """Make the next scan the anchor: after a pause, a jump or a change of speed."""
+        """Make the next scan the anchor: after a pause, a jump or a change of speed; `rate_hz` and `behind`
+        begin again."""
         self._anchor = None
         self._mapped.clear()
 

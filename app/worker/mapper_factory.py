@@ -19,6 +19,9 @@ def mapper_of(
         parameters: Parameters of the mapper.
         seed: Random seed.
         timer: Measures the stages, see `Mapper`.
+
+    Raises:
+        StemmapError: The forest that the parameters name does not exist.
     """
     return Mapper(
         parameters,

@@ -37,6 +37,9 @@ def compile_ahead() -> None:
 
     Kernels that remain uncompiled, also after errors of the processes, are compiled at their first call.
     While another process of the user compiles, it waits for up to half an hour.
+
+    Raises:
+        StemmapError: A process cannot be started.
     """
     if _cores() < len(_PROGRAMS) or is_compiled():
         return
@@ -68,7 +71,7 @@ def _cores() -> int:
 
 
 def _start(program: str) -> BlockingChildProcess:
-    """Start the process that runs one of `_PROGRAMS`."""
+    """Start the process that runs one of `_PROGRAMS`; raises StemmapError if the system cannot start it."""
     return BlockingChildProcess(python_module("app.worker.numba_warmup", program))
 
 
@@ -120,7 +123,8 @@ _SCENE = "sim:stand?duration=1"
 
 
 def warm_up() -> None:
-    """Compile or load all kernels of the mapper. The first time on a machine this takes minutes."""
+    """Compile or load all kernels of the mapper. The first time on a machine this takes minutes. Errors as
+    `compile_ahead`."""
     compile_ahead()
     map_scene()
 

@@ -140,8 +140,9 @@ class Outbox:
                 self._changed.wait(wait if self._picture is not None else None)
 
     def _with_new_path_only(self, shown: Shown) -> Shown:
-        """Return the frame with only the rows of the path that were not sent before, at most MOST_POINTS
-        points, and without the ground if it was sent before."""
+        """Return the frame with only the rows of the path that were not sent before, at most MOST_POINTS raw
+        and filtered points each, and without the ground if it was sent before. Path and ground count as sent
+        from now on."""
         old, self._sent_path = self._sent_path, shown.path
         start = 0 if old is None or shown.run != self._sent_run else rows_in_common(old, shown.path)
         picture = picture_of(shown.frame)

@@ -387,10 +387,12 @@ class Run:
         return self._map.parameters.at(index)
 
     def prepare(self) -> None:
-        """Map the first scan and discard the result, so that all kernels are compiled.
+        """Map the next scan, the first of a new run, with its parameters, and discard the result and the
+        measured times, so that all kernels are compiled.
 
         Raises:
             SourceError: There is no scan, or it cannot be read.
+            StemmapError: The scan cannot be mapped.
         """
         step = self._cursor.peek()
         if step is None:

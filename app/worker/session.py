@@ -238,6 +238,7 @@ class Session:
 
         Raises:
             SourceError: There is no scan, or it cannot be read.
+            StemmapError: The scan cannot be mapped, or a process that compiles cannot be started.
         """
         if isinstance(self._run, Run):
             self._compile_ahead()
@@ -392,11 +393,12 @@ class Session:
 
     def remap(self) -> tuple[Frame, MapChanges] | None:
         """Take the next step of a rerun: of its preview, or a scan. If the scan cannot be read, the rerun
-        ends with a warning and the map stays.
+        ends with a warning and the map stays. After the last scan, the recording of a live run gets the
+        parameters.
 
         Returns:
             After the last scan, the frame of the current scan in the new map and the differences; before, and
-                without a rerun, None.
+            without a rerun, None.
         """
         run, shown = self._run, self.frame
         if run is None or shown is None:
@@ -477,7 +479,7 @@ class Session:
         return self._robot is not None
 
     def _settle(self) -> None:
-        """Set the state "paused"."""
+        """Set the state "paused", whatever it was, and remove the reason of a failure."""
         self._state, self._detail = "paused", ""
 
     def _arrive(self, run: AnyRun) -> Frame | None:

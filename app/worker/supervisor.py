@@ -236,7 +236,8 @@ class WorkerProcess:
     # --- messages ---------------------------------------------------------------------------------
 
     async def _listen(self) -> str:
-        """Pass messages on until the worker ends; return the reason of the end."""
+        """Pass messages on until the worker ends, and return the reason of the end. A worker that hangs is
+        killed; `_gave_up` then states whether a source was being opened."""
         process = self._process
         if process is None or process.stdout is None:
             return "it could not be started"

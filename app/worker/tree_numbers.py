@@ -49,7 +49,8 @@ class TreeNumbers:
         return replace(trees, number=numbers)
 
     def begin_map(self, trees: Trees, ended: Mapping[int, Place]) -> None:
-        """Begin another map of the run.
+        """Begin another map of the run. Its confirmed trees get numbers first, then the others, then those
+        that ended.
 
         Args:
             trees: Its trees at the scan that was numbered last in the map before.
@@ -82,8 +83,8 @@ class TreeNumbers:
         return replace(rows_of(trees, rows), number=numbers), rows
 
     def _name(self, places: Mapping[int, Place]) -> None:
-        """Give numbers to trees of the present map: those of the trees of the last frame, then those of
-        earlier trees, then new ones.
+        """Give numbers to trees of the present map: those of the trees of the last frame that they are paired
+        with, then those of earlier trees, then new ones in the order of `places`.
 
         Args:
             places: Positions of trees that have no number yet, by their numbers in the map.

@@ -73,9 +73,8 @@ async def read(dashboard: Dash, browser: str = "") -> Response:
 @router.post("/annotations")
 async def add(body: _Add, dashboard: Dash) -> Response:
     """Add an annotation, or mark a tree as skipped in the review (kind "skipped", which is no ground truth
-    and not exported); return its number (`id`) and the numbers of edits that can be undone and repeated, with
-    201. 409 if another run was opened meanwhile, nothing can be annotated, or the run has
-    MOST_ANNOTATIONS."""
+    and not exported); return its number (`id`) and the counts of edits, see `edited`, with 201. 409 if
+    another run was opened meanwhile, nothing can be annotated, or the run has MOST_ANNOTATIONS."""
     (added,) = await apply_edit(dashboard, body, Store.add, [body.content])
     return await edited(dashboard, body, {"id": added}, 201)
 
@@ -83,7 +82,7 @@ async def add(body: _Add, dashboard: Dash) -> Response:
 @router.patch("/annotations/{number}")
 async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Response:
     """Change an annotation; 409 if it does not have this version any more or another run was opened, 404 for
-    an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
+    an unknown one. Return its number (`id`) and the counts of edits, see `edited`."""
     await apply_edit(dashboard, body, Store.change, number, body.version, body.content)
     return await edited(dashboard, body, {"id": number})
 
@@ -91,32 +90,33 @@ async def change(body: _AnnotationChange, number: Number, dashboard: Dash) -> Re
 @router.delete("/annotations/{number}")
 async def delete(body: _Delete, number: Number, dashboard: Dash) -> Response:
     """Delete an annotation; 409 if it does not have this version any more or another run was opened, 404 for
-    an unknown one. Return its number and the numbers of edits that can be undone and repeated."""
+    an unknown one. Return its number (`id`) and the counts of edits, see `edited`."""
     await apply_edit(dashboard, body, Store.change, number, body.version, None)
     return await edited(dashboard, body, {"id": number})
 
 
 @router.post("/annotations/undo")
 async def undo(body: Edit, dashboard: Dash) -> Response:
-    """Undo the last edit of the browser; return the numbers of edits that can be undone and repeated. 409 if
-    there is none, or if another person has changed the annotation since."""
+    """Undo the last edit of the browser; return the counts of edits, see `edited`. 409 if there is none, if
+    another person has changed the annotation since, or if another run was opened."""
     await apply_edit(dashboard, body, Store.undo)
     return await edited(dashboard, body, {})
 
 
 @router.post("/annotations/redo")
 async def redo(body: Edit, dashboard: Dash) -> Response:
-    """Repeat the edit that the browser undid last; return the numbers of edits that can be undone and
-    repeated. 409 if there is none, or if another person has changed the annotation since."""
+    """Repeat the edit that the browser undid last; return the counts of edits, see `edited`. 409 if there is
+    none, if another person has changed the annotation since, or if another run was opened."""
     await apply_edit(dashboard, body, Store.redo)
     return await edited(dashboard, body, {})
 
 
 @router.post("/annotations/import")
 async def import_table(body: _Import, dashboard: Dash) -> Response:
-    """Add the rows of a CSV table in one edit. Return the number of added rows (`added`), and the number of
-    rows that exist already as annotations (`left_out`). 422 if the table cannot be read, has a row out of
-    bounds or too many rows, 409 as in `add`; then nothing is added. Without new rows there is no edit."""
+    """Add the rows of a CSV table in one edit. Return the number of added rows (`added`), the number of rows
+    that exist already as annotations (`left_out`), and the counts of edits, see `edited`. 422 if the table
+    cannot be read, has a row out of bounds or too many rows, 409 as in `add`; then nothing is added. Without
+    new rows there is no edit."""
     contents = await asyncio.to_thread(_imported, body, dashboard.offset)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
     new = [content for content in contents if _key(content) not in existing]
@@ -167,8 +167,8 @@ def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
-    """Return an annotation, see `_rows`, as a GeoJSON point at its x and y, with class, DBH [cm], author and
-    time."""
+    """Return an annotation, see `_rows`, as a GeoJSON point at its x and y, with its `id` and the properties
+    `class`, `dbh_cm`, `who` and `edited`."""
     properties = {"class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"], "edited": _when(row)}
     geometry = {"type": "Point", "coordinates": [row["x"], row["y"]]}
     return {"type": "Feature", "id": row["id"], "geometry": geometry, "properties": properties}

@@ -76,10 +76,10 @@ class _Georeference(Edit):
 @router.put("/georeference")
 async def georeference(body: _Georeference, dashboard: Dash) -> Response:
     """Find the reference system of the map as `stemmap georeference` does, in a child process, and store it
-    in one edit, in place of the one before; files and figures have it from then on. Return the numbers of
-    edits that can be undone and repeated. 409 before the first map, or if another run was opened or the
-    reference system was changed meanwhile; 422 if there are too many points, or the values contradict one
-    another or do not fit the reference system."""
+    in one edit, in place of the one before; files and figures have it from then on. Return the counts of
+    edits, see `edited`. 409 before the first map, or if another run was opened or the reference system was
+    changed meanwhile; 422 if there are too many points, or the values contradict one another or do not fit
+    the reference system."""
     if dashboard.shown is None:
         raise NothingMappedError
     run, by = ShownRun.of(dashboard), body.by.model_dump()

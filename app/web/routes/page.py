@@ -52,7 +52,7 @@ _VISER_POLICY = (
 
 @router.get("/")
 def page(request: Request) -> Response:
-    """GET /: return the dashboard."""
+    """GET /: return the dashboard, or 304 if the browser has it."""
     return _file(request, page_folder() / "index.html", _PAGE_POLICY)
 
 
@@ -65,7 +65,7 @@ async def health(dashboard: Dash) -> Response:
 
 @router.get("/runs")
 def runs_page(request: Request) -> Response:
-    """GET /runs: return the page of all runs."""
+    """GET /runs: return the page of all runs, or 304 if the browser has it."""
     return _file(request, page_folder() / "runs.html", _PAGE_POLICY)
 
 
@@ -122,7 +122,8 @@ def lead_on(request: Request, port: int) -> Response:
 
 
 def page_answer(request: Request, path: Path) -> Response:
-    """Return a page of this program with the content security policy of pages."""
+    """Return a page of this program with the content security policy of pages, or 304 if the browser has
+    it."""
     return _file(request, path, _PAGE_POLICY)
 
 
@@ -264,10 +265,10 @@ async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: Calle
 
 @contextlib.asynccontextmanager
 async def telling(browser: WebSocket, live: Broadcast) -> AsyncIterator[None]:
-    """Send all state changes to a browser while the context is active.
+    """Send all state changes to a browser while the context is active, first the newest message of each kind.
 
     Args:
-        browser: Websocket of the browser.
+        browser: Websocket of the browser, which is accepted.
         live: Broadcast of the dashboard.
     """
     with live.listener() as listener:

@@ -57,7 +57,7 @@ class _ParameterFile(Body):
 @router.get("/parameters")
 async def read(dashboard: Dash) -> Response:
     """GET /api/parameters: return the values, the names of those that differ from the preset, the declaration
-    of each parameter, and the presets, see `ParameterState.as_plain`."""
+    of each parameter, and the presets, see `ParameterState.as_plain_with_specs`."""
     return json_reply(dashboard.parameters.as_plain_with_specs())
 
 
@@ -105,7 +105,8 @@ async def redo(dashboard: Dash) -> Response:
 @router.post("/parameters/reset")
 async def reset(body: _Reset, dashboard: Dash) -> Response:
     """POST /api/parameters/reset: set the named parameters, or all without names, to the values of the
-    preset; return the parameters as `GET /api/parameters` does. 422 for an unknown name."""
+    preset; return the parameters as `GET /api/parameters` does. 422 for an unknown name or values that
+    contradict others."""
     await dashboard.reset_parameters(list(body.names))
     return await read(dashboard)
 
@@ -113,7 +114,7 @@ async def reset(body: _Reset, dashboard: Dash) -> Response:
 @router.patch("/view")
 async def choose_view(body: _ViewChoice, dashboard: Dash) -> Response:
     """PATCH /api/view: show or hide a layer of the scene, or choose colours, labels or whether the view
-    follows the robot, for all browsers; return the view. 422 for an unknown choice."""
+    follows the robot, for all browsers; return the view, see `Scene.view`. 422 for an unknown choice."""
     await dashboard.choose_view(body.name, body.value)
     return json_reply(dashboard.scene.view)
 
@@ -127,14 +128,15 @@ async def download(dashboard: Dash) -> Response:
 
 @router.get("/sets")
 async def saved_sets(dashboard: Dash) -> Response:
-    """GET /api/sets: return name, author and time of the saved parameter sets."""
+    """GET /api/sets: return name, author and time of the saved parameter sets, see
+    `ParameterSets.as_plain`."""
     return json_reply(dashboard.sets.as_plain())
 
 
 @router.post("/sets")
 async def save_set(body: SaveSet, dashboard: Dash) -> Response:
     """POST /api/sets: save the values in force under a name; a set of that name is replaced. Return all saved
-    sets, with 201; 422 for the name of a preset, 409 if there are too many."""
+    sets as `GET /api/sets` does, with 201; 422 for the name of a preset, 409 if there are too many."""
     state = dashboard.parameters
     await dashboard.sets.save(body.name, state.preset, state.parameters, body.who)
     return json_reply(dashboard.sets.as_plain(), 201)
@@ -152,7 +154,7 @@ async def use_set(body: _SetName, dashboard: Dash) -> Response:
 
 @router.post("/sets/delete")
 async def delete_set(body: _SetName, dashboard: Dash) -> Response:
-    """Delete a saved set; return the others. 404 if there is none of this name."""
+    """Delete a saved set; return the others as `GET /api/sets` does. 404 if there is none of this name."""
     await dashboard.sets.delete(body.name)
     return json_reply(dashboard.sets.as_plain())
 

@@ -129,9 +129,9 @@ async def figures(dashboard: Dash, parameters: FigureParameters) -> Response:
 
 @router.post("/plots")
 async def add(body: _AddPlot, dashboard: Dash) -> Response:
-    """Add plots in one edit; return their numbers and the numbers of edits that can be undone and repeated,
-    with 201. 409 if another run was opened meanwhile, 422 for a shape that is no area, a name that is
-    taken, or too many plots or corners."""
+    """Add plots in one edit; return their numbers (`ids`) and the counts of edits, see `edited`, with 201.
+    409 if another run was opened meanwhile, 422 for a shape that is no area, a name that is taken, or too
+    many plots or corners."""
     return await _added(dashboard, body, [(plot.name, plot.shape.model_dump()) for plot in body.plots])
 
 
@@ -175,9 +175,9 @@ async def import_file(body: _ImportPlots, dashboard: Dash) -> Response:
 
 @router.patch("/plots/{number}")
 async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response:
-    """Rename a plot, or change the radius of a circle; return its number and the numbers of edits that can be
-    undone and repeated. 404 for an unknown plot, 409 if it does not have this version any more, 422 for a
-    name that is empty or taken, or the radius of another shape."""
+    """Rename a plot, or change the radius of a circle; return its number (`id`) and the counts of edits, see
+    `edited`. 404 for an unknown plot, 409 if it does not have this version any more or another run was
+    opened, 422 for a name that is empty or taken, or the radius of another shape."""
     row = next((row for row in dashboard.annotation_editor.plots if row.id == number), None)
     if row is None or row.content.plot is None:
         raise UnknownError("there is no such plot", where=f"plot {number}")

@@ -59,7 +59,7 @@ class _SetSpeed(Body):
     @field_validator("factor")
     @classmethod
     def _not_almost_zero(cls, factor: float) -> float:
-        """Refuse factors between 0 and SLOWEST."""
+        """Return the factor; ValueError if it is between 0 and SLOWEST."""
         if 0.0 < factor < SLOWEST:
             raise ValueError(f"should be 0 or at least {SLOWEST}")
         return factor

@@ -161,8 +161,8 @@ async def report(
 
 @router.patch("/{number}")
 async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
-    """Rename a run; return its number. Spaces are merged. 422 for a name that is empty or not printable, 404
-    for an unknown run."""
+    """Rename a run; return its number (`id`). Spaces are merged. 422 for a name that is empty or not
+    printable, 404 for an unknown run."""
     name = " ".join(body.name.split())
     if not name or not name.isprintable():
         raise BadRequestError("the name is empty or has characters that cannot be shown", where="name")
@@ -171,8 +171,8 @@ async def rename(body: _Name, number: Number, dashboard: Dash) -> Response:
 
 @router.delete("/{number}")
 async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
-    """Delete a run that is not open, and return its number; `restore` undoes the deletion for a month. 409 if
-    it is open here or in another dashboard of the fleet, 404 for an unknown run."""
+    """Delete a run that is not open, and return its number (`id`); `restore` undoes the deletion for a month.
+    409 if it is open here or in another dashboard of the fleet, 404 for an unknown run."""
     if number in request.app.state.open_records():
         here = number == dashboard.run_recorder.record
         what = "this run is open" if here else "this run is open in the dashboard of another robot"
@@ -185,7 +185,7 @@ async def delete(request: Request, number: Number, dashboard: Dash) -> Response:
 
 @router.post("/{number}/restore")
 async def restore(number: Number, dashboard: Dash) -> Response:
-    """Undo the deletion of a run; return its number. 404 if it does not exist any more."""
+    """Undo the deletion of a run; return its number (`id`). 404 if it does not exist any more."""
     return await _done(dashboard, number, lambda book: book.bring_back(number))
 
 
@@ -346,8 +346,9 @@ def _differences(name: str, parameters: dict[str, Any]) -> dict[str, Any]:
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a record for the page: its columns without the map and internal ones, and `key`, its number as
-    text. Its times are `begun_s` and `changed_s`, whole seconds since 1970."""
+    """Return a record for the page: its columns and `source`, without `map`, `revisions`, `run` and
+    `deleted_ns`, and `key`, its number as text. Its times are `begun_s` and `changed_s`, whole seconds since
+    1970."""
     kept = {
         name: value for name, value in row.items() if name not in ("map", "revisions", "run", "deleted_ns")
     }
@@ -363,7 +364,8 @@ def _revision(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _changed_s(folder: FilePath) -> int | None:
-    """Return the time of the last change of a finished folder [s since 1970]; None if it was removed."""
+    """Return the time of the last change of run.json in a finished folder, whole seconds since 1970; None if
+    it was removed."""
     try:
         return int((folder / "run.json").stat().st_mtime)
     except OSError:  # it was removed a moment ago
@@ -401,7 +403,8 @@ def _finished_folder(name: str, settings: Settings) -> FilePath:
 
 
 def _is_finished(path: FilePath, folder: FilePath) -> bool:
-    """Return whether a path is the folder of a finished run inside of a data folder.
+    """Return whether a path is the folder of a finished run: not hidden, with run.json and trees.csv, and
+    inside of a data folder, also where it is a link. False if it cannot be read.
 
     Args:
         path: The path.
