@@ -237,7 +237,8 @@ def stage_specs(stage_name: str, stage_model: type[Stage]) -> tuple[FieldSpec, .
 
 
 def _spec(stage_name: str, stage_model: type[Stage], name: str) -> FieldSpec:
-    """Return the description of one parameter.
+    """Return the description of one parameter. Its kind follows the annotation: Literal is "choice", str
+    "name".
 
     Args:
         stage_name: Name of the stage in dotted names.

@@ -234,10 +234,11 @@ def _trend(ground: Float) -> Float:
 
 
 def _remove_pits(z: Float, upright: Bool) -> None:
-    """Remove returns far below nearly all neighbouring cells, noise below the ground, in place.
+    """Remove returns more than PIT below the lower quartile of the 24 cells around, noise below the ground,
+    in place. At least four of these must be known.
 
-    The lower quartile of at least four neighbours decides, because among crowns few cells are ground. Returns
-    that continue upwards are no noise but, for example, the foot of a stem, whose neighbours can be crowns.
+    The lower quartile decides, because among crowns few cells are ground. Returns that continue upwards are
+    no noise but, for example, the foot of a stem, whose neighbours can be crowns.
 
     Args:
         z: Lowest returns above the trend, shape (columns, rows) [m]; removed cells become infinite.

@@ -70,7 +70,7 @@ def _trees_of(table: CsvTable, dbh_unit: str | None) -> TruthTrees:
     """Return the trees of a table; arguments as in `parse_truth_trees`.
 
     Raises:
-        SourceError: A column is missing, a cell is not a number, or the unit of the diameters is unknown.
+        SourceError: As in `parse_truth_trees`.
     """
     x, y = _positions(table)
     dbh = _diameters(table, dbh_unit)

@@ -261,7 +261,8 @@ class RunFiles:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
-        """After an exception, remove the incomplete files, and the folder if this object created it."""
+        """After an exception, remove the incomplete files, and the folder if this object created it; errors
+        as `abandon`. Without one, nothing is done: call `finish` before."""
         if error is not None:
             self.abandon()
 

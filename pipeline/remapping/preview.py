@@ -281,7 +281,8 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
 
 def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:
     """Return the trees of all scans. At a voxel column its class decides; elsewhere, trees have at least
-    `hits_to_confirm` clusters. Those of one stored scan count for all `spacing` scans of the run.
+    `hits_to_confirm` clusters. Those of one stored scan count for all `spacing` scans of the run. Trees of
+    columns come first, at the clusters within REACH of the column if there are any (else with 0 hits).
 
     Args:
         known: The run, for its columns.

@@ -483,8 +483,8 @@ def _loop(clearance: Float, least: float) -> Float | None:
 
 
 def _stations(clearance: Float, region: Bool) -> Int:
-    """Return cells around the middle of a region, one in each of STATIONS directions that has any: at a
-    certain part of the way to the border, if possible with much clearance.
+    """Return cells around the middle of a region, one in each of STATIONS directions that has any: at about
+    the share PART of the way to the border, if possible with much clearance.
 
     Args:
         clearance: Distance of each cell to obstacles, shape (R, C) [m].

@@ -171,7 +171,7 @@ class Plot:
         what: str,
         edge: float = np.inf,
     ) -> tuple[float, float]:
-        """Find a free position and mark it as occupied. About 9,500 random positions are tried.
+        """Find a free position and mark it as occupied. At most about 9,500 random positions are tried.
 
         Args:
             radius: Radius of the object [m].

@@ -178,7 +178,8 @@ def _add_object(scene: SceneBuilder, plot: Plot, name: str, x: float, y: float) 
 
 
 def draw_section(dbh: float, rng: np.random.Generator) -> Section:
-    """Draw the section of a stem of a DBH [m]; the depth of its furrows is that at breast height."""
+    """Return a random section of a stem of a DBH [m]; the depth of its furrows, limited to BARK, is that at
+    breast height."""
     return Section(
         oval=_draw("oval", rng),
         oval_phase=float(rng.uniform(0.0, np.pi)),

@@ -51,8 +51,8 @@ class _Blob:
         self._planes = planes
 
     def add(self, array: np.ndarray[Any, Any]) -> dict[str, Any]:
-        """Append the bytes of an array, and return its description for JSON: type (little-endian), shape and
-        position [bytes]."""
+        """Append the bytes of an array, and return its description for JSON: "dtype" (little-endian),
+        "shape", and "at", its position [bytes]."""
         data = np.ascontiguousarray(array)
         at = self.length
         raw = (

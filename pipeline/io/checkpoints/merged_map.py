@@ -136,8 +136,8 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
 
 
 def _moved_path(b: SavedMap, T: Pose2) -> Float:
-    """Return the path of a map in another frame, x, y [m], yaw [rad], shape (N, 3); T is the pose of its
-    frame in the new one."""
+    """Return the path of a map in another frame, x, y [m], yaw [rad, wrapped], shape (N, 3); T is the pose of
+    its frame in the new one."""
     poses = b.slam.path.poses()
     return np.column_stack([T.apply(poses[:, :2]), wrap_angle(poses[:, 2] + T.yaw)])
 

@@ -70,7 +70,7 @@ def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:
 
     Raises:
         SourceError: The scheme is that of a live robot, or the source cannot be opened.
-        UsageError: The scheme is unknown.
+        UsageError: The scheme is unknown, or the scenario or its options are not valid.
     """
     if scheme == "sim":
         from pipeline.io.readers.simulated import open_simulated

@@ -119,8 +119,8 @@ def shared_parts(first: str, second: str) -> int:
 
 
 def picture_of(message: Message, channels: Mapping[int, Channel], stamp_ns: int) -> Picture | None:
-    """Return the picture in a message; None if it cannot be decoded, or its sizes contradict each other or
-    exceed BYTES_LIMIT or PIXEL_LIMIT.
+    """Return the picture in a message; None if it cannot be decoded, the message is longer than BYTES_LIMIT,
+    or the sizes of raw pixels contradict each other or exceed PIXEL_LIMIT. Files (JPEG, PNG) are not checked.
 
     Args:
         message: Image or CompressedImage.

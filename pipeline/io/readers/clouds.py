@@ -58,8 +58,8 @@ def is_place(xyz: Float) -> NDArray[np.bool_]:
 
 
 def offset_for(middle: Float) -> Float:
-    """Return the offset of a cloud by a position in it, shape (3,) [m]: per axis 0 up to 1000 m, beyond that
-    rounded to 100 m.
+    """Return the offset of a cloud by a position in it, shape (3,) [m]: per axis 0 below 1000 m in magnitude,
+    else rounded to 100 m.
 
     The offset has whole hundreds of metres, so 32 bits hold the rest of the coordinates without loss.
     """

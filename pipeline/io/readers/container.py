@@ -313,7 +313,8 @@ class ChunkedFile(IndexedContainer):
     unreadable = "messages in damaged chunks of the recording"
 
     def __init__(self, path: Path) -> None:
-        """Open the file and read its index; chunks without a valid index are unpacked.
+        """Open the file and read its index; chunks without a valid index are unpacked. Times after steps back
+        of the recorder's clock are shifted.
 
         Raises:
             SourceError: The file cannot be opened, has another format, or defines no channel.

@@ -77,7 +77,8 @@ class McapFile(ChunkedFile):
         """Yield all definitions, attachments, metadata and messages that can be read; other chunks and
         records are counted in `damage`. Attachments with a wrong checksum are among these. Chunks are yielded
         in the order of the file, with the times that they have there, and with their own definitions, which
-        repeat earlier ones. Of a chunk that is damaged in part the records before the damage are yielded."""
+        repeat earlier ones. Of a chunk that is damaged in part the records before the damage are yielded.
+        SourceError if the disk refuses."""
         yield from self._schemas.values()
         yield from self._definitions.values()
         for opcode, offset, length in self._further:

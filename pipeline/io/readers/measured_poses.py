@@ -548,7 +548,8 @@ class FrameAlignment:
         return None
 
     def finish(self) -> tuple[Any, str]:
-        """Fit the frame to all readings; return it and "", or None and the reason why it is unknown."""
+        """Fit the frame to all readings; return it and "", or None and the reason why it is unknown. In both
+        cases the number of damaged readings is added to the text, if there are any."""
         if self._origin is None:
             return None, "no odometry can be read"
         found, why = self._fit(self._origin[1])
@@ -705,8 +706,8 @@ class FrameAlignments:
             self._open.remove(alignment)
 
     def _align_recording(self, alignment: FrameAlignment) -> tuple[Any, str]:
-        """Return the frame by the first _MOST_READINGS messages of a recording and "", or None and the
-        reason. Reading ends when the frame is known or refused."""
+        """Return the frame by the first _MOST_READINGS messages of a recording and a text without meaning, or
+        None and the reason. Reading ends when the frame is known or refused."""
         messages = self._container.messages(alignment.readings | self._odometry, None, {})
         for message in islice(messages, _MOST_READINGS):
             for stamped in self._times_of(message, {}):

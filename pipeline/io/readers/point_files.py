@@ -297,7 +297,8 @@ def _open_pcd(path: Path, head: bytes) -> PointTable:
     """Return the table of a PCD file with these first bytes.
 
     Raises:
-        ScanFileError: The header is damaged, lacks x, y or z, or promises too many points.
+        ScanFileError: The header is damaged, lacks x, y or z, or promises too many points, or packed data of
+            more than WHOLE_LIMIT bytes.
         OSError: It cannot be read.
     """
     dtype, points, data, start = _pcd_header(head)
@@ -463,7 +464,8 @@ def _open_ply(path: Path, head: bytes) -> PointTable:
     """Return the table of the vertices of a PLY file with these first bytes.
 
     Raises:
-        ScanFileError: The header is damaged, has no vertices with x, y and z, or lists precede the vertices.
+        ScanFileError: The header is damaged, has no vertices with x, y and z, or has lists in the vertices
+            or, in a binary file, before them.
         OSError: It cannot be read.
     """
     order, elements, start = _ply_header(head)
@@ -545,7 +547,9 @@ class _NumpyArray:
     fortran: bool
 
     def streams(self) -> list[_Stream]:
-        """Return the records of a table, or its columns if they are stored one after the other.
+        """Return the records of a table, or its columns if they are stored one after the other. The fields of
+        a structured array keep their names; the columns of a plain table are x, y, z, with four or five
+        columns also intensity, and the others are not used.
 
         Raises:
             ScanFileError: The array is not a table of numbers.
@@ -581,8 +585,8 @@ class _NumpyArray:
 
 
 def _open_npz(path: Path) -> PointTable:
-    """Open the array with a usual name, else the first that is a table of points, else arrays x, y and z of
-    equal length.
+    """Return the table of the array with a usual name (_BEST_NAMES, the first of them), else of the first
+    that is a table of points, else of arrays x, y, z and, if there is one, intensity of equal length.
 
     Raises:
         ScanFileError: The file is damaged or has no such array.

@@ -56,8 +56,8 @@ def read_poses(path: Path) -> list[Pose3]:
 
 
 def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
-    """Return times and poses of the LiDAR from a file: TUM rows t x y z qx qy qz qw with times [ns], or KITTI
-    rows (times None).
+    """Return times and poses of the LiDAR from a file: TUM rows t x y z qx qy qz qw with times [ns], int64,
+    shape (N,), or KITTI rows (times None, see `read_poses`).
 
     Raises:
         TextError: It has neither format, times that do not ascend, quaternions of no length, or positions
@@ -121,7 +121,7 @@ def _check_positions(positions: Float) -> None:
     """Check positions [m].
 
     Raises:
-        TextError: A position is beyond COORDINATE_LIMIT or NaN.
+        TextError: A coordinate is NaN, or its magnitude is not less than COORDINATE_LIMIT.
     """
     if not (np.abs(positions) < COORDINATE_LIMIT).all():
         raise TextError(f"it has positions beyond {COORDINATE_LIMIT:.0e} m")

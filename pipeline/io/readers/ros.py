@@ -185,7 +185,7 @@ class RosSource(MessageSource):
             yield record
 
     def _stamped(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message]]:
-        """Yield a message with its time, scans after other messages of the same time; nothing, counted in
+        """Yield a message with its time, with the rank 1 for a scan and 0 for others; nothing, counted in
         `losses`, if its time is impossible."""
         time_ns = self._clock.time_of(header_stamp(self._channels[message.channel], message.payload), message)
         if time_ns is None:
@@ -291,7 +291,8 @@ class RosSource(MessageSource):
     def _describe(
         self, first: Scan, frame: str, sensor: Sensor, digest: str, options: SourceOptions
     ) -> SourceDescription:
-        """Return the description of the source, and set the base frame.
+        """Return the description of the source with all warnings, to which some about frames, times and
+        damage are added, and set the base frame.
 
         Args:
             first: First scan.

@@ -47,7 +47,8 @@ class Db3File(IndexedContainer):
     unreadable = "messages that the database cannot give"
 
     def __init__(self, path: Path) -> None:
-        """Open the database and read the index of all messages.
+        """Open the database and read the index of all messages. Times after steps back of the recorder's
+        clock are shifted.
 
         Raises:
             SourceError: It is not a bag, or its tables cannot be read.

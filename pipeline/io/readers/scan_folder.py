@@ -54,6 +54,7 @@ class ScanFolder(FileSource):
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
         """Find the scan files, read the files of times and poses, and load the first scan that can be read.
+        Recordings of other formats in the folder give a warning.
 
         Raises:
             SourceError: There are no files, or none of the first ones holds a scan.
@@ -154,6 +155,7 @@ class ScanFolder(FileSource):
     def _read_stamps(self, places: list[Path], numbers: Int) -> Int:
         """Return the time of each scan [ns], int64, shape (N,): by a file of times, by the names, or else
         STEP_NS apart by the numbers. A file of times that is used is added to the files of the digest.
+        `_timed` is set to whether times were found.
 
         Args:
             places: Folders that are searched.
@@ -206,8 +208,8 @@ class ScanFolder(FileSource):
         return [poses[row] for row in rows.tolist()]
 
     def _rows(self, name: str, count: int, numbers: Int) -> Int | None:
-        """Return the row of each scan in a text file: the number of the scan if there are enough rows, else
-        its index if there are as many rows as scans; None (with a warning) if neither fits.
+        """Return the row of each scan in a text file, int64, shape (N,): the number of the scan if there are
+        enough rows, else its index if there are as many rows as scans; None (with a warning) if neither fits.
 
         Args:
             name: Name of the file.
@@ -247,7 +249,8 @@ def _in_order(files: list[Path]) -> list[Path]:
 
 
 def _times_in_names(files: list[Path]) -> Int | None:
-    """Return the times in the names of the files [ns], None when the names are no ascending times."""
+    """Return the times in the names of the files [ns], int64, shape (N,); None if a name is no time, or they
+    do not ascend strictly."""
     if not all(_TIME_NAME.fullmatch(file.stem) for file in files):
         return None
     stamps = [_name_ns(file.stem) for file in files]

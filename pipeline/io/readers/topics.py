@@ -160,7 +160,7 @@ def is_fixed(topic: str) -> bool:
 
 
 def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where: str) -> Topics:
-    """Choose the topics by role.
+    """Return the topics that are read by role, and all topics.
 
     Args:
         channels: Channels of the recording.
@@ -172,7 +172,8 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
 
     Raises:
         SourceError: There is no topic with scans, a role is unknown, or a topic chosen by the user does not
-            exist or has no type for its role. The message lists the topics.
+            exist or has no type for its role. The message lists the topics; that of an unknown role the
+            roles.
     """
     topics = _group(channels)
     unknown = sorted(wanted.keys() - TYPES_BY_ROLE.keys())

@@ -328,8 +328,9 @@ def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
 
 
 def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:
-    """Return the row of the trajectory for each file, int64, and warnings: the number of the file, or its
-    index if there are as many rows as files.
+    """Return the row of the trajectory for each file, int64, shape (N,), and warnings: the number of the file
+    if there are enough rows, else its index if there are as many rows as files. Rows without a file give a
+    warning.
 
     Args:
         number: Frame number of each file, ascending.

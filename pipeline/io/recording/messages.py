@@ -412,8 +412,8 @@ def _marker(
 
 
 def _detection(trees: Trees, row: int, head: Any) -> Any:  # noqa: ANN401
-    """Return a vision_msgs/Detection3D of the tree in a row, with the fixed height STEM_HEIGHT; an unknown
-    diameter has the width 0."""
+    """Return a vision_msgs/Detection3D of the tree in a row, class "tree" with the score 1, with the
+    covariance of its position and the fixed height STEM_HEIGHT; an unknown diameter has the width 0."""
     x, y = (float(value) for value in trees.position[row])
     covariance = np.zeros((6, 6))
     covariance[:2, :2] = trees.covariance[row]
