@@ -123,8 +123,8 @@ class Rate:
 
 @dataclass(frozen=True, slots=True)
 class MapScores:
-    """Scores of a map against the ground truth within reach of the path. Lengths are in metres; a score
-    without matched trees is None.
+    """Scores of a map against the ground truth within reach of the path. Lengths are in metres; an error
+    without matched trees, and a share of nothing, is None.
 
     Attributes:
         TA, FR: True acceptances and false rejections of the real trees; the counts sum to the real trees.

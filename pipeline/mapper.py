@@ -453,8 +453,8 @@ class Mapper:
     def _apply(
         self, index: int, correction: Correction | None, estimate: PoseEstimate
     ) -> tuple[PoseEstimate, Correction | None]:
-        """Correct SLAM, trees, columns and terrain by a decision, and end a search that is over.
-
+        """Correct SLAM, trees, columns and terrain by a decision. A loop, a located pose and a failed search
+        end the search and discard the stored states of the relocaliser (`Relocaliser.reset`).
         Args:
             index: Number of the scan.
             correction: The decision; None changes nothing.

@@ -148,9 +148,8 @@ _LOOKED, _RAYS = NAMES.index("looked at up to"), NAMES.index("rays up to")
 
 
 def seen_higher(columns: Columns) -> Int:
-    """Return at most MOST_STALE tiles, int64, shape (T, 2), with columns above which scans have looked at
-    least HIGHER since they were classified, largest increase of the visible height first; none without
-    columns.
+    """Return at most MOST_STALE tiles, int64, shape (T, 2), with columns whose visible height has increased
+    by more than HIGHER since they were classified, largest increase first; none without columns.
 
     A person next to the robot at the start is seen from two metres, where no ring reaches above the head.
     Later views from a distance add few returns, so that the tile does not count as grown.
@@ -272,8 +271,8 @@ class ColumnClassifier:
 
         Args:
             points: Points in the level sensor frame, float32, shape (N, 3) [m].
-            height: Their heights above the ground, shape (N,) [m]; points of unknown height (NaN) or above
-                SLICES * SLICE are ignored.
+            height: Their heights above the ground, shape (N,) [m]; points of unknown height (NaN), not above
+                0, from SLICES * SLICE on, or `range_max` or farther from the base are ignored.
             scan: Number of the scan, not negative, ascending.
             view: Pose and visibility of the scan.
         """

@@ -153,7 +153,7 @@ class VoxelMap:
         return self._with_room(np.arange(self.used), len(self.key), len(self.tile_key))
 
     def add(self, points: Float32, scan: int, most: int) -> None:
-        """Add the points of a scan, in place. Points below the ground, higher than SLICES * SLICE, farther
+        """Add the points of a scan, in place. Points below the ground, at SLICES * SLICE or higher, farther
         than 1,000 km, or with NaN are ignored; the scan counts in `added` even without points.
 
         When the map is full, its room grows to `most` voxels; a map with `most` voxels or more of room
@@ -175,15 +175,15 @@ class VoxelMap:
 
     def due_tiles(self, grown: float) -> Int:
         """Return the tiles, int64, shape (T, 2), whose returns have grown by more than the factor `grown`
-        since they were last classified, and mark them as classified. After FIRST_SCANS scans at most the
-        `MOST_TILES` with the largest growth are returned, which bounds the time of a scan; the others remain
-        due."""
+        since they were last classified, and mark them as classified. Tiles that were never classified are
+        due. After FIRST_SCANS scans at most the `MOST_TILES` with the largest growth, the older ones of equal
+        tiles, are returned, which bounds the time of a scan; the others remain due."""
         most = MOST_TILES if self.added > FIRST_SCANS else self.tiles
         return _select_due(self._tables(), self.tiles, grown, most)
 
     def around(self, tile: Int, margin: float) -> tuple[Float32, Int32]:
-        """Return mean (N, 3) [m] and number of returns (N,) of the voxels of a tile and within `margin` [m]
-        around it, as copies; empty where nothing was seen.
+        """Return mean, float32, shape (N, 3) [m], and number of returns, int32, shape (N,), of the voxels
+        whose mean is in a tile or within `margin` [m] around it, as copies; empty where nothing was seen.
 
         Args:
             tile: Indices of the tile along x and y, shape (2,).
@@ -561,10 +561,12 @@ class PackedVoxelMap:
         return memory
 
     def checked(self) -> PackedVoxelMap:
-        """Return this object after a check of the columns, which may come from a file.
+        """Return this object after a check of the columns, which may come from a file. Means, numbers of
+        returns and scans are not checked.
 
         Raises:
-            ValueError: The columns contradict each other or a key is not valid.
+            ValueError: The columns have different lengths, a key is negative or repeated, the tiles are not
+                those of the keys, or a room is no power of two or too small or large.
         """
         n, tiles = len(self.key), len(self.tile_judged)
         for room, used in ((self.room, n), (self.tile_room, tiles)):

@@ -153,8 +153,8 @@ def _with_rows(clusters: Clusters, others: Clusters, rows: Int) -> Clusters:
 def describe(
     points: Float32, labels: Labels, sensor: Sensor, parameters: Shape, lift_of: LiftOf = no_lift
 ) -> Clusters:
-    """Return the shape of each cluster; all verdicts are OTHER and `cut` is False.
-
+    """Return the shape of each cluster; all verdicts are OTHER, `cut` is False, and `hidden` is the array of
+    the labels.
     With the centre "centroid", radius and its sigma are NaN and the arc is 0; so are those of clusters with
     fewer than five points.
 

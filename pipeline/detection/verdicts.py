@@ -15,8 +15,8 @@ from pipeline.types.records import Bool, Clusters, Detections, Verdict
 
 def classify_clusters(clusters: Clusters, parameters: Detection) -> Clusters:
     """Return the clusters with new verdicts: that of the first check that fails, in the order of `checks`,
-    else TREE. The argument is not changed; its verdicts have no effect. A check of an unknown value (NaN)
-    does not fail."""
+    else TREE. The argument is not changed; its verdicts have no effect, and its other columns are shared. A
+    check of an unknown value (NaN) does not fail."""
     verdict = np.full(len(clusters.size), Verdict.TREE, np.int32)
     for check in reversed(checks(clusters, parameters)):  # the first check that fails is written last
         verdict[check.fails] = check.verdict

@@ -63,8 +63,8 @@ class GrowingColumns:
         return [column[: self._length] for column in self._columns]
 
     def write(self, start: int, *rows: Column) -> None:
-        """Replace the rows from `start`, which is at most N, onwards.
-
+        """Replace the rows from `start`, which is at most N, onwards; N becomes `start` plus the number of
+        the new rows.
         Args:
             start: First row.
             rows: The new rows of each column.
@@ -81,8 +81,8 @@ class GrowingColumns:
         self._length = end
 
     def return_to(self, length: int) -> None:
-        """Set the number of rows to `length`, which was reached before; rows after the present ones are those
-        that were written there last."""
+        """Set N to `length`, at most the largest N so far. A larger N than the present one gives back the
+        rows that were written there last."""
         self._length = length
 
 

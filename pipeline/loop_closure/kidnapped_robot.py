@@ -121,7 +121,8 @@ class Relocaliser(Generic[S]):
             parameters: Parameters of all stages.
 
         Returns:
-            The older stored state, to which the mapper must return, with the motions since then.
+            The older stored state (or the only one), to which the mapper must return, with the motions since
+            then.
 
         Raises:
             IndexError: No state was stored by `remember`.

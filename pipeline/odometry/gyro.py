@@ -55,7 +55,7 @@ class Gyro:
             imu: The reading.
             tilt: Roll and pitch [rad].
             standing: Whether the robot stands still by its wheels.
-            needed_ns: Readings from shortly before this time on are kept.
+            needed_ns: Readings from KEEP_NS before this time on are kept.
         """
         _, wy, wz = (float(w) for w in imu.angular_velocity)
         roll, pitch = tilt

@@ -113,8 +113,9 @@ class SharedErrors:
         )
 
     def drawn(self, rows: Int) -> SharedErrors:
-        """Return the estimates of resampled particles: those of the given rows, int64, shape (P,). The arrays
-        are independent copies; the estimates themselves before the first shared pose."""
+        """Return the estimates of resampled particles: those of the given rows, int64, shape (P,). `mean` and
+        `covariance` are copies, the other arrays are shared. Before the first shared pose the estimates
+        themselves are returned."""
         if not self.begun:
             return self
         # Indexing with brackets gives another memory layout, for which the kernels would be compiled again.
@@ -176,8 +177,9 @@ class SharedErrors:
     def without_shared_error(self, pose: PoseMeasurement, weights: Float) -> PoseMeasurement:
         """Return a measured pose minus the estimated shared error, H e, with the covariance R + H E H^T.
 
-        e and E are the mean and the covariance of the error over the particles. A pose without shared errors,
-        and each pose before the first shared one, is returned unchanged.
+        e and E are the mean and the covariance of the error over the particles. All other attributes of the
+        pose remain, `shared` as well. A pose without shared errors, and each pose before the first shared
+        one, is returned unchanged.
 
         Args:
             pose: The measured pose.
@@ -195,7 +197,11 @@ class SharedErrors:
     def for_particles(self, pose: PoseMeasurement | None) -> MeasuredPose:
         """Return a measured pose as the record for the kernels, `no_measured_pose()` for None. With shared
         errors, its mean and covariance are views, which `update_shared_errors` changes in place; a pose
-        without shared errors has its whole covariance as `own` and no particles."""
+        without shared errors has its whole covariance as `own` and no particles.
+
+        Raises:
+            IndexError: The pose has shared errors, and no estimates were begun (`begun_at`).
+        """
         nothing = no_measured_pose()
         if pose is None:
             return nothing

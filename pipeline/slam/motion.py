@@ -351,7 +351,8 @@ def moved_poses(pose: Float, motion: Float) -> Float:
 
 @compiled
 def moved_pose(pose: Float, motion: Float) -> Float:
-    """Return one pose x, y [m], yaw [rad], shape (3,), after a motion in its own frame, shape (3,)."""
+    """Return one pose x, y [m], yaw [rad], shape (3,), after a motion in its own frame, shape (3,), with yaw
+    in [-pi, pi). The arguments are unchanged."""
     one = np.empty((1, 3))
     for i in range(3):
         one[0, i] = pose[i]

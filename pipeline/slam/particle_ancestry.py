@@ -401,8 +401,8 @@ class TrajectoryBuffer:
         self.sigma_xy[-1] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
 
     def return_to(self, length: int) -> None:
-        """Set the number of scans to one that was reached before. After a return, scans that follow again
-        keep their rows until they are replaced."""
+        """Set the number of scans to `length`, at most the largest number so far. Rows beyond it keep their
+        values, which a later return to a larger number gives back, until `append` replaces them."""
         self._rows.return_to(length)
         self._with_pose = min(self._with_pose, length)
 

@@ -156,8 +156,8 @@ def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
 
 @compiled_within
 def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
-    """Copy row b of the pool to row n of the pool of `other`, which may be the same. Loops compile faster
-    than slices."""
+    """Copy landmarks and bounding box of row b of the pool to row n of the pool of `other`, which may be the
+    same; `owners` and `free` are not changed. Loops compile faster than slices."""
     for o in range(ROOM):
         other.mean[n, o, 0], other.mean[n, o, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
         for a in range(3):

@@ -57,7 +57,8 @@ class Room(NamedTuple):
 
 @compiled
 def room_for(detections: int, landmarks: int) -> Room:
-    """Return work arrays with space for all pairs, with the detections in ascending sequence."""
+    """Return work arrays with space for all pairs of these numbers of detections and landmarks. `sequence`
+    holds the detections in ascending order; the other arrays are uninitialised."""
     pairs = detections * landmarks
     return Room(
         np.empty(pairs, np.int64),

@@ -239,8 +239,9 @@ def search_offset(pose: Float, centre: Float, sigma: Float, landmarks: Float) ->
 def _on_landmark(
     x: float, y: float, c: float, s: float, centre: Float, d: int, landmarks: Float, reach: float
 ) -> int:
-    """Return 1 if detection d at a pose x, y [m] with cosine c and sine s of its yaw is within `reach` [m] of
-    a landmark, else 0."""
+    """Return 1 if detection d (row of `centre`, base frame, shape (D, 2) [m]) at a pose x, y [m] with cosine
+    c and sine s of its yaw is nearer than `reach` [m] to a landmark (`landmarks`, frame of the map, shape (L,
+    2) [m]), else 0."""
     wx = x + c * centre[d, 0] - s * centre[d, 1]
     wy = y + s * centre[d, 0] + c * centre[d, 1]
     for j in range(landmarks.shape[0]):
