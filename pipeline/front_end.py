@@ -132,6 +132,9 @@ def segment(
         T_base_lidar: Pose of the LiDAR on the robot.
         parameters: Parameters of all stages.
         timer: Called with the name of each stage; its context encloses the stage.
+
+    Raises:
+        ValueError: The cloud is too wide for the clustering engine "grid", see `dbscan_grid`.
     """
     if step.scan.stems is not None:
         return _segment_stems(step, step.scan.stems, T_base_lidar, parameters, timer)
@@ -157,7 +160,7 @@ def detect(scan: SegmentedScan, parameters: Detection, timer: StageTimer = no_ti
 def _segment_points(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, p: Parameters, timer: StageTimer
 ) -> SegmentedScan:
-    """Return the segmented scan of a LiDAR; arguments as in `segment`.
+    """Return the segmented scan of a LiDAR; arguments and errors as in `segment`.
 
     `column_input` is None unless the parameter `classification.method` is "columns" and the scan is due after
     `classification.interval`; `terrain` is None unless the scan updates the terrain map, which is due midway

@@ -177,8 +177,8 @@ class Mapper:
         return self._frame(step, scan, found, estimate, notices, correction, closure)
 
     def segment(self, step: Step) -> SegmentedScan:
-        """Return a scan filtered and segmented into ground and clusters by the present parameters. The map is
-        unchanged."""
+        """Return a scan filtered and segmented into ground and clusters by the present parameters, see
+        `front_end.segment`; the timer of the mapper encloses each stage. The map is unchanged."""
         return segment(step, self._sensor, self._T_base_lidar, self._parameters, self._timer)
 
     def segmenter(self) -> Callable[[Step], SegmentedScan]:
@@ -283,8 +283,8 @@ class Mapper:
     def _predict_motion(self, step: Step) -> tuple[Motion, tuple[str, ...]]:
         """Return the motion since the last scan with its uncertainty, by odometry and gyroscope, and
         warnings. A scan without odometry, and the first one with it, has no motion. When a missing odometry
-        returns, the motion since it was missing is left out if trees have determined it meanwhile. Stores the
-        odometry pose of the scan."""
+        returns, the motion since it was missing is left out if trees have determined it meanwhile, and else
+        included without the gyroscope. Stores the odometry pose of the scan."""
         before, now = self._odometry, step.T_odom_base
         self._odometry = before if now is None else now
         driven = Pose2() if before is None or now is None else before.inverse() @ now
@@ -455,6 +455,7 @@ class Mapper:
     ) -> tuple[PoseEstimate, Correction | None]:
         """Correct SLAM, trees, columns and terrain by a decision. A loop, a located pose and a failed search
         end the search and discard the stored states of the relocaliser (`Relocaliser.reset`).
+
         Args:
             index: Number of the scan.
             correction: The decision; None changes nothing.

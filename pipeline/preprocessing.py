@@ -173,7 +173,7 @@ def _rotate_block(
 
 @compiled
 def _deskew_block(u: Float, v: Float, dt: Float, sensor: Float, twist: Float) -> None:
-    """De-skew the points u, v, w of a block, in place; see `acquire`.
+    """De-skew x and y of the points of a block, in place; see `acquire`.
 
     The rotation within a sweep is less than 0.5 rad; there, the series of sine and cosine are accurate to 0.1
     mm at 100 m and faster than the library functions.

@@ -141,7 +141,7 @@ def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
 @compiled
 def near_rows(x: float, y: float, low: Float, bounds: Int) -> Int:
     """Return the rows of the three by three buckets around a position as runs (first, one past the last; 0, 0
-    for a row of buckets outside), shape (3, 2).
+    for a row of buckets outside), int64, shape (3, 2). A position outside counts to the nearest bucket.
 
     Args:
         x, y: The position [m].

@@ -565,8 +565,8 @@ class PackedVoxelMap:
         returns and scans are not checked.
 
         Raises:
-            ValueError: The columns have different lengths, a key is negative or repeated, the tiles are not
-                those of the keys, or a room is no power of two or too small or large.
+            ValueError: The columns have different lengths, a key is negative or repeated, the keys have
+                another number of tiles, or a room is no power of two or too small or large.
         """
         n, tiles = len(self.key), len(self.tile_judged)
         for room, used in ((self.room, n), (self.tile_room, tiles)):

@@ -155,8 +155,9 @@ def describe(
 ) -> Clusters:
     """Return the shape of each cluster; all verdicts are OTHER, `cut` is False, and `hidden` is the array of
     the labels.
+
     With the centre "centroid", radius and its sigma are NaN and the arc is 0; so are those of clusters with
-    fewer than five points.
+    fewer than five points, whose radial deviation by the circle fit is 0.
 
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.

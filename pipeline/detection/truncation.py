@@ -61,7 +61,7 @@ def is_truncated(
         raw: The whole scan, from which the field of view is estimated, float32, shape (M, 3) [m], same frame.
         sensor: Angle between shots, range sigma and maximum range of the LiDAR.
         filters: The pass-through box, whose vertical faces are borders.
-        acquisition: Minimum and maximum range.
+        acquisition: Minimum and maximum range; the smaller one of this maximum and that of the sensor counts.
     """
     box = np.array([filters.x_min, filters.x_max, filters.y_min, filters.y_max])
     ranges = np.array([acquisition.range_min, min(acquisition.range_max, sensor.range_max)])

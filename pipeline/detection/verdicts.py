@@ -92,7 +92,8 @@ class Check:
 def checks(clusters: Clusters, parameters: Detection) -> tuple[Check, ...]:
     """Return the checks of `classify_clusters` in their order, with all values and limits, as an explanation.
     All checks are returned for all clusters, also those that come after a failed one; the verdicts of the
-    clusters are not read. Radius and arc are NaN for clusters without a circle."""
+    clusters are not read. Radius and arc are NaN for clusters without a circle; `cut` counts as 0 unless the
+    parameter `whole` is set."""
     p, c = parameters, clusters
     has_circle = np.isfinite(c.radius)
     radius = np.where(has_circle, c.radius, np.nan)

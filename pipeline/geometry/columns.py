@@ -65,6 +65,7 @@ class GrowingColumns:
     def write(self, start: int, *rows: Column) -> None:
         """Replace the rows from `start`, which is at most N, onwards; N becomes `start` plus the number of
         the new rows.
+
         Args:
             start: First row.
             rows: The new rows of each column.

@@ -40,7 +40,8 @@ def interpolated(keyframes: Float, motions: Float, scans: Int, keyframe: Int, si
     """Return the pose of each scan between corrected keyframes, x, y [m], yaw [rad], shape (N, 3).
 
     Each pose is its keyframe composed with the odometry since then. The remaining difference to the next
-    keyframe is distributed linearly over the scans between the two.
+    keyframe is distributed linearly over the scans between the two; before the first keyframe and after the
+    last one nothing is distributed.
 
     Args:
         keyframes: Corrected poses, shape (K, 3).

@@ -499,6 +499,7 @@ def find_constellation(
     """Return the pose of local stems in a reference map, without an initial pose, or the reason of a refusal.
     Stems whose position or sigma is not finite are ignored; either side may be empty. The rows of the result
     refer to the tables as given; they are filled for a refused pose as well, and empty if no pose is found.
+
     Args:
         local: Stems in their own frame, for example of the map since the robot was lost.
         reference: Stems in the frame of the map.
@@ -557,8 +558,9 @@ class _Search:
         self._most, self._looked = most, 0
 
     def best_two(self) -> tuple[_Candidate | None, _Candidate | None]:
-        """Return the pose in which most stems agree, and the best pose with other pairs; None for each that
-        does not exist, with the reason in `reason`."""
+        """Return the pose in which most stems agree, and the best pose with other pairs (`is_same`), both of
+        the local stems about their mean. None for each that does not exist; without the first one, `reason`
+        is "too few stems" or "no agreement"."""
         local, reference, p = self._local, self._reference, self._p
         if min(len(local), len(reference)) < p.stems_min:
             return None, None
@@ -581,7 +583,11 @@ class _Search:
     def checked(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
         """Return the pose T_reference_local, its covariance, shape (3, 3), the decimal logarithm of the false
         alarms, and the reason of a refusal (None for none). `second` is the number of pairs of the second
-        best pose, 0 without one."""
+        best pose, 0 without one.
+
+        Raises:
+            LinAlgError: The pairs do not determine the pose.
+        """
         local, reference = self._local, self._reference
         at = np.flatnonzero(best.of >= 0)
         about_mean = Pose2(*(float(v) for v in best.pose))

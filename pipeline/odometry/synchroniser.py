@@ -203,7 +203,8 @@ class PoseBuffer:
 
         A position within SAME_TIME_NS of the scan is returned as it is. Otherwise the latest pose up to the
         scan is predicted to it by the odometry, if it is at most CARRIED_NS older; without odometry it must
-        be within SAME_TIME_NS. That pose and earlier ones are removed.
+        be within SAME_TIME_NS. That pose and earlier ones are removed, also if they are too old; positions
+        are not removed.
 
         Args:
             stamp_ns: Time of the scan [ns].
@@ -224,8 +225,8 @@ class PoseBuffer:
 
 
 def _carried(pose: PoseMeasurement, step: Pose2, stamp_ns: int) -> PoseMeasurement:
-    """Return a pose measurement predicted to a later time: P' = F P F^T + Q; Q has the sigma CARRIED times
-    the distance and the turn of the step.
+    """Return a pose measurement predicted to a later time: P' = F P F^T + Q, shared' = F shared, with the
+    Jacobian F of the step by the pose; Q has the sigma CARRIED times the distance and the turn of the step.
 
     Args:
         pose: The measurement.
@@ -562,8 +563,8 @@ class Synchroniser:
         self._suspect("there is no odometry", (WALK_SPEED * seconds, WALK_TURN * seconds))
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
-        """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None without one, and,
-        with a warning, if it is more than STALE_NS away."""
+        """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None without one, if it
+        is not a valid quaternion, and, with a warning, if it is more than STALE_NS away."""
         if not self._imu:
             return None
         nearest = min(self._imu, key=lambda imu: abs(imu.stamp_ns - stamp_ns))

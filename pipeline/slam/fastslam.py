@@ -178,7 +178,8 @@ class FastSlam:
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Set the pose of all particles by another source; they keep the map and the path of the best
-        particle. Weights, health statistics, shared errors and the motion since the last used scan are reset.
+        particle. Weights, health statistics, shared errors and the motions since the last used scan and since
+        the last keyframe are reset.
 
         If the graph has keyframes, it gets one more without odometry to the one before, and a loop from its
         first keyframe with this pose.
@@ -236,6 +237,9 @@ class FastSlam:
         Returns:
             The correction. None where the graph has no solution; the particles are unchanged then, and the
             next smoothing waits for another revisit.
+
+        Raises:
+            LinAlgError: A covariance in the graph is not positive definite.
         """
         graph, solution = self.state.graph, self.state.graph.solve()
         if solution is None:
@@ -255,6 +259,9 @@ class FastSlam:
         Returns:
             The correction; None if the graph has no solution, or if it gives the loop a weight below
             LOOP_WEIGHT_MIN. The state is unchanged then.
+
+        Raises:
+            LinAlgError: A covariance in the graph, or that of the loop, is not positive definite.
         """
         state, graph = self.state, self.state.graph
         path = state.genealogy.path(state.best)

@@ -78,6 +78,9 @@ class FrameUncertainty:
                 (L,).
             hits_min: Landmarks with fewer hits are ignored.
             reach: Landmarks farther from the pose are ignored [m].
+
+        Raises:
+            LinAlgError: `spread` is not positive semidefinite.
         """
         covariance, hidden = _with_frame(
             pose, spread, n_eff, mean, birth, hits, hits_min, reach, self.serial, self.pose, self.covariance,
@@ -109,6 +112,9 @@ class FrameUncertainty:
             n_eff: Effective number of particles.
             least: Lower bound of the covariance by measured poses and odometry, shape (3, 3).
             by_landmarks: Covariance by the landmarks in reach, shape (3, 3); None without any.
+
+        Raises:
+            LinAlgError: `spread` is not positive semidefinite.
         """
         covariance = at_least(spread, np.ascontiguousarray(least), NOISE / np.sqrt(n_eff))
         if by_landmarks is not None and np.trace(by_landmarks[:2, :2]) < np.trace(covariance[:2, :2]):
@@ -172,6 +178,9 @@ class FrameUncertainty:
         Args:
             correction: Path before and after.
             covariance: Covariance of the corrected pose at the scan of each reference pose, shape (M, 3, 3).
+
+        Raises:
+            IndexError: The scan of a reference pose is not in the path.
         """
         return replace(self, pose=correction.poses(self.pose, self.scan), covariance=covariance)
 
@@ -188,6 +197,9 @@ class FrameUncertainty:
             spread: Covariance from which the particles are drawn, shape (3, 3).
             total: Covariance of the pose in the frame of the map, shape (3, 3).
             at: x, y [m], yaw [rad] of the pose, shape (3,).
+
+        Raises:
+            LinAlgError: `spread` is not positive semidefinite.
         """
         return replace(self, hidden=at_least(spread, np.ascontiguousarray(total)) - spread, at=at)
 

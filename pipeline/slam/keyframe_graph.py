@@ -89,6 +89,7 @@ class ScanDetections:
 def combined(scans: Sequence[ScanDetections | Keyframe], T_keyframe_base: Float) -> tuple[Int, Float, Float]:
     """Return the means of detections of the same landmark over several scans, weighted by the inverse traces
     of their covariances.
+
     Of more than STEMS_MAX landmarks those with the smallest value of a hash are taken. All keyframes use the
     same hash, so that a stem which one keyframe takes is taken by the others as well, as far as they see it
     (bottom-k sampling; Broder 1997), near and far.
@@ -256,8 +257,9 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
     def without_uncertain(self, places: Places) -> KeyframeGraph:
-        """Return the graph without associations with landmarks of places that were not seen for certain in
-        the last REVISIT_DISTANCE; the path may have drifted by more than the distance between trees."""
+        """Return the graph in which each keyframe lacks the detections of landmarks whose place was last seen
+        for certain more than REVISIT_DISTANCE before the keyframe: the path may have drifted by more than the
+        distance between trees. Landmarks that precede all places remain."""
 
         def cleaned(keyframe: Keyframe) -> Keyframe:
             keep = places.last_seen(keyframe.birth) >= keyframe.distance - REVISIT_DISTANCE
@@ -530,7 +532,7 @@ class _Problem:
     def _factorised(self, H: Sparse, damping: float) -> Callable[[Float], Float] | None:
         """Return the function that solves for right-hand sides, shape (3K + 2L,) or (3K + 2L, N), by the LU
         factors of the normal matrix H plus `damping` times its diagonal, with the first pose fixed; None if
-        this matrix is singular."""
+        this matrix is singular. The first call stores the order of elimination in `order`."""
         from scipy import sparse
         from scipy.sparse.linalg import splu
 

@@ -97,6 +97,7 @@ class SharedErrors:
     def begun_at(cls, particles: int, pose: Float, covariance: Float) -> SharedErrors:
         """Return the estimates before the first measured pose: errors N(0, I), independent of the pose, and
         no `by_trees`.
+
         Args:
             particles: Number of particles.
             pose: Estimated pose, shape (3,).
@@ -286,8 +287,9 @@ def within_gate(T_map_base: Pose2, covariance: Float, motion: Motion, noise: Noi
     """Return whether a measured pose agrees with the prediction: y^T (P + R)^-1 y <= gate of the measurement.
     The gate is a squared Mahalanobis distance.
 
-    y is the difference to the predicted pose, P the covariance of the prediction and R that of the
-    measurement. Without a measured pose, or with an infinite gate, the result is True.
+    y is the difference to the predicted pose, P the covariance of the prediction with noise and slack of the
+    motion, and R that of the measurement, shared errors included. Without a measured pose, or with an
+    infinite gate, the result is True.
 
     Args:
         T_map_base: Pose before the motion.

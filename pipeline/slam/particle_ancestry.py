@@ -230,7 +230,7 @@ class Genealogy:
     @classmethod
     def of_path(cls, path: Float, particles: int) -> Genealogy:
         """Return an ancestry in which all particles have the same path, x, y [m], yaw [rad], shape (N, 3),
-        and no founders."""
+        and no founders. All whole blocks are settled; the poses after them are rounded to float32."""
         blocks = len(path) // BLOCK
         settled = tuple(path[BLOCK * k : BLOCK * (k + 1)].copy() for k in range(blocks))
         recent = tuple(

@@ -247,7 +247,7 @@ def map_of(maps: Maps, p: int) -> tuple[Float, Float, Int32, Float32, Int]:
 def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Float, Float, Int32, Int]:
     """Return the landmarks of particle p within `reach` [m] of x, y [m]: positions, shape (L, 2) [m];
     covariances xx, xy, yy, shape (L, 3) [m^2]; hits, int32, and birth numbers, int64, shape (L,). The
-    distance must be smaller than `reach`; the arrays are copies."""
+    distance must be smaller than `reach`; the arrays are copies, in the order of the places."""
     places = maps.places[p]
     mean, covariance, hits = np.empty((places, 2)), np.empty((places, 3)), np.empty(places, np.int32)
     birth = np.empty(places, np.int64)
@@ -272,6 +272,7 @@ def known_near(maps: Maps, p: int, x: float, y: float, reach: float) -> tuple[Fl
 @compiled
 def blocks_in_reach(maps: Maps, pose: Float, reach: float, fresh: int) -> tuple[Int32, Int32, int]:
     """Return the blocks of each particle whose bounding box is at most `reach` from its pose.
+
     Args:
         maps: Maps.
         pose: Poses, shape (P, 3).

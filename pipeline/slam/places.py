@@ -120,8 +120,8 @@ class Places:
         return (row < 0) | ~self.inactive[row] if len(self.birth) else row < 0
 
     def in_reach(self, birth: Int, distance: float) -> PlaceStates:
-        """Return the states of the places at a distance driven [m] for the landmarks of one scan; an empty
-        table if the places of all of them are active.
+        """Return the states of all places at a distance driven [m]; an empty table if the places of the given
+        landmarks are all active.
 
         Args:
             birth: Birth numbers of the landmarks in reach, int64, shape (L,).

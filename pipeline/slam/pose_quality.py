@@ -92,6 +92,7 @@ def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float)
 @compiled
 def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> float:
     """Return the Mahalanobis distance of two motions [sigma]. The yaw difference is wrapped.
+
     Args:
         by_trees, by_odometry: x, y [m], yaw [rad], shape (3,).
         covariance: Covariance of the odometry, shape (3, 3); SIGMA_FLOOR squared is added to its diagonal.
@@ -183,8 +184,8 @@ class RunningStatistics:
 
     @property
     def is_tree_motion_reliable(self) -> bool:
-        """Whether trees determined the motion in enough scans (TREE_MOTION_SCANS) to be trusted without the
-        odometry."""
+        """Whether `led` has reached the value after TREE_MOTION_SCANS scans in a row in which trees
+        determined the motion, so that it is trusted without the odometry."""
         return self.led >= TREE_MOTION_STEP * TREE_MOTION_SCANS
 
     def odometry_trust(self, noise: Noise) -> OdometryTrust:

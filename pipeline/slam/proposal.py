@@ -91,7 +91,8 @@ def likely_pairs(
     distance_max: float,
     room: Room,
 ) -> int:
-    """Collect the pairs within the gate in `room`, sorted by cost; return their number.
+    """Collect the pairs within the gate in `room`, sorted by cost, and set `landmark_of` of all detections to
+    -1; return the number of pairs.
 
     Args:
         pose: Pose before the scan.

@@ -169,7 +169,8 @@ def split(
     """Prepare the next Kalman update of some trees, so that it becomes one of split covariance intersection.
 
     Args:
-        P: Covariances of the states, shape (T, 4, 4); those of `rows` are replaced by P1.
+        P: Covariances of the states, shape (T, 4, 4); the position blocks of `rows` are replaced by P1,
+            before the prediction.
         shared: Shared parts of P, shape (T, 2, 2) [m^2]; those of `rows` are replaced by the shared part
             after the update.
         rows: Row of the tree of each measurement, without duplicates, shape (D,).

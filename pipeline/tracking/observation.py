@@ -42,10 +42,11 @@ def add_observations(
     """Add the detections of one scan to the columns of their tracks, in place: hits, sums of eccentricities
     and radii, and observed sides. NaN in eccentricity or radius adds nothing to its sum.
 
-    A radius is weighted by its variance and by the square of its distance. The errors that a fit does not
-    know, such as the width of a beam, grow with the distance and are the same in every scan, so a hundred
-    distant views must not outweigh a few near ones. It is also weighted by its height, since the taper of the
-    stem is unknown.
+    A radius is converted to breast height, by TAPER from above and by BUTT from below. It is weighted by its
+    inverse variance and by the inverse square of its distance: the errors that a fit does not know, such as
+    the width of a beam, grow with the distance and are the same in every scan, so a hundred distant views
+    must not outweigh a few near ones. The weight also decreases with the distance from breast height, since
+    the taper of the stem is unknown.
 
     Args:
         tracks: The tracks.

@@ -119,6 +119,7 @@ class TrackTable:
     ) -> TrackTable:
         """Return K new tracks without observations (hits 0), landmark and class, with the score 1 and
         consecutive numbers.
+
         Args:
             number: Number of the first one.
             stamp_ns: Time of the scan.
