@@ -340,8 +340,9 @@ class Mapper:
     def _update_trees(
         self, step: Step, scan: SegmentedScan, found: DetectionResult, estimate: PoseEstimate
     ) -> None:
-        """Update the Kalman filters of the trees, and classify new ones by the present columns. The scan that
-        finds a lost robot again has no data association, and updates no filter.
+        """Update the Kalman filters of the trees, and classify new ones by the present columns. A scan that
+        is not a view, and the one that finds a lost robot again, which has no data association, update no
+        filter.
 
         Args:
             step: The scan.

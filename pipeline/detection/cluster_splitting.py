@@ -68,8 +68,9 @@ def split_trunks(
     """Separate a trunk from each cluster that is not a single trunk but shows one in enough slices. The
     arguments are not changed.
 
-    Only clusters are examined that are too rough (ROUGH), wide or thick for a trunk, narrower than WIDEST,
-    high enough for the slices, and not hidden at an edge.
+    Only clusters are examined that are too rough (ROUGH), too wide (more than the largest diameter) or too
+    thick (more than the largest radius) for a trunk, narrower than WIDEST, high enough for the slices, and
+    not hidden at an edge.
 
     Args:
         points: float32, shape (N, 3) [m], level sensor frame.

@@ -329,7 +329,8 @@ class FastSlam:
 
     @property
     def is_supported(self) -> bool:
-        """Whether known trees were found where they should be visible, see `pose_quality.is_supported`."""
+        """Whether known trees were found where they should be visible, see `pose_quality.is_supported`. True
+        before any tree is known."""
         return is_supported(self.state.recent)
 
     @property

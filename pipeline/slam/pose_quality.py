@@ -214,8 +214,8 @@ def update_statistics(
     """Return the running statistics after one more scan.
 
     A mean is unchanged by a scan that does not measure it: `innovation` by NaN, `found` without well-known
-    landmarks in free view, `ambiguous` and `familiar` below FEWEST detections. `distrust` only decays here;
-    the caller sets it to 1 when the trees contradict the odometry.
+    landmarks in free view, `ambiguous` and `familiar` below FEWEST detections. `distrust` is unchanged: the
+    caller sets it to 1 when the trees contradict the odometry, and lets it decay (`decayed_distrust`).
 
     Args:
         recent: Statistics before the scan.
@@ -260,8 +260,8 @@ def distance_without_trees(alone: float, recognised: float, driven: float) -> fl
 
 
 def decayed_distrust(distrust: float, period: float) -> float:
-    """Return the distrust, 0 to 1, after a time [s]: it decays exponentially (DISTRUST_TIME), and is 0 below
-    0.01."""
+    """Return the distrust, 0 to 1, after the time `period` [s]: it decays exponentially (DISTRUST_TIME); 0.01
+    or less becomes 0."""
     left = distrust * math.exp(-period / DISTRUST_TIME)
     return left if left > 0.01 else 0.0
 

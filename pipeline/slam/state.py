@@ -29,7 +29,7 @@ class SlamState:
         motion_covariance: Covariance of `motion`, shape (3, 3).
         slack: Sum of the slack of position [m] and heading [rad] of the odometry since trees or a measured
             pose last determined the pose, shape (2,), see `motion.advanced`.
-        since_update: Distance driven since then, with 1 m per radian of turn [m].
+        since_update: Distance driven since the last used scan, with 1 m per radian of turn [m].
         detections: Number of detections in all scans so far; the next detection gets this birth number.
         views: Number of scans whose detections were used.
         best: Row of the best particle, whose map is reported.
@@ -112,9 +112,9 @@ class SlamState:
     def placed(self, pose: Float) -> SlamState:
         """Return a state with the particles at new poses, all with the map and the path of the best particle.
 
-        Weights, the motion since the last used scan, running statistics (except `mapped`), shared errors and
-        the hidden covariance of the frame are reset. All other attributes remain, also `since_update`,
-        `path`, the graph, the motion since the last keyframe and the places.
+        Weights, the motion since the last used scan, its slack, running statistics (except `mapped`), shared
+        errors and the hidden covariance of the frame are reset. All other attributes remain, also
+        `since_update`, `path`, the graph, the motion since the last keyframe and the places.
 
         Args:
             pose: New poses, shape (P, 3), not copied; P may differ from the present number.
