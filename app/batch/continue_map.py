@@ -275,8 +275,8 @@ def _in_another_run(
     begin: RunStart, source: Source, start: Start, pose: Pose2, found: Match | None, warnings: list[str]
 ) -> RunStart:  # fmt: skip
     """Return `begin`, changed to the start of another drive; the source is added to its sources, and its
-    times follow those of the map by PAUSE_NS where they overlap. A source that is part of the map already is
-    a warning.
+    times follow those of the map by PAUSE_NS where they overlap; its truth is that of the first source. A
+    source that is part of the map already is a warning.
 
     Args:
         begin: The start so far.

@@ -77,11 +77,12 @@ class Visit:
 
 def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: bool = False) -> Visit:
     """Return the visit of a run folder or of a table of trees (CSV). Rejected trees of a run, and objects in
-    a table that are not trees, are left out; those of a table have the sigma TABLE_SIGMA.
+    a table that are not trees, are left out. Trees of a table have the sigma TABLE_SIGMA and a local frame;
+    the observed area of a run is that within the default reach of stand figures.
 
     Args:
         path: The folder or the table.
-        dbh_unit: Unit of a diameter column without a unit.
+        dbh_unit: Unit of a diameter column of a table without a unit.
         may_be_empty: Whether it may have no trees.
 
     Raises:

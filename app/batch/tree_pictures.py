@@ -114,12 +114,12 @@ def keep_pictures(source: Source, trees: Trees, path: Path, folder: FilePath) ->
         folder: Folder of the run.
 
     Returns:
-        Number of written pictures, and a warning; 0 and "" for a source without a camera. A picture that
-        cannot be decoded is left out and counted in the warning.
+        Number of written pictures, and a warning or "". Without a camera they are 0 and "", without its
+        model 0 and the reason. A picture that cannot be decoded is left out and counted in the warning.
 
     Raises:
         OSError: An old picture cannot be deleted, or the folder cannot be created.
-        StemmapError: A picture cannot be written.
+        StemmapError: A picture cannot be written, or no process can be started to draw it.
     """
     for old in (folder / FOLDER).glob("tree_*.jpg"):
         old.unlink()

@@ -51,7 +51,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Score the runs and print the scores, with one set of parameters or, with --param-grid, with many. A run
     that cannot be scored is reported on standard error if there are several. With --json several runs become
-    one object by their names. `arguments` gets `files`, the file of true trees by run.
+    one object by their names, without those that could not be scored. `arguments` gets `files`, the file of
+    true trees by run; a single FILE of --truth serves all runs.
 
     Returns:
         Exit code: 0; 3 if some runs could not be scored; 1 if none could.
@@ -109,8 +110,8 @@ def _score(arguments: argparse.Namespace, number: int) -> tuple[MapScores, bool]
     """Return the scores of a run, and whether it is a whole cloud.
 
     Raises:
-        StemmapError: The run or its ground truth cannot be read, the ground truth has no trees along the
-            path, or all of them are far from those of the map.
+        StemmapError: The run or its ground truth cannot be read, the ground truth has no object within reach
+            of the path, or all its trees there are far from those of the map.
     """
     from app.batch.run_folder import read_run, score_map
     from app.batch.summary import far_map, far_truth

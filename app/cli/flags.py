@@ -340,8 +340,8 @@ def seed(text: str) -> int:
 
 
 def whole_number(low: int, high: int) -> Callable[[str], int]:
-    """Return a parser of whole numbers from low to high, both included, for argparse; it raises
-    ArgumentTypeError for other texts."""
+    """Return a parser of whole numbers from low to high, both included and at least 0, for argparse; it
+    raises ArgumentTypeError for other texts, also with a sign."""
 
     def parse(text: str) -> int:
         if text.isascii() and text.isdigit() and len(text) < 20 and low <= int(text) <= high:

@@ -350,8 +350,8 @@ class LiveSource:
         self._ending.set()
 
     def listen(self) -> bool:
-        """Process the messages that arrived before the description was known; return whether it is known now.
-        Does not wait.
+        """Process queued messages until the description is known; return whether it is. The first records
+        are held back for `take`. If scans were skipped before, a notice gives their number. Does not wait.
 
         Raises:
             SourceError: A message cannot be read.
@@ -376,8 +376,9 @@ class LiveSource:
         return self.ready
 
     def take(self) -> list[Record]:
-        """Return the records of the next queued message that has any; [] if none has. Does not wait. Messages
-        without records are processed, and pictures are passed to the camera.
+        """Return the records that `listen` held back, else those of the next queued message that has any; []
+        if none has. Does not wait. Messages without records are processed, and pictures are passed to the
+        camera.
 
         Raises:
             SourceError: A message cannot be read, or the topics of the robot cannot be used.

@@ -148,8 +148,8 @@ def plots(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def georeference(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the reference system of a map: `frame`, see `app.batch.georeference.MapFrame.record`, and the
-    control points, see `ControlPoint`. Nothing is written.
+    """Return the reference system of a map: `frame`, see `app.batch.georeference.MapFrame.record`, and
+    `points`, the control points as dicts, see `ControlPoint`; [] for another method. Nothing is written.
 
     Args:
         question: The key "path" has the folder of the run, "crs" the reference system, and "how" is
@@ -373,9 +373,9 @@ def recorded(uri: str) -> dict[str, Any]:
 
 
 def heard(uri: str) -> dict[str, Any]:
-    """Return the topics of a live robot with the rates of the usable ones, in the form of `recorded`; at most
-    MOST_TOPICS. It waits up to 8 s for topics, then counts messages for 3 s. Without topics the list is empty
-    and there is a warning.
+    """Return the topics of a live robot, at most MOST_TOPICS, in the form of `recorded`: see `_counted`; the
+    kind is "live" and `mount` None. It waits for topics, up to 8 s or 1.5 s after the last new one, then
+    counts messages of the usable topics for 3 s. Without topics the list is empty and there is a warning.
 
     Raises:
         SourceError: The address is invalid.
@@ -417,7 +417,7 @@ def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, An
 
 
 def _rate(messages: int, seconds: float) -> float | None:
-    """Return the mean rate of messages [Hz]; None with fewer than two or without a duration."""
+    """Return the mean rate of messages [Hz], one decimal; None with fewer than two or without a duration."""
     return round((messages - 1) / seconds, 1) if seconds > 0.0 and messages > 1 else None
 
 

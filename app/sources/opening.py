@@ -99,7 +99,8 @@ def run_limited(work: Callable[[], object], limits: ProcessLimits, where: str) -
 
 
 def _answer(receiving: int, wall_s: float) -> bytes | None:
-    """Return what the child writes until it ends; None if it does not end within `wall_s` [s]."""
+    """Return what the child writes to the pipe `receiving` until it closes it, as at its end; None if that
+    takes longer than `wall_s` [s]."""
     answer, until_s = b"", time.monotonic() + wall_s
     while select.select([receiving], [], [], max(until_s - time.monotonic(), 0.0))[0]:
         block = os.read(receiving, 1 << 16)
@@ -170,8 +171,8 @@ def check_address(uri: str) -> bool:
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:
-    """Open a run, see `pipeline.io.readers.open_source`. A file or folder is first opened in a child process,
-    so that it is read twice.
+    """Open a run, see `pipeline.io.readers.open_source`. On Linux a file or folder is first opened, with its
+    ground truth, in a child process with limits, so that it is read twice.
 
     Raises:
         SourceError: It cannot be read, or takes more time or memory than a file of its size should.
@@ -184,7 +185,8 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
 
 
 def open_cloud(uri: str) -> WholeCloud:
-    """Open a whole cloud, see `pipeline.io.readers.clouds.open_cloud`; first in a child process.
+    """Open a whole cloud, see `pipeline.io.readers.clouds.open_cloud`; on Linux first in a child process with
+    limits.
 
     Raises:
         SourceError: As for `open_source`.
@@ -196,7 +198,7 @@ def open_cloud(uri: str) -> WholeCloud:
 
 
 def check_cloud(uri: str) -> None:
-    """Open a whole cloud only in a child process.
+    """Open a whole cloud only in a child process with limits; nothing is checked on other systems than Linux.
 
     Raises:
         SourceError: As for `open_source`.
@@ -207,8 +209,8 @@ def check_cloud(uri: str) -> None:
 
 
 def _check(opening: Callable[[], object], uri: str) -> None:
-    """Run an opening in a child process if the source is a file or a folder; otherwise do nothing. Raises
-    SourceError if it fails or exceeds its limits."""
+    """Run an opening with limits, see `run_limited`, if the source is a file or a folder; otherwise do
+    nothing. Raises SourceError if it fails or exceeds its limits."""
     size = _size(uri)
     if size is not None:
         run_limited(opening, ProcessLimits.for_size(size), uri)

@@ -212,7 +212,8 @@ def choose_odometry(known: SourceDescription, choice: str) -> ChosenOdometry:
 
 
 def _no_matching(known: SourceDescription) -> str:
-    """Return why LiDAR odometry is not available for a source, or ""."""
+    """Return why LiDAR odometry is not available for a source: it has detected stems, scans of a planar
+    laser, or only one scan; else ""."""
     if known.preset == "stems":
         return "detected stems are not scans"
     if known.sensor.rings == 1:

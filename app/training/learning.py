@@ -341,8 +341,9 @@ def _examples(
 
 
 def table_lines(learned: LearningResult) -> list[str]:
-    """Return a table of TA, FR, TR and FA of the present and the new forest for each kind of sensor, as lines
-    of text; the first line gives the number of objects by class."""
+    """Return a table of TA, FR, TR and FA of the present ("old") and the new forest for each kind of sensor,
+    as lines of text. The first line gives the number of objects by class; there is a last one if the scores
+    of the present forest are optimistic."""
     classes = ", ".join(
         f"{n} {name}" for name, n in sorted(learned.things.items(), key=lambda item: -item[1])
     )

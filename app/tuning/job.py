@@ -80,7 +80,7 @@ class TuneSearch:
             request: The request from which the plan was made.
 
         Raises:
-            StemmapError: Another search runs, or no process can be started.
+            StemmapError: Another search runs or is being started or left, or no process can be started.
         """
         if self.is_under_way or self._turn.locked():
             raise StemmapError("a search is under way", remedy="Stop it first")

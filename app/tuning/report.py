@@ -444,7 +444,8 @@ def _times(comparison: Comparison) -> str:
 
 def _cell(cell: object) -> str:
     """Return a cell as it is written: empty for None, true or false for a bool, and with an apostrophe before
-    a text that a spreadsheet would compute, such as a file name `=1+1.mcap`."""
+    a text that a spreadsheet would compute because it begins with a character of `_COMPUTED`, such as a file
+    name `=1+1.mcap`."""
     if cell is None:
         return ""
     if isinstance(cell, bool):

@@ -88,7 +88,7 @@ class Numbers:
     group: str
 
     def __call__(self, value: float | None, digits: int = 1) -> str:
-        """Return a number with `digits` decimals; a dash for None, NaN and infinity."""
+        """Return a number with `digits` decimals and group separators; a dash for None, NaN and infinity."""
         if value is None or not math.isfinite(value):
             return "\N{EN DASH}"
         text = f"{value:z,.{digits}f}"  # without a sign of zero
@@ -295,7 +295,8 @@ def _step(length: float) -> float:
 
 
 def _map_scale(least: float) -> float:
-    """Return the denominator of a map scale that scale rulers have, the next from `least` > 0 on."""
+    """Return the denominator of a map scale that scale rulers have: the smallest of 1, 1.25, 2, 2.5, 3, 4, 5
+    and 7.5 times a power of ten that is at least `least` > 0."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(k * power for k in (1.0, 1.25, 2.0, 2.5, 3.0, 4.0, 5.0, 7.5, 10.0) if k * power >= least)
 
@@ -381,10 +382,11 @@ def stand_map(
 def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dict[str, Any]:
     """Return what the template draws of the diameter classes, without bars if there are no classes.
 
-    Coordinates are in mm. Keys: `width` and `height` of the drawing; `bars`, each with x, y, width, height,
-    middle, edge, high and low (plus and minus one standard error, at least 0) and `label`, the lower limit of
-    the class [cm] as text; `last`, the upper limit of the last class; `marks` of the axis as y and text; and
-    `title`.
+    Coordinates are in mm, y downwards. Keys: `width` and `height` of the drawing; `bars` (stems per hectare),
+    each with `x`, `y`, `width`, `height`, `middle` (x), `edge` (x of the lower limit of the class), `high`
+    and `low` (y of plus and minus one standard error, at least 0) and `label`, the lower limit of the class
+    [cm] as text; `last`, the upper limit of the last class, "" without one; `marks` of the axis as y and
+    text; and `title`.
 
     Args:
         whole: Stand figures of the whole observed area.
