@@ -414,8 +414,8 @@ class Fleet:
             member.start()
 
     async def _send_states(self) -> None:
-        """Send states every 0.5 s, maps every 1 s, and align a map every 5 s, until the task is cancelled.
-        Errors are only logged."""
+        """Send states every 0.5 s, maps every 1 s, and align a map every 5 s, unless the alignment before is
+        in progress, until the task is cancelled. Errors are only logged."""
         rounds = 0
         while True:
             try:

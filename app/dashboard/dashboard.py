@@ -348,7 +348,7 @@ class Dashboard:
 
     async def receive(self, message: protocol.FromWorker) -> None:
         """Process a message of the worker: update the state and broadcast it. Messages of a run that has been
-        left are ignored."""
+        left are ignored, except `Report` and `Answer`."""
         match message:
             case protocol.Report(status=status):
                 self._set_status(status)
@@ -372,8 +372,8 @@ class Dashboard:
                 )
 
     def _remapped(self, changes: protocol.MapChanges) -> None:
-        """Broadcast the differences after the run was mapped again, and clear the selection of
-        a tree that vanished."""
+        """Broadcast the differences after the run was mapped again, replace the events of trees and pose
+        quality, and clear the selection of a tree that vanished."""
         self.live.publish("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
         self._broadcast_events()
@@ -404,8 +404,8 @@ class Dashboard:
         )
 
     async def _forget(self) -> None:
-        """Remove map, path, selection, scores and events from the page, and show the ground truth of the run
-        that begins."""
+        """Remove map, path, observed area, selection, scores, events and the repetition of a part, and show
+        the ground truth of the run that begins."""
         self.shown = self.path = None
         self.seen = SeenRecorder()
         self.path_xy = np.zeros((0, 2))

@@ -119,7 +119,7 @@ class ParameterState:
         """Undo the last step, whoever made it.
 
         Raises:
-            StemmapError: There is no step to undo, or `check` refuses its values.
+            StemmapError: There is no step to undo, or `check` refuses its values; nothing changes.
         """
         self._go_back(self._undo, self._redo, "there is no change of a parameter to undo")
 
@@ -127,7 +127,8 @@ class ParameterState:
         """Repeat the step that was undone last.
 
         Raises:
-            StemmapError: No step was undone, a parameter was changed since, or `check` refuses the values.
+            StemmapError: No step was undone, a parameter was changed since, or `check` refuses the values;
+                nothing changes.
         """
         self._go_back(self._redo, self._undo, "there is no change of a parameter to do again")
 
@@ -219,14 +220,15 @@ class ParameterState:
         self.preset, self.parameters = preset_name, parameters
 
     def _go_back(self, steps: list[_Standing], others: list[_Standing], none: str) -> None:
-        """Put the last of `steps` in force, and append the present state to `others`.
+        """Put the last of `steps` in force and remove it, and append the present state to `others`. Revision
+        and step increase.
 
         Args:
             steps, others: The undo and redo steps, or the reverse.
             none: Message of the error if `steps` is empty.
 
         Raises:
-            StemmapError: There is no step, or `check` refuses its values.
+            StemmapError: There is no step, or `check` refuses its values; nothing changes.
         """
         if not steps:
             raise StemmapError(none)

@@ -330,8 +330,8 @@ def comparison_payload(
 
 def _clustered(frame: Frame) -> dict[str, NDArray[Any]]:
     """Return arrays for `packed`: `points`, filtered points, int16, shape (M, 3) [cm]; `labels`, the cluster
-    of each, int32, shape (M,), -1 for none; and `circles`, x, y, radius and height of each cluster, float32,
-    shape (K, 4) [m]. All are in the level frame of the sensor."""
+    of each, int32, shape (M,), -1 for none; and `circles`, x, y, radius (NaN if unknown) and height of the
+    centroid of each cluster, float32, shape (K, 4) [m]. All are in the level frame of the sensor."""
     circles = np.column_stack([frame.clusters.centre, frame.clusters.radius, frame.clusters.centroid[:, 2]])
     return {
         "points": in_centimetres(frame.filtered),

@@ -66,7 +66,7 @@ class LabelNodes:
         )
 
     def _place(self, key: int, label: Label) -> None:
-        """Send a label to its node if text or position changed."""
+        """Send a label to its node if its text changed or it moved by 15 cm or more."""
         node, before = self._node_of[key], self._shown.get(key)
         # Moves of a few centimetres make a label hard to read, and each one is a message.
         if before is not None and math.dist(before.place, label.place) < 0.15:

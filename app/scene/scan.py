@@ -163,7 +163,8 @@ def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
 
 
 def cloud_point_size(frame: Frame) -> float:
-    """Return the diameter of the points of a whole cloud [m]; it grows with the width of the plot."""
+    """Return the diameter of the points of a whole cloud [m]; it grows with the width of the plot within
+    CLOUD_SIZES."""
     return float(np.clip(extent(frame) / POINTS_ACROSS, *CLOUD_SIZES))
 
 

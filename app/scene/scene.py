@@ -69,8 +69,8 @@ class Scene:
         return messages_sent(self._server)
 
     def show(self, frame: Frame, path: Float) -> None:
-        """Show the results of a scan. After RENEW_AFTER messages viser is restarted first, and `port`
-        changes.
+        """Show the results of a scan. The first one sets the distance of the cameras to the extent of a whole
+        cloud. After RENEW_AFTER messages viser is restarted first, and `port` changes.
 
         Args:
             frame: Results of the scan.

@@ -55,7 +55,7 @@ class AnnotatedSource:
         source: Digest of the recording, or its URI where it has no digest.
         name: Name under which it was opened last.
         request: How it was mapped last, with its parameters; the defaults where it was never mapped.
-        annotations: The annotations that are not deleted.
+        annotations: The annotations of KINDS that are not deleted.
     """
 
     source: str
@@ -643,8 +643,8 @@ class Store:
 
 
 def _request_of(connection: Connection, run: Row[Any]) -> SourceRequest:
-    """Return the request with which a source was mapped last, with the path at which it was opened last; the
-    defaults if it was never mapped."""
+    """Return the request of the newest record of a source that has a scan and is not deleted, with the path
+    at which the source was opened last; the defaults without such a record."""
     newest = connection.execute(
         select(_records)
         .where(_records.c.run == run.id, _records.c.deleted_ns.is_(None), _records.c.scans > 0)

@@ -348,8 +348,8 @@ class Guard:
         return len(origins) == 1 and origins[0].lower() in (f"http://{host}", f"https://{host}")
 
     def _role(self, headers: Headers) -> Role | None:
-        """Return the role of a request by its session cookie or its header Authorization; None without a
-        valid one."""
+        """Return the role of a request by its session cookie, else by its header Authorization; None without
+        a valid one."""
         return self._role_by_cookie(headers) or self._role_by_bearer(headers)
 
     def _role_by_cookie(self, headers: Headers) -> Role | None:

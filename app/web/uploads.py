@@ -256,8 +256,9 @@ async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Cal
         wrote: Called with the length of each block but the last.
 
     Raises:
-        UploadError: The browser disconnected, or sent another length than announced. What has been
-            written remains.
+        UploadError: The browser disconnected, or sent another length than announced. What has been written
+            remains.
+        OSError: The file exists or cannot be written.
     """
     written, waiting = 0, bytearray()
     # Not in a thread: a cancelled request would not notice the file that is created afterwards.

@@ -238,7 +238,8 @@ class InventoryRun:
         return self.frame
 
     def map_with(self, sets: Sequence[Parameters]) -> list[Frame]:
-        """Return the frame of the map with each set of parameters; the run does not change.
+        """Return the frame of the map with each set of parameters, with tree numbers of its own; the run does
+        not change.
 
         Raises:
             StemmapError: The cloud cannot be mapped with a set.

@@ -393,8 +393,9 @@ class WorkerLoop:
             )
 
     def _report(self) -> None:
-        """Queue the views that were not sent yet, and the present status with speed, rate and scans behind.
-        Before the preparation the state is "starting"; a seek that takes long is named in `detail`."""
+        """Queue the views that were not sent yet, and the present status with the speed, and with rate and
+        scans behind, which are 0 unless the run plays. Before the preparation of a run that plays or seeks,
+        the state is "starting"; a seek that takes long is named in `detail`."""
         run = self._session.run
         for stamp_ns, free in () if run is None else run.take_views():
             self._put(protocol.View(self._run, stamp_ns, free))
@@ -421,7 +422,8 @@ class WorkerLoop:
         self._put(protocol.Report(status))
 
     def _behind(self, status: protocol.Status, now: float) -> int:
-        """Return the number of scans that wait to be mapped, at most those that are left in the run."""
+        """Return the number of scans that wait to be mapped: those in the queue of a live run, else at most
+        those that are left in the run."""
         if status.live:
             return status.scans_behind
         behind = self._replay.behind(now)

@@ -83,7 +83,8 @@ class Outbox:
         self._thread.join(timeout_s)
 
     def _write_all(self) -> None:
-        """Send messages until `close`, or until the reader is gone. Runs in a thread."""
+        """Send messages until `close`, or until the stream cannot be written, because its reader is gone.
+        Runs in a thread."""
         try:
             while (message := self._next()) is not None:
                 for packed in self._packed(message):
@@ -94,7 +95,8 @@ class Outbox:
 
     def _packed(self, message: FromWorker) -> list[bytes]:
         """Return the encoded message; if it is too large or has an array that cannot be sent, the last status
-        with a warning, encoded, or nothing before the first status."""
+        with a warning, encoded, or nothing before the first status. After a frame that was not sent, the next
+        one has the whole path and the ground."""
         try:
             return [self._codec.encode(self._made_ready(message))]
         except WireError as error:

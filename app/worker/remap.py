@@ -353,7 +353,8 @@ class Remapping:
         return rerun.done == until
 
     def finish(self) -> RunMap:
-        """End the rerun and return the new map."""
+        """End the rerun and return the new map, whose `before` is then the state after the last scan that the
+        rerun mapped."""
         self.rerun.close()
         self.map.before = self.rerun.mapper.snapshot()
         return self.map

@@ -134,7 +134,7 @@ class Run:
     @property
     def accumulated(self) -> Float32:
         """Points of all scans up to the current one: x, y in the map and height above the ground [m], shape
-        (N, 3); none without the column classifier."""
+        (N, 3); none without the column classifier. Not a copy."""
         return self.voxels.mean[: self.voxels.used]
 
     @property
@@ -230,7 +230,8 @@ class Run:
 
     def kept(self, index: int) -> Shown | None:
         """Return the results of a scan that was mapped, without mapping it again; its points are segmented
-        again. None if they are not stored. The run does not change."""
+        again. Trees that were never numbered are left out, see `TreeNumbers.stored`. None if the results or
+        the step are not stored. The run does not change."""
         shown = None if self._map.frames is None else self._map.frames.read(index)
         step = None if shown is None else self._cursor.stored(index)
         if shown is None or step is None:
@@ -327,7 +328,8 @@ class Run:
             on_preview(trees)
 
     def _known_map(self, frame: Frame) -> KnownMap:
-        """Return what a preview knows of the map up to the current scan, whose frame is given."""
+        """Return what a preview knows of the map up to the current scan, whose frame is given; its parameters
+        are those of the first scan."""
         return KnownMap(self._map.parameters.at(0), self._map.clusters, self.path, frame.columns)
 
     def cancel_remapping(self) -> None:

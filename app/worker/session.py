@@ -453,8 +453,8 @@ class Session:
         return status if robot is None else with_robot(status, robot)
 
     def close(self) -> None:
-        """Close the run or the robot, if one is open, and forget seek, warnings and comparison. The state
-        stays."""
+        """Close the run or the robot, if one is open, and forget seek, warnings and comparison. State and
+        parameters stay, and `play` can open the source again."""
         owner = self._run or self._robot
         if owner is not None:
             owner.close()
@@ -528,7 +528,8 @@ def with_robot(status: Status, robot: LiveSource) -> Status:
 
 
 def _with_run(status: Status, run: AnyRun, frame: Frame | None, path: Path | None) -> Status:
-    """Return the status with the fields that the run and its source determine.
+    """Return the status with the fields that the run and its source determine. The records that the source
+    left out and the notice of the cache are appended to its warnings.
 
     Args:
         status: The status.

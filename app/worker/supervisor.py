@@ -117,8 +117,8 @@ class WorkerProcess:
     async def send(self, command: protocol.ToWorker) -> None:
         """Send a command. Parameters, speed and source are stored and sent again after a restart.
 
-        An `Open` while another source does not finish opening kills the worker, which then opens the new
-        source. The call waits at most 5 s for the worker to read.
+        An `Open` more than 12 s after another one whose source is still not open kills the worker, which then
+        opens the new source. The call waits at most 5 s for the worker to read.
 
         Raises:
             WorkerBusyError: The worker does not run or accepts no commands, and this command is not sent
@@ -259,8 +259,9 @@ class WorkerProcess:
         return "it did not answer"
 
     async def _head(self, stdout: asyncio.StreamReader) -> bytes | None:
-        """Wait for the length of the next message; None if the worker hangs, which is reported before. Time
-        in which the worker waits for a processor is not counted. Raises IncompleteReadError at its end."""
+        """Wait for the length of the next message; None if the worker hangs, which is reported before, unless
+        a source is being opened or kernels are compiled. Time in which the worker waits for a processor is
+        not counted. Raises IncompleteReadError at its end."""
         silent_s = hung_s = 0.0
         before_s = starved_s(self.pid or 0)
         while True:
@@ -292,7 +293,9 @@ class WorkerProcess:
                 self._silence = None
 
     def _limit_s(self) -> float | None:
-        """Return the longest time [s] until the next message; None where no message is due."""
+        """Return the longest time [s] until the next message: the limit of opening while a source is being
+        opened or kernels are compiled, and after a command to a failed run; the limit of silence while a run
+        plays or waits, and after any other command; None otherwise and without a source."""
         status = self._status
         if self._open is None:
             return None
@@ -303,8 +306,9 @@ class WorkerProcess:
         return self._silence_limit_s if self._has_command or status.state in ("playing", "waiting") else None
 
     async def _deliver(self, message: protocol.FromWorker) -> None:
-        """Await the function given to `start` with a message. Its errors are logged and reported as a
-        failure; they do not end the supervision."""
+        """Await the function given to `start` with a message, and note from it whether the source is open.
+        Errors of the function are logged and, except for a `Report`, reported as a failure; they do not end
+        the supervision."""
         self._note_opening(message)
         if isinstance(message, protocol.Shown):
             self._ends_without_result = 0

@@ -233,8 +233,8 @@ async def section(dashboard: Dash) -> Response:
 
 @router.get("/stages", dependencies=[ViewerTurn])
 async def stages(shown: NewestScan) -> Response:
-    """Return the points of the current scan, stage by stage (Fig. 3), as a binary block; 409 before the first
-    map."""
+    """Return the points of the current scan, stage by stage (Fig. 3), as a binary block, see
+    `stages_payload`; 409 before the first map."""
     return bytes_reply(await asyncio.to_thread(stages_payload, shown.frame))
 
 
@@ -242,8 +242,8 @@ async def stages(shown: NewestScan) -> Response:
 async def compare(body: _Compare, dashboard: Dash, bounds: Bounds) -> Response:
     """Map the current scan with each of two parameter sets. Return both frames as a binary block, see
     `comparison_payload`, with the names `a` and `b` and `differences`, [name, value in a, value in b], in its
-    header. 404 for an unknown set, 409 without a scan, 429 if too many comparisons wait, 503 if the worker is
-    busy."""
+    header. 404 for an unknown set or one that the worker refuses, 409 without a scan, 422 for a set that is
+    not valid in this version, 429 if too many comparisons wait, 503 if the worker is busy."""
     sets = [_parameters_of(dashboard, name) for name in (body.a, body.b)]
     async with bounds.comparisons.turn():
         frames = await dashboard.worker_client.compare(sets)

@@ -212,10 +212,11 @@ async def _run_folder(
     key: str, settings: Settings, dashboard: Dashboard
 ) -> AsyncIterator[tuple[FilePath, list[SamplePlot]]]:
     """Yield the folder with the result files of a run and its plots; a temporary folder is removed
-    afterwards.
+    afterwards. The files have the reviews of the trees, and the reference system of the map if there is one.
 
     Args:
-        key: "open" for the open run, number of a record, or "folder:" and the name of a finished folder.
+        key: "open" or its number for the open run, as it is now; number of a record; or "folder:" and the
+            name of a finished folder.
         settings: Settings with the data folders.
         dashboard: The dashboard with its store.
 
@@ -338,7 +339,8 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - whatever a parameter is
 
 
 def _differences(name: str, parameters: dict[str, Any]) -> dict[str, Any]:
-    """Return the values by dotted name that differ from those of a preset; empty for an unknown preset."""
+    """Return the values by dotted name that differ from those of a preset, without parameters that it does
+    not have; empty for an unknown preset."""
     if name not in PRESETS:
         return {}
     usual = dict(preset(name).flat())
