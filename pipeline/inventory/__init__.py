@@ -140,7 +140,8 @@ class Inventory:
 
     def steps(self, parameters: Parameters) -> Generator[float, None, PlotMap]:
         """Map the cloud; yield the share of the work that is done, from 0 to 1, at least every few tenths of
-        a second, and return the map. The generator may be left before its end.
+        a second, and return the map. The generator may be left before its end. The points of a finished
+        reading are kept, and read again only for another slope.
 
         Args:
             parameters: All parameters; those named in PARAMETERS are used.

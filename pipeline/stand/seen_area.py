@@ -60,8 +60,8 @@ class SeenArea:
         return SeenArea(self.cell, self.place[keep], self.nearest[keep], self.views[keep])
 
     def joined(self, other: SeenArea, T_map_other: Pose2 | None = None) -> SeenArea:
-        """Return the union with the area of another drive, which has cells of the same size. A cell of both
-        has the smaller distance and the sum of the views.
+        """Return the union with the area of another drive, which has cells of the same size (not checked). A
+        cell of both has the smaller distance and the sum of the views.
 
         Args:
             other: The other area.
@@ -141,7 +141,8 @@ class ViewSelection:
 
     def take(self, T_map_base: Pose2) -> bool:
         """Return whether the view of a scan with this pose is recorded; then it counts as the last one. It is
-        SPACING or TURN away from the last one, and its cell of this size has fewer than MOST_VIEWS."""
+        the first, or SPACING or TURN away from the last one, and its cell of this size and sector have fewer
+        than MOST_VIEWS."""
         if self._last is not None:
             step = self._last.inverse() @ T_map_base
             if math.hypot(step.x, step.y) < SPACING and abs(step.yaw) < TURN:

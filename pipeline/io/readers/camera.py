@@ -78,7 +78,7 @@ def find_camera(
     container: Container, tree: TransformTree, base: str, topic: str
 ) -> tuple[Camera | None, str]:
     """Return the camera of a topic and "", or None and the reason. Of the CameraInfo topics, the one with the
-    most similar name is used, and of its first 20 messages the first valid one.
+    most similar name is used, and of its first 20 messages the first valid one. Its distortion is ignored.
 
     Args:
         container: The recording.

@@ -217,8 +217,8 @@ class LasCloud(CloudFile):
     name = "LAS"
 
     def _describe(self) -> CloudDescription:
-        """Return the description by the header, which is checked before laspy reads it. An error of laspy is
-        not caught.
+        """Return the description by the header, which is checked before laspy reads it, and store the number
+        of points that can be read. An error of laspy is not caught.
 
         Raises:
             SourceError: The header contradicts itself or the file, names too many points, or no point has

@@ -124,7 +124,8 @@ class ArrivalReader:
     def add(self, message: Message) -> list[Record]:
         """Process the next message; return the records that it completes, after notices of the source. Until
         the source is described by its first OPENING_SCANS scans, or for OPENING_NS after the first one,
-        messages are stored and [] is returned; then the stored ones follow at once.
+        messages are stored and [] is returned; then the stored ones follow at once. What cannot be used is
+        counted in `losses`.
 
         Raises:
             SourceError: There are scans, and none could be read in five attempts of OPENING_NS.
@@ -222,8 +223,9 @@ class LiveCamera:
         self._found: tuple[str, Camera | None, str] | None = None
 
     def add(self, message: Message) -> bool:
-        """Process a message of any channel: store pictures (the last MOST_PICTURES, MOST_BYTES), the
-        CameraInfo and fixed transforms. Return whether only the camera uses it."""
+        """Process a message of any channel: store pictures (the last MOST_PICTURES, MOST_BYTES), the latest
+        CameraInfo and the first _MOST_FIXED fixed transforms, larger ones than _LARGEST_TOLD omitted. Return
+        whether only the camera uses it."""
         number = message.channel
         if number not in self._numbers:
             if number in self._channels and len(self._fixed) < _MOST_FIXED:

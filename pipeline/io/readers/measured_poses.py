@@ -706,8 +706,8 @@ class FrameAlignments:
             self._open.remove(alignment)
 
     def _align_recording(self, alignment: FrameAlignment) -> tuple[Any, str]:
-        """Return the frame by the first _MOST_READINGS messages of a recording and a text without meaning, or
-        None and the reason. Reading ends when the frame is known or refused."""
+        """Return the frame by the first _MOST_READINGS messages of a recording and a text that does not
+        count, or None and the reason. Reading ends when the frame is known or refused."""
         messages = self._container.messages(alignment.readings | self._odometry, None, {})
         for message in islice(messages, _MOST_READINGS):
             for stamped in self._times_of(message, {}):

@@ -178,8 +178,9 @@ class Stamped(Generic[T_co]):
 
 
 def by_stamp(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -> Iterator[Stamped[T]]:
-    """Yield contents sorted by time, then by rank. Contents that arrive more than WINDOW_NS late, and those
-    earlier than the last one yielded, are left out. At most _HELD_LIMIT contents wait.
+    """Yield contents sorted by time, then by rank, then in the order of arrival. A content waits until one
+    that is more than WINDOW_NS later arrives, or more than _HELD_LIMIT contents wait. Contents that arrive
+    with a time before that of the last one yielded are left out.
 
     Args:
         arrivals: Contents in the order of arrival.

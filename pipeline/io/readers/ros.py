@@ -107,7 +107,7 @@ class RosSource(MessageSource):
         self, message: Message, losses: dict[str, int], from_ns: int | None = None
     ) -> Iterator[Record]:
         """Yield the records of one message of a live run; none for a channel that is not read. Call it in the
-        order of arrival.
+        order of arrival. Messages for the user are added to `notices`.
 
         Args:
             message: The message.

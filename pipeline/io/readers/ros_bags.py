@@ -272,8 +272,8 @@ class BagFile(ChunkedFile):
                 self._chunks[-1].index_is_whole = False
 
     def _take(self, header: Header, body: int, length: int) -> None:
-        """Store the contents of a record: a connection, a chunk, or the counts of a chunk; other kinds are
-        ignored.
+        """Store the contents of a record: a connection, a chunk, or a part of the index of the last chunk;
+        other kinds are ignored.
 
         Args:
             header: Fields of its header.
