@@ -86,8 +86,9 @@ def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: 
 
 
 def matched_rows(trees: Trees, truth: TruthTrees, distance_max: float) -> tuple[Int, Int]:
-    """Return the rows of the matched mapped trees in `trees`, and of the real trees in `truth` that they are
-    assigned to, int64, shape (K,) each. Pairs with another object of the ground truth are omitted.
+    """Return the rows of the matched mapped trees in `trees`, ascending, and of the real trees in `truth`
+    that they are assigned to, int64, shape (K,) each. Pairs with another object of the ground truth are
+    omitted.
 
     Args:
         trees: The map; confirmed trees are matched.

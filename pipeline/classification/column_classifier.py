@@ -118,8 +118,8 @@ LOW, HIGH = 0.6, 1.6  # m above the ground; voxels in this band decide when a co
 
 def corrected_columns(columns: Columns, memory: VoxelMap, correction: PathCorrection) -> Columns:
     """Return the columns after a correction of the path: position and lean move with the scan that last saw
-    the nearest voxel between LOW and HIGH, and tiles are updated. Without columns or such voxels, the columns
-    are returned as they are.
+    the horizontally nearest voxel between LOW and HIGH, and tiles are updated. All other attributes are
+    shared. Without columns or such voxels, the columns are returned as they are.
 
     Args:
         columns: The columns; not changed.

@@ -622,7 +622,7 @@ def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
     Args:
         points: Points, float32, shape (N, 3) [m].
         height: Their heights above the ground, float32, shape (N,) [m].
-        parameters: The height band.
+        parameters: The height band, which is compared in float32.
     """
     return _between(points, height, np.array([parameters.height_min, parameters.height_max], np.float32))
 

@@ -74,8 +74,8 @@ class Gyro:
 
     def _learn_bias(self, rate: float, *, standing: bool) -> None:
         """Add a turn rate [rad/s] to the estimate of the bias. After BLOCK rates in a row at standstill,
-        their mean counts if their scatter and mean are within STILL_SIGMA and STILL_MOST; a rate in motion
-        discards the block."""
+        their mean and scatter, if below STILL_MOST and STILL_SIGMA, enter the running means of about the last
+        BLOCKS_MOST blocks; a rate in motion discards the block."""
         if not standing:
             self._block.clear()
             return

@@ -131,8 +131,8 @@ class FileOdometry:
 
     def add(self, record: Record) -> Iterator[Record]:
         """Yield the records that replace one record: nothing for odometry; the pose of the base (if the file
-        has one) and the scan for a scan; the record itself for all others. A scan that is read again gets the
-        same row."""
+        has one) and the scan for a scan; the record itself for all others. A scan uses the next row when the
+        iterator is consumed; if it is read again, it gets the same row."""
         if isinstance(record, Odometry):
             return
         if isinstance(record, Scan):

@@ -288,8 +288,8 @@ def within_gate(T_map_base: Pose2, covariance: Float, motion: Motion, noise: Noi
     The gate is a squared Mahalanobis distance.
 
     y is the difference to the predicted pose, P the covariance of the prediction with noise and slack of the
-    motion, and R that of the measurement, shared errors included. Without a measured pose, or with an
-    infinite gate, the result is True.
+    motion (its `turn_sigma`, if known, replaces the noise of the heading), and R that of the measurement,
+    shared errors included. Without a measured pose, or with an infinite gate, the result is True.
 
     Args:
         T_map_base: Pose before the motion.

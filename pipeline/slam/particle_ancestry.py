@@ -289,7 +289,8 @@ class Genealogy:
 
     def mean_motion_from(self, scans: Int, weights: Float) -> Float:
         """Return the poses of the base at some scans relative to its pose at the newest scan, as means over
-        the particles, x, y [m], yaw [rad], shape (S, 3). Settled scans have the pose of one particle.
+        the particles, x, y [m], yaw [rad], shape (S, 3). Settled scans have the pose of one particle; a scan
+        after the newest one gives zeros.
 
         A single particle would add the noise of its random numbers (Rao-Blackwell).
 
@@ -389,8 +390,8 @@ class TrajectoryBuffer:
         return self._rows.column(_MOTION)
 
     def append(self, stamp_ns: int, motion: Pose2) -> None:
-        """Add a scan with its time [ns] and the odometry step from the scan before to it. Its sigma is
-        undefined until `set_sigma`."""
+        """Add a scan with its time [ns] and the odometry step from the scan before to it. Its sigma is NaN
+        until `set_sigma`, its pose until `path`."""
         unknown = np.full(1, np.nan)
         stamp, step = np.array([stamp_ns]), motion.as_array()[None]
         self._rows.write(len(self), stamp, unknown, unknown, unknown, unknown, step)

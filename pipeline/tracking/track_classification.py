@@ -130,8 +130,8 @@ def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
 
 
 def tree_columns(columns: Columns) -> Int:
-    """Return the rows of the columns of class tree, int64, those with most votes for tree first. Of columns
-    within ONE_TREE of each other, only the first remains."""
+    """Return the rows of the columns of class tree, int64, those with most votes for tree first, of equal
+    ones the lower row. Of columns nearer than ONE_TREE to each other, only the first remains."""
     return _best_first(columns.axis, columns.share, columns.verdict)
 
 
@@ -377,7 +377,7 @@ def nearest_other(place: Float, other: Float, reach: float) -> Int:
         place: Positions, x, y first, shape (N, 2 or more) [m].
         other: Other positions, x, y first, shape (M, 2 or more) [m]. The lowest row is returned of equally
             near ones.
-        reach: Maximum distance [m].
+        reach: Distance [m] above 0; a nearest position at this distance or farther does not count.
     """
     nearest = np.empty(place.shape[0], np.int64)
     cells, scale = cells_for(other.shape[0]), per_metre(reach)
