@@ -316,8 +316,9 @@ def external_clusters(
     TREE.
 
     The positions are rotated by the tilt of the step or, if it is unknown, by the median of the stem axes,
-    which are vertical on average. Without levelling, pitch of the robot would displace stems far below the
-    sensor. Stems outside of the range limits (inclusive) or with NaN in their position are left out.
+    which are vertical on average (`_levelling`). Without levelling, pitch of the robot would displace stems
+    far below the sensor. Stems outside of the range limits (inclusive) or with NaN in their position are left
+    out.
 
     Args:
         step: Step whose scan points are the stem positions in the sensor frame.

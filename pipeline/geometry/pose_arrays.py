@@ -104,9 +104,9 @@ class PathCorrection:
     def moved(self, place: Float, scan: Int) -> tuple[Float, Float]:
         """Return the corrected positions of objects, shape (N, 2) [m], and their rotations, shape (N,) [rad].
 
-        An object moves rigidly with the nearest pose of the path within NEAR of the scan that observed it:
-        the pass of the path that observed it decides, and the nearest pose of it has the shortest lever.
-        Without scans nothing moves. The arguments are unchanged.
+        An object moves rigidly with the nearest pose of the path, of one pose per SPACING, within NEAR of the
+        scan that observed it: the pass of the path that observed it decides, and the nearest pose of it has
+        the shortest lever. Without scans nothing moves. The arguments are unchanged.
 
         Args:
             place: Positions before the correction, shape (N, 2) [m].

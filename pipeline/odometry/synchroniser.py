@@ -404,8 +404,8 @@ class Synchroniser:
             self._imu.popleft()
 
     def _was_ahead(self, stamp_ns: int) -> bool:
-        """Return whether the last IMU readings were ahead of their time, and remove them then, with a
-        warning.
+        """Return whether the last IMU readings were ahead of their time; then those at `stamp_ns` or later
+        are removed, which is counted once and reported.
 
         They were ahead if the new reading, at `stamp_ns`, is AHEAD_NS or more before the last one, and is
         nearer to the newest scan or odometry. False without a scan or odometry.

@@ -253,10 +253,10 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
     to the axis. Several columns may be assigned to one stem.
 
-    Columns are assigned in their order, first those with a detected track. Each takes the track within REACH
-    that is most likely (see `_likeliest`) and not assigned yet. The class of a column depends on its
-    surroundings, up to RING_FAR: at a column without a detected track, but with a detected track in its
-    surroundings, that track is the stem, and the column is its undergrowth or a branch.
+    Each column in their order takes the track within REACH that is most likely (see `_likeliest`) and not
+    assigned yet. The class of a column depends on its surroundings, up to RING_FAR: at a column without a
+    track or with one without detections, but with a detected track in its surroundings
+    (`_detected_stem_near`), that track is the stem, and the column is its undergrowth or a branch.
 
     Args:
         tracks: The tracks, changed in place.
@@ -265,7 +265,7 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
         fewest: Minimum number of detections of a detected track.
 
     Returns:
-        Rows of the columns without a track.
+        Rows of the columns without a track, int64, in their order.
     """
     count = tracks.verdict.shape[0]
     taken, new, n = np.zeros(count, np.bool_), np.empty(trees.shape[0], np.int64), 0
