@@ -168,8 +168,8 @@ class AnnotationEditor:
 
     async def begin(self, source: str, uri: str, own: TruthTrees | None) -> None:
         """Read the annotations of a run that was opened; it is added to the store if necessary. Until they
-        are read, `truth` is that of the source. An error of the store is stored in `problem` and logged. If
-        another run is opened meanwhile, the result is ignored.
+        are read, `truth` is that of the source. An error of the store is stored in `problem`, and logged if
+        it is new. If another run is opened meanwhile, the result is ignored. `changed` is not called.
 
         Args:
             source: Digest of the recording, or its URI if it has no digest.

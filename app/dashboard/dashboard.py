@@ -132,7 +132,7 @@ class Dashboard:
 
     async def start(self, source: protocol.Open, make_scene: Callable[[], Scene]) -> None:
         """Start the worker, which opens a source while the scene is made, and load the saved parameter sets.
-        The source plays as soon as both are there.
+        The source plays as soon as both are there. Exceptions of `make_scene` pass through.
 
         Args:
             source: The source, without parameters of its own.
@@ -447,7 +447,8 @@ class Dashboard:
 
     async def _show(self, shown: protocol.Shown) -> None:
         """Take over the results of a scan: extend the path, broadcast map and events, record, score and draw
-        it. Results of a run that was left are ignored."""
+        it. A frame without ground has that of the frame before. Results of a run that was left are
+        ignored."""
         if shown.run != self._run:  # of a run that was left
             return
         number = self._opens

@@ -165,7 +165,7 @@ class SceneCommands(Protocol):
         """Change parameters by dotted name.
 
         Raises:
-            ParameterError: The values are refused and nothing changes.
+            StemmapError: The values are refused and nothing changes.
         """
 
     async def use_preset(self, name: str) -> None:

@@ -51,7 +51,8 @@ class ScanNodes:
             _report(batch, self._markers, on_cluster)
 
     def show(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
-        """Show a scan.
+        """Show a scan. For a whole cloud, points of clusters are drawn as such only, and clusters have
+        neither labels nor fitted circles.
 
         Args:
             frame: Results of the scan.

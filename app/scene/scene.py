@@ -367,7 +367,7 @@ class Follower:
     def look(
         self, client: viser.ClientHandle, pose: Pose2, z: float, *, from_above: bool, origin: bool = False
     ) -> None:
-        """Turn the camera of one browser to the robot.
+        """Turn the camera of one browser to the robot, from the distance that `frame_plot` has set.
 
         Args:
             client: The browser.

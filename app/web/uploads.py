@@ -72,8 +72,8 @@ class Uploads:
         self, name: str, size: int, stream: AsyncIterator[bytes], *, many: bool = False
     ) -> dict[str, Any]:
         """Receive a file, or the files of one recording as a folder, check it in a child process, and return
-        its path (`uri`), name, format (`kind`) and size (`bytes`). It gets a generated name; what is refused
-        is removed.
+        its path (`uri`), original `name`, format (`kind`) and size (`bytes`). It gets a generated name; what
+        is refused is removed.
 
         Args:
             name: Original name of the file or folder.

@@ -163,7 +163,8 @@ class WorkerLoop:
 
     def _next_command(self) -> protocol.ToWorker | None:
         """Return the next command, and wait for it until the next scan is due; None ends the worker. Of
-        successive parameter changes (a slider drag) or seeks (the timeline) the last one is returned.
+        successive parameter changes (a slider drag) or seeks (the timeline) the last one is returned, and the
+        others are dropped.
 
         Raises:
             queue.Empty: Work is due, see `_work`.

@@ -608,8 +608,8 @@ def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: i
 
 def _why_not(frame: Frame, place: Float) -> str:
     """Return the reason why a map has no tree at a place, as text: the class of the nearest column unless it
-    is a tree, else the number of observations of the nearest tree, or that nothing was detected. Only what is
-    within SAME counts. For a whole cloud it is the verdict of the nearest candidate.
+    is a tree; for a whole cloud the verdict of the nearest candidate; else the number of observations of the
+    nearest tree, or that nothing was detected. Only what is within SAME counts.
 
     Args:
         frame: Last scan in that map.

@@ -206,7 +206,9 @@ class Run:
         return frames
 
     def _map_step(self, step: Step, *, hurried: bool = False, new_map: bool = False) -> Frame:
-        """Map a step and make it the current scan. After an exception the mapper is broken until `approach`.
+        """Map a step with the parameters in force for it, make it the current scan, and return its frame with
+        the numbers of `TreeNumbers`. After an exception, which passes through, the mapper is broken until
+        `approach`.
 
         Args:
             step: The step.

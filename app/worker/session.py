@@ -290,6 +290,7 @@ class Session:
 
         Raises:
             SourceError: It cannot be read.
+            StemmapError: As in `open`.
         """
         opened = None
         if self._run is None and self._robot is not None and self._state != "failed":

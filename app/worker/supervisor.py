@@ -165,7 +165,8 @@ class WorkerProcess:
             self._await_opening()
 
     async def _write(self, command: protocol.ToWorker) -> bool:
-        """Write a command to the worker; returns whether the worker accepted it in time."""
+        """Write a command to the worker; return whether the worker accepted it in time. After an accepted
+        command a message of the worker is due, see `_limit_s`."""
         process = self._process
         if process is None or process.stdin is None or process.stdin.is_closing():
             return False
@@ -182,7 +183,9 @@ class WorkerProcess:
         return True
 
     async def _watch(self) -> None:
-        """Pass on the messages of the worker and restart it whenever it ends, until the task is cancelled."""
+        """Pass on the messages of the worker and restart it whenever it ends, until the task is cancelled: at
+        once if it was killed for another source, after `Play` or `Open` if opening took too long, else after
+        `_pause`."""
         while True:
             reason = await self._listen()
             self._opening = ""

@@ -116,8 +116,9 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
 
 
 def _named(point: dict[str, Any], number: int, offset: tuple[float, float]) -> dict[str, Any]:
-    """Return a control point as a new dict with a name, and with its place moved and rounded to micrometres;
-    x and y of a tree are None. Raises BadRequestError without a tree and a place.
+    """Return a control point as a new dict with a name, by default the number of its tree or `number`, and
+    with its place moved and rounded to micrometres; x and y of a tree are None. Raises BadRequestError
+    without a tree and a place.
 
     Args:
         point: See `app.batch.georeference.ControlPoint`.
