@@ -192,7 +192,7 @@ class Inventory:
         )
 
     def close(self) -> None:
-        """Delete the temporary file."""
+        """Delete the temporary file; another slope reads the source again."""
         self._cloud.close()
 
     def _points(self, slope_max: float) -> Generator[float, None, PlotPoints]:

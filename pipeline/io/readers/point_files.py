@@ -138,7 +138,7 @@ def _check_size(points: int, step: int) -> None:
     """Check the number of points and the bytes of one point in a header.
 
     Raises:
-        ScanFileError: They are too large.
+        ScanFileError: There are not 0 to MOST_POINTS points of 1 to STEP_LIMIT bytes.
     """
     if not 0 <= points <= MOST_POINTS or not 0 < step <= STEP_LIMIT:
         raise ScanFileError(f"its header promises {points} points of {step} bytes, too many to be read")

@@ -268,7 +268,8 @@ def _name_ns(stem: str) -> int:
 
 
 def _number(file: Path) -> int:
-    """Return the number at the end of the name of a file, -1 when there is none."""
+    """Return the number at the end of the name of a file, by its last nine digits at most; -1 without digits
+    there."""
     match = re.search(r"[0-9]{1,9}$", file.stem)
     return int(match.group()) if match else -1
 
