@@ -165,8 +165,8 @@ def _terrain(rng: np.random.Generator) -> SimulatedTerrain:
 
 
 def _add_object(scene: SceneBuilder, plot: Plot, name: str, x: float, y: float) -> None:
-    """Add an object of a kind of KINDS at x, y [m] to the scene, not to the ground truth; a hedge of 2 to 8 m
-    is parallel to the nearest edge of the plot."""
+    """Add an object of a kind of KINDS, or a hedge of 2 to 8 m parallel to the nearest edge of the plot, at
+    x, y [m] to the scene, not to the ground truth."""
     if name != "hedge":
         KINDS[name](scene, x, y)
         return

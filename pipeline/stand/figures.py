@@ -119,7 +119,8 @@ def stand_figures(
 
     Standard errors describe the figures of this plot, not of the stand around it: they contain the errors of
     the diameters, the trees of the part that was not observed, and the trees that were not detected. A plot
-    that is observed completely, with exact diameters, has standard errors of 0.
+    that is observed completely, with certain detection and exact diameters of all trees, has standard errors
+    of 0, except for the figures of the spatial pattern.
 
     Args:
         trees: Trees in the observed part, of any diameter.
