@@ -700,7 +700,7 @@ def serve_fleet(
     open_browser: bool,
     viewer: bool,
 ) -> int:
-    """Serve until SIGINT or SIGTERM; return the exit code: 0, or 1 if the server could not start.
+    """Serve until SIGINT or SIGTERM; return the exit code, see `run_server`.
 
     Args:
         settings: Settings of the deployment.
@@ -712,6 +712,7 @@ def serve_fleet(
 
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
+        SystemExit: The page fails at its start.
     """
 
     async def make_app(port: int, token: str) -> FastAPI:

@@ -261,7 +261,8 @@ def motion(path: Path | None, from_ns: int, to_ns: int) -> Pose2:
 
 
 def _pose_at(path: Path, stamp_ns: int) -> Pose2:
-    """Return `T_map_base` at a time [ns], see `motion`; the path has at least two poses."""
+    """Return `T_map_base` at a time [ns]: interpolated within the path, and extrapolated with the mean
+    velocity over _STEADY_NS at its ends. The path has at least two poses."""
     stamps = path.stamp_ns
     first, last = 0, len(stamps) - 1
     if stamp_ns <= stamps[first]:

@@ -131,8 +131,7 @@ def serve(
     open_browser: bool,
     viewer: bool = False,
 ) -> int:
-    """Serve the dashboard until SIGINT or SIGTERM; return the exit code: 0, or 1 if the server could not
-    start.
+    """Serve the dashboard until SIGINT or SIGTERM; return the exit code, see `run_server`.
 
     Args:
         settings: Settings of the deployment.
@@ -143,6 +142,7 @@ def serve(
 
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
+        SystemExit: The dashboard fails at its start.
     """
 
     async def make_app(port: int, token: str) -> ASGIApp:
@@ -170,7 +170,8 @@ def run_server(
     viewer: bool,
 ) -> int:
     """Serve an application until SIGINT or SIGTERM and print its link; return the exit code: 0, or 1 if the
-    server could not start. Free memory is returned to the system at intervals, see `trim_regularly`.
+    server ended before it was ready. Free memory is returned to the system at intervals, see
+    `trim_regularly`.
 
     Args:
         settings: Settings of the deployment; without a token a random one is used.
@@ -180,6 +181,7 @@ def run_server(
 
     Raises:
         StemmapError: The port is in use, or the address is not an address of this machine.
+        SystemExit: The application fails at its start; the code is that of uvicorn.
     """
     listening = bind(settings)
     port = listening.getsockname()[1]

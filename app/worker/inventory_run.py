@@ -344,7 +344,8 @@ def _frame_of(plot: PlotMap) -> Frame:
 
 
 def _clusters_of(plot: PlotMap, middle: Float, base_z: float, labels: Int32) -> Clusters:
-    """Return the candidates as clusters; what a cloud does not give is NaN.
+    """Return the candidates as clusters; what a cloud does not give is NaN. A candidate without a circle has
+    the extent of a thin box at breast height.
 
     Args:
         plot: The map.

@@ -269,7 +269,8 @@ class RunMap:
 
     def add(self, frame: Frame) -> None:
         """Add the results of the scan that was mapped last. If the run went back, the entries of this scan
-        and of later ones are replaced. A tree keeps the time of its first confirmation."""
+        and of later ones are replaced. A tree keeps the time of its first confirmation, unless the run went
+        back to or before it."""
         start_ns = self._start_ns()
         self.history.record(frame, start_ns)
         self.clusters.record(frame)
