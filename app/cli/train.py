@@ -37,8 +37,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int:
-    """Train a random forest with annotations, print its scores and those of the present one, and write it;
-    return 0. Warnings and progress go to standard error.
+    """Train a random forest with annotations, print its scores and those of the forest of the preset
+    "forest", and write it; return 0. Warnings and, on a terminal, progress go to standard error.
 
     Args:
         names: Annotated runs by URI or by their name in the dashboard; empty for all.
@@ -46,8 +46,8 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
         seed: Random seed.
 
     Raises:
-        StemmapError: There is no data folder, a run is unknown, the folder for `out` does not exist, or there
-            are too few annotations.
+        StemmapError: There is no data folder, a run is unknown, the folder for `out` does not exist, there are
+            too few annotations, or a file cannot be read or written; see also `learn`.
     """
     from contextlib import closing
 

@@ -263,7 +263,7 @@ class ScoringProcesses(Generic[T]):
         self, next_job: Callable[[int], tuple[T, Job] | None], wait_s: float | None = None
     ) -> list[tuple[T, JobResult]]:
         """Give a job to each free process, wait for the first result, and return the results since the last
-        call. A job whose processes were lost has an error as result.
+        call, in any order. A job whose processes were lost has an error as result.
 
         Args:
             next_job: Returns the next job for the process with this number, and what identifies it in the

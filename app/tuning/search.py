@@ -132,7 +132,7 @@ class Search:
         return self.start is not None and len(self._trials) >= self.plan.trials
 
     def trials(self) -> list[Trial]:
-        """Return all completed trials, by number."""
+        """Return all completed trials, by number, as another list."""
         return list(self._trials)
 
     def best(self) -> Trial | None:
