@@ -46,8 +46,8 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
         seed: Random seed.
 
     Raises:
-        StemmapError: There is no data folder, a run is unknown, the folder for `out` does not exist, there are
-            too few annotations, or a file cannot be read or written; see also `learn`.
+        StemmapError: There is no data folder, a run is unknown, the folder for `out` does not exist, there
+            are too few annotations, or a file cannot be read or written; see also `learn`.
     """
     from contextlib import closing
 
