@@ -22,7 +22,6 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from app.common.heap import trim_regularly
 from app.common.settings import DEFAULT_PORT, Settings
 from app.dashboard.parameters import ParameterState
 from app.web.auth import new_token, viewer_token
@@ -195,7 +194,6 @@ def run_server(
         await server.serve(sockets=[listening])
         return server.started
 
-    trim_regularly()
     with contextlib.closing(listening):
         return 0 if asyncio.run(served()) else 1
 

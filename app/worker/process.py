@@ -15,7 +15,6 @@ from functools import cache
 from typing import BinaryIO
 
 from app.common.child_process import private_streams
-from app.common.heap import trim_regularly
 from app.common.text import COMPILING
 from app.explain.history import RecentScans
 from app.robot.source import LiveSource
@@ -122,7 +121,6 @@ def run_as_worker(session: Session) -> None:
     """Run this process as the worker of the web process that started it, until stdin ends; does not return.
     SIGINT is ignored, and free memory is returned to the system at intervals."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
-    trim_regularly()
     incoming, outgoing = private_streams()
     work(session, incoming, outgoing)
     sys.stderr.flush()

@@ -17,7 +17,6 @@ from typing import Any
 import uvicorn
 
 from app.common.child_process import python_module
-from app.common.heap import trim_regularly
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
@@ -57,7 +56,6 @@ class Served:
 
     async def run(self) -> None:
         """Serve until the questions end."""
-        trim_regularly()
         serving = asyncio.create_task(self._server.serve(sockets=[self._listening]))
         with answers() as pipe:
             while line := await asyncio.to_thread(sys.stdin.readline):
