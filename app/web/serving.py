@@ -169,8 +169,7 @@ def run_server(
     viewer: bool,
 ) -> int:
     """Serve an application until SIGINT or SIGTERM and print its link; return the exit code: 0, or 1 if the
-    server ended before it was ready. Free memory is returned to the system at intervals, see
-    `trim_regularly`.
+    server ended before it was ready.
 
     Args:
         settings: Settings of the deployment; without a token a random one is used.
