@@ -119,7 +119,7 @@ def _read(
 
 def run_as_worker(session: Session) -> None:
     """Run this process as the worker of the web process that started it, until stdin ends; does not return.
-    SIGINT is ignored, and free memory is returned to the system at intervals."""
+    SIGINT is ignored."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the web process, which then ends us
     incoming, outgoing = private_streams()
     work(session, incoming, outgoing)
