@@ -223,7 +223,7 @@ async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
         ("x_m,y_m\n1,nan\n", "line 2"),
         ("x_m,y_m\n1e9,0\n", "line 2"),
         ("x_m,y_m\n2e7,0\n", "row 1"),
-        ("x_m,y_m,dbh_m\n1,0,31\n", "DBH"),
+        ("x_m,y_m,dbh_m\n1,0,31\n", "median diameter"),
         ("x_m,y_m,class\n1,0,shrub\n", "shrub"),
         ("x_m,y_m\n" + "".join(f"{k},0\n" for k in range(5001)), "5000"),
     ],

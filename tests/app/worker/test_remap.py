@@ -27,7 +27,7 @@ BASE = Parameters()
 FEWER = BASE.replace({"detection.e_max": 12.0, "slam.particles": 60})  # judged anew
 # Changes the trees but not the map of SLAM.
 LATER = BASE.replace({"tracking.proximity_radius": 0.3, "classification.tree_share": 0.3})
-JUDGED = BASE.replace({"detection.radius_max": 0.2})  # from the first scan on that it touches
+JUDGED = BASE.replace({"detection.e_max": 20.0})  # from the first scan on that it touches
 WIDER = BASE.replace({"clustering.eps": 0.25})  # looked at anew
 
 
