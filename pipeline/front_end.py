@@ -189,8 +189,8 @@ def _segment_points(
         # A leaning axis is compared between views at one height; without ground, at that of the points.
         seen = terrain if terrain is not None and shows_ground(terrain) else None
         lift_of = no_lift if seen is None else partial(_lift, seen, p.tracking.breast_height)
-        radius = (p.detection.radius_min, p.detection.radius_max)
-        labels, described = describe_stems(filtered, labels, sensor, p.shape, radius, lift_of)
+        radius_bounds = (p.detection.radius_min, p.detection.radius_max)
+        labels, described = describe_stems(filtered, labels, sensor, p.shape, radius_bounds, lift_of)
         cut = is_truncated(filtered, labels, raw, sensor, p.filters, p.acquisition)
         described = replace(described, cut=cut)
 

@@ -35,7 +35,7 @@ class TookTooLongError(StemmapError):
     """The child process was ended because it took too long."""
 
 
-class Answer(msgspec.Struct, frozen=True):
+class InspectionResult(msgspec.Struct, frozen=True):
     """Answer of the child process, or the error: what, where, remedy."""
 
     content: dict[str, Any] = {}
@@ -68,7 +68,7 @@ async def ask(
     async with free, await ChildProcess.start(command, line_limit=LARGEST_ANSWER) as child:
         try:
             await child.send(question)
-            answer = await child.receive(Answer, patience_s)
+            answer = await child.receive(InspectionResult, patience_s)
         except ProtocolError:
             answer = None
         except TimeoutError:

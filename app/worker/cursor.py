@@ -102,8 +102,8 @@ class Cursor:
         return self._ahead
 
     def take(self) -> Step | None:
-        """Return the next step and advance; results and errors as `peek`. A step that is taken for the first
-        time counts as `known`."""
+        """Return the next step and advance; results and errors as `peek`. A step counts as
+        `known` from the first time that it is taken."""
         step = self.peek()
         if step is None:
             return None

@@ -297,7 +297,8 @@ class Run:
         if previous is not None and previous.return_to(parameters):
             done = previous.before.path_length
             rerun = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
-            self._remapping = Remapping(rerun, previous, (None for _ in ()))
+            no_preview: Generator[None, None, None] = (None for _ in ())  # only the current scan is left
+            self._remapping = Remapping(rerun, previous, no_preview)
             return
         if previous is not None:
             previous.close()

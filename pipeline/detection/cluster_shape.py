@@ -103,7 +103,7 @@ def describe_stems(
     labels: Labels,
     sensor: Sensor,
     parameters: Shape,
-    radius: tuple[float, float],
+    radius_bounds: tuple[float, float],
     lift_of: LiftOf = no_lift,
 ) -> tuple[Labels, Clusters]:
     """Describe each cluster, after trunks are separated from vegetation that is clustered with them.
@@ -113,7 +113,7 @@ def describe_stems(
         labels: Cluster of each point; no cluster is empty.
         sensor: Range sigma and azimuth step of the LiDAR.
         parameters: Choice of centre, and number of slices of `split_trunks`.
-        radius: Smallest and largest radius of a trunk [m].
+        radius_bounds: Smallest and largest radius of a trunk [m].
         lift_of: See `describe`.
 
     Returns:
@@ -124,7 +124,7 @@ def describe_stems(
     whole = describe(points, labels, sensor, parameters, lift_of)
     if parameters.split_slices == 0 or parameters.centre != "circle":
         return labels, whole
-    parted, changed = split_trunks(points, labels, whole, sensor, parameters.split_slices, radius)
+    parted, changed = split_trunks(points, labels, whole, sensor, parameters.split_slices, radius_bounds)
     if not len(changed):
         return labels, whole
     number = np.full(parted.clusters + 1, -1, np.int32)  # the last entry is for noise, -1

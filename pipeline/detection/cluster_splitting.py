@@ -20,9 +20,8 @@ from pipeline.types.records import Bool, Clusters, Float32, Int, Int32, Labels, 
 
 SLICE = 0.2  # m; of height
 LEAST = 3  # minimum returns of a run
-ROUGH = (
-    0.06  # m; a cluster of a larger radial deviation, twice that of a trunk with bark, is not a single trunk
-)
+# m; a cluster of a larger radial deviation, twice that of a trunk with bark, is not a single trunk
+ROUGH = 0.06
 WIDEST = 2.5  # m; wider clusters (hedges, walls) are not split
 SHOTS = 2.6  # maximum distance between returns of a run in shots; one may be missing
 JUMP, JUMP_SIGMA = 0.06, 3.0  # m, and multiples of the range sigma: maximum range jump within a run
@@ -63,7 +62,7 @@ def split_trunks(
     clusters: Clusters,
     sensor: Sensor,
     slices: int,
-    radius: tuple[float, float],
+    radius_bounds: tuple[float, float],
 ) -> tuple[Labels, Int]:
     """Separate a trunk from each cluster that is not a single trunk but shows one in enough slices. The
     arguments are not changed.
@@ -78,7 +77,7 @@ def split_trunks(
         clusters: Shape of each cluster.
         sensor: Range sigma and azimuth step of the LiDAR.
         slices: Minimum number of agreeing slices, at least 1.
-        radius: Smallest and largest radius of a trunk [m].
+        radius_bounds: Smallest and largest radius of a trunk [m].
 
     Returns:
         Labels in which a trunk keeps the number of its cluster and the remaining points form a new cluster
@@ -86,14 +85,15 @@ def split_trunks(
         and of the new clusters, int64. Without a separated trunk, equal labels and no numbers.
     """
     width = np.maximum(clusters.extent[:, 0], clusters.extent[:, 1])
-    odd = (clusters.radial_std > ROUGH) | (width > 2.0 * radius[1]) | (clusters.radius > radius[1])
+    thickest = radius_bounds[1]
+    odd = (clusters.radial_std > ROUGH) | (width > 2.0 * thickest) | (clusters.radius > thickest)
     asked = odd & (width < WIDEST) & (clusters.extent[:, 2] > (slices - 1) * SLICE) & ~labels.hidden
     if not asked.any():
         return labels, np.zeros(0, np.int64)
     label = labels.label.copy()
     rows, bounds = group_rows(np.where(asked[label] & (label >= 0), label, -1).astype(np.int32), len(asked))
     apart = _split_trunks(
-        points, rows, bounds, sensor.azimuth_step, sensor.range_sigma, slices, radius, label
+        points, rows, bounds, sensor.azimuth_step, sensor.range_sigma, slices, radius_bounds, label
     )
     more = len(apart)
     rests = np.arange(labels.clusters, labels.clusters + more)
@@ -109,7 +109,7 @@ def _split_trunks(
     step: float,
     sigma: float,
     slices: int,
-    radius: tuple[float, float],
+    radius_bounds: tuple[float, float],
     label: Int32,
 ) -> Int:
     """Give the points that do not belong to trunks new numbers in `label`, in place: the i-th reduced cluster
@@ -124,7 +124,7 @@ def _split_trunks(
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
         slices: Number of slices that must agree.
-        radius: Smallest and largest radius of a trunk [m].
+        radius_bounds: Smallest and largest radius of a trunk [m].
         label: Cluster of each point, shape (N,); changed.
     """
     clusters = bounds.shape[0] - 1
@@ -137,7 +137,7 @@ def _split_trunks(
         if own.shape[0] < slices * LEAST:
             continue
         run, level = np.full(own.shape[0], -1, np.int64), np.empty(own.shape[0], np.int64)
-        found = _find_runs(points, own, step, sigma, radius, runs, run, level)
+        found = _find_runs(points, own, step, sigma, radius_bounds, runs, run, level)
         if found < slices or not _find_trunk(runs, found, level, slices):
             continue
         left = 0
@@ -157,7 +157,7 @@ def _find_runs(
     own: Int,
     step: float,
     sigma: float,
-    radius: tuple[float, float],
+    radius_bounds: tuple[float, float],
     runs: Runs,
     run: Int,
     level: Int,
@@ -174,7 +174,7 @@ def _find_runs(
         own: Rows of the points of the cluster, shape (n,).
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
-        radius: Smallest and largest radius of a trunk [m].
+        radius_bounds: Smallest and largest radius of a trunk [m].
         runs: The table; the columns `agrees` and `best` are not written.
         run: Run of each return, shape (n,); must be -1; changed.
         level: Receives the slice of each return, counted from the lowest return, shape (n,).
@@ -212,7 +212,7 @@ def _find_runs(
                 continue
         if k - begin >= LEAST and found < MOST_RUNS:
             part = order[begin:k]
-            if _follows_circle(part, across, reach, step, sigma, radius, c, s, runs, found):
+            if _follows_circle(part, across, reach, step, sigma, radius_bounds, c, s, runs, found):
                 height = 0.0
                 for i in part:
                     run[i] = found
@@ -231,7 +231,7 @@ def _follows_circle(
     reach: Float,
     step: float,
     sigma: float,
-    bounds: tuple[float, float],
+    radius_bounds: tuple[float, float],
     c: float,
     s: float,
     runs: Runs,
@@ -246,7 +246,7 @@ def _follows_circle(
         reach: Horizontal range of each return [m], shape (n,).
         step: Azimuth step of the sensor [rad].
         sigma: Standard deviation of its ranges [m].
-        bounds: Smallest and largest radius of a trunk [m].
+        radius_bounds: Smallest and largest radius of a trunk [m].
         c, s: Cosine and sine of the azimuth of the middle of the cluster.
         runs: The table.
         at: Row that is written.
@@ -258,7 +258,7 @@ def _follows_circle(
         mean += reach[i]
     mean /= n
     radius = 0.5 * (left - right + 0.5 * step) * mean
-    if radius < bounds[0] or radius > bounds[1]:
+    if not radius_bounds[0] <= radius <= radius_bounds[1]:
         return False
     middle, quarter = 0.5 * (left + right), 0.25 * (left - right)
     front, within = 0.0, 0

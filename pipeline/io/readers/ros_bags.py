@@ -131,14 +131,15 @@ class Db3File(IndexedContainer):
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """Return the .mcap and .db3 files (suffix in lower case) of a folder in the order of the numbers at the
+    """Return the .mcap and .db3 files (suffix in any case) of a folder in the order of the numbers at the
     end of their names; may be empty.
 
     Raises:
         SourceError: The files themselves are compressed, or there are several without metadata.yaml.
         OSError: The folder cannot be read.
     """
-    files = sorted((path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")), key=_natural)
+    bags = (path for path in folder.iterdir() if path.suffix.lower() in (".mcap", ".db3"))
+    files = sorted(bags, key=_natural)
     packed = sorted(path for path in folder.iterdir() if path.suffixes[-1:] == [".zstd"])
     if packed and not files:
         raise SourceError(

@@ -36,7 +36,7 @@ const RULES = {
 // `story` is null where nothing was accumulated.
 export function columnFigure(story, title) {
   if (!story) return el("figure", {}, el("figcaption", { text: title }),
-    el("p", { class: "dim note", text: "Nothing upright was accumulated here yet. Every fourth scan is accumulated, but none with a preset that does not classify, such as paper." }));
+    el("p", { class: "dim note", text: "Nothing upright was accumulated here yet. One scan per interval is accumulated (Tune, Classification), but none with a preset that does not classify, such as paper." }));
   const votes = Object.entries(story.votes).filter(([, share]) => share >= 0.005).sort((a, b) => b[1] - a[1]);
   return el("figure", { "data-gathered": story.verdict },
     el("figcaption", { text: title }),

@@ -91,9 +91,13 @@ async def test_the_files_of_one_recording_are_kept_as_a_folder(recordings: Path)
     async with running(Settings(folder=recordings.parent)) as (client, _):
         answer = await send_many(client, folder_of(files))
         assert answer.status_code == 201
-        told = answer.json()
-        place = Path(told["uri"])
-        assert (told["name"], told["kind"], place.parent) == ("drive 00", "fake recording", recordings)
+        uploaded = answer.json()
+        place = Path(uploaded["uri"])
+        assert (uploaded["name"], uploaded["kind"], place.parent) == (
+            "drive 00",
+            "fake recording",
+            recordings,
+        )
         assert kept(recordings) == [place.name]
         found = {str(path.relative_to(place)): path for path in place.rglob("*") if path.is_file()}
         assert {name: path.read_bytes() for name, path in found.items()} == files

@@ -76,6 +76,12 @@ def test_recordings_beside_scans_are_said_to_be_left_aside(tmp_path: Path, opene
     )
 
 
+def test_the_suffix_of_a_bag_in_a_folder_is_known_in_any_case(tmp_path: Path):
+    (tmp_path / "RUN.MCAP").write_bytes(b"\x89MCAP0\r\n" + bytes(50))
+    with pytest.raises(SourceError):
+        open_source(str(tmp_path))
+
+
 def test_a_folder_with_one_recording_that_is_no_run_is_that_recording(tmp_path: Path):
     capture = tmp_path / "run.pcap"
     capture.write_bytes(b"\xd4\xc3\xb2\xa1" + bytes(100))

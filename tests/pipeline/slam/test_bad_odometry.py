@@ -286,8 +286,8 @@ def test_a_measured_pose_is_used_between_two_views():
     slam = FastSlam(FOREST, 0)
     slam.process(0, Pose2(), detections([]), NOTHING_SEEN)
     motion = Motion(Pose2(0.5), measured=measured(0.6, 0.0, sigma=(1e-3, 1e-3, 1e-3)), is_view=False)
-    told = slam.process(1, motion, detections([]), NOTHING_SEEN)
-    assert told.T_map_base.x == pytest.approx(0.6, abs=0.01)
+    estimate = slam.process(1, motion, detections([]), NOTHING_SEEN)
+    assert estimate.T_map_base.x == pytest.approx(0.6, abs=0.01)
 
 
 def test_a_measured_pose_is_used_at_the_scan_of_its_time():
