@@ -23,7 +23,8 @@ BROWSERS = 5
 # Each window plays the same scans, so that what is compared is the same work.
 FROM_S, WINDOW_S, ROUNDS = 14.0, 8.0, 5
 IDLE_S, CHANGES, LATE, PAGES = 10.0, 30, 5, 3
-SLOWER, LATENCY_MS, IDLE_PERCENT, READY_S, LATE_S, SLIDER_MS = 5.0, 150.0, 5.0, 3.0, 2.0, 150.0  # asked for
+SLOWER, LATENCY_MS, IDLE_PERCENT, READY_S, LATE_S = 5.0, 150.0, 5.0, 3.0, 2.0  # asked for
+SLIDER_PAGE_MS, SLIDER_SCENE_MS = 100.0, 150.0  # asked for
 MAPPED_MS = 150.0
 LONGEST_S = 300.0
 
@@ -155,8 +156,8 @@ def _waiting(dashboard: Dashboard, returns: float) -> Table:
 
     dashboard.stand(FROM_S)
     page, scene = _slider_ms(dashboard)
-    row("a slider's change, to the page", page, "ms", SLIDER_MS, 0.95)
-    row("a slider's change, to the 3D scene", scene, "ms", SLIDER_MS, 0.95)
+    row("a slider's change, to the page", page, "ms", SLIDER_PAGE_MS, 0.95)
+    row("a slider's change, to the 3D scene", scene, "ms", SLIDER_SCENE_MS, 0.95)
     row("the server while a run stands, five browsers", _idle(dashboard), "% of a core", IDLE_PERCENT)
 
     dashboard.browsers.ask({"do": "browsers", "count": 0})
