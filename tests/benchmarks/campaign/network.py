@@ -10,6 +10,7 @@ import threading
 import time
 from contextlib import ExitStack
 from pathlib import Path
+from queue import SimpleQueue
 
 from tests.app.robot.conftest import free_port
 from tests.benchmarks.campaign import Result
@@ -64,20 +65,34 @@ class Proxy:
                     threading.Thread(target=self._pass_on, args=(source, sink), daemon=True).start()
 
     def _pass_on(self, source: socket.socket, sink: socket.socket) -> None:
+        """Pass one direction of a connection on until it ends. A delayed part waits in a queue, so that the
+        link keeps its throughput."""
+        parts = SimpleQueue[tuple[float, bytes]]()
+        threading.Thread(target=self._send, args=(parts, sink), daemon=True).start()
         with contextlib.suppress(OSError), selectors.DefaultSelector() as ready:
             ready.register(source, selectors.EVENT_READ)
             while True:
                 ready.select()
                 part = source.recv(_PART)
-                if not part:
-                    sink.shutdown(socket.SHUT_WR)
-                    return
-                if self.is_faulty and self._fault == "delay":
-                    time.sleep(_DELAY_S * len(part) / _PART)
-                elif self.is_faulty and self._fault == "slow":
+                if part and self.is_faulty and self._fault == "slow":
                     time.sleep(len(part) / _SLOW_BYTES_PER_S)
                 while self.is_faulty and self._fault == "stall":
                     time.sleep(0.05)
+                delay = _DELAY_S if self.is_faulty and self._fault == "delay" else 0.0
+                parts.put((time.monotonic() + delay, part))
+                if not part:
+                    return
+        parts.put((0.0, b""))
+
+    def _send(self, parts: SimpleQueue[tuple[float, bytes]], sink: socket.socket) -> None:
+        """Send each part at its time; an empty part ends the connection."""
+        with contextlib.suppress(OSError):
+            while True:
+                due, part = parts.get()
+                time.sleep(max(due - time.monotonic(), 0.0))
+                if not part:
+                    sink.shutdown(socket.SHUT_WR)
+                    return
                 sink.sendall(part)
 
 
