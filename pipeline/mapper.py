@@ -170,7 +170,7 @@ class Mapper:
             self._update_terrain(scan, estimate)
 
         # Back at a known place: close the loop.
-        closure: Correction | None = self._check_loop(step.index, estimate)
+        closure: Correction | None = self._check_loop(estimate)
         estimate, closure = self._apply(step.index, closure, estimate)
 
         self._last = (estimate.T_map_base, estimate.covariance)
@@ -428,19 +428,19 @@ class Mapper:
             return relocaliser.search(index, motion, found.detections, scan.free, p, run)
         return relocaliser.begin(index, found.detections, scan.free, p) if self._slam.is_lost else None
 
-    def _check_loop(self, index: int, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
+    def _check_loop(self, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
         """Return the loop that the robot has just closed, or `Smoothing` if the graph is to be solved; None
         otherwise and during the search of a lost robot."""
         p = self._parameters.relocalisation
         if self._relocaliser.is_searching:
             return None
-        if p.method != "none" and detection.is_due(
-            index, self._path.sigma_xy, self._slam.state.places.contradicted
-        ):
-            with self._timer("slam"):
-                loop = detection.find_loop(self._history(estimate), p)
-            if loop is not None:
-                return LoopClosure(loop)
+        if p.method != "none" and self._slam.is_keyframe_every(detection.EVERY):
+            recent = self._path.sigma_xy[self._slam.first_scan_within(detection.LATELY) :]
+            if detection.is_due(recent, self._slam.state.places.contradicted):
+                with self._timer("slam"):
+                    loop = detection.find_loop(self._history(estimate), p)
+                if loop is not None:
+                    return LoopClosure(loop)
         return Smoothing() if self._slam.is_smoothing_due else None
 
     def _history(self, estimate: PoseEstimate) -> detection.RunHistory:

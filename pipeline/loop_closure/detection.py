@@ -22,10 +22,9 @@ from pipeline.slam.keyframe_graph import drift_of, without_jumps
 from pipeline.slam.motion import Noise
 from pipeline.types.records import Int, PoseEstimate, Trees
 
-EVERY = 10  # scans between two searches
+EVERY = 10.0  # m of driven path between two searches, a quarter of LATELY
 UNSURE = 0.4  # m, sigma of the position; below it the data association recognises the trees one by one
-RECENT = 300  # scans; a search is due if the position was unsure in one of them
-LATELY = 40.0  # m of the path, in which the landmarks to be found were begun
+LATELY = 40.0  # m of driven path, in which the landmarks to be found were begun
 REACH = 30.0  # m around the robot, in which these landmarks are
 LEAST_HITS = 3
 HYPOTHESES = 30_000
@@ -76,19 +75,18 @@ class RunHistory:
         return scan
 
 
-def is_due(index: int, sigma_xy: Float, contradicted: bool) -> bool:
-    """Return whether a search is due after a scan: at each EVERY-th scan, if known places are contradicted or
-    the position was uncertain by more than UNSURE in one of the last RECENT scans.
+def is_due(sigma_xy: Float, contradicted: bool) -> bool:
+    """Return whether a search is due at a keyframe: if known places are contradicted, or the position was
+    uncertain by more than UNSURE in one of the last scans.
 
-    A pose that was uncertain and is no longer may have been corrected by the wrong trees, so the search
-    continues for RECENT scans.
+    A pose that was uncertain and is no longer may have been corrected by the wrong trees. The search
+    therefore continues while landmarks that were begun at the uncertain pose are among those to be found.
 
     Args:
-        index: Number of the scan.
-        sigma_xy: Standard deviation of the position at each scan so far, shape (N,) [m]; may be empty.
+        sigma_xy: Standard deviation of the position at each scan of the last LATELY metres [m]; may be empty.
         contradicted: See RunHistory.
     """
-    return index % EVERY == 0 and (contradicted or bool(sigma_xy[-RECENT:].max(initial=0.0) > UNSURE))
+    return contradicted or bool(sigma_xy.max(initial=0.0) > UNSURE)
 
 
 def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:

@@ -9,7 +9,9 @@ landmarks are independent, so each particle keeps a small Kalman filter a landma
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -221,11 +223,28 @@ class FastSlam:
         self.state = self.state.placed(pose)
 
     @property
+    def is_keyframe(self) -> bool:
+        """Whether the newest scan is a keyframe of the graph."""
+        return self.state.graph.newest_scan == len(self.state.genealogy) - 1
+
+    @property
     def is_smoothing_due(self) -> bool:
         """Whether the newest scan is a keyframe, the graph is due (`KeyframeGraph.is_due`), and no measured
         pose with shared errors was used."""
-        graph, scan = self.state.graph, len(self.state.genealogy) - 1
-        return graph.is_due and graph.newest_scan == scan and not self.state.shared.begun
+        return self.is_keyframe and self.state.graph.is_due and not self.state.shared.begun
+
+    def is_keyframe_every(self, distance: float) -> bool:
+        """Return whether the newest scan is the first keyframe at or after another multiple of `distance` [m]
+        of the driven path."""
+        last = self.state.graph.keyframes[-2:]
+        return self.is_keyframe and last[0].distance // distance < last[-1].distance // distance
+
+    def first_scan_within(self, distance: float) -> int:
+        """Return the scan number of the first keyframe of the last `distance` [m] of the driven path; the
+        newest scan without a keyframe there."""
+        keyframes, begin = self.state.graph.keyframes, self.state.distance - distance
+        row = bisect_left(keyframes, begin, key=attrgetter("distance"))
+        return keyframes[row].scan if row < len(keyframes) else len(self.state.genealogy) - 1
 
     def smooth(self, index: int) -> PathCorrection | None:
         """Solve the graph. All particles continue from its newest pose with its path and landmarks.

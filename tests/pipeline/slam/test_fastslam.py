@@ -563,6 +563,19 @@ def test_the_power_of_the_weights_is_that_of_the_likelihood():
     assert ratios[0.25] == pytest.approx(0.25 * ratios[1.0])
 
 
+@pytest.mark.parametrize("step", [0.125, 0.5, 2.0, 25.0])
+def test_keyframes_at_multiples_of_a_distance_do_not_depend_on_the_number_of_scans(step):
+    slam = fresh()
+    due = []
+    for k in range(round(100.0 / step) + 1):
+        slam.process(k, Pose2(step if k else 0.0), detections(TREES[:0]), NOTHING_SEEN)
+        within = step * (k - slam.first_scan_within(20.0))
+        assert min(step * k, 20.0) - max(step, 1.0) < within <= 20.0
+        if slam.is_keyframe_every(10.0):
+            due.append(step * k)
+    np.testing.assert_allclose(due, np.arange(1, 1 + 100.0 / max(step, 10.0)) * max(step, 10.0))
+
+
 def test_the_covariance_after_smoothing_is_that_of_the_graph():
     """All particles are drawn given the map, whose own error they share."""
     rng = np.random.default_rng(1)
