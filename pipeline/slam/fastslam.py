@@ -67,7 +67,6 @@ from pipeline.slam.state import SlamState
 from pipeline.types.records import Detections, Health, Int, Landmarks, PoseEstimate, PoseMeasurement
 
 SCANS_MAX = 20  # scans between two keyframes whose detections the graph uses
-LOOP_WEIGHT_MIN = 0.5  # weight of a loop by its kernel; the graph contradicts a loop with less
 REFERENCES = 1024  # at each multiple of it, reference poses without landmarks are dropped
 PLACED = 1  # distinguishes the random numbers of `place` from those of a scan
 
@@ -275,9 +274,12 @@ class FastSlam:
             index: Number of the scan, which seeds the random numbers.
             loop: The loop.
 
+        Associations since the robot left the place were made at the drifted pose. With the loop, they are
+        replaced by those that it gives. Of both, the solution with the larger support is taken.
+
         Returns:
-            The correction; None if the graph has no solution, or if it gives the loop a weight below
-            LOOP_WEIGHT_MIN. The state is unchanged then.
+            The correction; None if the graph has no solution with the loop, or if it has less support with
+            the loop than without. The state is unchanged then.
 
         Raises:
             LinAlgError: A covariance in the graph, or that of the loop, is not positive definite.
@@ -287,16 +289,21 @@ class FastSlam:
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        graph = graph.without_uncertain(state.places)
+        without = graph.solve()
+        support = 0.0 if without is None else graph.support(loop.first, without)
+        graph = graph.without_revisits(loop.first)
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance, self.path())
         solution = graph.solve(new_loop=True)
-        if solution is None or solution.loop_weight[-1] < LOOP_WEIGHT_MIN:
+        if solution is None:
             return None
+        # Landmarks that the loop brings together are one tree.
         moved = corrected_landmarks(state.map_of(state.best), graph, solution, path)
         names = same_trees(moved, graph.first_birth_after(loop.first))
         graph = replace(graph.renamed(*names), pose=solution.pose)
-        again = graph.solve()
-        return self._corrected(index, graph, again or solution, loop.covariance, names)
+        solution = graph.solve()
+        if solution is None or graph.support(loop.first, solution) < support:
+            return None
+        return self._corrected(index, graph, solution, loop.covariance, names)
 
     def _corrected(
         self,

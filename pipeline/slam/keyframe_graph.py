@@ -24,8 +24,8 @@ from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.association import associate
 from pipeline.slam.motion import Noise, compounded
 from pipeline.slam.particle_maps import MapColumns
-from pipeline.slam.places import REVISIT_DISTANCE, Places
-from pipeline.types.records import Int
+from pipeline.slam.places import REVISIT_DISTANCE
+from pipeline.types.records import Bool, Int
 
 Sparse = Any  # scipy.sparse.csc_matrix, or its factors; scipy has no types
 #: Scale of the Cauchy kernel [sigma]: 95 % of the efficiency of least squares for Gaussian errors (Holland,
@@ -143,7 +143,6 @@ class Solution:
         position: Their positions, shape (L, 2) [m].
         covariance: Covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3).
         conditional: Covariance of the newest keyframe's pose given all other poses and stems, shape (3, 3).
-        loop_weight: Weight of each loop by its kernel, shape (E,): 1 where it fits, near 0 where it does not.
     """
 
     pose: Float
@@ -151,7 +150,6 @@ class Solution:
     position: Float
     covariance: Float
     conditional: Float
-    loop_weight: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,20 +254,42 @@ class KeyframeGraph:
 
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
-    def without_uncertain(self, places: Places) -> KeyframeGraph:
-        """Return the graph in which each keyframe lacks the detections of landmarks whose place was last seen
-        for certain more than REVISIT_DISTANCE before the keyframe: the path may have drifted by more than the
-        distance between trees. Landmarks that precede all places remain."""
+    def _revisits(self, scan: int) -> list[Bool]:
+        """Return which detections of each keyframe, shape (D,), show landmarks from before a scan again:
+        those more than REVISIT_DISTANCE after the first keyframe behind the scan, of landmarks begun before
+        it.
 
-        def cleaned(keyframe: Keyframe) -> Keyframe:
-            keep = places.last_seen(keyframe.birth) >= keyframe.distance - REVISIT_DISTANCE
-            if keep.all():
-                return keyframe
-            return replace(
-                keyframe, birth=keyframe.birth[keep], centre=keyframe.centre[keep], R=keyframe.R[keep]
-            )
+        Raises:
+            IndexError: The graph has no keyframe.
+        """
+        row = min(int(np.searchsorted(self.scans, scan, side="right")), len(self.keyframes) - 1)
+        first = self.keyframes[row]
+        begin = first.distance + REVISIT_DISTANCE
+        return [(k.birth < first.first_birth) & (k.distance > begin) for k in self.keyframes]
 
-        return replace(self, keyframes=tuple(cleaned(k) for k in self.keyframes))
+    def without_revisits(self, scan: int) -> KeyframeGraph:
+        """Return the graph without the detections that show landmarks from before a scan again: the path may
+        have drifted by more than the distance between trees. Raises IndexError without a keyframe."""
+        keyframes = list(self.keyframes)
+        for n, revisits in enumerate(self._revisits(scan)):
+            if revisits.any():
+                k, keep = keyframes[n], ~revisits
+                keyframes[n] = replace(k, birth=k.birth[keep], centre=k.centre[keep], R=k.R[keep])
+        return replace(self, keyframes=tuple(keyframes))
+
+    def support(self, scan: int, solution: Solution) -> float:
+        """Return the number of detections that show landmarks from before a scan again, each with its weight
+        by the kernel in a solution of the graph. Raises IndexError without a keyframe."""
+        total = 0.0
+        for keyframe, pose, revisits in zip(self.keyframes, solution.pose, self._revisits(scan), strict=True):
+            known = revisits & np.isin(keyframe.birth, solution.birth)
+            l = solution.position[np.searchsorted(solution.birth, keyframe.birth[known])]  # noqa: E741
+            C = Pose2(*pose.tolist()).rotation()
+            y = (l - pose[:2]) @ C - keyframe.centre[known]
+            xx, xy, yy = keyframe.R[known].T
+            d2 = (yy * y[:, 0] ** 2 - 2.0 * xy * y[:, 0] * y[:, 1] + xx * y[:, 1] ** 2) / (xx * yy - xy**2)
+            total += float(_weight(d2).sum())
+        return total
 
     def thinned(self) -> KeyframeGraph:
         """Return the graph without every second keyframe, and without every second loop of more than
@@ -311,8 +331,8 @@ class KeyframeGraph:
         result. The graph is unchanged.
 
         Args:
-            new_loop: Whether the last loop was just added. The Cauchy kernel has no slope far from the
-                minimum, so the problem is first solved with the full weight of this loop.
+            new_loop: Whether the last loop was just added and has its full weight, without the kernel, which
+                has no slope far from the minimum.
 
         Raises:
             LinAlgError: The covariance of a detection, a motion or a loop is not positive definite.
@@ -320,12 +340,7 @@ class KeyframeGraph:
         if len(self.keyframes) < 2:
             return None
         problem = _Problem(self)
-        if new_loop:
-            first = problem.minimum(quadratic_loops=1)
-            if first is None:
-                return None
-            problem.pose = first[0]
-        minimum = problem.minimum()
+        minimum = problem.minimum(quadratic_loops=int(new_loop))
         try:
             return None if minimum is None else problem.solution(*minimum)
         except np.linalg.LinAlgError:
@@ -384,7 +399,7 @@ class _Problem:
         self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
         self.order: Int | None = None  # of elimination, the same for all steps
 
-    def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Sparse, Float] | None:
+    def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Sparse] | None:
         """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
         iteration ends without a test of convergence.
 
@@ -392,12 +407,12 @@ class _Problem:
             quadratic_loops: Number of loops at the end that have no Cauchy kernel.
 
         Returns:
-            Poses, shape (K, 3), yaw wrapped; positions of the stems, shape (L, 2) [m]; normal matrix, sparse,
-            shape (3K + 2L, 3K + 2L); and weights of motions and loops, shape (E,). None if the normal matrix
-            is singular or the damping exceeds its limit.
+            Poses, shape (K, 3), yaw wrapped; positions of the stems, shape (L, 2) [m]; and normal matrix,
+            sparse, shape (3K + 2L, 3K + 2L). None if the normal matrix is singular or the damping exceeds its
+            limit.
         """
         x, l = self.pose.copy(), self._triangulated()  # noqa: E741
-        cost, H, g, weight = self._linearised(x, l, quadratic_loops)
+        cost, H, g = self._linearised(x, l, quadratic_loops)
         damping, factor, most = DAMPING
         for _ in range(ITERATIONS_MAX):
             step = self._step(H, g, damping)
@@ -405,21 +420,21 @@ class _Problem:
                 return None
             dx, dl = step[: 3 * len(x)].reshape(-1, 3), step[3 * len(x) :].reshape(-1, 2)
             moved, placed = x + dx, l + dl
-            new_cost, new_H, new_g, new_weight = self._linearised(moved, placed, quadratic_loops)
+            new_cost, new_H, new_g = self._linearised(moved, placed, quadratic_loops)
             if new_cost > cost * (1.0 + 1e-9):
                 damping *= factor
                 if damping > most:
                     return None
                 continue
             converged = cost - new_cost < CONVERGED * cost
-            x, l, cost, H, g, weight = moved, placed, new_cost, new_H, new_g, new_weight  # noqa: E741
+            x, l, cost, H, g = moved, placed, new_cost, new_H, new_g  # noqa: E741
             damping = max(damping / factor, DAMPING[0])
             if converged:
                 break
         x[:, 2] = wrap_angle(x[:, 2])
-        return x, l, H, weight
+        return x, l, H
 
-    def solution(self, x: Float, l: Float, H: Sparse, weight: Float) -> Solution:  # noqa: E741
+    def solution(self, x: Float, l: Float, H: Sparse) -> Solution:  # noqa: E741
         """Return the record of a minimum. A diagonal block of the normal matrix H is the information of a
         pose given all other unknowns.
 
@@ -427,14 +442,13 @@ class _Problem:
             x: Poses, shape (K, 3).
             l: Stems, shape (L, 2) [m].
             H: Normal matrix, sparse, shape (3K + 2L, 3K + 2L).
-            weight: Weights of motions and loops, shape (E,).
 
         Raises:
             LinAlgError: Nothing observes the newest pose, or the problem is singular.
         """
         end = 3 * len(x)
         conditional = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
-        return Solution(x, self.birth, l, self._marginals(H), conditional, weight[self.motions :])
+        return Solution(x, self.birth, l, self._marginals(H), conditional)
 
     def _triangulated(self) -> Float:
         """Return the mean position of each landmark by its detections at the poses in `pose`, shape (L, 2)
@@ -450,7 +464,7 @@ class _Problem:
         x: Float,
         l: Float,  # noqa: E741
         quadratic_loops: int,
-    ) -> tuple[float, Sparse, Float, Float]:
+    ) -> tuple[float, Sparse, Float]:
         """Return cost and linear system at an estimate.
 
         Args:
@@ -459,8 +473,8 @@ class _Problem:
             quadratic_loops: Number of loops at the end that have no Cauchy kernel.
 
         Returns:
-            Robust cost; normal matrix, sparse, shape (3K + 2L, 3K + 2L); gradient, shape (3K + 2L,), poses
-            first; and weights of motions (1) and loops by their kernel, shape (E,).
+            Robust cost; normal matrix, sparse, shape (3K + 2L, 3K + 2L); and gradient, shape (3K + 2L,),
+            poses first.
         """
         from scipy import sparse
 
@@ -517,7 +531,7 @@ class _Problem:
             shape=(3 * E + 2 * M, size),
         )
         b = np.concatenate([e.ravel(), r.ravel()])
-        return cost, (A.T @ A).tocsc(), A.T @ b, weight
+        return cost, (A.T @ A).tocsc(), A.T @ b
 
     def _step(self, H: Sparse, g: Float, damping: float) -> Float | None:
         """Return the Levenberg-Marquardt step for the normal matrix H and the gradient g, shape (3K + 2L,);

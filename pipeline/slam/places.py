@@ -107,12 +107,6 @@ class Places:
         row = self._row(birth)
         return (row >= 0) & self.is_old(distance)[row] if len(self.birth) else row >= 0
 
-    def last_seen(self, birth: Int) -> Float:
-        """Return the distance driven at which the place of each landmark was last seen for certain [m], shape
-        (L,), by birth numbers, int64, shape (L,); infinite for landmarks that precede all places."""
-        row = self._row(birth)
-        return np.where(row < 0, np.inf, self.seen[row]) if len(self.birth) else np.full(len(birth), np.inf)
-
     def is_usable(self, birth: Int) -> Bool:
         """Return which landmarks are not in inactive places, shape (L,), by birth numbers of shape (L,); True
         for landmarks that precede all places."""
