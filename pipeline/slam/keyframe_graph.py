@@ -255,21 +255,28 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
     def _revisits(self, scan: int) -> list[Bool]:
-        """Return which detections of each keyframe, shape (D,), show landmarks from before a scan again:
-        those more than REVISIT_DISTANCE after the first keyframe behind the scan, of landmarks begun before
-        it.
+        """Return which detections of each keyframe, shape (D,), belong to the present revisit of what was
+        mapped until a scan: they show landmarks that were begun until then, more than REVISIT_DISTANCE after
+        it, and not before a gap of REVISIT_DISTANCE without such detections.
 
         Raises:
             IndexError: The graph has no keyframe.
         """
         row = min(int(np.searchsorted(self.scans, scan, side="right")), len(self.keyframes) - 1)
         first = self.keyframes[row]
-        begin = first.distance + REVISIT_DISTANCE
-        return [(k.birth < first.first_birth) & (k.distance > begin) for k in self.keyframes]
+        old = [
+            (k.birth < first.first_birth) & (k.distance > first.distance + REVISIT_DISTANCE)
+            for k in self.keyframes
+        ]
+        shown = [k.distance for k, rows in zip(self.keyframes, old, strict=True) if rows.any()]
+        at = np.array([first.distance, *shown, self.keyframes[-1].distance])
+        begin = at[np.flatnonzero(np.diff(at, prepend=-np.inf) > REVISIT_DISTANCE)[-1]]
+        return [rows & (k.distance >= begin) for k, rows in zip(self.keyframes, old, strict=True)]
 
     def without_revisits(self, scan: int) -> KeyframeGraph:
-        """Return the graph without the detections that show landmarks from before a scan again: the path may
-        have drifted by more than the distance between trees. Raises IndexError without a keyframe."""
+        """Return the graph without the detections of the present revisit of what was mapped until a scan: the
+        path may have drifted by more than the distance between trees. Raises IndexError without a keyframe.
+        """
         keyframes = list(self.keyframes)
         for n, revisits in enumerate(self._revisits(scan)):
             if revisits.any():
@@ -278,8 +285,8 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(keyframes))
 
     def support(self, scan: int, solution: Solution) -> float:
-        """Return the number of detections that show landmarks from before a scan again, each with its weight
-        by the kernel in a solution of the graph. Raises IndexError without a keyframe."""
+        """Return the number of detections of the present revisit of what was mapped until a scan, each with
+        its weight by the kernel in a solution of the graph. Raises IndexError without a keyframe."""
         total = 0.0
         for keyframe, pose, revisits in zip(self.keyframes, solution.pose, self._revisits(scan), strict=True):
             known = revisits & np.isin(keyframe.birth, solution.birth)

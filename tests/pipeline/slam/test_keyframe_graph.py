@@ -220,6 +220,20 @@ def lap(true, drift, *, takes_for_known):
     return graph
 
 
+def test_a_loop_keeps_the_associations_of_earlier_revisits():
+    """A way of 300 m on which four trees are seen at 0, at 120 to 150 and from 210 m on."""
+    graph, none = KeyframeGraph(), np.zeros((0, 2))
+    for k in range(31):
+        sees = np.full((4, 2), 3.0) if k == 0 or 12 <= k <= 15 or k >= 21 else none
+        birth, R = np.arange(len(sees)), np.tile([SIGMA**2, 0.0, SIGMA**2], (len(sees), 1))
+        T = np.array([10.0 * k, 0.0, 0.0])
+        motion = np.array([10.0 if k else 0.0, 0.0, 0.0])
+        graph = graph.with_keyframe(Keyframe(k, 4 * min(k, 1), 10.0 * k, motion, Q, birth, sees, R), T)
+    kept = [len(k.birth) > 0 for k in graph.without_revisits(0).keyframes]
+    assert np.flatnonzero(kept).tolist() == [0, 12, 13, 14, 15]
+    assert graph.without_revisits(29).keyframes == graph.keyframes, "they are no revisit so soon"
+
+
 def test_a_loop_overrules_associations_by_the_drifted_path():
     """The path had drifted by 3 m, and its last keyframes take stems for known ones 3 m away."""
     true = arc(42, turn=2.0 * np.pi / 41.0, radius=40.0)
