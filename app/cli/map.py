@@ -9,8 +9,9 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from app.cli import flags
 from pipeline.errors import ParameterError, SourceError
@@ -145,13 +146,15 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     saved = read_saved_run(arguments.continued) if arguments.continued else None
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
+    request = flags.source_request(arguments, arguments.source)
+    chosen = request.kept_choices()
+    if arguments.as_live:
+        chosen = {**(chosen or {}), "as_live": True}
+    options = replace(request.options(), as_live=arguments.as_live)
+    recording = flags.recording_place(arguments, arguments.source)
     with (
-        closing(open_any(arguments.source, flags.source_options(arguments))) as opened,
-        _listening(
-            opened,
-            flags.recording_place(arguments, arguments.source),
-            publish=arguments.publish,
-        ),
+        closing(open_any(arguments.source, options)) as opened,
+        _listening(opened, recording, publish=arguments.publish),
     ):
         revisions = (
             () if saved or flags.says_parameters(arguments) else recorded_parameters(opened.description)
@@ -176,7 +179,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             stop_after=arguments.stop_after,
             revisions=revisions,
             on_frame=None if live is None else lambda frame, mapper: live.mapped(frame, mapper.path),
-            chosen=_choices(arguments),
+            chosen=chosen,
         )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
@@ -187,15 +190,6 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     return _tell(
         [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
     )
-
-
-def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the topics and the mounting that the flags give, see `SourceRequest.kept_choices`, for run.json,
-    with `as_live` if that was given; None if there are none of these."""
-    from app.sources.request import request_of_options
-
-    kept = request_of_options(arguments.source, flags.source_options(arguments)).kept_choices()
-    return {**(kept or {}), "as_live": True} if arguments.as_live else kept
 
 
 def _tell(
