@@ -23,8 +23,8 @@ from pydantic import Field, ValidationError
 from starlette.requests import HTTPConnection
 from starlette.responses import Response
 
-from app.common.request_queue import RequestQueue
 from app.common.settings import Settings
+from app.common.timers import RequestQueue
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.sources.request import FILE, SourceRequest

@@ -10,7 +10,7 @@ import pytest
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from app.common.request_queue import RequestQueue
+from app.common.timers import RequestQueue
 from app.web.auth import Role, viewer_token
 from app.web.routes import access
 from app.web.routes.access import ConnectionLimit
