@@ -34,7 +34,7 @@ from app.batch.tree_pictures import keep_pictures
 from app.common.text import changed_values, count, preset_words, version
 from app.common.timers import Stopwatch
 from app.sources.request import ChosenOdometry, with_odometry
-from app.worker.mapper_factory import mapper_of
+from app.store.forests import mapper_of
 from pipeline.config import Parameters
 from pipeline.detection.free_space import clear_range
 from pipeline.errors import SourceError, StemmapError
