@@ -10,8 +10,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path as FilePath
@@ -29,7 +28,7 @@ from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.store.records import FRAME, PLOT, Content, UnknownError
 from app.store.store import Store
-from app.web.responses import BadRequestError, Body, Number, json_reply
+from app.web.responses import BadRequestError, Body, Number, as_bad_request, json_reply
 from app.web.routes.access import (
     Dash,
     Edit,
@@ -146,7 +145,7 @@ async def add_along(body: _Along, dashboard: Dash) -> Response:
     there would be too many."""
     if dashboard.path is None:
         raise NothingMappedError
-    with _as_bad_request():
+    with as_bad_request():
         centres = centres_along(dashboard.path_xy, body.every).round(3).tolist()
     circles = [{"kind": "circle", "x": x, "y": y, "radius": body.radius} for x, y in centres]
     return await _added(dashboard, body, [("", shape) for shape in circles])
@@ -161,10 +160,8 @@ async def import_file(body: _ImportPlots, dashboard: Dash) -> Response:
         file = await asyncio.to_thread(_written, body.files, FilePath(folder))
         async with in_thread(run.folder()) as run_folder:
             question = {"ask": "plots", "path": str(file), "run": str(run_folder), "crs": body.crs.strip()}
-            try:
+            with as_bad_request(where=file.name):
                 read = await inspection.ask(question)
-            except StemmapError as error:
-                raise BadRequestError(error.what, where=file.name, remedy=error.remedy) from None
     x, y = dashboard.offset
     moved = [
         [[[[px - x, py - y] for px, py in ring] for ring in part] for part in plot["polygons"]]
@@ -198,15 +195,6 @@ async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response
     return await edited(dashboard, body, {"id": number})
 
 
-@contextmanager
-def _as_bad_request() -> Iterator[None]:
-    """Raise a StemmapError of the context, which is about the values of a request, as BadRequestError."""
-    try:
-        yield
-    except StemmapError as error:
-        raise BadRequestError(error.what, where=error.where, remedy=error.remedy) from None
-
-
 async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, dict[str, Any]]]) -> Response:
     """Add plots, given by name ("" for the next free number) and shape, in one edit, and return the
     response 201 with their `ids`; raises BadRequestError if one is not valid, a name is taken or there would
@@ -215,7 +203,7 @@ async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, di
     for name, shape in plots:
         name = _checked_name(name, taken) if name else _free("", taken)
         taken.add(name)
-        with _as_bad_request():
+        with as_bad_request():
             middle = plot_of(name, shape).shape.centroid
         contents.append(Content(middle.x, middle.y, PLOT, None, {"name": name, "shape": shape}))
     rows = dashboard.annotation_editor.plots
@@ -362,10 +350,8 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
                 FilePath(question["table"]).write_text(body.by.table, encoding="utf-8")
         elif isinstance(body.by, _Gnss):
             question["start_ns"] = run.start_ns
-        try:
+        with as_bad_request(where=""):
             found = await inspection.ask(question, patience_s=_GNSS_PATIENCE_S)
-        except StemmapError as error:
-            raise BadRequestError(error.what, remedy=error.remedy) from None
     points = [_named(point, 0, (-offset[0], -offset[1])) for point in found["points"]]
     if len(points) > _MOST_POINTS:
         raise BadRequestError(
