@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -271,10 +272,7 @@ def numbers(shape: str, largest: float = 1e8) -> Callable[[str], tuple[float, ..
     least, most = shape.partition("[")[0].count(",") + 1, shape.count(",") + 1
 
     def parse(text: str) -> tuple[float, ...]:
-        try:
-            values = tuple(float(part) for part in text.split(","))
-        except ValueError:
-            values = ()
+        values = tuple(map(_number, text.split(",")))
         if not least <= len(values) <= most or not all(abs(value) <= largest for value in values):
             raise argparse.ArgumentTypeError(
                 f"{text!r} is not {shape}: numbers up to {largest:g} with commas between them"
@@ -359,10 +357,7 @@ def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
     """
 
     def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = 0.0
+        value = _number(text)
         if not 0.0 < value < limit:
             raise argparse.ArgumentTypeError(f"{text!r} is not a {quantity}")
         return value
@@ -372,13 +367,24 @@ def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
 
 def share(text: str) -> float:
     """Parse a number from 0 to 1, both included; ArgumentTypeError for other texts."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
+    value = _number(text)
     if not 0.0 <= value <= 1.0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 to 1")
     return value
+
+
+def _number(text: str) -> float:
+    """Return the number of a text, NaN for other texts."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def print_warnings(texts: Iterable[str]) -> None:
+    """Print warnings to standard error, without characters that steer a terminal."""
+    for text in texts:
+        print(f"warning: {plain(text)}", file=sys.stderr)
 
 
 def chosen_parameters(

@@ -95,8 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     from app.batch.run_folder import partial_output_warnings
     from pipeline.io.readers import is_cloud
 
-    for line in partial_output_warnings(arguments.out):
-        print(f"warning: {line}", file=sys.stderr)
+    flags.print_warnings(partial_output_warnings(arguments.out))
     if arguments.kind == "plot" or (arguments.kind == "auto" and is_cloud(arguments.source)):
         return _run_plot(arguments)
     return _run_scans(arguments)
@@ -207,8 +206,7 @@ def _tell(
     for line in summary:
         print(line)
     print(f"files in {out}" + (" (replaced)" if replaces else ""))
-    for warning in warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    flags.print_warnings(warnings)
     for reason, number in losses.items():
         print(f"left out: {reason} ({number:,})", file=sys.stderr)
     return 3 if losses else 0

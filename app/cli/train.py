@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import plain
+from app.cli.flags import plain, print_warnings
 from app.cli.flags import seed as whole_seed
 from app.common.text import count
 from pipeline.errors import StemmapError, UsageError
@@ -74,8 +74,7 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
     )
     for line in table_lines(learned):
         print(plain(line))
-    for warning in learned.warnings:
-        print(f"warning: {plain(warning)}", file=sys.stderr)
+    print_warnings(learned.warnings)
     if out is None:
         name = Forests(settings.folder).keep(learned.data)
         print(f"stored as {name}; use it with --set classification.forest={name}")
