@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,7 +67,6 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
         runs,
         preset("forest").classification,
         settings.folder,
-        date=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
         seed=seed,
         progress=lambda words: print(plain(words), file=sys.stderr) if sys.stderr.isatty() else None,
     )
