@@ -16,7 +16,7 @@ from starlette.middleware import Middleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.common.settings import Settings
+from app.common.settings import BODY_LIMIT, Settings
 from app.common.timers import TooManyRequestsError
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
@@ -142,7 +142,7 @@ def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) ->
         host=settings.host,
         port=port,
         further_hosts=settings.hosts,
-        body_limit=settings.body_limit,
+        body_limit=BODY_LIMIT,
         upload_limit=settings.upload_limit,
     )
     app = FastAPI(
