@@ -606,7 +606,7 @@ def robots_at(address: ZenohAddress) -> list[str]:
         link.close()
 
 
-_TRY_AGAIN_LATER, _REFUSED = 1013, 1003
+_REFUSED = 1003
 
 router = APIRouter()
 
@@ -678,10 +678,7 @@ async def fleet_live(browser: WebSocket) -> None:
     closes the connection with code 1003; without room for another connection it is closed with 1013 before it
     is accepted."""
     fleet: Fleet = browser.app.state.fleet
-    with fleet.pages.place(role_of(browser.scope)) as free:
-        if not free:
-            await browser.close(_TRY_AGAIN_LATER)
-            return
+    with fleet.pages.place(role_of(browser.scope)):
         await browser.accept()
         async with telling(browser, fleet.live):
             if (await browser.receive())["type"] != "websocket.disconnect":
