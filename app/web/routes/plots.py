@@ -337,8 +337,6 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
     edits, see `edited`. 409 before the first map, or if another run was opened or the reference system was
     changed meanwhile; 422 if there are too many points, or the values contradict one another or do not fit
     the reference system."""
-    if dashboard.shown is None:
-        raise NothingMappedError
     run, by = ShownRun.of(dashboard), body.by.model_dump()
     offset = dashboard.offset
     async with in_thread(run.folder()) as folder:
