@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import viser
 
 from app.common.user import current_user
+from app.scene.viser_server import set_value
 from pipeline.config import PRESETS, FieldSpec, Parameters, field_specs, preset
 from pipeline.errors import StemmapError
 
@@ -87,9 +88,9 @@ class TunePanel:
             widget, value = self._widgets[spec.name], values[spec.name]
             widget.min, widget.max = _range(spec, value)
             if spec.name not in moving:
-                widget.value = _kind(spec)(value)
+                set_value(widget, _kind(spec)(value))
             widget.label = _label(spec, spec.name in changed)
-        self._preset.value = preset_name
+        set_value(self._preset, preset_name)
         self._summary.content = _summary(len(changed), preset_name)
 
     def suit(self, *, cloud: bool) -> None:

@@ -156,3 +156,8 @@ def add_posed(scene: viser.SceneApi, name: str) -> viser.FrameHandle:
     frame.position, frame.wxyz = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)  # only the last of both is sent
     frame.position, frame.wxyz = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
     return frame
+
+
+def set_value(widget: Any, value: float | int | bool | str) -> None:  # noqa: ANN401
+    """Set the value of a widget from code; all browsers receive it."""
+    widget.value = value

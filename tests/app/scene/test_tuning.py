@@ -9,6 +9,7 @@ import pytest
 from viser import _messages
 
 from app.scene import Scene
+from app.scene.viser_server import set_value
 from pipeline.config import Parameters, field_specs, preset
 from tests.app.scene.recorder import Recorder, Refusing
 
@@ -113,7 +114,7 @@ async def test_while_one_change_is_under_way_only_the_newest_waits(scene: Scene,
         scene._tuning.change("clustering.eps", eps, None)
         await asyncio.sleep(0)
     # What the server says about the first change does not pull the slider away from the hand.
-    scene._tune._widgets["clustering.eps"].value = 0.5
+    set_value(scene._tune._widgets["clustering.eps"], 0.5)
     scene.show_parameters(preset("forest").replace({"clustering.eps": 0.2}), "forest")
     assert scene._tune._widgets["clustering.eps"].value == 0.5
     go.set()
