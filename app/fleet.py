@@ -242,17 +242,14 @@ class Member:
         source: The run that the dashboard opens.
         listening: Listening socket of its port.
         app: Application of the dashboard.
-        settings: Settings of the deployment.
     """
 
-    def __init__(
-        self, name: str, source: Open, listening: socket.socket, app: FastAPI, settings: Settings
-    ) -> None:
+    def __init__(self, name: str, source: Open, listening: socket.socket, app: FastAPI) -> None:
         self.name, self.source = name, source
         self.port = int(listening.getsockname()[1])
         self.dashboard: Dashboard = app.state.dashboard
         self._listening = listening
-        self._server = _Server(uvicorn_config(app, settings))
+        self._server = _Server(uvicorn_config(app))
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
@@ -374,7 +371,7 @@ class Fleet:
             self.notice = f"{name} is not shown: {error}"
             return False
         app = build(
-            replace(self._settings, port=listening.getsockname()[1]),
+            self._settings,
             port=listening.getsockname()[1],
             token=self._token,
             source=source,
@@ -385,7 +382,7 @@ class Fleet:
                 self._port, lambda: {each.dashboard.run_recorder.record for each in self.members.values()}
             ),
         )
-        self.members[name] = Member(name, source, listening, app, self._settings)
+        self.members[name] = Member(name, source, listening, app)
         if self._is_warm:
             self.members[name].start()
         return True
@@ -609,7 +606,7 @@ def robots_at(address: ZenohAddress) -> list[str]:
         link.close()
 
 
-_TRY_AGAIN_LATER, _REFUSED = 1013, 1003
+_REFUSED = 1003
 
 router = APIRouter()
 
@@ -681,10 +678,7 @@ async def fleet_live(browser: WebSocket) -> None:
     closes the connection with code 1003; without room for another connection it is closed with 1013 before it
     is accepted."""
     fleet: Fleet = browser.app.state.fleet
-    with fleet.pages.place(role_of(browser.scope)) as free:
-        if not free:
-            await browser.close(_TRY_AGAIN_LATER)
-            return
+    with fleet.pages.place(role_of(browser.scope)):
         await browser.accept()
         async with telling(browser, fleet.live):
             if (await browser.receive())["type"] != "websocket.disconnect":

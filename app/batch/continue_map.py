@@ -14,7 +14,7 @@ import numpy as np
 
 from app.batch.run_folder import is_of_cloud, read_run_record
 from app.batch.summary import RunTotals
-from app.worker.mapper_factory import mapper_of
+from app.store.forests import mapper_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import StemmapError

@@ -22,10 +22,17 @@ from typing import Any
 import numpy as np
 import shapely
 
-from app.batch.georeference import LOCAL_NAME, WGS84, MapFrame, heights_at, read_map_frame, reproject
+from app.batch.georeference import (
+    LOCAL_NAME,
+    WGS84,
+    MapFrame,
+    gis_package,
+    heights_at,
+    read_map_frame,
+    reproject,
+)
 from app.batch.run_folder import read_run, read_terrain
 from app.batch.stand import StandResult
-from app.common.extras import needed
 from app.common.text import version
 from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Float
@@ -268,7 +275,7 @@ def _layers(run: ExportedRun) -> dict[str, Any]:
     """Return the layers as GeoDataFrames by name, in the coordinates of the files: `trees`, and where
     there are any `path`, `plots` and `contours`; their columns are LAYER_FIELDS and the geometry. Raises
     StemmapError if a package is not installed or the terrain covers too large an area."""
-    geopandas = needed("geopandas", "gis", "GIS files")
+    geopandas = gis_package("geopandas", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
             run.columns, geometry=shapely.points(run.place.reshape(-1, 2)), crs=run.crs
@@ -424,7 +431,7 @@ def _write_dxf(run: ExportedRun, file: FilePath) -> None:
     """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS and CONTOURS. A tree without a
     diameter is a point without a circle, one without a height has z 0. StemmapError if ezdxf is not
     installed."""
-    ezdxf = needed("ezdxf", "gis", "DXF files")
+    ezdxf = gis_package("ezdxf", "DXF files")
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
     try:
@@ -462,7 +469,7 @@ def _write_dxf(run: ExportedRun, file: FilePath) -> None:
 def _write_xlsx(run: ExportedRun, file: FilePath) -> None:
     """Write a workbook with the sheets trees, plots (if there are any), fields and about. StemmapError if
     xlsxwriter is not installed."""
-    xlsxwriter = needed("xlsxwriter", "gis", "XLSX files")
+    xlsxwriter = gis_package("xlsxwriter", "XLSX files")
     book = xlsxwriter.Workbook(str(file), {"nan_inf_to_errors": False, "strings_to_formulas": False})
     book.set_properties({"created": _DATE.replace(tzinfo=None), "comments": f"stemmap {version()}"})
     bold = book.add_format({"bold": True})
@@ -571,7 +578,7 @@ def contours(run: ExportedRun) -> list[tuple[float, Float]]:
     found = terrain_raster(run)
     if found is None or min(found[0].shape) < 2:
         return []
-    contourpy = needed("contourpy", "gis", "contours")
+    contourpy = gis_package("contourpy", "contours")
     raster, west, north = found
     x = west + (np.arange(raster.shape[1]) + 0.5) * TERRAIN_CELL
     y = north - (np.arange(raster.shape[0]) + 0.5) * TERRAIN_CELL
@@ -593,7 +600,7 @@ def _write_geotiff(run: ExportedRun, file: FilePath) -> None:
         StemmapError: The run has no terrain, its reference system has no EPSG code up to 32766, or tifffile
             is not installed.
     """
-    tifffile = needed("tifffile", "gis", "GeoTIFF files")
+    tifffile = gis_package("tifffile", "GeoTIFF files")
     found = terrain_raster(run)
     if found is None:
         raise StemmapError("the run has no terrain", where=run.uri)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -138,6 +139,24 @@ class ControlPoint:
     x: float | None = None
     y: float | None = None
     z: float | None = None
+
+
+def gis_package(module: str, purpose: str) -> Any:  # noqa: ANN401 - a module
+    """Import a package of the extra `gis` and return it.
+
+    Args:
+        module: Its name.
+        purpose: What needs it, a plural for the message, such as "GIS files".
+
+    Raises:
+        StemmapError: It, or a module that it needs, is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise StemmapError(
+            f"{purpose} need the package {module}", remedy="Install it with: pip install 'stemmap[gis]'"
+        ) from None
 
 
 def projected(crs: str) -> str:

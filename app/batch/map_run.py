@@ -34,7 +34,7 @@ from app.batch.tree_pictures import keep_pictures
 from app.common.text import changed_values, count, preset_words, version
 from app.common.timers import Stopwatch
 from app.sources.request import ChosenOdometry, with_odometry
-from app.worker.mapper_factory import mapper_of
+from app.store.forests import mapper_of
 from pipeline.config import Parameters
 from pipeline.detection.free_space import clear_range
 from pipeline.errors import SourceError, StemmapError
@@ -297,13 +297,11 @@ def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
     (new value by dotted name, against the revision before); first an empty one from scan 0 on. Revisions
     without a change are omitted."""
     revisions: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
-    before = plan.parameters.flat()
+    before = plan.parameters
     for first, parameters in plan.revisions:
-        after = parameters.flat()
-        changes = {name: value for name, value in after.items() if value != before[name]}
-        if changes:
+        if changes := parameters.changes_from(before):
             revisions.append({"revision": len(revisions), "from_scan": first, "changes": changes})
-        before = after
+        before = parameters
     return revisions
 
 

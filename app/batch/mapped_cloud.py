@@ -15,6 +15,7 @@ from app.batch.georeference import heights_at, read_map_frame
 from app.batch.run_folder import read_run, read_terrain
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float, Pose2
+from pipeline.io.atomic_files import write_beside
 from pipeline.io.readers.clouds import SYSTEM_OF_DRIVE
 
 if TYPE_CHECKING:
@@ -39,12 +40,11 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
 
     Args:
         folder: Folder of the run.
-        file: File .las or .laz, which is replaced; after an error it may be incomplete.
+        file: File .las or .laz, which is replaced; it does not change after an error.
 
     Raises:
         StemmapError: The run or its source cannot be read, it is live or continues another run, or no point
-            is near known ground.
-        OSError: The file cannot be written.
+            is near known ground, or the file cannot be written.
     """
     import laspy
     from scipy.spatial import cKDTree
@@ -63,16 +63,16 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
     header.system_identifier = SYSTEM_OF_DRIVE if is_of_drive else "stemmap"
     header.creation_date = datetime.date(2000, 1, 1)  # the same run gives the same bytes
     header.scales = np.full(3, 0.001)
-    header.offsets = np.floor(np.append(frame.to_crs(np.zeros((1, 2))), frame.z))
-    if len(trees.number):
-        header.offsets = np.floor(np.append(frame.to_crs(trees.position[:1]), frame.z))
+    origin = trees.position[:1] if len(trees.number) else np.zeros((1, 2))
+    header.offsets = np.floor(np.append(frame.to_crs(origin), frame.z))
     if frame.crs:
         import pyproj
 
         header.add_crs(pyproj.CRS.from_user_input(frame.crs))
     parts = _parts_of_drive(folder) if cloud is None else _parts_of_cloud(cloud)
     written = 0
-    with laspy.open(file, "w", header=header) as writer:
+    is_laz = file.suffix.lower() == ".laz"
+    with write_beside(file) as partial, laspy.open(partial, "w", header=header, do_compress=is_laz) as writer:
         for points in parts:
             ground = heights_at(terrain, points[:, :2])
             number = np.zeros(len(points), np.uint32)

@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import shapely
 
-from app.batch.georeference import LOCAL, LOCAL_NAME, MapFrame, read_map_frame
-from app.common.extras import needed
+from app.batch.georeference import LOCAL, LOCAL_NAME, MapFrame, gis_package, read_map_frame
 from app.store.records import FRAME, PLOT
 from pipeline.errors import SourceError, StemmapError
 from pipeline.stand.plots import PLOTS_MAX, SamplePlot, checked, circle, plot_of
@@ -46,7 +45,7 @@ def read_plots(file: FilePath, run: FilePath, *, crs: str | None) -> list[Sample
         StemmapError: geopandas is not installed; the file cannot be read or has no plots; a shape is not a
             valid area; or its reference system does not fit the run.
     """
-    geopandas = needed("geopandas", "gis", "plots from files")
+    geopandas = gis_package("geopandas", "plots from files")
     if file.suffix.lower() not in SUFFIXES:
         raise SourceError("plots are .gpkg, .shp (also in a .zip) or .geojson files", where=str(file))
     try:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 
-from app.cli.flags import add_dbh_unit_flag, positive_number
+from app.cli.flags import add_dbh_unit_flag, positive_number, print_warnings
 from app.cli.stand import reviewed
 
 HELP = "compare two runs or surveys of one stand: growth, new, missing and moved trees"
@@ -68,6 +67,5 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         write_comparison(a, b, found, arguments.out)
         print(f"files in {arguments.out}")
-    for text in record["warnings"]:
-        print(f"warning: {text}", file=sys.stderr)
+    print_warnings(record["warnings"])
     return 3 if record["warnings"] else 0

@@ -314,8 +314,7 @@ def _swept(arguments: argparse.Namespace, plan: SweepPlan) -> list[JobResult]:
         answers = sweep(list(plan.jobs.values()), processes, bar.update)
     if kept.used:
         print(f"{count(kept.used, 'stored result')} used", file=sys.stderr)
-    for warning in processes.warnings():
-        print(f"warning: {flags.plain(warning)}", file=sys.stderr)
+    flags.print_warnings(processes.warnings())
     return answers
 
 

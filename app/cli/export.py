@@ -67,36 +67,20 @@ def _export(arguments: argparse.Namespace, folder: Path) -> int:
     if arguments.to == TREE_MANAGER:
         return _tree_manager(arguments, folder)
     from app.batch.export import export_run, read_for_export
+    from app.batch.mapped_cloud import write_cloud
     from app.batch.stand import stand_of
 
     if arguments.out is not None:
         raise UsageError("--out is only for tree-manager", remedy="Name the file with --to")
     file = Path(arguments.to)
     if file.suffix.lower() in (".las", ".laz"):
-        return _cloud(folder, file)
+        print(f"{write_cloud(folder, file):,} points in {file}")
+        return 0
     plots, parameters = chosen_plots(arguments), stand_parameters(arguments)
     exported = read_for_export(folder, stand_of(folder, parameters, plots) if plots else None)
     written = export_run(exported, file)
     frame = exported.frame.title
     print(f"{len(exported.place)} trees in {frame} coordinates: {', '.join(map(str, written))}")
-    return 0
-
-
-def _cloud(run: Path, file: Path) -> int:
-    """Write the cloud with the number of the tree of each point and print the number of points; return 0.
-    Errors as in `run`."""
-    from app.batch.mapped_cloud import write_cloud
-    from pipeline.io.atomic_files import write_beside
-
-    with write_beside(file) as partial:
-        # laspy compresses by the name of the file
-        named = partial.with_name(partial.name + file.suffix.lower())
-        try:
-            points = write_cloud(run, named)
-            named.replace(partial)
-        finally:
-            named.unlink(missing_ok=True)
-    print(f"{points:,} points in {file}")
     return 0
 
 

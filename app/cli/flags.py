@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from app.common.text import COMPILING, count
-from pipeline.errors import ParameterError
+from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
+    from app.sources.request import SourceRequest
     from app.tuning.plan import PlannedRun
     from pipeline.config import Parameters
-    from pipeline.io.readers import SourceOptions
 
 SOURCE_HELP = (
     "a recording (.mcap, .db3, .bag, .pcap, .zip of Victoria Park), a folder of scans (.bin, .pcd, .ply, "
@@ -123,6 +124,12 @@ def add_force_flag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--force", action="store_true", help="overwrite the map of another source in the folder"
     )
+
+
+def refuse_to_overwrite(file: Path, *, force: bool) -> None:
+    """Raise StemmapError if a file exists, unless `force`."""
+    if file.exists() and not force:
+        raise StemmapError("the file exists already", where=str(file), remedy="Name another, or add --force")
 
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
@@ -265,10 +272,7 @@ def numbers(shape: str, largest: float = 1e8) -> Callable[[str], tuple[float, ..
     least, most = shape.partition("[")[0].count(",") + 1, shape.count(",") + 1
 
     def parse(text: str) -> tuple[float, ...]:
-        try:
-            values = tuple(float(part) for part in text.split(","))
-        except ValueError:
-            values = ()
+        values = tuple(map(_number, text.split(",")))
         if not least <= len(values) <= most or not all(abs(value) <= largest for value in values):
             raise argparse.ArgumentTypeError(
                 f"{text!r} is not {shape}: numbers up to {largest:g} with commas between them"
@@ -278,20 +282,14 @@ def numbers(shape: str, largest: float = 1e8) -> Callable[[str], tuple[float, ..
     return parse
 
 
-def source_options(arguments: argparse.Namespace) -> SourceOptions:
-    """Return the options of the source that the flags give; the angles of --mount are converted to
-    radians."""
-    from math import radians
+def source_request(arguments: argparse.Namespace, uri: str) -> SourceRequest:
+    """Return how a source is opened and mapped as the flags give it; --mount is converted to radians. Without
+    the flag --odometry the odometry is "auto"."""
+    from app.sources.request import SourceRequest, mount_of_degrees
 
-    from pipeline.geometry.poses import Pose3
-    from pipeline.io.readers import SourceOptions
-
-    mount = arguments.mount
-    return SourceOptions(
-        topics=dict(arguments.topics),
-        T_base_lidar=None if mount is None else Pose3.from_euler(mount[:3], *map(radians, mount[3:])),
-        seed=arguments.seed,
-        as_live=getattr(arguments, "as_live", False),
+    odometry = getattr(arguments, "odometry", "auto")
+    return SourceRequest(
+        uri, odometry, arguments.seed, dict(arguments.topics), mount_of_degrees(arguments.mount)
     )
 
 
@@ -310,13 +308,11 @@ def planned_run(
     Raises:
         StemmapError: The file of true trees cannot be read.
     """
-    from app.sources.request import SourceRequest, mount_of_degrees
     from app.store.records import contents_of
     from app.tuning.plan import PlannedRun
     from pipeline.io.ground_truth import read_truth_trees
 
-    mount = mount_of_degrees(arguments.mount)
-    source = SourceRequest(uri, arguments.odometry, arguments.seed, dict(arguments.topics), mount)
+    source = source_request(arguments, uri)
     if truth is None:
         return PlannedRun(source, held_out=held_out)
     trees = read_truth_trees(Path(truth), dbh_unit=arguments.dbh_unit)
@@ -361,10 +357,7 @@ def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
     """
 
     def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = 0.0
+        value = _number(text)
         if not 0.0 < value < limit:
             raise argparse.ArgumentTypeError(f"{text!r} is not a {quantity}")
         return value
@@ -374,13 +367,24 @@ def positive_number(limit: float, quantity: str) -> Callable[[str], float]:
 
 def share(text: str) -> float:
     """Parse a number from 0 to 1, both included; ArgumentTypeError for other texts."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
+    value = _number(text)
     if not 0.0 <= value <= 1.0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 to 1")
     return value
+
+
+def _number(text: str) -> float:
+    """Return the number of a text, NaN for other texts."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def print_warnings(texts: Iterable[str]) -> None:
+    """Print warnings to standard error, without characters that steer a terminal."""
+    for text in texts:
+        print(f"warning: {plain(text)}", file=sys.stderr)
 
 
 def chosen_parameters(

@@ -8,7 +8,7 @@ import shlex
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
-from app.cli.flags import SOURCE_HELP, add_source_flags, plain, program, seed, source, source_options
+from app.cli.flags import SOURCE_HELP, add_source_flags, plain, program, seed, source, source_request
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,7 +46,9 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             print("\n".join(_cloud_lines(cloud)))
         return 0
-    with closing(open_source(arguments.source, source_options(arguments))) as opened:
+    with closing(
+        open_source(arguments.source, source_request(arguments, arguments.source).options())
+    ) as opened:
         if arguments.json:
             print(json.dumps(_record(opened), indent=1, allow_nan=False))
         else:

@@ -9,8 +9,9 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from app.cli import flags
 from pipeline.errors import ParameterError, SourceError
@@ -94,8 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     from app.batch.run_folder import partial_output_warnings
     from pipeline.io.readers import is_cloud
 
-    for line in partial_output_warnings(arguments.out):
-        print(f"warning: {line}", file=sys.stderr)
+    flags.print_warnings(partial_output_warnings(arguments.out))
     if arguments.kind == "plot" or (arguments.kind == "auto" and is_cloud(arguments.source)):
         return _run_plot(arguments)
     return _run_scans(arguments)
@@ -145,13 +145,15 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     saved = read_saved_run(arguments.continued) if arguments.continued else None
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
+    request = flags.source_request(arguments, arguments.source)
+    chosen = request.kept_choices()
+    if arguments.as_live:
+        chosen = {**(chosen or {}), "as_live": True}
+    options = replace(request.options(), as_live=arguments.as_live)
+    recording = flags.recording_place(arguments, arguments.source)
     with (
-        closing(open_any(arguments.source, flags.source_options(arguments))) as opened,
-        _listening(
-            opened,
-            flags.recording_place(arguments, arguments.source),
-            publish=arguments.publish,
-        ),
+        closing(open_any(arguments.source, options)) as opened,
+        _listening(opened, recording, publish=arguments.publish),
     ):
         revisions = (
             () if saved or flags.says_parameters(arguments) else recorded_parameters(opened.description)
@@ -176,7 +178,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             stop_after=arguments.stop_after,
             revisions=revisions,
             on_frame=None if live is None else lambda frame, mapper: live.mapped(frame, mapper.path),
-            chosen=_choices(arguments),
+            chosen=chosen,
         )
         first = saved.sources[0].digest if saved else opened.description.digest
         replaces = check_folder(arguments.out, first, force=arguments.force)
@@ -187,15 +189,6 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     return _tell(
         [*outcome.summary, times], arguments.out, outcome.warnings, outcome.losses, replaces=replaces
     )
-
-
-def _choices(arguments: argparse.Namespace) -> dict[str, Any] | None:
-    """Return the topics and the mounting that the flags give, see `SourceRequest.kept_choices`, for run.json,
-    with `as_live` if that was given; None if there are none of these."""
-    from app.sources.request import request_of_options
-
-    kept = request_of_options(arguments.source, flags.source_options(arguments)).kept_choices()
-    return {**(kept or {}), "as_live": True} if arguments.as_live else kept
 
 
 def _tell(
@@ -213,8 +206,7 @@ def _tell(
     for line in summary:
         print(line)
     print(f"files in {out}" + (" (replaced)" if replaces else ""))
-    for warning in warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    flags.print_warnings(warnings)
     for reason, number in losses.items():
         print(f"left out: {reason} ({number:,})", file=sys.stderr)
     return 3 if losses else 0

@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from app.cli.flags import refuse_to_overwrite
+
 HELP = "repair a recording that was cut or damaged"
 
 
@@ -34,10 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise StemmapError(
             "this is the damaged file", where=str(arguments.out), remedy="Name another with --out"
         )
-    if arguments.out.exists() and not arguments.force:
-        raise StemmapError(
-            "the file exists already", where=str(arguments.out), remedy="Name another, or add --force"
-        )
+    refuse_to_overwrite(arguments.out, force=arguments.force)
     mended = mend(arguments.file, arguments.out)
     print(f"{arguments.out}: {mended.messages} messages")
     for reason, number in mended.losses.items():

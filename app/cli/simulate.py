@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import compilation_notice, progress_bar, seed
+from app.cli.flags import compilation_notice, progress_bar, refuse_to_overwrite, seed
 
 if TYPE_CHECKING:
     from pipeline.io.readers.camera import Picture
@@ -43,13 +43,16 @@ def run(arguments: argparse.Namespace) -> int:
         StemmapError: The scenario is invalid, a file exists without --force, or cannot be written.
     """
     from app.common.text import count
+    from pipeline.io.atomic_files import write_texts
     from pipeline.io.readers.simulated import open_simulated
     from pipeline.io.recording import write_recording
     from pipeline.io.recording.rendering import CAMERA, with_pictures
+    from pipeline.io.result_files import csv_text, number_text
 
     out: Path = arguments.out
     table = out.with_suffix(".trees.csv")
-    _refuse_to_overwrite([out, table], arguments.force)
+    for file in (out, table):
+        refuse_to_overwrite(file, force=arguments.force)
     source = open_simulated(_uri(arguments))
     description = source.description
     truth = source.truth()
@@ -64,7 +67,10 @@ def run(arguments: argparse.Namespace) -> int:
         truth=truth,
         camera=CAMERA if arguments.camera else None,
     )
-    _write_trees(table, source)
+    trees = source.run.scene.truth
+    places = zip(trees.x, trees.y, 100.0 * trees.dbh, trees.kind, strict=True)
+    cells = [[*map(number_text, (x, y, dbh), (4, 4, 2)), kind] for x, y, dbh, kind in places]
+    write_texts(table.parent, {table.name: csv_text(("x_m", "y_m", "dbh_cm", "class"), cells)})
     print(f"{out}: {count(description.scans or 0, 'scan')}; its ground truth is attached, and in {table}")
     return 0
 
@@ -88,17 +94,6 @@ def _uri(arguments: argparse.Namespace) -> str:
     return uri
 
 
-def _refuse_to_overwrite(paths: list[Path], force: bool) -> None:
-    """Raise StemmapError if a file exists, unless `force`."""
-    from pipeline.errors import StemmapError
-
-    for path in paths:
-        if path.exists() and not force:
-            raise StemmapError(
-                "the file exists already", where=str(path), remedy="Name another, or add --force"
-            )
-
-
 def _with_progress(source: SimulatedSource) -> Iterator[Record]:
     """Yield the records of a source, with a progress bar of its scans if standard error is a terminal."""
     from pipeline.types.records import Scan
@@ -107,16 +102,3 @@ def _with_progress(source: SimulatedSource) -> Iterator[Record]:
         for record in source.records():
             yield record
             bar.update(isinstance(record, Scan))
-
-
-def _write_trees(path: Path, source: SimulatedSource) -> None:
-    """Write the true objects of the scene as CSV: x, y [m], DBH [cm] (empty if unknown), class; raises
-    StemmapError if the file cannot be written."""
-    from pipeline.io.atomic_files import write_beside
-
-    trees = source.run.scene.truth
-    with write_beside(path) as partial, partial.open("w", encoding="utf-8", newline="\n") as file:
-        file.write("x_m,y_m,dbh_cm,class\n")
-        for x, y, dbh, kind in zip(trees.x, trees.y, trees.dbh, trees.kind, strict=True):
-            diameter = f"{100.0 * dbh:.2f}" if dbh == dbh else ""
-            file.write(f"{x:.4f},{y:.4f},{diameter},{kind}\n")

@@ -9,7 +9,7 @@ from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from app.cli.flags import numbers, positive_number
+from app.cli.flags import numbers, positive_number, print_warnings
 from pipeline.errors import ParameterError, StemmapError
 
 if TYPE_CHECKING:
@@ -236,7 +236,6 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         StemmapError: A flag or plot is not valid, the run cannot be read, or a file cannot be written.
     """
-    import sys
 
     from app.batch.stand import stand_files, stand_of, stand_summary
     from pipeline.io.atomic_files import write_texts
@@ -245,8 +244,7 @@ def run(arguments: argparse.Namespace) -> int:
     with reviewed(arguments.run) as folder:
         result = stand_of(folder, parameters, plots)
     print("\n".join(stand_summary(result)))
-    for warning in result.warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+    print_warnings(result.warnings)
     if arguments.out is not None:
         write_texts(arguments.out, stand_files(result))
         print(f"files in {arguments.out}")

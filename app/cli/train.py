@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.cli.flags import plain
+from app.cli.flags import plain, print_warnings
 from app.cli.flags import seed as whole_seed
 from app.common.text import count
 from pipeline.errors import StemmapError, UsageError
@@ -68,14 +67,12 @@ def learn_from_annotations(names: list[str], out: Path | None, seed: int) -> int
         runs,
         preset("forest").classification,
         settings.folder,
-        date=time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
         seed=seed,
         progress=lambda words: print(plain(words), file=sys.stderr) if sys.stderr.isatty() else None,
     )
     for line in table_lines(learned):
         print(plain(line))
-    for warning in learned.warnings:
-        print(f"warning: {plain(warning)}", file=sys.stderr)
+    print_warnings(learned.warnings)
     if out is None:
         name = Forests(settings.folder).keep(learned.data)
         print(f"stored as {name}; use it with --set classification.forest={name}")

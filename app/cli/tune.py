@@ -95,8 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     with closing(search_processes(plan, arguments.workers)) as workers:
         search = Search(plan, workers)
         stopped = _search(search)
-        for warning in workers.warnings():
-            print(f"warning: {flags.plain(warning)}", file=sys.stderr)
+        flags.print_warnings(workers.warnings())
         return _finish(search, arguments, stopped=stopped)
 
 

@@ -78,12 +78,13 @@ class ChildProcess:
 
     Attributes:
         pid: Process number.
+        stdin, stdout: Its standard input and output, for other messages than lines of JSON.
     """
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
         assert process.stdin is not None  # noqa: S101 - `start` opens both
         assert process.stdout is not None  # noqa: S101
-        self._process, self._stdin, self._stdout = process, process.stdin, process.stdout
+        self._process, self.stdin, self.stdout = process, process.stdin, process.stdout
         self.pid = process.pid
 
     @classmethod
@@ -123,8 +124,8 @@ class ChildProcess:
             NotImplementedError: The message has a value without a form in JSON; nothing is sent.
         """
         with contextlib.suppress(ConnectionError):
-            self._stdin.write(_encoded(message))
-            await self._stdin.drain()
+            self.stdin.write(_encoded(message))
+            await self.stdin.drain()
 
     async def receive(self, kind: type[T], timeout_s: float | None = None) -> T | None:
         """Wait for the next message; None when the child has ended.
@@ -139,7 +140,7 @@ class ChildProcess:
         """
         try:
             async with asyncio.timeout(timeout_s):
-                line = await self._stdout.readline()
+                line = await self.stdout.readline()
         except ValueError:
             raise ProtocolError("protocol error: a line is too long") from None
         return _decoded(line, kind)
@@ -151,24 +152,28 @@ class ChildProcess:
         Returns:
             Its return code; negative number of the signal that ended it.
         """
-        self._stdin.close()
+        self.stdin.close()
         try:
             if grace_s > 0.0:
                 with contextlib.suppress(TimeoutError):
                     await asyncio.wait_for(self._wait(), grace_s)
         finally:
-            if self._process.returncode is None:
-                # `Process.kill` would reap a child that has just died, and its return code would be lost.
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(self.pid, signal.SIGKILL)
+            self.kill()
             await self._wait()
         return self._process.returncode or 0
+
+    def kill(self) -> None:
+        """Kill the child, if it runs, without waiting for its end."""
+        if self._process.returncode is None:
+            # `Process.kill` would reap a child that has just died, and its return code would be lost.
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, signal.SIGKILL)
 
     async def _wait(self) -> None:
         """Wait for the end of the process. Its remaining output is read, because a full pipe would block
         it."""
         with contextlib.suppress(RuntimeError):  # another task waits in `receive`, which reads it
-            while await self._stdout.read(1 << 16):
+            while await self.stdout.read(1 << 16):
                 pass
         await self._process.wait()
 

@@ -35,6 +35,8 @@ VARIABLES: dict[str, str] = {
 RESULTS = "results"
 Files = Literal["", "any", "folders"]
 
+#: Largest body of a request that is no upload, and largest websocket message of a browser [bytes].
+BODY_LIMIT = MESSAGE_LIMIT = 1_000_000
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
 
 
@@ -48,10 +50,8 @@ class Settings:
         token: Token of the owner's link; empty for a new one.
         hosts: Further host names by which browsers may call the server.
         recordings: Folder whose recordings the page offers, or None.
-        body_limit: Maximum size of the body of a request [bytes].
         folder: Folder of runs, annotations and uploads; None keeps them in memory.
         upload_limit: Maximum size of an uploaded recording [bytes].
-        message_limit: Maximum size of a websocket message of a browser [bytes].
         files: Files that an owner may open: "any", "folders" (recordings in the data folders), or "" for any
             file in requests from this machine and only the data folders in others.
     """
@@ -61,9 +61,7 @@ class Settings:
     token: str = ""
     hosts: tuple[str, ...] = ()
     recordings: Path | None = None
-    body_limit: int = 1_000_000
     upload_limit: int = 20_000_000_000
-    message_limit: int = 1_000_000
     folder: Path | None = None
     files: Files = ""
 
@@ -141,7 +139,7 @@ class Environment(msgspec.Struct, frozen=True, rename=lambda name: f"STEMMAP_{na
 
 def from_environment(environment: Mapping[str, str] | None = None) -> Settings:
     """Return the settings from the environment variables of VARIABLES, with defaults for those that are not
-    set; the limits of bodies and messages are always the defaults. No folder is created.
+    set. No folder is created.
 
     Args:
         environment: The variables; None for those of this process.

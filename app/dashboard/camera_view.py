@@ -12,7 +12,7 @@ import numpy as np
 
 from app.batch.tree_pictures import stem_corners
 from app.common.draw_picture import Drawing, draw_safely
-from app.common.request_queue import RequestQueue
+from app.common.timers import RequestQueue
 from app.dashboard.payload import clusters_payload
 from app.dashboard.selection import NoStoryError, WorkerClient
 from app.worker.protocol import CameraPicture

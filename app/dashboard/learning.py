@@ -4,7 +4,6 @@ progress is sent to the browsers."""
 from __future__ import annotations
 
 import asyncio
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -131,7 +130,6 @@ class Learning:
             "sources": sources,
             "classification": parameters.classification.model_dump(),
             "folder": str(folder),
-            "date": time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime()),
         }
         try:
             reply = await self._ask(question)

@@ -7,7 +7,7 @@ import asyncio
 import itertools
 from collections.abc import Awaitable, Callable, Collection
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from app.dashboard.broadcast import Broadcast
 from app.explain.records import ClusterStory, MapSection, TreeStory
@@ -33,6 +33,7 @@ _MOST_WAITING = 100
 Send = Callable[[Question], Awaitable[None]]
 
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 
@@ -78,57 +79,54 @@ class WorkerClient:
             scan: Index of the scan; None if no scan is shown, which raises NothingMappedError.
             cluster: Row of the cluster.
         """
-        run = self._shown_run()
         if scan is None:
             raise NothingMappedError
-        answer = await self._ask(AskCluster(next(self._tickets), run, scan, cluster))
-        return _known(answer.cluster)
+        return _known((await self._ask(AskCluster, scan, cluster)).cluster)
 
     async def tree(self, number: int) -> TreeStory:
         """Return the explanation of a tree, by its number, after the current scan; raises NoStoryError
         without such a tree, WorkerBusyError without an answer."""
-        answer = await self._ask(AskTree(next(self._tickets), self._shown_run(), number))
-        return _known(answer.tree)
+        return _known((await self._ask(AskTree, number)).tree)
 
     async def compare(self, sets: list[Parameters]) -> list[Frame]:
         """Return the results of the current scan under each of several parameter sets, in their order; raises
         NoStoryError without a scan, WorkerBusyError without an answer."""
         plain = [each.model_dump() for each in sets]
-        answer = await self._ask(AskCompare(next(self._tickets), self._shown_run(), plain))
-        return _known(answer.frames)
+        return _known((await self._ask(AskCompare, plain)).frames)
 
     async def camera(self, stamp_ns: int) -> CameraPicture:
         """Return the camera picture of the run nearest to a time [ns]; raises NoStoryError without one,
         WorkerBusyError without an answer."""
-        answer = await self._ask(AskCamera(next(self._tickets), self._shown_run(), stamp_ns))
-        return _known(answer.camera)
+        return _known((await self._ask(AskCamera, stamp_ns)).camera)
 
     async def tree_picture(self, number: int) -> CameraPicture:
         """Return the camera picture of the run that shows a tree best, by its number; raises NoStoryError
         without one, WorkerBusyError without an answer."""
-        answer = await self._ask(AskTreePicture(next(self._tickets), self._shown_run(), number))
-        return _known(answer.camera)
+        return _known((await self._ask(AskTreePicture, number)).camera)
 
     async def section(self) -> MapSection:
         """Return the accumulated points at breast height after the current scan; raises NoStoryError without
         a run, WorkerBusyError without an answer."""
-        answer = await self._ask(AskSection(next(self._tickets), self._shown_run()))
-        return _known(answer.section)
+        return _known((await self._ask(AskSection)).section)
 
-    def _shown_run(self) -> int:
-        """Return the number of the shown run; raises NothingMappedError if there is none."""
-        run = self._run()
-        if run is None:
-            raise NothingMappedError
-        return run
-
-    async def _ask(self, question: Question) -> Answer:
+    async def _ask(
+        self, kind: Callable[Concatenate[int, int, P], Question], *values: P.args, **named: P.kwargs
+    ) -> Answer:
         """Send a question and return its answer.
 
+        Args:
+            kind: Type of the question.
+            values, named: Its fields after `ticket` and `run`.
+
         Raises:
+            NothingMappedError: No run is shown.
             WorkerBusyError: 100 questions wait already, or there is no answer in time.
             NoStoryError: The worker answers that the object does not exist.
         """
+        run = self._run()
+        if run is None:
+            raise NothingMappedError
+        question = kind(next(self._tickets), run, *values, **named)
         if len(self._waiting) >= _MOST_WAITING:
             raise WorkerBusyError("too many requests at once", remedy="Try again")
         waiting = self._waiting[question.ticket] = asyncio.get_running_loop().create_future()

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import viser
@@ -201,12 +200,8 @@ class SceneCommands(Protocol):
         """
 
 
-@dataclass(frozen=True, slots=True, eq=True)
-class _Origin:
-    """The person and the connection from which a change comes."""
-
-    user: str
-    client: viser.ClientHandle | None
+#: The name of the person and the connection from which a change comes.
+_Origin = tuple[str, viser.ClientHandle | None]
 
 
 class PanelCommands:
@@ -237,7 +232,7 @@ class PanelCommands:
             value: New value.
             client: Browser that made the change; None if unknown.
         """
-        self._waiting[name] = (value, _Origin(current_user.get(), client))
+        self._waiting[name] = (value, (current_user.get(), client))
         if not self._busy:
             self._busy = True
             self._start(self._send_waiting())
@@ -257,10 +252,11 @@ class PanelCommands:
         try:
             while self._waiting:
                 _, origin = next(iter(self._waiting.values()))
+                user, client = origin
                 changes = {name: value for name, (value, of) in self._waiting.items() if of == origin}
                 self._waiting = {k: each for k, each in self._waiting.items() if k not in changes}
-                current_user.set(origin.user)  # of this task only
-                await self._run_command(self._commands.change_parameters(changes), origin.client)
+                current_user.set(user)  # of this task only
+                await self._run_command(self._commands.change_parameters(changes), client)
         finally:
             self._busy = False
 

@@ -184,7 +184,7 @@ def cloud(question: dict[str, Any]) -> dict[str, Any]:
         question: The key "path" has the folder of the run, and "file" the .laz file.
 
     Raises:
-        StemmapError, OSError: See `app.batch.mapped_cloud.write_cloud`.
+        StemmapError: See `app.batch.mapped_cloud.write_cloud`.
     """
     from app.batch.mapped_cloud import write_cloud
 

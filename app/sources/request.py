@@ -117,21 +117,6 @@ def request_of_kept(
     return SourceRequest(uri, odometry, seed, topics, kept.mount, preset, dict(parameters or {}))
 
 
-def request_of_options(uri: str, options: SourceOptions) -> SourceRequest:
-    """Return the request of a run that a command opened with topics, mounting and seed as reader options; its
-    odometry is "auto", and parameters are not part of it."""
-    mounted = options.T_base_lidar
-    mount = None if mounted is None else mount_of(mounted)
-    return SourceRequest(uri, "auto", options.seed, dict(options.topics), mount)
-
-
-def mount_of(pose: Pose3) -> Mount:
-    """Return x, y, z [m], roll, pitch, yaw [rad] of a pose as Python floats."""
-    x, y, z = map(float, pose.t)
-    roll, pitch, yaw = map(float, pose.euler())
-    return (x, y, z, roll, pitch, yaw)
-
-
 def mount_of_degrees(mount: tuple[float, float, float, float, float, float] | None) -> Mount | None:
     """Convert the angles roll, pitch, yaw of a mounting x, y, z [m], roll, pitch, yaw from degrees to
     radians; None stays None."""

@@ -22,6 +22,9 @@ from pipeline.io.atomic_files import write_beside
 # Other names are imported where they are used, because the web process starts without Numba.
 if TYPE_CHECKING:
     from pipeline.classification.forest import Forest
+    from pipeline.front_end import StageTimer
+    from pipeline.io.readers import SourceDescription
+    from pipeline.mapper import Mapper
 
 FOLDER = "forests"
 #: Name of the forest of the package, the default of the parameter.
@@ -170,3 +173,30 @@ def kept_forests() -> Forests:
 
 
 _of = cache(Forests)
+
+
+def mapper_of(
+    source: SourceDescription, parameters: Parameters, seed: int, timer: StageTimer | None = None
+) -> Mapper:
+    """Return a mapper before the first scan of a source, with the forests that are kept on this machine.
+
+    Args:
+        source: Description with the sensor and its extrinsics.
+        parameters: Parameters of the mapper.
+        seed: Random seed.
+        timer: Measures the stages, see `Mapper`; None for no measurement.
+
+    Raises:
+        StemmapError: The forest that the parameters name does not exist.
+    """
+    from pipeline.front_end import no_timer
+    from pipeline.mapper import Mapper
+
+    return Mapper(
+        parameters,
+        sensor=source.sensor,
+        T_base_lidar=source.T_base_lidar,
+        seed=seed,
+        timer=timer or no_timer,
+        forests=kept_forests(),
+    )

@@ -14,7 +14,20 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
-from sqlalchemy import Connection, Engine, Insert, Row, Select, delete, func, insert, select, true, update
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Engine,
+    Insert,
+    Row,
+    Select,
+    delete,
+    func,
+    insert,
+    select,
+    true,
+    update,
+)
 
 from app.sources.request import SourceRequest, request_of_kept
 from app.store.database import annotated as _annotations
@@ -234,9 +247,7 @@ class RunRecords:
         Raises:
             UnknownError: The run does not exist or was deleted.
         """
-        with self._engine.begin() as connection:
-            _found(connection, record)
-            connection.execute(update(_records).where(_records.c.id == record).values(name=name))
+        self._set(record, _records.c.deleted_ns.is_(None), name=name)
 
     def delete(self, record: int) -> None:
         """Delete a run; the deletion can be undone for 30 days.
@@ -244,11 +255,7 @@ class RunRecords:
         Raises:
             UnknownError: The run does not exist or was deleted.
         """
-        with self._engine.begin() as connection:
-            _found(connection, record)
-            connection.execute(
-                update(_records).where(_records.c.id == record).values(deleted_ns=self._clock())
-            )
+        self._set(record, _records.c.deleted_ns.is_(None), deleted_ns=self._clock())
 
     def bring_back(self, record: int) -> None:
         """Undo the deletion of a run; nothing happens if it was not deleted.
@@ -256,11 +263,17 @@ class RunRecords:
         Raises:
             UnknownError: The run does not exist any more.
         """
+        self._set(record, deleted_ns=None)
+
+    def _set(self, record: int, *conditions: ColumnElement[bool], **values: object) -> None:
+        """Set columns of the record of a run.
+
+        Raises:
+            UnknownError: The record does not exist or does not meet the conditions.
+        """
+        chosen = update(_records).where(_records.c.id == record, *conditions)
         with self._engine.begin() as connection:
-            found = connection.execute(
-                update(_records).where(_records.c.id == record).values(deleted_ns=None)
-            )
-            if not found.rowcount:
+            if not connection.execute(chosen.values(**values)).rowcount:
                 raise _unknown(record)
 
     # --- uploads ---------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ there and not in the server.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
@@ -21,6 +22,7 @@ from app.batch.summary import rate_text
 from app.common.child_process import ParentConnection, run_child
 from app.common.text import count, version
 from app.store.forests import LEAST_OTHERS, LEAST_TREES, Forests
+from app.store.records import moment
 from app.store.store import AnnotatedSource
 from app.training.annotated_runs import AnnotatedRun, Progress, annotated_run, examples_of
 from app.training.examples import TREE, Examples, object_numbers
@@ -208,7 +210,6 @@ def learn(
     in_force: Classification,
     folder: Path | None,
     *,
-    date: str,
     seed: int = 0,
     progress: Progress = lambda _: None,
 ) -> LearningResult:
@@ -219,7 +220,6 @@ def learn(
         runs: The annotated runs. One that cannot be read is left out with a warning.
         in_force: The parameters in force, with the name of the present forest and its threshold.
         folder: Data folder, with the present forest and stored examples; None where there is none.
-        date: Date that is stored with the forest.
         seed: Random seed.
         progress: Called with progress messages.
 
@@ -256,7 +256,7 @@ def learn(
         reasons = [what_lacks([e for _, e in of_run]) if not warnings else "", *warnings]
         raise StemmapError("too few annotations: " + "; ".join(w for w in reasons if w))
     about = {
-        "date": date,
+        "date": moment(time.time_ns()),
         "version": version(),
         "base": PACKAGE,
         "seed": seed,
@@ -377,14 +377,12 @@ class LearningRequest(msgspec.Struct, frozen=True):
         sources: The annotated runs.
         classification: Parameters of the classification in force, with the name of the present forest.
         folder: The data folder, where the new forest is stored.
-        date: Date of the training.
         seed: Random seed.
     """
 
     sources: list[AnnotatedSource]
     classification: dict[str, Any]
     folder: str
-    date: str
     seed: int = 0
 
 
@@ -401,7 +399,7 @@ def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str
     """
     folder, present = Path(request.folder), Classification.model_validate(request.classification)
     runs = [annotated_run(source) for source in request.sources]
-    learned = learn(runs, present, folder, date=request.date, seed=request.seed, progress=progress)
+    learned = learn(runs, present, folder, seed=request.seed, progress=progress)
     return as_plain(learned, Forests(folder).keep(learned.data), present.forest)
 
 

@@ -27,7 +27,8 @@ from app.tuning.jobs import check_run
 from app.tuning.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
 from app.tuning.result import Result, SearchMessage, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
-from pipeline.errors import StemmapError
+from pipeline.errors import SourceError, StemmapError
+from pipeline.io.readers import check_existence
 from pipeline.types.records import TruthTrees
 
 COMMAND = python_module("app.tuning.search")
@@ -358,10 +359,8 @@ def _why_gone(uri: str) -> str:
     if it can. A simulated run can always be opened."""
     if is_live(uri):
         return "it is a live run, which cannot be mapped again"
-    if uri.startswith("sim:"):
-        return ""
     try:
-        there = Path(uri.removeprefix("file://")).expanduser().exists()
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: unknown home directory
-        there = False
-    return "" if there else "its recording does not exist any more"
+        check_existence(uri.removeprefix("file://"))
+    except SourceError:
+        return "its recording does not exist any more"
+    return ""

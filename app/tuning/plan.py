@@ -58,15 +58,15 @@ class Pooled:
         ta: TA / (TA + FR).
         false_share: (FA + spurious) / (TA + FA + spurious), the share of mapped trees that are false; 0 for
             an empty map.
-        position_rmse: sqrt(sum TA_k rmse_k^2 / sum TA_k) [m].
-        pair_error: Mean over all pairs [%].
+        position_rmse_m: sqrt(sum TA_k rmse_k^2 / sum TA_k) [m].
+        mean_pair_error_percent: Mean over all pairs [%].
     """
 
     f1: float
     ta: float
     false_share: float
-    position_rmse: float | None
-    pair_error: float | None
+    position_rmse_m: float | None
+    mean_pair_error_percent: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +98,7 @@ class Goal:
         if self.name == "ta":
             beyond = pooled.false_share - self.false_max
             return 1.0 - pooled.ta if beyond <= 0.0 else self.declaration.broken + beyond
-        error = pooled.position_rmse if self.name == "position" else pooled.pair_error
+        error = pooled.position_rmse_m if self.name == "position" else pooled.mean_pair_error_percent
         short = start.f1 - pooled.f1
         return self.declaration.broken + max(short, 0.0) if error is None or short > 1e-12 else error
 
@@ -118,7 +118,7 @@ class Goal:
         """Return the score, in the unit of the goal, from pooled scores; None if it is unknown."""
         if self.name in ("f1", "ta"):
             return pooled.f1 if self.name == "f1" else pooled.ta
-        error = pooled.position_rmse if self.name == "position" else pooled.pair_error
+        error = pooled.position_rmse_m if self.name == "position" else pooled.mean_pair_error_percent
         return None if error is None else self.figure(error)
 
     def shown(self, loss: float) -> str:
@@ -157,8 +157,8 @@ def pool(scores: Sequence[MapScores]) -> Pooled:
         f1=2.0 * ta / (2.0 * ta + fr + wrong) if ta else 0.0,
         ta=ta / (ta + fr) if ta else 0.0,
         false_share=wrong / (ta + wrong) if wrong else 0.0,
-        position_rmse=None if rms is None else math.sqrt(rms),
-        pair_error=_mean(pairs),
+        position_rmse_m=None if rms is None else math.sqrt(rms),
+        mean_pair_error_percent=_mean(pairs),
     )
 
 

@@ -4,6 +4,7 @@ page."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -208,15 +209,8 @@ _LABELS = {
 def _file_scores(scores: Sequence[MapScores]) -> dict[str, float]:
     """Return the pooled scores for a file, rounded to 6 decimals: `f1`, `ta`, `false_share`,
     `position_rmse_m` and `mean_pair_error_percent`. Unknown ones are omitted, because TOML has no null."""
-    pooled = pool(scores)
-    values = {
-        "f1": pooled.f1,
-        "ta": pooled.ta,
-        "false_share": pooled.false_share,
-        "position_rmse_m": pooled.position_rmse,
-        "mean_pair_error_percent": pooled.pair_error,
-    }
-    return {name: round(value, 6) for name, value in values.items() if value is not None}
+    values = asdict(pool(scores)).items()
+    return {name: round(value, 6) for name, value in values if value is not None}
 
 
 def _scores(trial: Trial, held_out: bool) -> tuple[MapScores, ...]:
@@ -316,8 +310,8 @@ def _figures(scores: Sequence[MapScores]) -> dict[str, Any]:
         "f1": pooled.f1,
         "TA": pooled.ta,
         "false_share": pooled.false_share,
-        "rmse_cm": None if pooled.position_rmse is None else 100.0 * pooled.position_rmse,
-        "pair_error_percent": pooled.pair_error,
+        "rmse_cm": None if pooled.position_rmse_m is None else 100.0 * pooled.position_rmse_m,
+        "pair_error_percent": pooled.mean_pair_error_percent,
     }
 
 

@@ -22,11 +22,10 @@ from app.batch.run_folder import NO_PATH, as_written, read_run, score_map
 from app.common.child_process import ParentConnection, run_child
 from app.dashboard.annotations import laid_over
 from app.sources.request import SourceRequest, request_of_kept, with_odometry
-from app.store.forests import kept_forests
+from app.store.forests import kept_forests, mapper_of
 from app.store.records import as_truth, contents_of
 from app.tuning.jobs import Job, JobResult, RunWithTruth
 from app.tuning.plan import PlannedRun
-from app.worker.mapper_factory import mapper_of
 from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import SourceError, StemmapError

@@ -16,8 +16,8 @@ from starlette.middleware import Middleware
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.common.request_queue import TooManyRequestsError
-from app.common.settings import Settings
+from app.common.settings import BODY_LIMIT, Settings
+from app.common.timers import TooManyRequestsError
 from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
@@ -26,13 +26,12 @@ from app.dashboard.selection import NoStoryError, NothingMappedError
 from app.store.async_store import AsyncStore, StoreBusyError
 from app.store.forests import Forests
 from app.store.records import UnknownError
-from app.web import uploads as upload_routes
+from app.web import uploads
 from app.web.auth import Guard, viewer_token
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
-from app.web.routes import georeference, page, parameters, plots, results, run, runs, tuning
+from app.web.routes import page, parameters, plots, results, run, runs, tuning
 from app.web.routes.access import Limits, NotPermittedError
-from app.web.uploads import UploadError, Uploads
 from app.worker.protocol import Open, WorkerBusyError
 from app.worker.supervisor import WorkerProcess
 from pipeline.errors import ParameterError, StemmapError
@@ -42,21 +41,8 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-ROUTERS = tuple(
-    module.router
-    for module in (
-        page,
-        run,
-        runs,
-        parameters,
-        results,
-        annotation_routes,
-        plots,
-        georeference,
-        tuning,
-        upload_routes,
-    )
-)
+_ROUTES = (page, run, runs, parameters, results, annotation_routes, plots, tuning, uploads)
+ROUTERS = tuple(module.router for module in _ROUTES)
 
 MakeScene = Callable[[Dashboard, asyncio.AbstractEventLoop], "Scene"]
 MakeWorker = Callable[[], WorkerProcess]
@@ -117,11 +103,11 @@ def build(
     learning = Learning(
         dashboard.store, settings.folder, lambda state: dashboard.live.publish("learning", state)
     )
-    uploads = Uploads(settings.uploads, settings.upload_limit, dashboard.store)
+    kept_uploads = uploads.Uploads(settings.uploads, settings.upload_limit, dashboard.store)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        await asyncio.to_thread(uploads.clear)
+        await asyncio.to_thread(kept_uploads.clear)
         dashboard.worker = make_worker()
         loop = asyncio.get_running_loop()
         await dashboard.start(source, lambda: (make_scene or _scene)(dashboard, loop))
@@ -135,7 +121,7 @@ def build(
     app.state.dashboard, app.state.settings = dashboard, settings
     app.state.fleet_port = None if fleet is None else fleet.port
     app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.run_recorder.record}
-    app.state.uploads, app.state.learning, app.state.limits = uploads, learning, Limits()
+    app.state.uploads, app.state.learning, app.state.limits = kept_uploads, learning, Limits()
     for router in ROUTERS:
         app.include_router(router)
     return app
@@ -156,7 +142,7 @@ def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) ->
         host=settings.host,
         port=port,
         further_hosts=settings.hosts,
-        body_limit=settings.body_limit,
+        body_limit=BODY_LIMIT,
         upload_limit=settings.upload_limit,
     )
     app = FastAPI(
@@ -213,7 +199,7 @@ def _answer_errors(app: FastAPI) -> None:
     async def for_people(_: Request, error: Exception) -> Response:
         assert isinstance(error, StemmapError)  # noqa: S101 - the handler is registered for it
         status = next(statuses[t] for t in type(error).__mro__ if t in statuses)
-        if isinstance(error, UploadError):
+        if isinstance(error, uploads.UploadError):
             status = error.status
         return failure_reply(status, error, _RETRY_AFTER_S if status in (429, 503) else None)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Annotated, Any
 
 import msgspec
@@ -45,6 +46,16 @@ class SaveSet(Body):
 
 class BadRequestError(StemmapError):
     """A request that does not fit the route."""
+
+
+@contextmanager
+def as_bad_request(where: str | None = None) -> Iterator[None]:
+    """Raise a StemmapError inside the context as BadRequestError, at another place unless `where` is None."""
+    try:
+        yield
+    except StemmapError as error:
+        place = error.where if where is None else where
+        raise BadRequestError(error.what, where=place, remedy=error.remedy) from None
 
 
 def json_reply(content: object, status: int = 200) -> Response:

@@ -22,7 +22,7 @@ import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from app.common.settings import DEFAULT_PORT, Settings
+from app.common.settings import DEFAULT_PORT, MESSAGE_LIMIT, Settings
 from app.dashboard.parameters import ParameterState
 from app.web.auth import new_token, viewer_token
 from app.worker.protocol import Open
@@ -188,7 +188,7 @@ def run_server(
         print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
 
     async def served() -> bool:
-        config, link = uvicorn_config(await make_app(port, token), settings), link_of(settings, port, token)
+        config, link = uvicorn_config(await make_app(port, token)), link_of(settings, port, token)
         server = LinkedServer(config, settings, link, open_browser=open_browser)
         await server.serve(sockets=[listening])
         return server.started
@@ -216,7 +216,7 @@ def _is_of_this_server(record: logging.LogRecord) -> bool:
     return not is_cancelled and not str(record.msg).startswith(_OF_CLIENTS)
 
 
-def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
+def uvicorn_config(app: ASGIApp) -> uvicorn.Config:
     """Return the uvicorn configuration of the application: without access log, since the first address
     contains the token, and without compression of websockets. Messages about single clients are filtered out
     of uvicorn's log."""
@@ -225,7 +225,7 @@ def uvicorn_config(app: ASGIApp, settings: Settings) -> uvicorn.Config:
         app,
         http=HttpProtocol,
         ws="websockets-sansio",
-        ws_max_size=settings.message_limit,
+        ws_max_size=MESSAGE_LIMIT,
         ws_per_message_deflate=False,  # point clouds do not compress well, and compression costs a core
         timeout_graceful_shutdown=_GRACE_S,
         server_header=False,

@@ -18,7 +18,7 @@ import numpy as np
 
 from app.common.child_process import BlockingChildProcess, python_module, run_child
 from app.common.settings import data_folder
-from app.worker.mapper_factory import mapper_of
+from app.store.forests import mapper_of
 from pipeline.config import Parameters
 
 if TYPE_CHECKING:

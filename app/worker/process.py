@@ -36,7 +36,7 @@ _GRACE_S, _LIVE_GRACE_S = 1.0, 9.0
 def new_session() -> Session:
     """Return a session that uses the real pipeline, for the worker and for commands that map in this
     process."""
-    from app.worker.mapper_factory import mapper_of
+    from app.store.forests import mapper_of
     from app.worker.numba_warmup import compile_ahead, warm_up
 
     return Session(

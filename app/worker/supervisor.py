@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import time
 from collections import deque
@@ -11,10 +10,11 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
-from app.common.child_process import exit_reason, python_module, starved_s
+from app.common.child_process import ChildProcess, exit_reason, python_module, starved_s
 from app.common.timers import cancel
 from app.robot.address import is_live
 from app.worker import protocol
+from pipeline.errors import StemmapError
 
 WORKER = python_module("app.worker.process")
 
@@ -78,7 +78,7 @@ class WorkerProcess:
         self._clock = clock
         self._codec_in, self._codec_out = protocol.from_worker(), protocol.to_worker()
         self._on_message: OnMessage  # set by `start`
-        self._process: asyncio.subprocess.Process | None = None
+        self._process: ChildProcess | None = None
         self._task: asyncio.Task[None] | None = None
         self._open: protocol.Open | None = None
         self._settings: dict[type, protocol.ToWorker] = {}
@@ -149,14 +149,8 @@ class WorkerProcess:
         """Start the process, and send it the stored parameters, speed and source. Its messages wait in the
         pipe until `start`. If the system cannot start it, it counts as ended."""
         try:
-            self._process = await asyncio.create_subprocess_exec(
-                *self._command,
-                stdin=asyncio.subprocess.PIPE,
-                stdout=asyncio.subprocess.PIPE,
-                limit=_BUFFER,
-                start_new_session=True,  # Ctrl-C in the terminal must not reach it
-            )
-        except OSError:  # no memory, no process: counts as an end, so it is tried again
+            self._process = await ChildProcess.start(self._command, line_limit=_BUFFER)
+        except StemmapError:  # no memory, no process: counts as an end, so it is tried again
             return
         for command in (*self._settings.values(), self._open):
             if command is not None:
@@ -168,7 +162,7 @@ class WorkerProcess:
         """Write a command to the worker; return whether the worker accepted it in time. After an accepted
         command a message of the worker is due, see `_limit_s`."""
         process = self._process
-        if process is None or process.stdin is None or process.stdin.is_closing():
+        if process is None or process.stdin.is_closing():
             return False
         try:
             process.stdin.write(self._codec_out.encode(command))
@@ -228,13 +222,8 @@ class WorkerProcess:
         self._replaced = True
         self._wanted.set()
         self._opening = ""
-        self._kill()
-
-    def _kill(self) -> None:
-        """Kill the worker, if it runs, without waiting for its end."""
         if self._process is not None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.kill()
+            self._process.kill()
 
     # --- messages ---------------------------------------------------------------------------------
 
@@ -242,7 +231,7 @@ class WorkerProcess:
         """Pass messages on until the worker ends, and return the reason of the end. A worker that hangs is
         killed; `_gave_up` then states whether a source was being opened."""
         process = self._process
-        if process is None or process.stdout is None:
+        if process is None:
             return "it could not be started"
         self._status, self._has_command = protocol.Status(state="starting"), False
         try:
@@ -254,11 +243,11 @@ class WorkerProcess:
                     self._status = message.status
                 await self._deliver(message)
         except asyncio.IncompleteReadError:
-            return exit_reason(await process.wait())
+            return exit_reason(await process.end(_GRACE_S))
         except protocol.WireError as error:
             return f"protocol error: {error}"
         self._gave_up = bool(self._opening)
-        self._kill()
+        process.kill()
         return "it did not answer"
 
     async def _head(self, stdout: asyncio.StreamReader) -> bytes | None:
@@ -364,12 +353,5 @@ class WorkerProcess:
         process, self._process = self._process, None
         if process is None:
             return
-        if process.stdin is not None:
-            process.stdin.close()
-        try:
-            grace_s = _LIVE_GRACE_S if self._open is not None and is_live(self._open.uri) else _GRACE_S
-            await asyncio.wait_for(process.wait(), grace_s)
-        except TimeoutError:
-            with contextlib.suppress(ProcessLookupError):
-                process.kill()
-            await process.wait()
+        grace_s = _LIVE_GRACE_S if self._open is not None and is_live(self._open.uri) else _GRACE_S
+        await process.end(grace_s)

@@ -67,7 +67,7 @@ async def served(scene: FakeScene | None = None) -> AsyncIterator[tuple[str, Das
     listening = bind(settings)
     port = listening.getsockname()[1]
     app = build_app(settings, scene=scene, port=port)
-    server = uvicorn.Server(uvicorn_config(app, settings))
+    server = uvicorn.Server(uvicorn_config(app))
     task = asyncio.create_task(server._serve([listening]))
     while not server.started:
         await asyncio.sleep(0.01)

@@ -20,11 +20,13 @@ from urllib.parse import parse_qsl, urlencode
 import msgspec
 from fastapi import Depends, Query
 from pydantic import Field, ValidationError
+from starlette.exceptions import WebSocketException
 from starlette.requests import HTTPConnection
 from starlette.responses import Response
+from starlette.status import WS_1013_TRY_AGAIN_LATER
 
-from app.common.request_queue import RequestQueue
 from app.common.settings import Settings
+from app.common.timers import RequestQueue
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.learning import Learning
 from app.sources.request import FILE, SourceRequest
@@ -49,15 +51,20 @@ class ConnectionLimit:
         self._taken: Counter[Role] = Counter()
 
     @contextmanager
-    def place(self, role: Role) -> Iterator[bool]:
-        """Take a place inside the context and yield True; if none is left for this role, take none and yield
-        False."""
-        free = self._taken[role] < MOST[role]
-        self._taken[role] += free
+    def place(self, role: Role) -> Iterator[None]:
+        """Take a place inside the context.
+
+        Raises:
+            WebSocketException: None is left for this role. It closes a websocket that is not accepted yet
+                with 1013.
+        """
+        if self._taken[role] >= MOST[role]:
+            raise WebSocketException(WS_1013_TRY_AGAIN_LATER)
+        self._taken[role] += 1
         try:
-            yield free
+            yield
         finally:
-            self._taken[role] -= free
+            self._taken[role] -= 1
 
 
 class Limits:

@@ -186,7 +186,6 @@ def plotly_script() -> Path:
 
 
 _REFUSED = 1003
-_TRY_AGAIN_LATER = 1013
 
 _Number = Annotated[int, Meta(ge=0, le=LARGEST_NUMBER)]
 
@@ -212,10 +211,7 @@ async def live(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: Caller
     """WebSocket /api/live: send states as they change, the newest of each kind, and receive selections; those
     of viewers are ignored. The websocket is closed with 1013 before it is accepted if too many pages are
     open, and with 1003 after an invalid message."""
-    with bounds.pages.place(role) as free:
-        if not free:
-            await browser.close(_TRY_AGAIN_LATER)
-            return
+    with bounds.pages.place(role):
         await browser.accept()
         async with telling(browser, dashboard.live):
             await _receive(browser, dashboard, may_select=role == "owner")
@@ -249,10 +245,7 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool
 async def viser(browser: WebSocket, dashboard: Dash, bounds: Bounds, role: CallerRole) -> None:
     """WebSocket /viser: connect the browser with the 3D scene; viewers cannot change it. The websocket is
     closed with 1013 before it is accepted if too many scenes are open."""
-    with bounds.scenes.place(role) as free:
-        if not free:
-            await browser.close(_TRY_AGAIN_LATER)
-            return
+    with bounds.scenes.place(role):
         scene = dashboard.scene
         await bridge(
             browser,

@@ -1,6 +1,8 @@
-"""Plots of the open run, drawn, typed, along the path or from GIS files, and their stand figures.
+"""Plots of the open run, drawn, typed, along the path or from GIS files, their stand figures, and the
+reference system of the map, by control points, GNSS or by hand.
 
-A plot is an annotation of class `plot`: undo, redo and deletion are routes of `app.web.routes.annotations`.
+Plots are annotations of class `plot`, the reference system is one of class `frame`: undo, redo and deletion
+are routes of `app.web.routes.annotations`.
 """
 
 from __future__ import annotations
@@ -8,8 +10,7 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path as FilePath
@@ -20,13 +21,14 @@ from fastapi import APIRouter
 from pydantic import Field
 from starlette.responses import Response
 
+from app.batch.georeference import NAME_MAX
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.selection import NothingMappedError
 from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
-from app.store.records import PLOT, Content, UnknownError
+from app.store.records import FRAME, PLOT, Content, UnknownError
 from app.store.store import Store
-from app.web.responses import BadRequestError, Body, Number, json_reply
+from app.web.responses import BadRequestError, Body, Number, as_bad_request, json_reply
 from app.web.routes.access import (
     Dash,
     Edit,
@@ -39,6 +41,8 @@ from app.web.routes.access import (
 )
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
+from pipeline.io.readers.base import COORDINATE_LIMIT
+from pipeline.stand import POINT_SIGMA
 from pipeline.stand.plots import centres_along, plot_of
 
 router = APIRouter(prefix="/api")
@@ -141,7 +145,7 @@ async def add_along(body: _Along, dashboard: Dash) -> Response:
     there would be too many."""
     if dashboard.path is None:
         raise NothingMappedError
-    with _as_bad_request():
+    with as_bad_request():
         centres = centres_along(dashboard.path_xy, body.every).round(3).tolist()
     circles = [{"kind": "circle", "x": x, "y": y, "radius": body.radius} for x, y in centres]
     return await _added(dashboard, body, [("", shape) for shape in circles])
@@ -156,10 +160,8 @@ async def import_file(body: _ImportPlots, dashboard: Dash) -> Response:
         file = await asyncio.to_thread(_written, body.files, FilePath(folder))
         async with in_thread(run.folder()) as run_folder:
             question = {"ask": "plots", "path": str(file), "run": str(run_folder), "crs": body.crs.strip()}
-            try:
+            with as_bad_request(where=file.name):
                 read = await inspection.ask(question)
-            except StemmapError as error:
-                raise BadRequestError(error.what, where=file.name, remedy=error.remedy) from None
     x, y = dashboard.offset
     moved = [
         [[[[px - x, py - y] for px, py in ring] for ring in part] for part in plot["polygons"]]
@@ -193,15 +195,6 @@ async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response
     return await edited(dashboard, body, {"id": number})
 
 
-@contextmanager
-def _as_bad_request() -> Iterator[None]:
-    """Raise a StemmapError of the context, which is about the values of a request, as BadRequestError."""
-    try:
-        yield
-    except StemmapError as error:
-        raise BadRequestError(error.what, where=error.where, remedy=error.remedy) from None
-
-
 async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, dict[str, Any]]]) -> Response:
     """Add plots, given by name ("" for the next free number) and shape, in one edit, and return the
     response 201 with their `ids`; raises BadRequestError if one is not valid, a name is taken or there would
@@ -210,7 +203,7 @@ async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, di
     for name, shape in plots:
         name = _checked_name(name, taken) if name else _free("", taken)
         taken.add(name)
-        with _as_bad_request():
+        with as_bad_request():
             middle = plot_of(name, shape).shape.centroid
         contents.append(Content(middle.x, middle.y, PLOT, None, {"name": name, "shape": shape}))
     rows = dashboard.annotation_editor.plots
@@ -286,3 +279,111 @@ def _figures(run: ShownRun, parameters: Stand) -> dict[str, Any]:
         except StemmapError as error:
             found["problem"] = f"{error.what}. {error.remedy}".strip()
     return found
+
+
+# --- reference system ------------------------------------------------------------------------------
+
+# Reading the fixes of a long recording.
+_GNSS_PATIENCE_S = 300.0
+_MOST_POINTS = 200  # every browser receives them with each edit of an annotation
+_LONGEST_CRS = 100
+_Coordinate = Annotated[float, Field(gt=-COORDINATE_LIMIT, lt=COORDINATE_LIMIT)]
+
+
+class _ControlPoint(Body):
+    """A control point: a tree by its number, or a place on the map."""
+
+    name: Annotated[str, Field(max_length=NAME_MAX)] = ""
+    east: _Coordinate
+    north: _Coordinate
+    tree: Number | None = None
+    x: Metres | None = None
+    y: Metres | None = None
+    z: _Coordinate | None = None
+
+
+class _ControlPoints(Body):
+    """Two or more points, or a CSV table of them as text."""
+
+    how: Literal["control"]
+    points: Annotated[list[_ControlPoint], Field(max_length=_MOST_POINTS, default_factory=list)]
+    table: Annotated[str, Field(max_length=1_000_000)] = ""
+    point_sigma: Annotated[float, Field(gt=0.0, le=100.0)] = POINT_SIGMA
+
+
+class _Gnss(Body):
+    how: Literal["gnss"]
+
+
+class _ByHand(Body):
+    """Position of the map's origin, and the angle of its x axis from east to north."""
+
+    how: Literal["hand"]
+    east: _Coordinate
+    north: _Coordinate
+    turn_deg: Annotated[float, Field(ge=-360.0, le=360.0)] = 0.0
+    z: _Coordinate = 0.0
+
+
+class _Georeference(Edit):
+    crs: Annotated[str, Field(min_length=1, max_length=_LONGEST_CRS)]
+    by: Annotated[_ControlPoints | _Gnss | _ByHand, Field(discriminator="how")]
+
+
+@router.put("/georeference")
+async def georeference(body: _Georeference, dashboard: Dash) -> Response:
+    """Find the reference system of the map as `stemmap georeference` does, in a child process, and store it
+    in one edit, in place of the one before; files and figures have it from then on. Return the counts of
+    edits, see `edited`. 409 before the first map, or if another run was opened or the reference system was
+    changed meanwhile; 422 if there are too many points, or the values contradict one another or do not fit
+    the reference system."""
+    run, by = ShownRun.of(dashboard), body.by.model_dump()
+    offset = dashboard.offset
+    async with in_thread(run.folder()) as folder:
+        question: dict[str, Any] = {"ask": "georeference", "path": str(folder), "crs": body.crs.strip(), **by}
+        if isinstance(body.by, _ControlPoints):
+            question["points"] = [_named(point, k, offset) for k, point in enumerate(by["points"], 1)]
+            if body.by.table:
+                question["table"] = str(folder / "points.csv")
+                FilePath(question["table"]).write_text(body.by.table, encoding="utf-8")
+        elif isinstance(body.by, _Gnss):
+            question["start_ns"] = run.start_ns
+        with as_bad_request(where=""):
+            found = await inspection.ask(question, patience_s=_GNSS_PATIENCE_S)
+    points = [_named(point, 0, (-offset[0], -offset[1])) for point in found["points"]]
+    if len(points) > _MOST_POINTS:
+        raise BadRequestError(
+            f"a run can have at most {_MOST_POINTS} control points",
+            remedy="Leave some out, or use stemmap georeference --control FILE",
+        )
+    crs = found["frame"]["crs"]
+    if len(crs) > _LONGEST_CRS:  # WKT; what was typed can be sent again
+        crs = body.crs.strip()
+    values = {**by, "table": "", "points": points, "crs": crs, "frame": found["frame"]}
+    content, before = Content(0.0, 0.0, FRAME, None, values), dashboard.annotation_editor.frame
+    if before is None:
+        await apply_edit(dashboard, body, Store.add, [content])
+    else:
+        await apply_edit(dashboard, body, Store.change, before.id, before.version, content)
+    return await edited(dashboard, body, {})
+
+
+def _named(point: dict[str, Any], number: int, offset: tuple[float, float]) -> dict[str, Any]:
+    """Return a control point as a new dict with a name, by default the number of its tree or `number`, and
+    with its place moved and rounded to micrometres; x and y of a tree are None. Raises BadRequestError
+    without a tree and a place.
+
+    Args:
+        point: See `app.batch.georeference.ControlPoint`.
+        number: Its number, for a mark without a name.
+        offset: Motion of its place [m].
+    """
+    if point["tree"] is not None:
+        return {**point, "name": point["name"] or str(point["tree"]), "x": None, "y": None}
+    if point["x"] is None or point["y"] is None:
+        raise BadRequestError(
+            f"point {point['name'] or number} has no place on the map",
+            remedy="Pick it on the map, or name a tree",
+        )
+    place = {"x": round(point["x"] + offset[0], 6), "y": round(point["y"] + offset[1], 6)}
+    return {**point, "name": point["name"] or str(number), **place}

@@ -22,9 +22,9 @@ from app.web.responses import (
     Body,
     Number,
     Word,
+    as_bad_request,
     bytes_reply,
     error_reply,
-    failure_reply,
     json_reply,
     text_reply,
 )
@@ -32,7 +32,6 @@ from app.web.routes.access import Bounds, Dash, FigureParameters, ViewerTurn, in
 from app.worker.protocol import Shown
 from pipeline.config import Parameters
 from pipeline.config.stages import Stand
-from pipeline.errors import StemmapError
 from pipeline.io.block_file import LARGE
 
 router = APIRouter(prefix="/api")
@@ -107,12 +106,10 @@ async def export_cloud(
     """Return the cloud of the run as LAZ, see `app.batch.mapped_cloud.write_cloud`; a child process reads the
     source again. Only for owners. 409 before the first map; 422 if the source cannot be read."""
     run, file = ShownRun.of(dashboard), there / "cloud.laz"
-    try:
+    with as_bad_request():
         async with in_thread(run.folder()) as folder:
             question = {"ask": "cloud", "path": str(folder), "file": str(file)}
             await inspection.ask(question, patience_s=_CLOUD_S)
-    except StemmapError as error:
-        return failure_reply(422, error)
     return FileResponse(
         file, 200, {"Cache-Control": "no-store"}, "application/octet-stream", filename=file.name
     )
@@ -129,10 +126,8 @@ async def export(
     for a run with the same map and plots. 409 before the first map; 422 if a package is missing, the map
     lacks what the format shows, or all plots are outside of what was observed."""
     run = ShownRun.of(dashboard)
-    try:
+    with as_bad_request():
         content, name = await asyncio.to_thread(_exported, run, f".{suffix}", parameters)
-    except StemmapError as error:
-        return failure_reply(422, error)
     return bytes_reply(content, filename=name)
 
 

@@ -131,17 +131,7 @@ async def open_source(body: _Source, dashboard: Dash, settings: Deployment, any_
     for an unknown odometry or invalid parameters, 409 if the source cannot be opened; the open run is kept
     then."""
     request = permitted_request(
-        SourceRequest(
-            body.uri,
-            body.odometry,
-            body.seed,
-            {str(role): name for role, name in body.topics.items()},
-            mount_of_degrees(body.mount),
-            body.preset,
-            dict(body.parameters),
-        ),
-        settings,
-        any_file,
+        SourceRequest(**{**body.model_dump(), "mount": mount_of_degrees(body.mount)}), settings, any_file
     )
     await dashboard.open(request)
     return json_reply({}, 202)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from argparse import Namespace
 from pathlib import Path
 from typing import Any
 from unittest.mock import AsyncMock
@@ -12,18 +13,18 @@ import msgspec
 import numpy as np
 import pytest
 
+from app.cli.flags import source_request
 from app.common.settings import Settings
 from app.dashboard import run_recorder
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
 from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
-from app.sources.request import SourceRequest, request_of_kept, request_of_options
+from app.sources.request import SourceRequest, request_of_kept
 from app.store.records import Author, Content
 from app.training.annotated_runs import annotated_run
 from app.worker.protocol import Begin, Open, Shown, View
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers.base import SourceOptions
 from pipeline.types.records import TruthTrees
 from tests.app.batch.finished_runs import write_run
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
@@ -202,12 +203,12 @@ def test_damaged_choices_are_left_out(kept: object):
 
 
 def test_the_choices_of_a_run_without_a_browser_are_kept_as_well():
-    wanted = SourceRequest("", topics={"imu": "/imu"}, mount=(1.0, 2.0, 3.0, 0.1, -0.2, 0.3))
-    kept = request_of_options("", wanted.options()).kept_choices()
-    again = request_of_kept("", odometry="auto", seed=0, choices=kept)
-    assert again.topics == wanted.topics
-    np.testing.assert_allclose(again.mount or (), wanted.mount or ())
-    assert request_of_options("", SourceOptions(seed=5)).kept_choices() is None
+    given = Namespace(seed=0, topics=[("imu", "/imu")], mount=(1.0, 2.0, 3.0, 0.0, -90.0, 45.0))
+    request = source_request(given, "fake:")
+    again = request_of_kept("fake:", odometry="auto", seed=0, choices=request.kept_choices())
+    assert again.topics == {"imu": "/imu"}
+    np.testing.assert_allclose(again.mount or (), (1.0, 2.0, 3.0, 0.0, -0.5 * np.pi, 0.25 * np.pi))
+    assert source_request(Namespace(seed=5, topics=[], mount=None), "fake:").kept_choices() is None
 
 
 async def test_learning_uses_topics_mounting_seed_and_odometry_of_the_mapped_run(both: Running) -> None:

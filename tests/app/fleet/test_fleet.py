@@ -54,7 +54,7 @@ async def served(*names: str) -> AsyncIterator[tuple[str, Fleet]]:
     for name in names:
         assert fleet.add(name, Open(f"fake:{name}"))
     app = build_fleet(SETTINGS, port=port, token=TOKEN, fleet=fleet)
-    server = uvicorn.Server(uvicorn_config(app, SETTINGS))
+    server = uvicorn.Server(uvicorn_config(app))
     task = asyncio.create_task(server._serve([listening]))
     async with asyncio.timeout(60):
         while not (server.started and all(member.started for member in fleet.members.values())):

@@ -48,15 +48,15 @@ def test_several_runs_are_pooled_tree_by_tree():
     assert pooled.ta == 10 / 14
     assert pooled.f1 == pytest.approx(2 * 10 / (2 * 10 + 4 + 1 + 3))
     assert pooled.false_share == 4 / 14
-    assert pooled.position_rmse == pytest.approx(math.sqrt((8 * 0.01 + 2 * 0.04) / 10))
-    assert pooled.pair_error == pytest.approx((28 * 1.0 + 1 * 5.0) / 29)
+    assert pooled.position_rmse_m == pytest.approx(math.sqrt((8 * 0.01 + 2 * 0.04) / 10))
+    assert pooled.mean_pair_error_percent == pytest.approx((28 * 1.0 + 1 * 5.0) / 29)
 
 
 def test_an_empty_map_has_no_errors_and_the_worst_f1():
     pooled = pool([NOTHING])
     assert (pooled.f1, pooled.ta, pooled.false_share) == (0.0, 0.0, 0.0)
-    assert pooled.position_rmse is None
-    assert pooled.pair_error is None
+    assert pooled.position_rmse_m is None
+    assert pooled.mean_pair_error_percent is None
 
 
 @given(scores)
@@ -82,13 +82,13 @@ def test_a_set_beyond_the_bound_loses_against_each_within(name, some, others):
             assert kept == (pooled.false_share <= 0.1)
         elif kept:
             assert pooled.f1 >= start.f1 - 1e-9
-            assert loss in (pooled.position_rmse, pooled.pair_error)
+            assert loss in (pooled.position_rmse_m, pooled.mean_pair_error_percent)
 
 
 def test_the_start_itself_is_within_the_bound_of_errors():
     start = pool([ONE, OTHER])
-    assert Goal("position").loss(start, start) == start.position_rmse
-    assert Goal("pairs").loss(start, start) == start.pair_error
+    assert Goal("position").loss(start, start) == start.position_rmse_m
+    assert Goal("pairs").loss(start, start) == start.mean_pair_error_percent
     assert Goal("f1").loss(start, start) == 1 - start.f1
     assert Goal("position").shown(0.0123) == "RMSE 1.23 cm"
 

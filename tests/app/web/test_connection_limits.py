@@ -7,10 +7,11 @@ import itertools
 from contextlib import ExitStack
 
 import pytest
+from starlette.exceptions import WebSocketException
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
 
-from app.common.request_queue import RequestQueue
+from app.common.timers import RequestQueue
 from app.web.auth import Role, viewer_token
 from app.web.routes import access
 from app.web.routes.access import ConnectionLimit
@@ -29,11 +30,12 @@ def few(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_places_are_given_by_role_and_given_back() -> None:
     room = ConnectionLimit()
     with ExitStack() as stack:
-        assert [stack.enter_context(room.place("viewer")) for _ in range(3)] == [True, True, False]
-        with room.place("owner") as free:
-            assert free
-            with room.place("owner") as none:
-                assert not none
+        stack.enter_context(room.place("viewer"))
+        stack.enter_context(room.place("viewer"))
+        with pytest.raises(WebSocketException), room.place("viewer"):
+            pass
+        with room.place("owner"), pytest.raises(WebSocketException), room.place("owner"):
+            pass
         assert room._taken.total() == 2
     assert room._taken.total() == 0
 

@@ -273,7 +273,7 @@ async def test_a_browser_that_leaves_in_the_middle_leaves_nothing(recordings: Pa
     settings = Settings(port=0, folder=recordings.parent)
     listening = bind(settings)
     port = listening.getsockname()[1]
-    server = uvicorn.Server(uvicorn_config(build_app(settings, port=port), settings))
+    server = uvicorn.Server(uvicorn_config(build_app(settings, port=port)))
     task = asyncio.create_task(server._serve([listening]))
     head = (
         f"POST /api/uploads?name=a.mcap HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\n"

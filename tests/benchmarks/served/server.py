@@ -52,7 +52,7 @@ class Served:
             make_worker=self._worker,
         )
         self._dashboard: Dashboard = app.state.dashboard
-        self._server = uvicorn.Server(uvicorn_config(app, settings))
+        self._server = uvicorn.Server(uvicorn_config(app))
 
     async def run(self) -> None:
         """Serve until the questions end."""
