@@ -482,13 +482,24 @@ def open_run(
 
     Raises:
         SourceError: The odometry is not available for this source; the source is closed.
-        StemmapError: The forest that the parameters name does not exist; the source stays open.
+        StemmapError: The forest that the parameters name does not exist; the source is closed.
     """
     try:
-        moving, chosen = with_odometry(source, odometry)
-    except SourceError:
+        return _opened_run(source, odometry, seed, parameters, make_mapper)
+    except BaseException:
         source.close()
         raise
+
+
+def _opened_run(
+    source: Source | LiveSource,
+    odometry: str,
+    seed: int,
+    parameters: Parameters,
+    make_mapper: MakeMapper,
+) -> tuple[Run, tuple[str, ...]]:
+    """Return the result of `open_run`; arguments and errors as there, but the source stays open after one."""
+    moving, chosen = with_odometry(source, odometry)
     stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
     description = source.description
     left_out = Counter[str]()

@@ -237,9 +237,6 @@ class FastSlam:
         Returns:
             The correction. None where the graph has no solution; the particles are unchanged then, and the
             next smoothing waits for another revisit.
-
-        Raises:
-            LinAlgError: A covariance in the graph is not positive definite.
         """
         graph, solution = self.state.graph, self.state.graph.solve()
         if solution is None:
@@ -259,9 +256,6 @@ class FastSlam:
         Returns:
             The correction; None if the graph has no solution, or if it gives the loop a weight below
             LOOP_WEIGHT_MIN. The state is unchanged then.
-
-        Raises:
-            LinAlgError: A covariance in the graph, or that of the loop, is not positive definite.
         """
         state, graph = self.state, self.state.graph
         path = state.genealogy.path(state.best)

@@ -307,26 +307,23 @@ class KeyframeGraph:
 
     def solve(self, *, new_loop: bool = False) -> Solution | None:
         """Return the minimum next to the present poses. None with fewer than two keyframes, if the problem is
-        singular, or if no step decreases the cost. After ITERATIONS_MAX steps the best estimate so far is the
+        singular, if a covariance is not positive definite, or if no step decreases the cost. After ITERATIONS_MAX steps the best estimate so far is the
         result. The graph is unchanged.
 
         Args:
             new_loop: Whether the last loop was just added. The Cauchy kernel has no slope far from the
                 minimum, so the problem is first solved with the full weight of this loop.
-
-        Raises:
-            LinAlgError: The covariance of a detection, a motion or a loop is not positive definite.
         """
         if len(self.keyframes) < 2:
             return None
-        problem = _Problem(self)
-        if new_loop:
-            first = problem.minimum(quadratic_loops=1)
-            if first is None:
-                return None
-            problem.pose = first[0]
-        minimum = problem.minimum()
         try:
+            problem = _Problem(self)
+            if new_loop:
+                first = problem.minimum(quadratic_loops=1)
+                if first is None:
+                    return None
+                problem.pose = first[0]
+            minimum = problem.minimum()
             return None if minimum is None else problem.solution(*minimum)
         except np.linalg.LinAlgError:
             return None
