@@ -106,8 +106,8 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     _CHUNK; z by the terrain of each scan and the nearest known terrain of the run.
 
     Raises:
-        StemmapError: The run is live or has several recordings, its source cannot be read, or no point is near
-            known ground.
+        StemmapError: The run is live or has several recordings, its source cannot be read, or no point
+            is near known ground.
     """
     from app.batch.continue_map import at_origin
     from app.robot.address import is_live

@@ -48,7 +48,8 @@ def merge_runs(
     *,
     force: bool,
 ) -> MergeResult:
-    """Merge run b into run a, and write the files of a run and correspondence.csv; seen.csv only if both runs have it. Scores of run a are not part of the result.
+    """Merge run b into run a, and write the files of a run and correspondence.csv; seen.csv only if both runs
+    have it. Scores of run a are not part of the result.
 
     Args:
         folder_a, folder_b: Folders of finished runs.

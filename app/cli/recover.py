@@ -28,7 +28,7 @@ def run(arguments: argparse.Namespace) -> int:
             or nothing is readable.
     """
     from pipeline.errors import StemmapError
-    from pipeline.io.recording.mcap_writer import mend
+    from pipeline.io.recording.mcap_writer import repair
 
     if arguments.out.exists() and arguments.file.exists() and arguments.out.samefile(arguments.file):
         raise StemmapError(
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise StemmapError(
             "the file exists already", where=str(arguments.out), remedy="Name another, or add --force"
         )
-    mended = mend(arguments.file, arguments.out)
+    mended = repair(arguments.file, arguments.out)
     print(f"{arguments.out}: {mended.messages} messages")
     for reason, number in mended.losses.items():
         print(f"lost: {number} {reason}", file=sys.stderr)

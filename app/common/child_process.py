@@ -342,7 +342,7 @@ def run_child(
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
         if isinstance(error.code, str):
-            print(error.code, file=sys.stderr)
+            sys.stderr.write(error.code + "\n")
     except BaseException:
         traceback.print_exc()
         code = 1

@@ -289,12 +289,12 @@ class Run:
             StemmapError: The forest that the parameters name does not exist.
         """
         self.cancel_remapping()
-        if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
+        if self._map.parameters.are_all(parameters, NOT_OF_THE_MAP):
             return
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
         reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
         previous, self._previous = self._previous, None
-        if previous is not None and previous.return_to(parameters):
+        if previous is not None and previous.rewind_if_same(parameters):
             done = previous.before.path_length
             rerun = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
             no_preview: Generator[None, None, None] = (None for _ in ())  # only the current scan is left

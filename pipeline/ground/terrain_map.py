@@ -161,7 +161,8 @@ def merged_terrain(a: HeightMapState, b: HeightMapState, T_a_b: Pose2) -> Height
     known, row = _cells_of(a.tiles)
     other, other_row = _cells_of(b.tiles)
     # Each cell of the result takes the cell of b at its centre, so that a turned grid has no gaps.
-    around = np.round(T_a_b.apply((other + 0.5) * CELL) / CELL - 0.5).astype(np.int64)
+    centre: Float = (other.astype(np.float64) + 0.5) * CELL
+    around = np.floor(T_a_b.apply(centre) / CELL).astype(np.int64)
     near = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
     place = np.unique((around[:, None] + near).reshape(-1, 2), axis=0)
     wanted = np.floor(T_a_b.inverse().apply((place + 0.5) * CELL) / CELL).astype(np.int64)

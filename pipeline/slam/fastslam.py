@@ -340,7 +340,7 @@ class FastSlam:
         estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
         return replace(estimate, health=before.health, landmark_of=before.landmark_of)
 
-    def lost(self, estimate: PoseEstimate) -> Health:
+    def health_without_detections(self, estimate: PoseEstimate) -> Health:
         """Return the health of an estimate for a scan that detected no tree and has no doubt about the
         odometry. Whether it is "lost" depends on the running statistics and on the covariance of the
         estimate."""

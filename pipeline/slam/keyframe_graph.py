@@ -307,8 +307,8 @@ class KeyframeGraph:
 
     def solve(self, *, new_loop: bool = False) -> Solution | None:
         """Return the minimum next to the present poses. None with fewer than two keyframes, if the problem is
-        singular, if a covariance is not positive definite, or if no step decreases the cost. After ITERATIONS_MAX steps the best estimate so far is the
-        result. The graph is unchanged.
+        singular, if a covariance is not positive definite, or if no step decreases the cost. After
+        ITERATIONS_MAX steps the best estimate so far is the result. The graph is unchanged.
 
         Args:
             new_loop: Whether the last loop was just added. The Cauchy kernel has no slope far from the
