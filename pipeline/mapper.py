@@ -455,7 +455,10 @@ class Mapper:
         self, index: int, correction: Correction | None, estimate: PoseEstimate
     ) -> tuple[PoseEstimate, Correction | None]:
         """Correct SLAM, trees, columns and terrain by a decision. A loop, a located pose and a failed search
-        end the search and discard the stored states of the relocaliser (`Relocaliser.reset`).
+        end the search and discard the stored states of the relocaliser (`Relocaliser.reset`). A smoothing
+        keeps them: where the robot was carried away before it, the smoothing is wrong as well, and a restart
+        must revert it. Where it was carried away later, the graph of the stored state is solved again after
+        the next revisit.
 
         Args:
             index: Number of the scan.
@@ -477,7 +480,7 @@ class Mapper:
                 for scan, motion in motions:
                     estimate = slam.process(scan, motion, no_detections(), NOTHING_FREE)
                 slam.state = replace(slam.state, recent=recent)
-                return replace(estimate, health=slam.lost(estimate)), correction
+                return replace(estimate, health=slam.health_without_detections(estimate)), correction
             case Smoothing():
                 if not self._correct_map(slam.smooth(index), estimate):
                     return estimate, None

@@ -6,6 +6,7 @@ import datetime
 import math
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING
 
@@ -105,8 +106,8 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     _CHUNK; z by the terrain of each scan and the nearest known terrain of the run.
 
     Raises:
-        StemmapError: The run is live or continues another one, its source cannot be read, or no point is near
-            known ground.
+        StemmapError: The run is live or has several recordings, its source cannot be read, or no point
+            is near known ground.
     """
     from app.batch.continue_map import at_origin
     from app.robot.address import is_live
@@ -120,13 +121,13 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     if is_live(run.uri):
         raise StemmapError("a live run has no recording to be read again", where=run.uri)
     if run.record.get("continued"):
-        raise StemmapError("a run that continues another one has no single cloud", where=str(folder))
+        raise StemmapError("a run of several recordings has no single cloud", where=str(folder))
     odometry = str(run.record.get("odometry") or "auto")
     request = request_of_kept(run.uri, odometry=odometry, seed=run.seed, choices=run.record.get("chosen"))
-    source, chosen = with_odometry(open_source(run.uri, request.options()), odometry)
-    thinned = Thinned(1 << 22, 0.02)
-    T_base_lidar, p = source.description.T_base_lidar, run.parameters
-    try:
+    thinned, p = Thinned(1 << 22, 0.02), run.parameters
+    with closing(open_source(run.uri, request.options())) as opened:
+        source, chosen = with_odometry(opened, odometry)
+        T_base_lidar = source.description.T_base_lidar
         for row, step in enumerate(at_origin(source, []).steps(source, chosen.steps, Counter())):
             if row >= len(run.path.x):
                 break
@@ -140,8 +141,6 @@ def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
             known = np.isfinite(z)
             values = np.column_stack([place, z, np.zeros(len(z))])[known]
             thinned.add(np.ascontiguousarray(values, np.float32))
-    finally:
-        source.close()
     points = thinned.points
     if not len(points):
         raise StemmapError("the run has no points near known ground", where=str(folder))

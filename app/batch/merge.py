@@ -21,7 +21,7 @@ from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Pose2
 from pipeline.io.checkpoints.merged_map import MergedMap, merge_maps
 from pipeline.io.checkpoints.saved_map import SavedMap
-from pipeline.io.result_files import DETECTION_COLUMNS, RunFiles, csv_text, seen_text
+from pipeline.io.result_files import DETECTION_COLUMNS, RunFiles, csv_text, seen_text, terrain_text
 from pipeline.loop_closure.stem_matching import MapStems, Match, find_constellation
 from pipeline.types.records import Path, Trees
 
@@ -48,8 +48,8 @@ def merge_runs(
     *,
     force: bool,
 ) -> MergeResult:
-    """Merge run b into run a, and write the files of a run, but not terrain.csv, and correspondence.csv;
-    seen.csv only if both runs have it. Scores of run a are not part of the result.
+    """Merge run b into run a, and write the files of a run and correspondence.csv; seen.csv only if both runs
+    have it. Scores of run a are not part of the result.
 
     Args:
         folder_a, folder_b: Folders of finished runs.
@@ -89,7 +89,10 @@ def merge_runs(
         path = _path(merged)
         _update(record, saved, path, int(np.count_nonzero(trees.confirmed)), match)
         table = _correspondence(merged, b.map, _shown(trees), _shown(trees_a), _shown(trees_b))
-        more = {"correspondence.csv": csv_text(CORRESPONDENCE_COLUMNS, table)}
+        more = {
+            "correspondence.csv": csv_text(CORRESPONDENCE_COLUMNS, table),
+            "terrain.csv": terrain_text(merged.map.ground.record),
+        }
         seen_a, seen_b = read_seen_area(folder_a), read_seen_area(folder_b)
         if seen_a is not None and seen_b is not None:
             more["seen.csv"] = seen_text(seen_a.joined(seen_b, match.pose))

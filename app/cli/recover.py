@@ -30,14 +30,14 @@ def run(arguments: argparse.Namespace) -> int:
             or nothing is readable.
     """
     from pipeline.errors import StemmapError
-    from pipeline.io.recording.mcap_writer import mend
+    from pipeline.io.recording.mcap_writer import repair
 
     if arguments.out.exists() and arguments.file.exists() and arguments.out.samefile(arguments.file):
         raise StemmapError(
             "this is the damaged file", where=str(arguments.out), remedy="Name another with --out"
         )
     refuse_to_overwrite(arguments.out, force=arguments.force)
-    mended = mend(arguments.file, arguments.out)
+    mended = repair(arguments.file, arguments.out)
     print(f"{arguments.out}: {mended.messages} messages")
     for reason, number in mended.losses.items():
         print(f"lost: {number} {reason}", file=sys.stderr)

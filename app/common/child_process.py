@@ -323,8 +323,8 @@ def run_child(
     low_priority: bool = False,
 ) -> NoReturn:
     """Run the program of a child process, then end the process: with code 0; with 1 after an exception, whose
-    traceback is printed; after SystemExit with its code, or 1 and no message if that is not an integer; with
-    1 at once when the parent closes the connection or ends. It never returns.
+    traceback is printed; after SystemExit with its code, or with 1 if that is a message, which is printed;
+    with 1 at once when the parent closes the connection or ends. It never returns.
 
     Standard input is empty for the program, and what it prints goes to standard error. Ctrl-C is ignored: the
     parent ends its children.
@@ -346,6 +346,8 @@ def run_child(
         main(ParentConnection(incoming, outgoing))
     except SystemExit as error:
         code = error.code if isinstance(error.code, int) else 1
+        if isinstance(error.code, str):
+            sys.stderr.write(error.code + "\n")
     except BaseException:
         traceback.print_exc()
         code = 1

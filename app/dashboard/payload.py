@@ -264,7 +264,7 @@ _ALIGNED = 4
 _FARTHEST_CM = 32_767
 
 
-def packed(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
+def binary_payload(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> bytes:
     """Return a binary block: length of the header (4 bytes, little-endian), header as JSON, arrays. The
     header and each array are padded to a multiple of four bytes; the length includes the padding.
 
@@ -306,7 +306,7 @@ def stages_payload(frame: Frame) -> bytes:
     """Return the stages of Fig. 3 as a binary block: the header of `described` without ground truth, and the
     arrays `raw`, int16, shape (N, 3) [cm], and those of `_clustered`."""
     arrays = {"raw": in_centimetres(frame.raw), **_clustered(frame)}
-    return packed(described(frame, None, 0.0), arrays)
+    return binary_payload(described(frame, None, 0.0), arrays)
 
 
 def comparison_payload(
@@ -325,13 +325,13 @@ def comparison_payload(
         f"{name}{k}": array for k, frame in enumerate(frames) for name, array in _clustered(frame).items()
     }
     pictures = [described(frame, truth, match_distance) for frame in frames]
-    return packed({**header, "pictures": pictures}, arrays)
+    return binary_payload({**header, "pictures": pictures}, arrays)
 
 
 def _clustered(frame: Frame) -> dict[str, NDArray[Any]]:
-    """Return arrays for `packed`: `points`, filtered points, int16, shape (M, 3) [cm]; `labels`, the cluster
-    of each, int32, shape (M,), -1 for none; and `circles`, x, y, radius (NaN if unknown) and height of the
-    centroid of each cluster, float32, shape (K, 4) [m]. All are in the level frame of the sensor."""
+    """Return arrays for `binary_payload`: `points`, filtered points, int16, shape (M, 3) [cm]; `labels`, the
+    cluster of each, int32, shape (M,), -1 for none; and `circles`, x, y, radius (NaN if unknown) and height
+    of the centroid of each cluster, float32, shape (K, 4) [m]. All are in the level frame of the sensor."""
     circles = np.column_stack([frame.clusters.centre, frame.clusters.radius, frame.clusters.centroid[:, 2]])
     return {
         "points": in_centimetres(frame.filtered),

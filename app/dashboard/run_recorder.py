@@ -233,7 +233,7 @@ class RunRecorder:
         store refuses."""
         state, record = page.best, page.record
         if state is not None and record is not None:
-            files = packed(await asyncio.to_thread(state.files))
+            files = zip_of(await asyncio.to_thread(state.files))
             await self._ask(lambda store: store.book.put_files(record, files))
 
     async def _ask(self, work: Callable[[Store], None]) -> None:
@@ -248,7 +248,7 @@ class RunRecorder:
         self._problem = ""
 
 
-def packed(texts: Mapping[str, str]) -> bytes:
+def zip_of(texts: Mapping[str, str]) -> bytes:
     """Return files as a zip archive; the same texts give the same bytes."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:

@@ -156,10 +156,11 @@ class Scene:
 
     def clear(self) -> None:
         """Remove run, ground truth and selection from the scene. The panel and the choices of the view
-        stay."""
+        stay; the cameras return to the size of a robot."""
         self._frame, self._path = None, np.zeros((0, 2))
         self._truth = self._selected = self._ring = None
         self._accumulated = Accumulated()
+        self._follower.frame_plot(0.0)  # the new one does not know where the cameras are
         with self._server.atomic():
             self._server.scene.reset()
             self._add_nodes()

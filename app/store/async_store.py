@@ -56,10 +56,21 @@ class AsyncStore:
             self._waiting -= 1
 
     async def close(self) -> None:
-        """Finish the requests that wait, and close the database; errors as `ask`. No request may follow."""
+        """Finish the requests that wait, however many they are, and close the database. No request may
+        follow.
+
+        Raises:
+            StemmapError: The database cannot be closed.
+        """
+        try:
+            await asyncio.get_running_loop().run_in_executor(self._thread, self._close)
+        finally:
+            self._thread.shutdown()
+
+    def _close(self) -> None:
+        """Close the database if it is open; errors as `_work`."""
         if self._store is not None:
-            await self.ask(lambda store: store.close())
-        self._thread.shutdown()
+            self._work(lambda store: store.close())
 
     def _work(self, function: Callable[[Store], T]) -> T:
         """Call a function with the store, which is opened if necessary; errors of the database become

@@ -344,7 +344,7 @@ def lines(comparison: Comparison) -> list[str]:
         rows = list(comparison.means)
     if len(rows) > MOST_LINES:
         left_out = len(rows) - MOST_LINES
-        rows = sorted(rows, key=lambda row: -(row.figures.get("f1") or -1.0))[:MOST_LINES]
+        rows = sorted(rows, key=_by_f1)[:MOST_LINES]
         notes.append(f"{count(left_out, 'set')} with a smaller F1 not shown; --out DIR writes all of them")
     heads = [
         "set",
@@ -355,6 +355,12 @@ def lines(comparison: Comparison) -> list[str]:
     ]
     cells = [_cells(comparison, row, one=one) for row in rows]
     return [*_aligned([heads, *cells]), *notes, *_best_lines(comparison)]
+
+
+def _by_f1(row: Row) -> float:
+    """Return the key that sorts rows by decreasing F1, those without F1 last."""
+    f1 = row.figures.get("f1")
+    return 1.0 if f1 is None else -f1
 
 
 def files(comparison: Comparison, folder: Path) -> list[str]:

@@ -94,12 +94,12 @@ class Outbox:
             return  # the web process is gone; the reader of commands ends the worker
 
     def _packed(self, message: FromWorker) -> list[bytes]:
-        """Return the encoded message; if it is too large or has an array that cannot be sent, the last status
+        """Return the encoded message; if it is too large or has a value that cannot be sent, the last status
         with a warning, encoded, or nothing before the first status. After a frame that was not sent, the next
         one has the whole path and the ground."""
         try:
             return [self._codec.encode(self._made_ready(message))]
-        except WireError as error:
+        except (WireError, NotImplementedError) as error:
             if isinstance(message, Shown):
                 self._sent_path = self._sent_ground = None  # what was in it did not arrive
             self._refused = f"a picture could not be shown: {error}"

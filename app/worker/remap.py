@@ -306,11 +306,11 @@ class RunMap:
                 self.frames.forget_from(index)
         return changes
 
-    def return_to(self, parameters: Parameters) -> bool:
+    def rewind_if_same(self, parameters: Parameters) -> bool:
         """Return to the state before the current scan, and use these parameters from there on. Return whether
         all earlier scans have them too, so that the map is that of a rerun; False leaves the map unusable."""
         self.use(parameters, self.before.path_length)
-        if not self.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
+        if not self.parameters.are_all(parameters, NOT_OF_THE_MAP):
             return False
         self.mapper.parameters = parameters
         self.mapper.restore(self.before)
@@ -485,7 +485,7 @@ class ParameterHistory:
         """Return the parameters with which the scan with this index (0 or more) was or will be mapped."""
         return self._sets[bisect_right(self._starts, index) - 1]
 
-    def apply_to_all(self, parameters: Parameters, aside: set[str]) -> bool:
+    def are_all(self, parameters: Parameters, aside: set[str]) -> bool:
         """Return whether every scan was mapped with these values.
 
         Args:

@@ -289,12 +289,12 @@ class Run:
             StemmapError: The forest that the parameters name does not exist.
         """
         self.cancel_remapping()
-        if self._map.parameters.apply_to_all(parameters, NOT_OF_THE_MAP):
+        if self._map.parameters.are_all(parameters, NOT_OF_THE_MAP):
             return
         self._caches.of(self._map.mapper.parameters)  # in use: the caches not used for longest are closed
         reread, cache = None if self._is_live else self._cursor.again, self._caches.of(parameters)
         previous, self._previous = self._previous, None
-        if previous is not None and previous.return_to(parameters):
+        if previous is not None and previous.rewind_if_same(parameters):
             done = previous.before.path_length
             rerun = Rerun(previous.mapper, cache, reread, segment_ahead, done=done)
             no_preview: Generator[None, None, None] = (None for _ in ())  # only the current scan is left
@@ -482,13 +482,24 @@ def open_run(
 
     Raises:
         SourceError: The odometry is not available for this source; the source is closed.
-        StemmapError: The forest that the parameters name does not exist; the source stays open.
+        StemmapError: The forest that the parameters name does not exist; the source is closed.
     """
     try:
-        moving, chosen = with_odometry(source, odometry)
-    except SourceError:
+        return _opened_run(source, odometry, seed, parameters, make_mapper)
+    except BaseException:
         source.close()
         raise
+
+
+def _opened_run(
+    source: Source | LiveSource,
+    odometry: str,
+    seed: int,
+    parameters: Parameters,
+    make_mapper: MakeMapper,
+) -> tuple[Run, tuple[str, ...]]:
+    """Return the result of `open_run`; arguments and errors as there, but the source stays open after one."""
+    moving, chosen = with_odometry(source, odometry)
     stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
     description = source.description
     left_out = Counter[str]()

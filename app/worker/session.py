@@ -220,7 +220,7 @@ class Session:
 
         Raises:
             SourceError: The odometry is not available for this source; the source is closed.
-            StemmapError: The forest that the parameters name does not exist.
+            StemmapError: The forest that the parameters name does not exist; the source is closed.
         """
         warnings: tuple[str, ...]
         if isinstance(source, CloudSource):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -107,28 +107,80 @@ def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -
     """
     from scipy.spatial import cKDTree
 
-    keys = np.array(list(tiles), np.int64).reshape(-1, 2)
-    if not len(keys):
+    if not tiles:
         return {}
-    cells = np.stack(list(tiles.values())).reshape(-1, SIDE, SIDE, COLUMNS)
-    n, i, j = np.nonzero(cells[..., VIEWS])
-    row: Float = cells[n, i, j].astype(np.float64)
-    place = SIDE * keys[n] + np.column_stack([i, j])
+    place, row = _cells_of(tiles)
     centre: Float = (place.astype(np.float64) + 0.5) * CELL
     _, scan = cKDTree(correction.before[:, :2]).query(centre)
     corrected, _ = correction.moved(centre, np.asarray(scan))
     shift = np.round((corrected - centre) / CELL).astype(np.int64)
-    moved, of = np.unique(place + shift, axis=0, return_inverse=True)
+    return _tiles_of(place + shift, row, tiles)
+
+
+def _tiles_of(place: Int, row: Float, order: Iterable[Tile]) -> dict[Tile, Float32]:
+    """Return tiles of cells. Cells that coincide are averaged by their weights, and their weights and views
+    are added.
+
+    Args:
+        place: Indices of the cells along x and y of the whole map, shape (N, 2).
+        row: Cells, shape (N, COLUMNS).
+        order: Tiles that come first in the result, in their order; all other ones follow.
+    """
+    moved, of = np.unique(place, axis=0, return_inverse=True)
     fresh = _averaged(row, of.ravel(), len(moved))
     home, rest = np.divmod(moved, SIDE)
-    # Tiles keep their order, least recently seen first; new tiles follow.
-    order = {tile: k for k, tile in enumerate(tiles)}
+    first = {tile: k for k, tile in enumerate(order)}
     names = [(int(a), int(b)) for a, b in np.unique(home, axis=0)]
-    names.sort(key=lambda tile: order.get(tile, len(order)))
+    names.sort(key=lambda tile: first.get(tile, len(first)))
     out = {tile: np.zeros((SIDE, SIDE, COLUMNS), np.float32) for tile in names}
     for k, (a, b) in enumerate(home):
         out[(int(a), int(b))][rest[k, 0], rest[k, 1]] = fresh[k]
     return out
+
+
+def _cells_of(tiles: Mapping[Tile, Float32]) -> tuple[Int, Float]:
+    """Return the known cells of tiles: their indices along x and y of the whole map, int64, shape (N, 2), and
+    their columns, float64, shape (N, COLUMNS)."""
+    keys = np.array(list(tiles), np.int64).reshape(-1, 2)
+    cells = np.array(list(tiles.values()), np.float32).reshape(-1, SIDE, SIDE, COLUMNS)
+    n, i, j = np.nonzero(cells[..., VIEWS])
+    return SIDE * keys[n] + np.column_stack([i, j]), cells[n, i, j].astype(np.float64)
+
+
+def merged_terrain(a: HeightMapState, b: HeightMapState, T_a_b: Pose2) -> HeightMapState:
+    """Return the terrain of two runs in the frame of the first, published, with the sensor at the end of the
+    second; both are unchanged. With more than MOST_TILES tiles, the least recently seen ones are left out.
+
+    Each run has its own height 0; that of b is moved by the median difference of the cells that both know.
+    With fewer than LEAST of these, the heights of b are unknown in a, and the terrain of a is returned.
+
+    Args:
+        a, b: Terrain of the two runs.
+        T_a_b: Pose of the frame of b in that of a.
+    """
+    known, row = _cells_of(a.tiles)
+    other, other_row = _cells_of(b.tiles)
+    # Each cell of the result takes the cell of b at its centre, so that a turned grid has no gaps.
+    centre: Float = (other.astype(np.float64) + 0.5) * CELL
+    around = np.floor(T_a_b.apply(centre) / CELL).astype(np.int64)
+    near = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1]), axis=-1).reshape(-1, 2)
+    place = np.unique((around[:, None] + near).reshape(-1, 2), axis=0)
+    wanted = np.floor(T_a_b.inverse().apply((place + 0.5) * CELL) / CELL).astype(np.int64)
+    row_of = {cell: k for k, cell in enumerate(map(tuple, other.tolist()))}
+    found = np.array([row_of.get(cell, -1) for cell in map(tuple, wanted.tolist())], np.int64)
+    place, moved = place[found >= 0], other_row[found[found >= 0]]
+    mean_of = dict(zip(map(tuple, known.tolist()), row[:, MEAN].tolist(), strict=True))
+    means = np.array([mean_of.get(cell, np.nan) for cell in map(tuple, place.tolist())])
+    both = np.isfinite(means)
+    if np.count_nonzero(both) < LEAST:
+        return replace(a, record=_record(a.tiles))
+    rise = float(np.median(means[both] - moved[both, MEAN]))
+    moved[:, MEAN] += rise
+    tiles = _tiles_of(np.concatenate([known, place]), np.concatenate([row, moved]), a.tiles)
+    while len(tiles) > MOST_TILES:
+        del tiles[next(iter(tiles))]
+    sensor_z = None if b.sensor_z is None else b.sensor_z + rise
+    return HeightMapState(tiles, sensor_z, a.scans + b.scans, _record(tiles))
 
 
 def _averaged(row: Float, of: Int, cells: int) -> Float32:

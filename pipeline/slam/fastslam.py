@@ -255,9 +255,6 @@ class FastSlam:
         Returns:
             The correction. None where the graph has no solution; the particles are unchanged then, and the
             next smoothing waits for another revisit.
-
-        Raises:
-            LinAlgError: A covariance in the graph is not positive definite.
         """
         graph, solution = self.state.graph, self.state.graph.solve()
         if solution is None:
@@ -280,9 +277,6 @@ class FastSlam:
         Returns:
             The correction; None if the graph has no solution with the loop, or if it has less support with
             the loop than without. The state is unchanged then.
-
-        Raises:
-            LinAlgError: A covariance in the graph, or that of the loop, is not positive definite.
         """
         state, graph = self.state, self.state.graph
         path = state.genealogy.path(state.best)
@@ -372,7 +366,7 @@ class FastSlam:
         estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
         return replace(estimate, health=before.health, landmark_of=before.landmark_of)
 
-    def lost(self, estimate: PoseEstimate) -> Health:
+    def health_without_detections(self, estimate: PoseEstimate) -> Health:
         """Return the health of an estimate for a scan that detected no tree and has no doubt about the
         odometry. Whether it is "lost" depends on the running statistics and on the covariance of the
         estimate."""

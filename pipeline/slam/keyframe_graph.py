@@ -334,21 +334,18 @@ class KeyframeGraph:
 
     def solve(self, *, new_loop: bool = False) -> Solution | None:
         """Return the minimum next to the present poses. None with fewer than two keyframes, if the problem is
-        singular, or if no step decreases the cost. After ITERATIONS_MAX steps the best estimate so far is the
-        result. The graph is unchanged.
+        singular, if a covariance is not positive definite, or if no step decreases the cost. After
+        ITERATIONS_MAX steps the best estimate so far is the result. The graph is unchanged.
 
         Args:
             new_loop: Whether the last loop was just added and has its full weight, without the kernel, which
                 has no slope far from the minimum.
-
-        Raises:
-            LinAlgError: The covariance of a detection, a motion or a loop is not positive definite.
         """
         if len(self.keyframes) < 2:
             return None
-        problem = _Problem(self)
-        minimum = problem.minimum(quadratic_loops=int(new_loop))
         try:
+            problem = _Problem(self)
+            minimum = problem.minimum(quadratic_loops=int(new_loop))
             return None if minimum is None else problem.solution(*minimum)
         except np.linalg.LinAlgError:
             return None

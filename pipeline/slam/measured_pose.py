@@ -178,9 +178,9 @@ class SharedErrors:
     def without_shared_error(self, pose: PoseMeasurement, weights: Float) -> PoseMeasurement:
         """Return a measured pose minus the estimated shared error, H e, with the covariance R + H E H^T.
 
-        e and E are the mean and the covariance of the error over the particles. All other attributes of the
-        pose remain, `shared` as well. A pose without shared errors, and each pose before the first shared
-        one, is returned unchanged.
+        e and E are the mean and the covariance of the error over the particles. The result has no shared
+        errors (`shared` is None); all other attributes of the pose remain. A pose without shared errors, and
+        each pose before the first shared one, is returned unchanged.
 
         Args:
             pose: The measured pose.
@@ -193,7 +193,9 @@ class SharedErrors:
         away = mean - middle
         E = np.einsum("p,pij->ij", weights, self.covariance[pose.source]) + (weights[:, None] * away).T @ away
         at = pose.T_map_base.as_array() - H @ middle
-        return replace(pose, T_map_base=type(pose.T_map_base)(*at), covariance=pose.own + H @ E @ H.T)
+        return replace(
+            pose, T_map_base=type(pose.T_map_base)(*at), covariance=pose.own + H @ E @ H.T, shared=None
+        )
 
     def for_particles(self, pose: PoseMeasurement | None) -> MeasuredPose:
         """Return a measured pose as the record for the kernels, `no_measured_pose()` for None. With shared

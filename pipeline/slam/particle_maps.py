@@ -204,7 +204,7 @@ def taken(maps: Maps, rows: Int) -> Maps:
 
 def is_sound(maps: Maps, particles: int) -> bool:
     """Return whether maps from a file are consistent: shapes, number of particles, indices, numbers of owners
-    and free rows. Data types, positions, covariances, hits and scores are not checked."""
+    and free rows. Positions, covariances, hits and scores are not checked; the codec checks data types."""
     template = _with_pool(maps.block, maps.places, len(maps.owners))
     if any(getattr(maps, name).shape != getattr(template, name).shape for name in Maps._fields):
         return False

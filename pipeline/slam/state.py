@@ -113,8 +113,8 @@ class SlamState:
         """Return a state with the particles at new poses, all with the map and the path of the best particle.
 
         Weights, the motion since the last used scan, its slack, running statistics (except `mapped`), shared
-        errors and the hidden covariance of the frame are reset. All other attributes remain, also
-        `since_update`, `path`, the graph, the motion since the last keyframe and the places.
+        errors and the hidden covariance of the frame are reset; `since_update` is added to `distance`. All
+        other attributes remain, also `path`, the graph, the motion since the last keyframe and the places.
 
         Args:
             pose: New poses, shape (P, 3), not copied; P may differ from the present number.
@@ -128,6 +128,8 @@ class SlamState:
             motion=np.zeros(3),
             motion_covariance=np.zeros((3, 3)),
             slack=np.zeros(2),
+            since_update=0.0,
+            distance=self.distance + self.since_update,
             best=0,
             genealogy=self.genealogy.redrawn(rows),
             recent=RunningStatistics(mapped=self.recent.mapped),

@@ -114,14 +114,17 @@ async def redo(body: Edit, dashboard: Dash) -> Response:
 @router.post("/annotations/import")
 async def import_table(body: _Import, dashboard: Dash) -> Response:
     """Add the rows of a CSV table in one edit. Return the number of added rows (`added`), the number of rows
-    that exist already as annotations (`left_out`), and the counts of edits, see `edited`. 422 if the table
-    cannot be read, has a row out of bounds or too many rows, 409 as in `add`; then nothing is added. Without
-    new rows there is no edit."""
+    that exist already as annotations or earlier in the table (`left_out`), and the counts of edits, see
+    `edited`. 422 if the table cannot be read, has a row out of bounds or too many rows, 409 as in `add`; then
+    nothing is added. Without new rows there is no edit."""
     contents = await asyncio.to_thread(_imported, body, dashboard.offset)
     existing = {_key(row.content) for row in dashboard.annotation_editor.rows}
-    new = [content for content in contents if _key(content) not in existing]
+    new: dict[tuple[float, float, str], Content] = {}
+    for content in contents:
+        if _key(content) not in existing:
+            new.setdefault(_key(content), content)
     if new:
-        await apply_edit(dashboard, body, Store.add, new)
+        await apply_edit(dashboard, body, Store.add, list(new.values()))
     return await edited(dashboard, body, {"added": len(new), "left_out": len(contents) - len(new)})
 
 

@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Path, Query
 from starlette.responses import FileResponse, Response
 
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.payload import comparison_payload, doubts_of, packed, stages_payload, trees_payload
+from app.dashboard.payload import binary_payload, comparison_payload, doubts_of, stages_payload, trees_payload
 from app.dashboard.scores import pairs_payload
 from app.dashboard.selection import NothingMappedError
 from app.dashboard.shown_run import ShownRun
@@ -223,7 +223,7 @@ async def section(dashboard: Dash) -> Response:
     of a cell and `origin`, the lower left corner of cell (0, 0) [m], and the array `cells`, the occupied
     cells along x and y, int32, shape (N, 2); 409 before the first map, 503 if the worker is busy."""
     found = await dashboard.worker_client.section()
-    return bytes_reply(packed({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
+    return bytes_reply(binary_payload({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
 
 
 @router.get("/stages", dependencies=[ViewerTurn])

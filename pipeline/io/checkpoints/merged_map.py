@@ -12,6 +12,7 @@ from pipeline.classification.voxel_map import TILE
 from pipeline.config import Parameters
 from pipeline.geometry.gaussian import spread_by_pose
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
+from pipeline.ground.terrain_map import PackedHeightMap, merged_terrain
 from pipeline.io.checkpoints.saved_map import SavedMap
 from pipeline.slam import SlamState
 from pipeline.slam.association import associate
@@ -50,7 +51,7 @@ def merge_maps(
     """Merge map b into map a; both are unchanged. Trees that `associate` pairs within GATE sigma (with
     `relocalisation.slack` added) and `slam.distance_max` become one with the number in a; other trees of b
     get new numbers. The run continues at the end of b, in the frame of a, without graph and places. The
-    height map is that of a.
+    terrain of b is left out if the runs have too little ground in common, see `merged_terrain`.
 
     Args:
         a, b: The maps.
@@ -89,6 +90,7 @@ def merge_maps(
         slam=_slam(a.slam, b.slam, T_a_b, covariance, path, parameters.slam.distance_max),
         memory=_memory(a.memory, b.memory, T_a_b, len(path), 1 << parameters.classification.voxels_log2),
         columns=_columns(a.columns, b.columns, T_a_b),
+        ground=PackedHeightMap.of(merged_terrain(a.ground.unpacked(), b.ground.unpacked(), T_a_b)),
         tracks=tracks,
         next_number=a.next_number + int(np.count_nonzero(fresh)),
         odometry=None,

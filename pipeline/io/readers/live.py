@@ -198,7 +198,7 @@ class ArrivalReader:
 
 #: Most pictures in memory, and their bytes; a paused run can still show those of its scan.
 MOST_PICTURES, MOST_BYTES = 60, 64 << 20
-_MOST_FIXED, _LARGEST_TOLD = 200, 64 << 10
+_MOST_FIXED, _LARGEST_STORED = 200, 64 << 10
 
 
 class LiveCamera:
@@ -224,8 +224,8 @@ class LiveCamera:
 
     def add(self, message: Message) -> bool:
         """Process a message of any channel: store pictures (the last MOST_PICTURES, MOST_BYTES), the latest
-        CameraInfo and the first _MOST_FIXED fixed transforms, larger ones than _LARGEST_TOLD omitted. Return
-        whether only the camera uses it."""
+        CameraInfo and the first _MOST_FIXED fixed transforms, larger ones than _LARGEST_STORED omitted.
+        Return whether only the camera uses it."""
         number = message.channel
         if number not in self._numbers:
             if number in self._channels and len(self._fixed) < _MOST_FIXED:
@@ -236,7 +236,7 @@ class LiveCamera:
             self._bytes += len(message.payload)
             while len(self._held) > MOST_PICTURES or self._bytes > MOST_BYTES:
                 self._bytes -= len(self._held.popleft()[1].payload)
-        elif len(message.payload) <= _LARGEST_TOLD and (self._info is None or self._is_other(message)):
+        elif len(message.payload) <= _LARGEST_STORED and (self._info is None or self._is_other(message)):
             self._info, self._found = message, None
         return True
 
@@ -275,9 +275,9 @@ class LiveCamera:
         return self._info is None or info.payload[head:] != self._info.payload[head:]
 
     def _keep_fixed(self, message: Message) -> None:
-        """Store a message of fixed transforms unless it is stored or larger than _LARGEST_TOLD."""
+        """Store a message of fixed transforms unless it is stored or larger than _LARGEST_STORED."""
         known = {each.payload for each in self._fixed}
-        if len(message.payload) <= _LARGEST_TOLD and message.payload not in known:
+        if len(message.payload) <= _LARGEST_STORED and message.payload not in known:
             self._fixed.append(message)
             self._found = None
 

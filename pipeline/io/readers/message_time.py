@@ -177,7 +177,7 @@ class Stamped(Generic[T_co]):
     content: T_co
 
 
-def by_stamp(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -> Iterator[Stamped[T]]:
+def in_order_of_stamps(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -> Iterator[Stamped[T]]:
     """Yield contents sorted by time, then by rank, then in the order of arrival. A content waits until one
     that is more than WINDOW_NS later arrives, or more than _HELD_LIMIT contents wait. Contents that arrive
     with a time before that of the last one yielded are left out.

@@ -21,8 +21,8 @@ from pipeline.io.readers.message_time import (
     Clock,
     ClockStepFilter,
     Stamped,
-    by_stamp,
     header_stamp,
+    in_order_of_stamps,
 )
 from pipeline.io.readers.ros_records import RecordDecoder
 from pipeline.io.readers.scan_columns import rings_descend, sensor_of
@@ -100,7 +100,7 @@ class RosSource(MessageSource):
         counted in `losses`."""
         losses: dict[str, int] = {}
         self._losses = losses
-        for stamped in by_stamp(self._arrivals(start_ns, losses), losses):
+        for stamped in in_order_of_stamps(self._arrivals(start_ns, losses), losses):
             yield from self._decoded(stamped, losses)
 
     def records_of(

@@ -267,7 +267,7 @@ class PcapSource(FileSource):
         """
         if not len(packets):
             raise SourceError(
-                f"the capture has no data packets of a known Velodyne sensor to port {DATA_PORT}",
+                "the capture has no data packets of a known Velodyne sensor",
                 where=uri,
                 remedy="HDL-32E, VLP-16, VLP-32, Puck Hi-Res and VLS-128 can be read.",
             )

@@ -312,7 +312,7 @@ class LiveWriter(_RosWriter):
 
 
 @dataclass(frozen=True, slots=True)
-class Mended:
+class RepairResult:
     """Result of a repair.
 
     Attributes:
@@ -324,7 +324,7 @@ class Mended:
     losses: dict[str, int]
 
 
-def mend(path: Path, out: Path) -> Mended:
+def repair(path: Path, out: Path) -> RepairResult:
     """Write all complete messages, attachments and metadata of a recording to a new file, which appears when
     it is complete; return what was written and lost. Messages of a channel without a definition count as
     lost.
@@ -369,4 +369,4 @@ def mend(path: Path, out: Path) -> Mended:
                 raise SourceError("nothing in the recording is whole", where=str(path))
             writer.finish()
         recording.damage.pop(NOT_FINISHED, None)  # the new file has an index
-        return Mended(written, {**recording.damage, **lost})
+        return RepairResult(written, {**recording.damage, **lost})

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from app.batch.tree_pictures import best_views, keep_pictures
-from app.common.draw_picture import Drawing, draw
+from app.common.draw_picture import Drawing, draw, draw_safely
 from pipeline.io.readers import open_source
 from pipeline.io.readers.camera import nearest
 from pipeline.io.readers.ros import RosSource
@@ -149,3 +149,8 @@ def bomb() -> bytes:
 def test_what_is_no_picture_is_refused(picture: Drawing):
     with pytest.raises(Exception, match=r".+"):
         draw(picture)
+
+
+def test_the_reason_why_a_picture_cannot_be_drawn_is_printed(capfd):
+    assert draw_safely(drawing(b"no picture")) is None
+    assert "UnidentifiedImageError" in capfd.readouterr().err

@@ -13,7 +13,7 @@ from app.cli import main
 
 FILES = {
     "trees.csv", "path.csv", "trees.geojson", "detections.csv", "run.json", "state.zip", "correspondence.csv",
-    "seen.csv"
+    "seen.csv", "terrain.csv"
 }  # fmt: skip
 
 
@@ -100,6 +100,16 @@ def test_the_merged_run_can_be_judged_and_continued(runs, tmp_path, capsys):
     assert len(set(before) & set(after)) >= 0.9 * len(before)
     for number in set(before) & set(after):
         assert abs(float(before[number]["x_m"]) - float(after[number]["x_m"])) < 0.3
+
+
+def test_the_terrain_of_both_runs_is_written_and_read_again(runs, tmp_path, capsys):
+    cells = {
+        name: {(row["x_m"], row["y_m"]) for row in rows(runs / name, "terrain.csv")} for name in ("a", "both")
+    }
+    assert cells["a"] < cells["both"]
+    assert main(["export", str(runs / "both"), "--out", str(tmp_path / "gis")]) in (0, 3)
+    assert main(["report", str(runs / "both"), "--out", str(tmp_path / "report.html")]) == 0
+    capsys.readouterr()
 
 
 def test_paths_and_detections_follow_one_another(runs):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import AsyncIterator, Callable
 from functools import partial
 from pathlib import Path
@@ -19,7 +20,7 @@ from websockets.typing import Origin
 from app.common.settings import Settings
 from app.dashboard.annotations import AnnotationEditor, counted, laid_over, truth_of
 from app.dashboard.dashboard import Dashboard
-from app.store.async_store import AsyncStore
+from app.store.async_store import LARGEST_QUEUE, AsyncStore, StoreBusyError
 from app.store.records import Annotation, Content, contents_of
 from app.web.auth import session_value
 from app.worker.protocol import Shown
@@ -201,6 +202,10 @@ async def test_a_table_goes_in_and_comes_out(both: Running) -> None:
     assert (answer["added"], answer["left_out"], answer["undo"]) == (2, 0, 1)
     again = (await edit(client, "POST", "/import", table=table, dbh_unit="m")).json()
     assert (again["added"], again["left_out"], again["undo"]) == (0, 2, 1)
+    twice = table + "9.0,9.0,0.2,tree\n" * 2
+    mixed = (await edit(client, "POST", "/import", table=twice, dbh_unit="m")).json()
+    assert (mixed["added"], mixed["left_out"]) == (1, 3)
+    await edit(client, "POST", "/undo")
     out = await client.get("/api/annotations.csv")
     assert 'filename="truth.csv"' in out.headers["content-disposition"]
     read = contents_of(parse_truth_trees(out.text, where="here"))
@@ -394,6 +399,22 @@ async def test_the_store_works_beside_the_event_loop() -> None:
     assert name.startswith("store")
     assert threading.current_thread().name != name
     await store.close()
+
+
+@pytest.mark.parametrize("is_open", [True, False])
+async def test_a_store_with_a_full_queue_finishes_its_requests_and_closes(is_open: bool) -> None:
+    store, held = AsyncStore(None), threading.Event()
+    if is_open:
+        await store.ask(lambda _: None)
+    requests = [asyncio.ensure_future(store.ask(lambda _: held.wait(20.0))) for _ in range(LARGEST_QUEUE)]
+    await asyncio.sleep(0)
+    with pytest.raises(StoreBusyError):
+        await store.ask(lambda _: None)
+    closing = asyncio.ensure_future(store.close())
+    await asyncio.sleep(0)
+    held.set()
+    await closing
+    assert all(await asyncio.gather(*requests))
 
 
 def test_who_asks_for_one_of_two_truths_is_not_told_the_other() -> None:

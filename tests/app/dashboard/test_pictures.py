@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from app.dashboard.payload import in_centimetres, packed, stages_payload
+from app.dashboard.payload import binary_payload, in_centimetres, stages_payload
 from app.worker.loop import WorkerLoop
 from app.worker.process import new_session
 from app.worker.protocol import Answer, AskCompare, FromWorker, Shown, ToWorker
@@ -99,7 +99,7 @@ def test_a_block_is_read_as_it_was_packed():
         "b": np.ones((2, 3), np.float32),
         "c": np.zeros(0, np.int32),
     }
-    header, read = unpacked(packed({"index": 3, "name": "Bäume"}, arrays))
+    header, read = unpacked(binary_payload({"index": 3, "name": "Bäume"}, arrays))
     assert header == {"index": 3, "name": "Bäume"}
     for name, array in arrays.items():
         np.testing.assert_array_equal(read[name], array)

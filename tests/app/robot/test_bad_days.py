@@ -18,7 +18,7 @@ from app.worker.protocol import Begin, Open
 from pipeline.config import Parameters
 from pipeline.io.readers import open_source
 from pipeline.io.readers.topics import IMU, ODOMETRY, POINT_CLOUD
-from pipeline.io.recording.mcap_writer import mend
+from pipeline.io.recording.mcap_writer import repair
 from tests.app.robot.conftest import SCANS, Child, until
 from tests.app.robot.test_live_session import URI, announce, stage
 from tests.app.robot.test_live_session import sending as sending
@@ -96,7 +96,7 @@ def test_a_file_that_may_not_grow_ends_the_recording_alone(drive: Path, tmp_path
     assert told["shown"] == SCANS, "every scan was mapped"
     assert "File too large" in told["recording"]
     assert 0 < out.stat().st_size <= 1_500_000
-    mend(out, tmp_path / "mended.mcap")
+    repair(out, tmp_path / "mended.mcap")
     with closing(open_source(str(tmp_path / "mended.mcap"))) as mended:
         records: Iterator[Any] = mended.records()
         assert next(records) is not None

@@ -30,7 +30,7 @@ from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.topics import POINT_CLOUD
 from pipeline.io.recording import write_recording
-from pipeline.io.recording.mcap_writer import mend
+from pipeline.io.recording.mcap_writer import repair
 from pipeline.types.records import Scan
 from tests.app.robot.conftest import Child, until
 from tests.app.robot.test_live_session import FakeLink, announce
@@ -265,7 +265,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_map(stand: Path, tmp_path: P
     until(lambda: heard.source.recording.startswith("not recording"))
     assert "No space left on device" in heard.source.recording
     heard.source.close()
-    found = mend(recording.path, tmp_path / "mended.mcap")
+    found = repair(recording.path, tmp_path / "mended.mcap")
     assert found.losses
     with closing(open_source(str(tmp_path / "mended.mcap"))) as mended:
         assert 0 < sum(isinstance(record, Scan) for record in mended.records()) < 20
@@ -334,7 +334,7 @@ def test_damage_never_harms_the_mender(small: Path, tmp_path_factory, data):
     folder = tmp_path_factory.mktemp("damaged")
     (folder / "d.mcap").write_bytes(content)
     try:
-        found = mend(folder / "d.mcap", folder / "m.mcap")
+        found = repair(folder / "d.mcap", folder / "m.mcap")
     except SourceError:
         assert not (folder / "m.mcap").exists()
         return
@@ -349,7 +349,7 @@ def test_a_killed_recorder_loses_at_most_its_last_second(drive: Path, tmp_path: 
     told = [child.hear().split() for _ in range(60 + 13 * attempt)]
     child.kill()
     times = {int(number): float(at) for number, at in told}
-    found = mend(out, tmp_path / "mended.mcap")
+    found = repair(out, tmp_path / "mended.mcap")
     kept = [log_ns for log_ns, _ in messages_of(tmp_path / "mended.mcap")]
     assert found.messages == len(kept)
     assert kept == list(range(1, len(kept) + 1)), "nothing is missing before the end"

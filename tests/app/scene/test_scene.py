@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -245,3 +247,15 @@ def test_the_path_by_odometry_begins_with_the_path_and_follows_a_jump_back(scene
     assert len(segments) == 1
     np.testing.assert_allclose(segments[0, 0, :2], [0.0, 0.0])
     np.testing.assert_allclose(segments[0, 1, :2], [last.T_odom_base.x, last.T_odom_base.y], rtol=1e-6)
+
+
+def test_cameras_return_to_the_robot_after_a_large_cloud(scene: Scene, monkeypatch: pytest.MonkeyPatch):
+    camera = SimpleNamespace()
+    client = SimpleNamespace(atomic=contextlib.nullcontext, camera=camera)
+    monkeypatch.setattr(scene._server, "get_clients", lambda: {0: client})
+    scene._follower.frame_plot(240.0)
+    np.testing.assert_allclose(camera.position, 20.0 * np.array(scene_module.BEHIND))
+    scene.clear()
+    scene.show(make_frame(1), PATH[:2])
+    np.testing.assert_allclose(camera.position, scene_module.BEHIND)
+    np.testing.assert_allclose(scene._server.initial_camera.position, scene_module.BEHIND)

@@ -13,6 +13,7 @@ import pytest
 from app.tuning.jobs import JobResult
 from app.tuning.report import (
     CRITERIA,
+    MOST_LINES,
     Comparison,
     SweepPlan,
     best_of,
@@ -121,3 +122,16 @@ def test_a_spreadsheet_computes_no_name(comparison, tmp_path):
     files(replace(comparison, plan=replace(comparison.plan, runs=runs)), tmp_path)
     with (tmp_path / "results.csv").open() as file:
         assert {row["source"] for row in csv.DictReader(file)} == {"'=1+1", "'-2"}
+
+
+def test_a_set_without_a_right_tree_comes_before_one_that_failed():
+    values = tuple(0.01 * (k + 1) for k in range(MOST_LINES + 1))
+    sets: tuple[dict[str, Value], ...] = tuple({"clustering.eps": eps} for eps in values)
+    run = PreparedRun("first", job(0.1).run, "forest")
+    jobs = {(s, 0): job(eps) for s, eps in enumerate(values)}
+    answers = {(s, 0): JobResult(scores(0.5), seconds=1.0) for s in range(MOST_LINES - 1)}
+    answers[MOST_LINES - 1, 0] = JobResult(None, error="the disk is full")
+    answers[MOST_LINES, 0] = JobResult(scores(0.0), seconds=1.0)
+    text = "\n".join(lines(compare_results(SweepPlan((run,), sets, jobs, {}), answers)))
+    assert "the disk is full" not in text
+    assert f"{values[-1]:g}" in text

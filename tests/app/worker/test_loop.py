@@ -9,7 +9,7 @@ import queue
 import threading
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -475,3 +475,12 @@ def test_no_more_scans_are_behind_than_the_run_has_left(monkeypatch):
     assert driver._behind(status, 0.0) == 204
     assert driver._behind(replace(status, scans=None), 0.0) == 696  # nobody knows how many there are
     assert driver._behind(replace(status, live=True, scans_behind=3), 0.0) == 3
+
+
+def test_a_message_with_a_value_that_cannot_be_sent_is_dropped_and_the_next_one_is_sent() -> None:
+    stream = io.BytesIO()
+    mailbox = Outbox(stream)
+    mailbox.put(Answer(1, missing=cast(Any, object())))
+    mailbox.put(Answer(2))
+    mailbox.close(5.0)
+    assert [message.ticket for message in received(stream) if isinstance(message, Answer)] == [2]

@@ -13,9 +13,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.worker.protocol import Status
+from app.worker.run import open_run
 from app.worker.session import Session, with_robot
 from pipeline.config import Parameters
-from pipeline.errors import SourceError
+from pipeline.errors import SourceError, StemmapError
 from pipeline.types.records import Frame, Step
 from tests.app.fakes import FakeMapper, FakeSource, make_session, scan
 
@@ -490,3 +491,13 @@ def test_a_robot_whose_scans_wait_is_not_called_silent(waiting: int, state: str)
     )
     told = with_robot(Status(state="playing", source="zenoh:"), cast(Any, robot))
     assert (told.state, told.detail) == (state, "" if waiting else "Nothing heard for 3 s")
+
+
+def test_a_source_without_a_mapper_is_closed() -> None:
+    def refuses(*_: object) -> Any:
+        raise StemmapError("the forest 'oak' does not exist")
+
+    source = FakeSource(3)
+    with pytest.raises(StemmapError, match="oak"):
+        open_run(source, "auto", 7, Parameters(), refuses)
+    assert source.closed

@@ -21,7 +21,7 @@ import httpx
 
 from pipeline.errors import StemmapError
 from pipeline.io.readers import open_source
-from pipeline.io.recording.mcap_writer import mend
+from pipeline.io.recording.mcap_writer import repair
 from pipeline.types.records import Scan
 from tests.app.robot.conftest import free_port
 from tests.benchmarks.campaign import Result
@@ -240,7 +240,7 @@ def check_recording(result: Result, path: Path, period_s: float = 0.1) -> int:
     is a fault."""
     mended = path.with_suffix(".mended.mcap")
     try:
-        mend(path, mended)
+        repair(path, mended)
         with contextlib.closing(open_source(str(mended))) as source:
             stamps = [record.stamp_ns for record in source.records() if isinstance(record, Scan)]
     except StemmapError as error:

@@ -78,7 +78,7 @@ def kill_once(folder: Path, k: int, pace: str = "") -> tuple[int, int, float, bo
     from pipeline.io.readers import open_source
     from pipeline.io.readers.mcap_file import McapFile
     from pipeline.io.recording import write_recording
-    from pipeline.io.recording.mcap_writer import mend
+    from pipeline.io.recording.mcap_writer import repair
     from tests.app.robot.conftest import Child
 
     drive, out, mended = folder / "drive.mcap", folder / f"killed{k}.mcap", folder / f"mended{k}.mcap"
@@ -90,7 +90,7 @@ def kill_once(folder: Path, k: int, pace: str = "") -> tuple[int, int, float, bo
     told = [child.hear().split() for _ in range(60 + 67 * k % 250)]
     child.kill()
     times = {int(number): float(at) for number, at in told}
-    mend(out, mended)
+    repair(out, mended)
     with closing(McapFile(mended)) as recording:
         numbers = [channel.number for channel in recording.channels]
         kept = sorted(m.log_ns for m in recording.messages(numbers, None, {}) if m.log_ns in times)

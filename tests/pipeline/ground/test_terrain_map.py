@@ -9,7 +9,7 @@ from pipeline.config import preset
 from pipeline.geometry.poses import Pose2
 from pipeline.ground import terrain_map
 from pipeline.ground.scan_ground import find_terrain
-from pipeline.ground.terrain_map import HeightMapper, PackedHeightMap
+from pipeline.ground.terrain_map import HeightMapper, PackedHeightMap, merged_terrain
 from pipeline.io.checkpoints.codec import decode, encode
 from tests.pipeline.ground.test_ground import SENSOR_HEIGHT, _rings
 
@@ -92,3 +92,27 @@ def test_a_wrong_sensor_height_is_corrected_at_known_cells():
     mapper.add(find_terrain(points, FOREST), Pose2(), OFFSET)
     assert mapper.state.sensor_z == pytest.approx(SENSOR_HEIGHT + 0.3, abs=0.01)
     assert np.abs(mapper.record().height).max() < 0.01
+
+
+def test_the_terrain_of_a_second_run_is_moved_in_plan_and_height():
+    slope, T = 8.0, Pose2(6.0, 2.0, 0.6)
+    a = _driven(slope, 0.0, _poses(0.0, 10)).state
+    b = _driven(slope, -T.yaw, _poses(0.0, 10)).state  # the same plane, seen from its own origin
+    both = merged_terrain(a, b, T)
+    middle = (both.record.place + 0.5) * both.record.cell
+    near = np.hypot(*middle.T) < 12.0
+    error = (both.record.height - np.tan(np.radians(slope)) * middle[:, 0])[near]
+    assert np.sqrt(np.mean(error**2)) < 0.07
+    assert abs(np.median(error)) < 0.04  # the error of each of the two maps
+    known = {tuple(cell) for cell in both.record.place.tolist()}
+    assert known > {tuple(cell) for cell in terrain_map._record(a.tiles).place.tolist()}
+    assert both.sensor_z == pytest.approx(b.sensor_z + 6.0 * np.tan(np.radians(slope)), abs=0.05)
+    assert both.scans == a.scans + b.scans
+
+
+def test_terrain_without_common_ground_is_that_of_the_first_run():
+    a = _driven(0.0, 0.0, _poses(0.0, 7)).state
+    alone = merged_terrain(a, a, Pose2(500.0, 0.0, 0.0))
+    assert alone.tiles is a.tiles
+    assert alone.record.views.max() == 7
+    assert merged_terrain(a, HeightMapper().state, Pose2()).tiles is a.tiles

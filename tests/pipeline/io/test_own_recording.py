@@ -18,7 +18,7 @@ from pipeline.io.ground_truth import ATTACHMENT, read_truth
 from pipeline.io.readers import Source, open_source
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.recording import write_recording
-from pipeline.io.recording.mcap_writer import mend
+from pipeline.io.recording.mcap_writer import repair
 from pipeline.types.records import Imu, Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 
@@ -119,7 +119,7 @@ def test_a_recording_that_ends_after_a_whole_record_has_lost_nothing(tmp_path: P
         (data_end + 5, {"bytes at the end of a recording that was cut": 5}),
     ):
         path.write_bytes(content[:length])
-        mended = mend(path, tmp_path / "mended.mcap")
+        mended = repair(path, tmp_path / "mended.mcap")
         if losses is None:
             assert sum(mended.losses.values()) > 1
         else:

@@ -22,7 +22,7 @@ from mcap.writer import CompressionType, Writer
 from pipeline.geometry.poses import Pose3
 from pipeline.io.readers.container import BrokenChunkError, unpack
 from pipeline.io.readers.mcap_file import MAGIC, MESSAGE_HEAD, RECORD, McapFile
-from pipeline.io.readers.message_time import WINDOW_NS, Stamped, by_stamp
+from pipeline.io.readers.message_time import WINDOW_NS, Stamped, in_order_of_stamps
 from pipeline.io.readers.topics import POINT_CLOUD
 from pipeline.io.readers.transforms import TransformTree
 from pipeline.types.records import Scan
@@ -189,7 +189,7 @@ def test_reading_twice_gives_the_same_and_losses_do_not_add_up(tmp_path: Path, o
 def test_what_comes_less_than_a_second_late_finds_its_place(arrivals: list[tuple[int, int]]):
     ordered = sorted(arrivals, key=lambda arrival: arrival[0] + arrival[1])
     losses: dict[str, int] = {}
-    sorted_ = list(by_stamp([Stamped(stamp, 0, stamp) for stamp, _late in ordered], losses))
+    sorted_ = list(in_order_of_stamps([Stamped(stamp, 0, stamp) for stamp, _late in ordered], losses))
     assert [stamped.content for stamped in sorted_] == sorted(stamp for stamp, _late in arrivals)
     assert losses == {}
 
@@ -197,9 +197,12 @@ def test_what_comes_less_than_a_second_late_finds_its_place(arrivals: list[tuple
 def test_what_comes_too_late_is_counted():
     losses: dict[str, int] = {}
     stamps = [0, 3 * WINDOW_NS, 1, 5 * WINDOW_NS]
-    kept = [s.content for s in by_stamp([Stamped(stamp, 0, stamp) for stamp in stamps], losses)]
+    kept = [s.content for s in in_order_of_stamps([Stamped(stamp, 0, stamp) for stamp in stamps], losses)]
     assert kept == [0, 1, 3 * WINDOW_NS, 5 * WINDOW_NS]
-    kept = [s.content for s in by_stamp([Stamped(stamp, 0, stamp) for stamp in [0, *stamps[1:], 2]], losses)]
+    kept = [
+        s.content
+        for s in in_order_of_stamps([Stamped(stamp, 0, stamp) for stamp in [0, *stamps[1:], 2]], losses)
+    ]
     assert kept == [0, 1, 3 * WINDOW_NS, 5 * WINDOW_NS]
     assert losses == {"records that came too late to be put in order": 1}
 

@@ -595,3 +595,13 @@ def test_the_covariance_after_smoothing_is_that_of_the_graph():
     assert np.trace(after[:2, :2]) >= 0.7 * np.trace(marginal[:2, :2])
     assert spread is not None
     assert np.trace(spread[:2, :2]) < 0.5 * np.trace(marginal[:2, :2]), "else this test shows nothing"
+
+
+def test_a_placed_filter_begins_a_new_step_and_keeps_the_driven_distance():
+    slam = fresh(update_distance=1.0)
+    slam.process(0, Pose2(), seen_from(Pose2()), ALL_FREE)
+    slam.process(1, Pose2(0.4, 0.0, 0.0), seen_from(Pose2(0.4)), ALL_FREE)
+    assert slam.state.since_update == pytest.approx(0.4)
+    slam.place(2, Pose2(5.0, 0.0, 0.0), np.eye(3) * 1e-4)
+    assert slam.state.since_update == 0.0
+    assert slam.state.distance == pytest.approx(0.4)

@@ -383,3 +383,12 @@ def test_detections_between_two_keyframes_are_combined_by_their_weight():
     np.testing.assert_allclose(centre, expected, atol=1e-9)
     weight = 1.0 / (0.02 * np.arange(1, 6))
     np.testing.assert_allclose(R[:, 0], (weight**2 * 0.01 * np.arange(1, 6)).sum() / weight.sum() ** 2)
+
+
+@pytest.mark.parametrize("Q_of_one", [np.diag([-1.0, 1.0, 1.0]), np.diag([1e-2, 1e-2, -1.0])])
+def test_a_covariance_that_is_not_positive_definite_gives_no_solution(Q_of_one):
+    graph = graph_of(arc(4))
+    first, *others = graph.keyframes
+    broken = replace(graph, keyframes=(first, replace(others[0], covariance=Q_of_one), *others[1:]))
+    assert graph.solve() is not None
+    assert broken.solve() is None

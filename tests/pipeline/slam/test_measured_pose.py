@@ -173,6 +173,8 @@ def test_the_estimated_shared_error_is_subtracted_for_the_gate():
     seen = begun.without_shared_error(z, weights)
     assert seen.T_map_base.x == pytest.approx(1.0 - 2.0 * SHIFT)
     assert seen.covariance[0, 0] == pytest.approx(OWN[0] ** 2 + 0.01 * SHIFT**2)
+    assert seen.shared is None
+    np.testing.assert_array_equal(seen.own, seen.covariance)
 
 
 def test_resampled_particles_keep_independent_copies_of_their_errors():
