@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -16,11 +16,24 @@ class Stage(BaseModel):
     model_config = ConfigDict(
         frozen=True, strict=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True
     )
+    #: Pairs of parameters of which the first must be less than the second.
+    ascending: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @classmethod
     def title(cls) -> str:
         """Return the title of the stage: its docstring up to the first colon, without spaces at its ends."""
         return (cls.__doc__ or cls.__name__).partition(":")[0].strip()
+
+    @model_validator(mode="after")
+    def _is_ascending(self) -> Self:
+        """Return the parameters; ValueError that names both parameters of a pair of `ascending` and their
+        values if the first is not less than the second, also if both are equal."""
+        stage = type(self).__name__.lower()
+        for low, high in self.ascending:
+            first, second = getattr(self, low), getattr(self, high)
+            if first >= second:
+                raise ValueError(f"{stage}.{low} = {first} must be less than {stage}.{high} = {second}")
+        return self
 
 
 def number(
@@ -89,28 +102,13 @@ def choice(default: str | bool, title: str) -> Any:  # noqa: ANN401
     return Field(default=default, title=title)
 
 
-def _require_less(stage: Stage, stage_name: str, *pairs: tuple[str, str]) -> None:
-    """Raise a ValueError that names both parameters and their values if the first of a pair is not less than
-    the second.
-
-    Args:
-        stage: The parameters of the stage.
-        stage_name: Name of the stage in dotted names.
-        pairs: Names of the lower and the upper parameter.
-    """
-    for low, high in pairs:
-        if getattr(stage, low) >= getattr(stage, high):
-            raise ValueError(
-                f"{stage_name}.{low} = {getattr(stage, low)} must be less than "
-                f"{stage_name}.{high} = {getattr(stage, high)}"
-            )
-
-
 # --- one scan -------------------------------------------------------------------------------------
 
 
 class Acquisition(Stage):
     """Acquisition: which returns of the sensor are used (Eq. 1)."""
+
+    ascending = (("range_min", "range_max"),)
 
     level: Literal["none", "imu"] = choice("imu", "Level the scan")
     """Rotate the scan by the tilt that the IMU or the pose reports."""
@@ -127,15 +125,11 @@ class Acquisition(Stage):
     range_max: float = number(40.0, "Maximum range", "m", 1.0, 250.0, 1.0)
     """Farther returns are not used."""
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        """Return the parameters; ValueError if `range_min` is not less than `range_max`."""
-        _require_less(self, "acquisition", ("range_min", "range_max"))
-        return self
-
 
 class Filters(Stage):
     """Filters: the pass-through box in the sensor frame and the voxel grid (Eq. 2)."""
+
+    ascending = (("x_min", "x_max"), ("y_min", "y_max"), ("z_min", "z_max"))
 
     x_min: float = number(-40.0, "x min", "m", -100.0, 100.0, 0.1, (-50.0, 50.0), main=True)
     """Rear face of the pass-through box."""
@@ -158,16 +152,11 @@ class Filters(Stage):
     voxel_size: float = number(0.01, "Voxel size", "m", 0.0, 1.0, 0.001, (0.005, 0.2), main=True)
     """Points in a cube of this edge length are replaced by their mean; 0 turns the filter off."""
 
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        """Return the parameters; ValueError if a lower face of the box is not less than the upper one, also
-        if both are equal."""
-        _require_less(self, "filters", ("x_min", "x_max"), ("y_min", "y_max"), ("z_min", "z_max"))
-        return self
-
 
 class Ground(Stage):
     """Ground: the terrain model and the height band above it that is searched for trunks."""
+
+    ascending = (("height_min", "height_max"),)
 
     method: Literal["none", "polar"] = choice("polar", "Ground model")
     """polar: ground surface on a polar grid with a maximum slope; none: no ground."""
@@ -180,12 +169,6 @@ class Ground(Stage):
 
     slope_max: float = number(35.0, "Maximum slope", "deg", 1.0, 80.0, 1.0)
     """Maximum slope of the terrain."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        """Return the parameters; ValueError if `height_min` is not less than `height_max`."""
-        _require_less(self, "ground", ("height_min", "height_max"))
-        return self
 
 
 class Clustering(Stage):
@@ -228,6 +211,8 @@ class Shape(Stage):
 class Detection(Stage):
     """Detection: which clusters are trees, and the reason why the others are not."""
 
+    ascending = (("e_min", "e_max"), ("radius_min", "radius_max"))
+
     whole: bool = choice(True, "Whole trunks only")
     """Reject clusters that are cut off by the box, the range limit or the edge of the field of view."""
 
@@ -262,13 +247,6 @@ class Detection(Stage):
 
     sigma_bearing: float = number(0.4, "Bearing sigma", "deg", 0.01, 20.0, 0.05)
     """Standard deviation of the bearing to a trunk centre, added to the covariance of the fit."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        """Return the parameters; ValueError if a lower limit of eccentricity or radius is not less than the
-        upper one, also if both are equal."""
-        _require_less(self, "detection", ("e_min", "e_max"), ("radius_min", "radius_max"))
-        return self
 
 
 # --- the pose -------------------------------------------------------------------------------------
@@ -404,6 +382,8 @@ class Tracking(Stage):
 class Obstacles(Stage):
     """Obstacles: returns in the path of the robot, and the zones in which it should slow down and stop."""
 
+    ascending = (("height_min", "height_max"), ("stop_distance", "slow_distance"))
+
     method: Literal["none", "way"] = choice("way", "Obstacle detection")
     """way: search the path that results from the current velocities; none: off."""
 
@@ -427,13 +407,6 @@ class Obstacles(Stage):
 
     min_points: int = count(5, "Minimum returns", "", 1, 100)
     """Returns within half a metre that make an obstacle; fewer returns are rain or insects."""
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Self:
-        """Return the parameters; ValueError if `height_min` is not less than `height_max`, or `stop_distance`
-        not less than `slow_distance`."""
-        _require_less(self, "obstacles", ("height_min", "height_max"), ("stop_distance", "slow_distance"))
-        return self
 
 
 class Evaluation(Stage):
