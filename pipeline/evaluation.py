@@ -85,26 +85,6 @@ def _solve(found: Float, truth: Float, distance_max: float, rows: Int, columns: 
     truth_of[mine[chosen[good]]] = others[partner[good]]
 
 
-def matched_rows(trees: Trees, truth: TruthTrees, distance_max: float) -> tuple[Int, Int]:
-    """Return the rows of the matched mapped trees in `trees`, ascending, and of the real trees in `truth`
-    that they are assigned to, int64, shape (K,) each. Pairs with another object of the ground truth are
-    omitted.
-
-    Args:
-        trees: The map; confirmed trees are matched.
-        truth: Ground truth in the frame of the map.
-        distance_max: Maximum distance of a pair [m].
-    """
-    confirmed = np.flatnonzero(trees.confirmed)
-    is_tree = np.array([kind == "tree" for kind in truth.kind], np.bool_)
-    position = np.stack([truth.x, truth.y], axis=1)
-    truth_of = match(trees.position[confirmed], position, distance_max)
-    # Other objects take part in the assignment, as in the scores; their pairs are dropped afterwards.
-    good = truth_of >= 0
-    good[good] = is_tree[truth_of[good]]
-    return confirmed[good], truth_of[good]
-
-
 # A ground truth is doubtful if less than this share of at least so many trees matches.
 _DOUBTFUL_SHARE, _DOUBTFUL_TREES = 0.25, 4
 
@@ -314,7 +294,6 @@ class PathError:
 
     Attributes:
         rms, median, largest: Over all compared positions [m].
-        at_end: At the last common time [m].
         compared: Number of true positions within the time of the path.
         aligned: Whether a rigid motion was fitted first.
     """
@@ -322,7 +301,6 @@ class PathError:
     rms: float
     median: float
     largest: float
-    at_end: float
     compared: int
     aligned: bool
 
@@ -352,7 +330,6 @@ def path_error(path: Path, truth: TruthPath, *, align: bool | None = None) -> Pa
         rms=float(np.sqrt((distance**2).mean())),
         median=float(np.median(distance)),
         largest=float(distance.max()),
-        at_end=float(distance[-1]),
         compared=len(distance),
         aligned=aligned,
     )

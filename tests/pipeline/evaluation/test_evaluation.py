@@ -17,7 +17,6 @@ from pipeline.evaluation import (
     evaluate,
     fit_rigid,
     match,
-    matched_rows,
     pair_distances,
     pair_errors,
     path_error,
@@ -169,14 +168,6 @@ def test_unknown_diameters_are_left_out():
     assert e.dbh_rmse is None
 
 
-def test_matched_rows_are_of_confirmed_trees_and_true_trees():
-    found = trees([[9, 9], [0, 0], [5, 0]])
-    found.confirmed[2] = False
-    truth = truth_trees([[9, 9], [0.1, 0], [5, 0]], ["pole", "tree", "tree"])
-    ours, theirs = matched_rows(found, truth, 0.5)
-    assert (ours.tolist(), theirs.tolist()) == ([1], [1])
-
-
 # --- pairs ----------------------------------------------------------------------------------------
 
 
@@ -242,7 +233,6 @@ def test_a_path_in_another_frame_is_aligned_to_nothing(motion):
     inside = error_of(path_of(X, Y), truth_of(moved[:, 0], moved[:, 1]))
     wanted = np.hypot(*(moved - np.stack([X, Y], axis=1)).T)
     assert inside.rms == pytest.approx(np.sqrt((wanted**2).mean()), abs=1e-9)
-    assert inside.at_end == pytest.approx(wanted[-1], abs=1e-9)
     assert inside.largest == pytest.approx(wanted.max(), abs=1e-9)
     assert inside.median == pytest.approx(np.median(wanted), abs=1e-9)
     assert not inside.aligned
