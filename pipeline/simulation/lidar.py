@@ -372,6 +372,24 @@ class Sweep:
     solid: Int32
 
 
+def cast_beams(
+    lidar: SpinningLidar, solids: Solids, terrain: SimulatedTerrain, R: Float, o: Float, key: int
+) -> tuple[Float, Float, Int32]:
+    """Return the directions of the beams of a sweep in the world, shape (C, K, 3), and range [m] and shape of
+    the first return of each, see `first_returns`, shape (C, K) each.
+
+    Args:
+        lidar: The sensor.
+        solids, terrain: The scene.
+        R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
+        key: Random seed of foliage.
+    """
+    directions = ray_directions(R, lidar.beams())
+    away = np.hypot(*(solids.capsule[:, :2] - o[lidar.columns // 2, :2]).T)
+    order = np.argsort(away, kind="stable")
+    return directions, *first_returns(solids, terrain.packed, R, o, directions, lidar.optics, key, order)
+
+
 def sweep_scene(
     lidar: SpinningLidar,
     solids: Solids,
@@ -397,12 +415,9 @@ def sweep_scene(
     """
     key = int(rng.integers(0, 2**62))
     noise = lidar.range_sigma * rng.standard_normal((lidar.columns, lidar.rings))
-    directions = ray_directions(R, lidar.beams())
-    away = np.hypot(*(solids.capsule[:, :2] - o[lidar.columns // 2, :2]).T)
-    optics, order = lidar.optics, np.argsort(away, kind="stable")
-    ranges, hit = first_returns(solids, terrain.packed, R, o, directions, optics, key, order)
+    directions, ranges, hit = cast_beams(lidar, solids, terrain, R, o, key)
     returns = [
-        measure(ranges, hit, solids, terrain.packed, o, directions, optics, noise, key, last)
+        measure(ranges, hit, solids, terrain.packed, o, directions, lidar.optics, noise, key, last)
         for last in ((False, True) if lidar.dual else (False,))
     ]
     if lidar.dual:

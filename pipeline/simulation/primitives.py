@@ -7,7 +7,7 @@ also has a capsule that encloses the shape.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -81,13 +81,7 @@ class Solids(NamedTuple):
     def join(self, other: Solids) -> Solids:
         """Return new columns with these shapes followed by others; the numbers of the objects are not
         changed."""
-        return Solids(
-            np.concatenate([self.kind, other.kind]),
-            np.concatenate([self.shape, other.shape]),
-            np.concatenate([self.capsule, other.capsule]),
-            np.concatenate([self.surface, other.surface]),
-            np.concatenate([self.owner, other.owner]),
-        )
+        return Solids(*(np.concatenate(columns) for columns in zip(self, other, strict=True)))
 
     def placed(self, offset: Float, yaw: float) -> Solids:
         """Return the shapes turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]; these
@@ -157,12 +151,8 @@ class SolidsBuilder:
         """
         self.cone(owner, start, end, radii, reflectivity=reflectivity)
         _, shape, capsule, surface, _ = self._rows.pop()
-        figures = (
-            section.oval, section.oval_phase, section.fluted, section.fluted_phase, section.bark,
-            float(section.furrows), section.furrow_phase,
-        )  # fmt: skip
         capsule[6] *= section.widest
-        self._rows.append((STEM, shape, capsule, [*surface[:2], *figures], owner))
+        self._rows.append((STEM, shape, capsule, [*surface[:2], *astuple(section)], owner))
 
     def ellipsoid(
         self,

@@ -211,7 +211,7 @@ def obstacle_aware_drive(
     decides the speed of the next one. Each sweep is simulated with a coarse LiDAR.
 
     Args:
-        course: The course. An open one is driven to its end, where the robot stops; a closed one repeatedly.
+        course: The course, which is open; the robot stops at its end.
         speed: Speed on the straight [m/s].
         scene: The scene.
         T_base_lidar: Extrinsics of the LiDAR.
@@ -225,10 +225,8 @@ def obstacle_aware_drive(
         share = SPEED[zone]
         v, s = speeds[-1], along[-1]
         for _ in range(_TICKS):
-            here = s % course.s[-1] if course.closed else min(s, float(course.s[-1]))
-            wanted = share * float(np.interp(here, course.s, limit))
-            if not course.closed:
-                wanted = min(wanted, float(np.sqrt(2.0 * _GAIN * max(course.s[-1] - s, 0.0))))
+            wanted = share * float(np.interp(s, course.s, limit))
+            wanted = min(wanted, float(np.sqrt(2.0 * _GAIN * max(course.s[-1] - s, 0.0))))
             v = min(max(wanted, v - _BRAKE * step), v + _GAIN * step)
             s += v * step
             speeds.append(v)

@@ -11,9 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.simulation.lidar import SolidStateLidar, SpinningLidar
+from pipeline.simulation.lidar import SolidStateLidar, SpinningLidar, cast_beams
 from pipeline.simulation.primitives import STEM, Section
-from pipeline.simulation.ray_casting import first_returns, ray_directions
 from pipeline.simulation.robot_motion import Course
 from pipeline.simulation.scenarios import Scenario
 from pipeline.simulation.scene import Plot, SimulatedScene
@@ -313,9 +312,7 @@ def truth_in_view(
     """
     solids, met = scene.still, np.zeros(len(scene.kinds), np.int64)
     for k, (_, R, o) in enumerate(poses):
-        directions = ray_directions(R, lidar.at_scan(k).beams())
-        order = np.argsort(np.hypot(*(solids.capsule[:, :2] - o[len(o) // 2, :2]).T), kind="stable")
-        ranges, hit = first_returns(solids, scene.terrain.packed, R, o, directions, lidar.optics, k, order)
+        directions, ranges, hit = cast_beams(lidar.at_scan(k), solids, scene.terrain, R, o, k)
         column, ring = np.nonzero((hit >= 0) & (ranges < lidar.range_max))
         solid = hit[column, ring]
         on_stem = solids.kind[solid] == STEM

@@ -11,8 +11,8 @@ import pytest
 from pipeline.config import Parameters
 from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose2
-from pipeline.simulation.robot_motion import RATE_HZ, lay_course, speed_limit
-from pipeline.simulation.run import MOUNTING, SimulatedRun, obstacle_aware_drive, open_run
+from pipeline.simulation.robot_motion import RATE_HZ
+from pipeline.simulation.run import MOUNTING, SimulatedRun, open_run
 from pipeline.simulation.scenarios import parse_uri
 from pipeline.types.records import Step, Zone
 
@@ -69,14 +69,3 @@ def test_the_same_request_drives_the_same_path():
     request = parse_uri("sim:crossing?duration=3")
     first, second = open_run(request).motion.drive, open_run(request).motion.drive
     np.testing.assert_array_equal(first.x, second.x)
-
-
-def test_on_a_loop_the_robot_keeps_to_the_course_and_to_its_speed():
-    angle = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-    course = lay_course(np.stack([2.0 * np.cos(angle), 2.0 * np.sin(angle)], axis=1), closed=True)
-    drive = obstacle_aware_drive(course, 0.9, crossing().scene, MOUNTING, 1, 20.0)
-    assert drive.yaw[-1] > 2.0 * np.pi
-    assert drive.speed.max() <= speed_limit(course, 0.9).max() + 1e-9
-    np.testing.assert_allclose(
-        np.hypot(np.diff(drive.x), np.diff(drive.y)) * RATE_HZ, drive.speed[1:], atol=0.02
-    )
