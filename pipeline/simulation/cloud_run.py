@@ -25,10 +25,15 @@ from pipeline.inventory.terrain_raster import TerrainRaster
 from pipeline.jit import compiled
 from pipeline.simulation import run as simulated
 from pipeline.simulation.lidar import SpinningLidar, Sweep, scan_of_returns
-from pipeline.simulation.motion_sensors import inertial_readings
 from pipeline.simulation.primitives import SolidsBuilder
 from pipeline.simulation.ray_casting import Optics
-from pipeline.simulation.robot_motion import drive_course, lap_time, lay_course, lay_on_terrain
+from pipeline.simulation.robot_motion import (
+    drive_course,
+    inertial_readings,
+    lap_time,
+    lay_course,
+    lay_on_terrain,
+)
 from pipeline.simulation.run import MOUNTING, SimulatedRun, odometry_of, random_stream
 from pipeline.simulation.scenarios import RunRequest
 from pipeline.simulation.scene import SimulatedScene

@@ -14,24 +14,22 @@ from pipeline.config import Parameters
 from pipeline.front_end import segment
 from pipeline.geometry.poses import Pose2, Pose3, wrap_angle
 from pipeline.simulation.lidar import SpinningLidar, Sweep, sweep_scene
-from pipeline.simulation.motion_sensors import (
+from pipeline.simulation.robot_motion import (
     IMU_HZ,
     ODOMETRY_HZ,
-    Inertial,
-    inertial_readings,
-    wheel_odometry,
-)
-from pipeline.simulation.robot_motion import (
     RATE_HZ,
     Course,
     Drive,
+    Inertial,
     TerrainModel,
     TrueMotion,
     drive_course,
+    inertial_readings,
     lay_course,
     lay_on_terrain,
     on_course,
     speed_limit,
+    wheel_odometry,
 )
 from pipeline.simulation.scenarios import EXACT, QUALITIES, WILD, RunRequest
 from pipeline.simulation.scene import SimulatedScene, build_scene

@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions
-from pipeline.simulation.motion_sensors import IMU_HZ, ODOMETRY_HZ
+from pipeline.simulation.robot_motion import IMU_HZ, ODOMETRY_HZ
 from pipeline.simulation.run import START_NS, SimulatedRun, open_run
 from pipeline.simulation.scenarios import CLOUD, SCHEME, RunRequest, parse_uri, scenarios
 from pipeline.types.records import Record, Truth

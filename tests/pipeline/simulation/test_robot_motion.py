@@ -9,19 +9,21 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.poses import Pose3, euler_rotation
 from pipeline.io.readers.simulated import open_simulated
-from pipeline.simulation.motion_sensors import GRAVITY, inertial_readings, wheel_odometry
 from pipeline.simulation.robot_motion import (
     ACCELERATION,
+    GRAVITY,
     RATE_HZ,
     YAW_GAIN,
     YAW_RATE,
     Course,
     Spin,
     drive_course,
+    inertial_readings,
     lap_time,
     lay_course,
     lay_on_terrain,
     sharp_cells,
+    wheel_odometry,
     within_gains,
 )
 from pipeline.simulation.scenarios import QUALITIES, SCENARIOS, Scenario

@@ -14,10 +14,9 @@ from pipeline.config import preset
 from pipeline.evaluation import evaluate
 from pipeline.io.readers.simulated import open_simulated
 from pipeline.simulation.lidar import SpinningLidar, sweep_scene
-from pipeline.simulation.motion_sensors import SPIN, wheel_odometry
 from pipeline.simulation.primitives import ELLIPSOID, STEM, Section, SolidsBuilder
 from pipeline.simulation.ray_casting import meet_cone, meet_stem
-from pipeline.simulation.robot_motion import drive_course, lay_course, lay_on_terrain
+from pipeline.simulation.robot_motion import SPIN, drive_course, lay_course, lay_on_terrain, wheel_odometry
 from pipeline.simulation.scenarios import QUALITIES, SCENARIOS, WILD
 from pipeline.simulation.scene import Plot
 from pipeline.simulation.scene_objects import SceneBuilder
