@@ -7,8 +7,9 @@ also has a capsule that encloses the shape.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import astuple, dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -81,7 +82,8 @@ class Solids(NamedTuple):
     def join(self, other: Solids) -> Solids:
         """Return new columns with these shapes followed by others; the numbers of the objects are not
         changed."""
-        return Solids(*(np.concatenate(columns) for columns in zip(self, other, strict=True)))
+        columns: Iterator[tuple[Any, Any]] = zip(self, other, strict=True)
+        return Solids(*map(np.concatenate, columns))
 
     def placed(self, offset: Float, yaw: float) -> Solids:
         """Return the shapes turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]; these
