@@ -14,7 +14,7 @@ from app.scene.colours import ViewSettings
 from app.scene.labels import MOST_LABELS, Label, LabelNodes, Place
 from app.scene.nodes import Batch, Circles, CloudNode, Float, GroundNode, Segments
 from pipeline.config.stages import Evaluation
-from pipeline.geometry.columns import rows_of
+from pipeline.geometry.columns import GrowingColumns, rows_of
 from pipeline.types.records import HIDDEN, Frame, HeightMap, Trees, TruthTrees
 
 Ring = tuple[float, float, float] | None
@@ -312,16 +312,27 @@ class Accumulated:
     """Filtered points of all scans in the frame of the map, one per cell, placed by the pose of their scan.
 
     Attributes:
-        points: float32, shape (N, 3) [m], in order of arrival.
         left_out: Number of cells left out because of the limit MOST_POINTS.
     """
 
     def __init__(self) -> None:
-        self.points = np.zeros((0, 3), np.float32)
         self.left_out = 0
         self._recent: list[_PlacedScan] = []
-        self._keys = np.zeros(0, np.int64)
-        self._scans: list[tuple[int, int, NDArray[np.float64]]] = []  # scan, points before it, pose
+        self._rows = GrowingColumns(np.zeros((0, 3), np.float32), np.zeros(0, np.int64))  # points, cells
+        # Columns, not objects: each scan of a long drive adds a row. Scan, points before it, pose.
+        self._scans = GrowingColumns(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """The points, float32, shape (N, 3) [m], in order of arrival; later calls do not change them."""
+        points: NDArray[np.float32] = self._rows.shared()[0]
+        return points
+
+    @property
+    def nbytes(self) -> int:
+        """Size of the stored points of the run and of the places of their scans [bytes], without those for
+        the time windows."""
+        return self._rows.nbytes + self._scans.nbytes
 
     def take(self, frame: Frame) -> bool:
         """Add the filtered points of a scan; if the run went back, remove those of this and later scans
@@ -338,21 +349,23 @@ class Accumulated:
         placed = _placed(frame)
         self._keep_recent(frame, placed)
         pose = frame.estimate.T_map_base.as_array()
-        if self._scans:
-            moved = pose - self._scans[-1][2]
+        scans, before, poses = (self._scans.column(k) for k in range(3))
+        if len(scans):
+            moved = pose - poses[-1]
             turned = abs((moved[2] + np.pi) % (2.0 * np.pi) - np.pi)
             if np.hypot(*moved[:2]) < STEP and turned < TURN:
                 return went_back
         keys, first = np.unique(_keys(placed), return_index=True)
-        new = np.sort(first[~np.isin(keys, self._keys)])
-        room = MOST_POINTS - len(self.points)
+        new = np.sort(first[~np.isin(keys, self._rows.column(1))])
+        count = len(self._rows)
+        room = MOST_POINTS - count
         self.left_out += max(0, len(new) - room)
         new = new[:room]
-        if self._scans and self._scans[-1][1] == len(self.points):
-            self._scans.pop()  # it added no point, and only the last such scan is needed, for its pose
-        self._scans.append((frame.index, len(self.points), pose))
-        self.points = np.vstack([self.points, placed[new].astype(np.float32)])
-        self._keys = np.concatenate([self._keys, _keys(placed[new])])
+        row = len(scans)
+        if row and before[-1] == count:
+            row -= 1  # it added no point, and only the last such scan is needed, for its pose
+        self._scans.write(row, np.array([frame.index]), np.array([count]), pose[None])
+        self._rows.write(count, placed[new].astype(np.float32), _keys(placed[new]))
         return went_back or len(new) > 0
 
     def points_of(self, window: str) -> NDArray[np.float32]:
@@ -384,12 +397,13 @@ class Accumulated:
     def _go_back(self, index: int) -> bool:
         """Remove the points of the scan with this index and of later ones, and reset `left_out` if there were
         any; return whether there were."""
-        keep = None
-        while self._scans and self._scans[-1][0] >= index:
-            keep = self._scans.pop()[1]
-        if keep is None:
+        scans = self._scans.column(0)
+        row = int(np.searchsorted(scans, index))
+        if row == len(scans):
             return False
-        self.points, self._keys, self.left_out = self.points[:keep], self._keys[:keep], 0
+        self._rows.return_to(int(self._scans.column(1)[row]))
+        self._scans.return_to(row)
+        self.left_out = 0
         return True
 
 

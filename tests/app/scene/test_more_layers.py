@@ -55,6 +55,15 @@ def test_a_robot_that_stands_gathers_nothing_new():
     assert gathered.take(make_frame(2, pose=Pose2(0.5 * STEP, 0.0, 0.5)))
 
 
+def test_a_long_drive_stores_40_bytes_for_a_scan_and_20_for_a_point():
+    gathered = Accumulated()
+    scans = 300
+    for frame in frames([(1.0 * k, 0.0) for k in range(scans)]):
+        gathered.take(frame)
+    assert len(gathered.points) > scans  # each scan added points
+    assert gathered.nbytes <= 2 * (40 * scans + 20 * len(gathered.points))  # the capacity doubles
+
+
 def test_what_has_no_room_is_counted(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("app.scene.map.MOST_POINTS", 50)
     gathered = Accumulated()
