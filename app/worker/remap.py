@@ -176,7 +176,7 @@ class ScanCounts:
 
     def __init__(self) -> None:
         self._rows = GrowingColumns(
-            np.zeros((0, len(Verdict)), np.int32), np.zeros((0, len(_STATES)), np.int32), np.zeros(0)
+            np.zeros((0, len(Verdict)), np.int32), np.zeros((0, len(_STATES)), np.bool_), np.zeros(0)
         )
         self._warnings: dict[int, tuple[str, ...]] = {}  # of the scans with warnings
         self._begin()

@@ -42,3 +42,12 @@ def test_a_scan_that_is_mapped_again_replaces_its_counts() -> None:
     assert counts.totals(3, [], {}).warnings == ["slow (3 times)"]
     counts.record(scan(9, Verdict.WALL))  # beyond the next one
     assert counts.totals(3, [], {}).verdicts == {"bush": 2, "tree": 3}
+
+
+def test_a_scan_takes_79_bytes() -> None:
+    counts, scans = ScanCounts(), 300
+    for index in range(scans):
+        counts.record(scan(index, Verdict.TREE))
+    each = 4 * len(Verdict) + 3 + 8  # numbers by verdict, pose quality, sigma
+    assert each == 79
+    assert counts._rows.nbytes <= 2 * each * scans  # the capacity doubles

@@ -60,3 +60,15 @@ def test_a_return_forward_has_the_scans_that_were_there():
     path = buffer.path(EstimatedPath.of(poses[:150]))
     assert path.stamp_ns.tolist() == path.sigma_xy.tolist() == list(range(150))
     np.testing.assert_array_equal(path.x, 0.0)
+
+
+def test_a_scan_takes_64_bytes_and_24_of_the_estimate():
+    scans = 3_000
+    buffer, estimate = TrajectoryBuffer(), EstimatedPath()
+    for number in range(scans):
+        estimate = estimate.with_pose(np.array([np.cos(0.01 * number), np.sin(0.01 * number), 0.0]))
+        buffer.append(number, Pose2())
+        buffer.set_sigma(np.eye(3))
+        buffer.path(estimate)
+    assert buffer._rows.nbytes <= 2 * 64 * scans  # the capacity doubles
+    assert sum(block.nbytes for block in (*estimate.blocks, estimate.newest)) == 24 * scans
