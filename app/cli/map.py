@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.cli import flags
-from pipeline.errors import ParameterError, SourceError
+from pipeline.errors import ParameterError, SourceError, StemmapError
 
 if TYPE_CHECKING:
     from app.batch.continue_map import Start
@@ -130,12 +130,13 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     for parameters, a recorded live run is mapped with the parameters of its recording.
 
     Raises:
-        StemmapError: The source cannot be read, the start in the map was not found, or the folder has the map
-            of another source or cannot be written.
+        StemmapError: The source cannot be read, the start in the map was not found or is that of a live source
+            and not given, or the folder has the map of another source or cannot be written.
     """
     from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run
     from app.batch.run_folder import check_folder
+    from app.robot.address import is_live
     from app.robot.source import LiveSource, open_any
     from app.worker.numba_warmup import compile_ahead
     from app.worker.run import recorded_parameters
@@ -143,6 +144,14 @@ def _run_scans(arguments: argparse.Namespace) -> int:
 
     truth_trees = read_truth_trees(arguments.truth, dbh_unit=arguments.dbh_unit) if arguments.truth else None
     saved = read_saved_run(arguments.continued) if arguments.continued else None
+    start = _in_the_map(arguments.start)
+    if saved and start == "auto" and is_live(arguments.source):
+        raise StemmapError(
+            "a robot that is driving cannot be located in a saved map by its stems",
+            where=arguments.source,
+            remedy="Give its pose with --start X,Y,YAW (m, m, degrees) or --start last, or record the drive and "
+            "continue the map with the file",
+        )
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
     request = flags.source_request(arguments, arguments.source)
@@ -174,7 +183,7 @@ def _run_scans(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             odometry=arguments.odometry,
             truth_trees=truth_trees,
-            continued=ContinuedMap(saved, _in_the_map(arguments.start)) if saved else None,
+            continued=ContinuedMap(saved, start) if saved else None,
             stop_after=arguments.stop_after,
             revisions=revisions,
             on_frame=None if live is None else lambda frame, mapper: live.mapped(frame, mapper.path),

@@ -104,6 +104,13 @@ def test_another_stand_is_not_found_in_the_map(stand, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_live_robot_needs_a_given_start(stand, tmp_path, capsys):
+    words = ["map", "zenoh:tcp/127.0.0.1:9?robot=r", "--continue", str(stand), "--out", str(tmp_path / "out")]
+    assert main(words) == 1
+    assert "--start X,Y,YAW" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_start_that_is_given_is_taken(stand, tmp_path):
     words = ["map", "sim:stand?duration=3&seed=4", "--continue", str(stand), "--out", str(tmp_path)]
     assert main([*words, "--start", "0,0,0"]) == 0
