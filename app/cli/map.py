@@ -149,8 +149,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
         raise StemmapError(
             "a robot that is driving cannot be located in a saved map by its stems",
             where=arguments.source,
-            remedy="Give its pose with --start X,Y,YAW (m, m, degrees) or --start last, or record the drive and "
-            "continue the map with the file",
+            remedy="Give its pose with --start X,Y,YAW (m, m, degrees) or --start last, or record the drive "
+            "and continue the map with the file",
         )
     if arguments.seed is None:
         arguments.seed = saved.seed if saved else 0
