@@ -130,8 +130,8 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     for parameters, a recorded live run is mapped with the parameters of its recording.
 
     Raises:
-        StemmapError: The source cannot be read, the start in the map was not found or is that of a live source
-            and not given, or the folder has the map of another source or cannot be written.
+        StemmapError: The source cannot be read, the start in the map was not found or, of a live source, is
+            not given, or the folder has the map of another source or cannot be written.
     """
     from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run
