@@ -432,16 +432,23 @@ class Mapper:
         """Return the loop that the robot has just closed, or `Smoothing` if the graph is to be solved; None
         otherwise and during the search of a lost robot."""
         p = self._parameters.relocalisation
-        if self._relocaliser.is_searching:
+        if self._relocaliser.is_searching or not self._slam.is_keyframe:
             return None
-        if p.method != "none" and self._slam.is_keyframe_every(detection.EVERY):
-            recent = self._path.sigma_xy[self._slam.first_scan_within(detection.LATELY) :]
-            if detection.is_due(recent, self._slam.state.places.contradicted):
-                with self._timer("slam"):
-                    loop = detection.find_loop(self._history(estimate), p)
-                if loop is not None:
-                    return LoopClosure(loop)
+        if p.method != "none" and self._is_search_due():
+            with self._timer("slam"):
+                loop = detection.find_loop(self._history(estimate), p)
+            if loop is not None:
+                return LoopClosure(loop)
         return Smoothing() if self._slam.is_smoothing_due else None
+
+    def _is_search_due(self) -> bool:
+        """Return whether a loop is to be searched for at a keyframe: while known places are contradicted, and
+        each EVERY metres where the pose was uncertain (`detection.is_uncertain`)."""
+        slam = self._slam
+        if slam.state.places.contradicted:
+            return True
+        recent = self._path.sigma_xy[slam.first_scan_within(detection.LATELY) :]
+        return slam.is_keyframe_every(detection.EVERY) and detection.is_uncertain(recent)
 
     def _history(self, estimate: PoseEstimate) -> detection.RunHistory:
         """Return path and map for the search of loops, with the pose at the newest scan."""

@@ -63,9 +63,9 @@ class AsyncStore:
             StemmapError: The database cannot be closed.
         """
         try:
-            await asyncio.get_running_loop().run_in_executor(self._thread, self._close)
+            await asyncio.shield(asyncio.get_running_loop().run_in_executor(self._thread, self._close))
         finally:
-            self._thread.shutdown()
+            self._thread.shutdown(wait=False)
 
     def _close(self) -> None:
         """Close the database if it is open; errors as `_work`."""

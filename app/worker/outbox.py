@@ -99,10 +99,12 @@ class Outbox:
         one has the whole path and the ground."""
         try:
             return [self._codec.encode(self._made_ready(message))]
-        except (WireError, NotImplementedError) as error:
+        except (WireError, NotImplementedError, ValueError, OverflowError) as error:
             if isinstance(message, Shown):
                 self._sent_path = self._sent_ground = None  # what was in it did not arrive
-            self._refused = f"a picture could not be shown: {error}"
+            if self._report is message:
+                self._report = None
+            self._refused = f"a message could not be sent: {error}"
             return [] if self._report is None else [self._codec.encode(self._with_refusal(self._report))]
 
     def _made_ready(self, message: FromWorker) -> FromWorker:

@@ -176,7 +176,9 @@ def merged_terrain(a: HeightMapState, b: HeightMapState, T_a_b: Pose2) -> Height
         return replace(a, record=_record(a.tiles))
     rise = float(np.median(means[both] - moved[both, MEAN]))
     moved[:, MEAN] += rise
-    tiles = _tiles_of(np.concatenate([known, place]), np.concatenate([row, moved]), a.tiles)
+    seen = set(map(tuple, np.unique(place // SIDE, axis=0).tolist()))
+    older = [tile for tile in a.tiles if tile not in seen]
+    tiles = _tiles_of(np.concatenate([known, place]), np.concatenate([row, moved]), older)
     while len(tiles) > MOST_TILES:
         del tiles[next(iter(tiles))]
     sensor_z = None if b.sensor_z is None else b.sensor_z + rise

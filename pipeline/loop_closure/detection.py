@@ -22,7 +22,7 @@ from pipeline.slam.keyframe_graph import drift_of, without_jumps
 from pipeline.slam.motion import Noise
 from pipeline.types.records import Int, PoseEstimate, Trees
 
-EVERY = 10.0  # m of driven path between two searches, a quarter of LATELY
+EVERY = 10.0  # m of driven path between two searches at an uncertain pose, a quarter of LATELY
 UNSURE = 0.4  # m, sigma of the position; below it the data association recognises the trees one by one
 LATELY = 40.0  # m of driven path, in which the landmarks to be found were begun
 REACH = 30.0  # m around the robot, in which these landmarks are
@@ -75,18 +75,16 @@ class RunHistory:
         return scan
 
 
-def is_due(sigma_xy: Float, contradicted: bool) -> bool:
-    """Return whether a search is due at a keyframe: if known places are contradicted, or the position was
-    uncertain by more than UNSURE in one of the last scans.
+def is_uncertain(sigma_xy: Float) -> bool:
+    """Return whether the position was uncertain by more than UNSURE in one of some scans.
 
-    A pose that was uncertain and is no longer may have been corrected by the wrong trees. The search
-    therefore continues while landmarks that were begun at the uncertain pose are among those to be found.
+    A pose that was uncertain and is no longer may have been corrected by the wrong trees. The search of loops
+    therefore continues while landmarks that were begun at an uncertain pose are among those to be found.
 
     Args:
         sigma_xy: Standard deviation of the position at each scan of the last LATELY metres [m]; may be empty.
-        contradicted: See RunHistory.
     """
-    return contradicted or bool(sigma_xy.max(initial=0.0) > UNSURE)
+    return bool(sigma_xy.max(initial=0.0) > UNSURE)
 
 
 def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:

@@ -224,7 +224,8 @@ class FastSlam:
     @property
     def is_keyframe(self) -> bool:
         """Whether the newest scan is a keyframe of the graph."""
-        return self.state.graph.newest_scan == len(self.state.genealogy) - 1
+        graph = self.state.graph
+        return bool(graph.keyframes) and graph.newest_scan == len(self.state.genealogy) - 1
 
     @property
     def is_smoothing_due(self) -> bool:
@@ -271,21 +272,22 @@ class FastSlam:
             index: Number of the scan, which seeds the random numbers.
             loop: The loop.
 
-        Associations since the robot left the place were made at the drifted pose. With the loop, they are
-        replaced by those that it gives. Of both, the solution with the larger support is taken.
+        Associations with known landmarks in the present revisit were made at the drifted pose. With the loop
+        they are left out, and landmarks that it brings together are one tree. The loop is taken if its
+        solution has the larger support.
 
         Returns:
-            The correction; None if the graph has no solution with the loop, or if it has less support with
-            the loop than without. The state is unchanged then.
+            The correction; None if the graph has no solution with the loop, or if it has no more support
+            with the loop than without. The state is unchanged then.
         """
         state, graph = self.state, self.state.graph
         path = state.genealogy.path(state.best)
         if graph.newest_scan != len(path) - 1:
             keyframe = self._keyframe(state, state.since_keyframe, state.detections)
             graph = graph.with_keyframe(keyframe, path[-1])
-        without = graph.solve()
-        support = 0.0 if without is None else graph.support(loop.first, without)
-        graph = graph.without_revisits(loop.first)
+        revisit, without = graph.revisit(loop.first), graph.solve()
+        support = 0.0 if without is None else graph.support(revisit, without)
+        graph = graph.without(revisit)
         graph = graph.with_loop(loop.anchor, loop.T_map_base, loop.covariance, self.path())
         solution = graph.solve(new_loop=True)
         if solution is None:
@@ -295,7 +297,7 @@ class FastSlam:
         names = same_trees(moved, graph.first_birth_after(loop.first))
         graph = replace(graph.renamed(*names), pose=solution.pose)
         solution = graph.solve()
-        if solution is None or graph.support(loop.first, solution) < support:
+        if solution is None or graph.support(revisit, solution) <= support:
             return None
         return self._corrected(index, graph, solution, loop.covariance, names)
 

@@ -118,6 +118,24 @@ def combined(scans: Sequence[ScanDetections | Keyframe], T_keyframe_base: Float)
     return names[taken], mean[taken], spread[taken]
 
 
+@dataclass(frozen=True, slots=True)
+class Revisit:
+    """A stretch at the end of the path that shows known landmarks again.
+
+    Attributes:
+        first_birth: Landmarks with a smaller birth number are known from before.
+        begin: Distance driven at its first keyframe [m].
+    """
+
+    first_birth: int
+    begin: float
+
+    def of(self, keyframe: Keyframe) -> Bool:
+        """Return which detections of a keyframe belong to the revisit, shape (D,)."""
+        known: Bool = (keyframe.birth < self.first_birth) & (keyframe.distance >= self.begin)
+        return known
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LoopEdge:
     """A relative pose that stem matching measured.
@@ -254,42 +272,39 @@ class KeyframeGraph:
 
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
-    def _revisits(self, scan: int) -> list[Bool]:
-        """Return which detections of each keyframe, shape (D,), belong to the present revisit of what was
-        mapped until a scan: they show landmarks that were begun until then, more than REVISIT_DISTANCE after
-        it, and not before a gap of REVISIT_DISTANCE without such detections.
+    def revisit(self, scan: int) -> Revisit:
+        """Return the present revisit of what was mapped until a scan. Its detections show landmarks that were
+        begun until then, more than REVISIT_DISTANCE after the scan, and not before a gap of REVISIT_DISTANCE
+        without such detections.
 
         Raises:
             IndexError: The graph has no keyframe.
         """
         row = min(int(np.searchsorted(self.scans, scan, side="right")), len(self.keyframes) - 1)
         first = self.keyframes[row]
-        old = [
-            (k.birth < first.first_birth) & (k.distance > first.distance + REVISIT_DISTANCE)
-            for k in self.keyframes
+        begin = first.distance + REVISIT_DISTANCE
+        shown = [
+            k.distance for k in self.keyframes if k.distance >= begin and (k.birth < first.first_birth).any()
         ]
-        shown = [k.distance for k, rows in zip(self.keyframes, old, strict=True) if rows.any()]
-        at = np.array([first.distance, *shown, self.keyframes[-1].distance])
-        begin = at[np.flatnonzero(np.diff(at, prepend=-np.inf) > REVISIT_DISTANCE)[-1]]
-        return [rows & (k.distance >= begin) for k, rows in zip(self.keyframes, old, strict=True)]
+        at = np.array([begin, *shown, self.keyframes[-1].distance])
+        gaps = np.flatnonzero(np.diff(at) > REVISIT_DISTANCE)
+        return Revisit(first.first_birth, float(at[gaps[-1] + 1] if len(gaps) else begin))
 
-    def without_revisits(self, scan: int) -> KeyframeGraph:
-        """Return the graph without the detections of the present revisit of what was mapped until a scan: the
-        path may have drifted by more than the distance between trees. Raises IndexError without a keyframe.
-        """
+    def without(self, revisit: Revisit) -> KeyframeGraph:
+        """Return the graph without the detections of a revisit: the path may have drifted by more than the
+        distance between trees."""
         keyframes = list(self.keyframes)
-        for n, revisits in enumerate(self._revisits(scan)):
-            if revisits.any():
-                k, keep = keyframes[n], ~revisits
-                keyframes[n] = replace(k, birth=k.birth[keep], centre=k.centre[keep], R=k.R[keep])
+        for n, k in enumerate(keyframes):
+            if (shown := revisit.of(k)).any():
+                keyframes[n] = replace(k, birth=k.birth[~shown], centre=k.centre[~shown], R=k.R[~shown])
         return replace(self, keyframes=tuple(keyframes))
 
-    def support(self, scan: int, solution: Solution) -> float:
-        """Return the number of detections of the present revisit of what was mapped until a scan, each with
-        its weight by the kernel in a solution of the graph. Raises IndexError without a keyframe."""
+    def support(self, revisit: Revisit, solution: Solution) -> float:
+        """Return the number of detections of a revisit, each with its weight by the kernel in a solution of
+        the graph."""
         total = 0.0
-        for keyframe, pose, revisits in zip(self.keyframes, solution.pose, self._revisits(scan), strict=True):
-            known = revisits & np.isin(keyframe.birth, solution.birth)
+        for keyframe, pose in zip(self.keyframes, solution.pose, strict=True):
+            known = revisit.of(keyframe) & np.isin(keyframe.birth, solution.birth)
             l = solution.position[np.searchsorted(solution.birth, keyframe.birth[known])]  # noqa: E741
             C = Pose2(*pose.tolist()).rotation()
             y = (l - pose[:2]) @ C - keyframe.centre[known]

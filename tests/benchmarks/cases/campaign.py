@@ -79,7 +79,7 @@ def _table(steps: list[dict[str, Any]]) -> Table:
             )
         )
     hours = sum(step["seconds"] for step in steps) / 3600.0
-    peak = next(row[-1] for row in rows if row[0] == "damaged files")
+    peak = max((row[-1] for row in rows if row[0] == "damaged files"), default=0.0)
     return Table(
         f"{hours:.2f} h of faults on this machine",
         ("kind", "steps", "files, requests, kills ...", "edits", "faults", "longest s", "peak MiB"),

@@ -162,13 +162,15 @@ def test_the_support_is_the_number_of_revisits_that_fit(drift):
     """Four trees at the beginning of a lap, seen again at its end at a pose that may have drifted."""
     true = arc(42, turn=2.0 * np.pi / 41.0, radius=40.0)
     graph = lap(true, drift, takes_for_known=drift == 0.0)
-    assert graph.support(3, graph.solve()) == pytest.approx(16.0 if drift == 0.0 else 0.0, abs=1.0)
+    assert graph.support(graph.revisit(3), graph.solve()) == pytest.approx(
+        16.0 if drift == 0.0 else 0.0, abs=1.0
+    )
     closed = graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3), graph.pose)
     first = closed.solve(new_loop=True)
     assert off(first.pose, true)[-1] < 0.1
     # The trees of the second visit get the names of the first one.
     again = replace(closed.renamed(np.arange(100, 104), np.arange(4)), pose=first.pose)
-    assert again.support(3, again.solve()) == pytest.approx(16.0, abs=1.0)
+    assert again.support(graph.revisit(3), again.solve()) == pytest.approx(16.0, abs=1.0)
 
 
 def test_a_loop_corrects_the_drift_of_the_way_between():
@@ -229,15 +231,16 @@ def test_a_loop_keeps_the_associations_of_earlier_revisits():
         T = np.array([10.0 * k, 0.0, 0.0])
         motion = np.array([10.0 if k else 0.0, 0.0, 0.0])
         graph = graph.with_keyframe(Keyframe(k, 4 * min(k, 1), 10.0 * k, motion, Q, birth, sees, R), T)
-    kept = [len(k.birth) > 0 for k in graph.without_revisits(0).keyframes]
+    kept = [len(k.birth) > 0 for k in graph.without(graph.revisit(0)).keyframes]
     assert np.flatnonzero(kept).tolist() == [0, 12, 13, 14, 15]
-    assert graph.without_revisits(29).keyframes == graph.keyframes, "they are no revisit so soon"
+    assert graph.without(graph.revisit(29)).keyframes == graph.keyframes, "they are no revisit so soon"
 
 
 def test_a_loop_overrules_associations_by_the_drifted_path():
     """The path had drifted by 3 m, and its last keyframes take stems for known ones 3 m away."""
     true = arc(42, turn=2.0 * np.pi / 41.0, radius=40.0)
-    graph = lap(true, 3.0, takes_for_known=True).without_revisits(3)
+    graph = lap(true, 3.0, takes_for_known=True)
+    graph = graph.without(graph.revisit(3))
     assert [len(k.birth) for k in graph.keyframes] == [4] * 4 + [0] * 38
     solution = with_full_weight_first(graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3), graph.pose))
     assert off(solution.pose, true)[-1] < 0.1
