@@ -273,22 +273,21 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(rename(k) for k in self.keyframes))
 
     def revisit(self, scan: int) -> Revisit:
-        """Return the present revisit of what was mapped until a scan. Its detections show landmarks that were
-        begun until then, more than REVISIT_DISTANCE after the scan, and not before a gap of REVISIT_DISTANCE
-        without such detections.
+        """Return the present revisit of what was mapped until a scan: at least the last REVISIT_DISTANCE of
+        the path. Its detections show landmarks that were begun until then; before it, there is a gap of
+        REVISIT_DISTANCE without such detections, or the first REVISIT_DISTANCE after the scan.
 
         Raises:
             IndexError: The graph has no keyframe.
         """
         row = min(int(np.searchsorted(self.scans, scan, side="right")), len(self.keyframes) - 1)
-        first = self.keyframes[row]
+        first, newest = self.keyframes[row], self.keyframes[-1].distance
         begin = first.distance + REVISIT_DISTANCE
-        shown = [
-            k.distance for k in self.keyframes if k.distance >= begin and (k.birth < first.first_birth).any()
-        ]
-        at = np.array([begin, *shown, self.keyframes[-1].distance])
+        shown = [k.distance for k in self.keyframes if (k.birth < first.first_birth).any()]
+        at = np.array([*(distance for distance in shown if distance >= begin), newest])
         gaps = np.flatnonzero(np.diff(at) > REVISIT_DISTANCE)
-        return Revisit(first.first_birth, float(at[gaps[-1] + 1] if len(gaps) else begin))
+        last = at[gaps[-1] + 1] if len(gaps) else at[0]
+        return Revisit(first.first_birth, max(begin, float(min(last, newest - REVISIT_DISTANCE))))
 
     def without(self, revisit: Revisit) -> KeyframeGraph:
         """Return the graph without the detections of a revisit: the path may have drifted by more than the

@@ -162,15 +162,14 @@ def test_the_support_is_the_number_of_revisits_that_fit(drift):
     """Four trees at the beginning of a lap, seen again at its end at a pose that may have drifted."""
     true = arc(42, turn=2.0 * np.pi / 41.0, radius=40.0)
     graph = lap(true, drift, takes_for_known=drift == 0.0)
-    assert graph.support(graph.revisit(3), graph.solve()) == pytest.approx(
-        16.0 if drift == 0.0 else 0.0, abs=1.0
-    )
+    revisit, known = graph.revisit(3), 16.0 if drift == 0.0 else 0.0
+    assert graph.support(revisit, graph.solve()) == pytest.approx(known, abs=1.0)
     closed = graph.with_loop(0, Pose2(*true[-1]), 1e-4 * np.eye(3), graph.pose)
     first = closed.solve(new_loop=True)
     assert off(first.pose, true)[-1] < 0.1
     # The trees of the second visit get the names of the first one.
     again = replace(closed.renamed(np.arange(100, 104), np.arange(4)), pose=first.pose)
-    assert again.support(graph.revisit(3), again.solve()) == pytest.approx(16.0, abs=1.0)
+    assert again.support(revisit, again.solve()) == pytest.approx(16.0, abs=1.0)
 
 
 def test_a_loop_corrects_the_drift_of_the_way_between():
