@@ -197,7 +197,7 @@ ROOMS = {
     "pipeline/slam": "tests/pipeline/slam",
     "pipeline/tracking": "tests/pipeline/tracking",
     "pipeline/detection": "tests/pipeline/detection",
-    "pipeline/evaluation": "tests/pipeline/evaluation",
+    "pipeline/evaluation.py": "tests/pipeline/evaluation",
     "pipeline/geometry": "tests/pipeline/geometry tests/pipeline/evaluation tests/pipeline/preprocessing "
     "tests/pipeline/tracking tests/pipeline/slam/test_joint_association.py "
     "tests/pipeline/slam/test_measured_pose.py",
@@ -346,7 +346,8 @@ def _outcome(mutant: Mutant, tree: Path, folder: Path) -> str:
     file.write_bytes(text[:at] + mutant.new.encode() + text[at + len(old) :])
     try:
         code = _exit_code(tests, tree, tests in _WITH_NUMBA, limit_s)
-        return "survived" if code == 0 else "killed"
+        # A test fails, or a module cannot be imported; other codes are errors of the call.
+        return {0: "survived", 1: "killed", 2: "killed"}.get(code, f"pytest ends with {code}")
     except subprocess.TimeoutExpired:
         return "killed"
     finally:
