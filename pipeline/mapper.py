@@ -511,9 +511,16 @@ class Mapper:
         return estimate, correction
 
     def _correct_map(self, correction: PathCorrection | None, before: PoseEstimate) -> bool:
-        """Move trees, columns and terrain with the path; return whether there is a correction. Columns and
-        terrain are moved only when all corrections since then together can displace a column by
-        CORRECTION_MIN or more. `before` is the pose before the correction."""
+        """Move trees, columns and terrain with the path; return whether there is a correction.
+
+        Trees move with each correction. Columns and terrain move only when the corrections since they last
+        moved can together displace a column within `range_max` by CORRECTION_MIN or more; the result is True
+        also if they do not move yet.
+
+        Args:
+            correction: None changes nothing.
+            before: The estimate before the correction; its health and associations are kept.
+        """
         if correction is None:
             return False
         estimate = self._slam.estimate(before)

@@ -127,13 +127,15 @@ def _numbers(path: FilePath, keep: Bool) -> np.ndarray:
 def compare(
     a: Visit, b: Visit, *, same_frame: bool = False, reach: float = 1.0, dbh_sigma: float = 0.01
 ) -> VisitComparison:
-    """Align two visits and compare their trees.
+    """Find the pose of the second visit in the frame of the first by their stems, without an initial pose,
+    and compare the trees of pairs.
 
     Args:
         a, b: The earlier and the later visit.
-        same_frame: Whether their coordinates are taken as equal, without any alignment; no error then.
-        reach: Largest distance of the two positions of a tree [m].
-        dbh_sigma: Standard deviation of a diameter that has none [m].
+        same_frame: Whether their coordinates are taken as equal; then there is no alignment, `T_a_b` is the
+            identity, and nothing is raised.
+        reach: Largest distance of the two positions of a tree in the frame of `a` [m].
+        dbh_sigma: Standard deviation of a known diameter that has none [m].
 
     Raises:
         StemmapError: The stems do not agree with certainty.

@@ -236,7 +236,6 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         StemmapError: A flag or plot is not valid, the run cannot be read, or a file cannot be written.
     """
-
     from app.batch.stand import stand_files, stand_of, stand_summary
     from pipeline.io.atomic_files import write_texts
 

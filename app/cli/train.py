@@ -30,8 +30,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Train a forest with annotations, print its scores and write it; return 0. Errors as
-    `learn_from_annotations`."""
+    """Train a forest with the annotations of the runs that the arguments name (all without any), print its
+    scores, and write it to `--out`, or without it to the data folder; return 0.
+
+    Raises:
+        StemmapError: See `learn_from_annotations`.
+    """
     return learn_from_annotations(arguments.runs, arguments.out, arguments.seed)
 
 

@@ -392,7 +392,7 @@ def _number(value: object) -> object:
 
 
 def _decoded(line: bytes, kind: type[T]) -> T | None:
-    """Return the message of a line; None for an incomplete or empty line.
+    """Return the message of a line; None for an incomplete one, with which the sender ended.
 
     Raises:
         ProtocolError: The line is not JSON of this type.

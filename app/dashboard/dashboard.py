@@ -245,11 +245,11 @@ class Dashboard:
         await self.tune(lambda state: state.change(changes, gesture))
 
     async def use_preset(self, name: str) -> None:
-        """Use all values of a preset.
+        """Set all parameters to the values of a preset, as one undo step.
 
         Raises:
-            StemmapError: There is no preset of this name (ParameterError), or its forest does not exist;
-                nothing changes.
+            StemmapError: There is no preset of this name (ParameterError), or its forest does not exist or
+                cannot be read; nothing changes.
         """
         await self.tune(lambda state: state.use_preset(name))
 

@@ -328,12 +328,6 @@ class Accumulated:
         points: NDArray[np.float32] = self._rows.shared()[0]
         return points
 
-    @property
-    def nbytes(self) -> int:
-        """Size of the stored points of the run and of the places of their scans [bytes], without those for
-        the time windows."""
-        return self._rows.nbytes + self._scans.nbytes
-
     def take(self, frame: Frame) -> bool:
         """Add the filtered points of a scan; if the run went back, remove those of this and later scans
         first.

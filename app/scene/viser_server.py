@@ -76,12 +76,13 @@ def _guarded_handshakes(secret: str) -> Iterator[None]:
 
 
 def _check_first(secret: str, then: Callable[..., Any] | None) -> Callable[..., Any]:
-    """Return a `process_request` of `websockets` that answers 403 without the secret, sets the current user
-    from the header USER_HEADER (SOMEBODY for an invalid name), and then calls `then`.
+    """Return a `process_request` of `websockets` that answers 403 without the secret. With it, it sets the
+    current user from the header USER_HEADER (percent-encoded; SOMEBODY if it is missing or no valid name),
+    and returns the answer of `then`, or None, which accepts the connection.
 
     Args:
         secret: Required value of the header SECRET_HEADER.
-        then: viser's own `process_request`, or None.
+        then: viser's own `process_request`, a function or coroutine function; None for none.
     """
 
     async def process_request(connection: ServerConnection, request: Request) -> Response | None:

@@ -128,8 +128,9 @@ class OpenDrive:
             yield mapper.process(*cached)
 
     def _from_scans(self, mapper: Mapper, cache: ScanCache) -> Iterator[Frame]:
-        """Yield the frames of all scans; the front end runs and its results are cached. The scans stay in
-        memory for the next call if their points have at most `_STEPS_LIMIT` bytes."""
+        """Yield the frames of all scans; the front end runs and its results are cached. When all frames were
+        taken, the scans stay in memory for the next call if their points have at most `_STEPS_LIMIT`
+        bytes."""
         held: list[Step] | None = []
         size = 0
         for step in self._read_steps():

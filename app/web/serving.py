@@ -347,7 +347,8 @@ def _has_display() -> bool:
 
 
 def _name(host: str) -> str:
-    """Return the host as it is written in a link."""
+    """Return the host as it is written in a link: the name of this machine for 0.0.0.0 and ::, which mean all
+    its addresses, and other IPv6 addresses in brackets."""
     if host in ("0.0.0.0", "::"):  # noqa: S104 - compared with, not bound to
         return socket.gethostname()
     return f"[{host}]" if ":" in host else host

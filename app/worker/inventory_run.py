@@ -187,8 +187,11 @@ class InventoryRun:
         """Compute the next step of the first inventory. Return the frame of the map if this step completed
         it; None before, and if the map was complete already.
 
+        Args:
+            hurried: Ignored; it is there because `Run.map_next` has it.
+
         Raises:
-            StemmapError: The cloud cannot be mapped.
+            StemmapError: The cloud cannot be mapped; the next call begins the inventory again.
         """
         del hurried
         if self.current >= 0:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 
 import msgspec
@@ -484,47 +485,35 @@ def open_run(
         SourceError: The odometry is not available for this source; the source is closed.
         StemmapError: The forest that the parameters name does not exist; the source is closed.
     """
-    try:
-        return _opened_run(source, odometry, seed, parameters, make_mapper)
-    except BaseException:
-        source.close()
-        raise
+    with ExitStack() as on_error:
+        on_error.callback(source.close)
+        moving, chosen = with_odometry(source, odometry)
+        stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
+        description = source.description
+        left_out = Counter[str]()
+        if live is None:
 
+            def read() -> Iterator[Step]:
+                left_out.clear()  # the source is read from its start
+                return steps(moving.records(None), odometry=chosen.steps, losses=left_out)
 
-def _opened_run(
-    source: Source | LiveSource,
-    odometry: str,
-    seed: int,
-    parameters: Parameters,
-    make_mapper: MakeMapper,
-) -> tuple[Run, tuple[str, ...]]:
-    """Return the result of `open_run`; arguments and errors as there, but the source stays open after one."""
-    moving, chosen = with_odometry(source, odometry)
-    stopwatch, live = Stopwatch(), source if isinstance(source, LiveSource) else None
-    description = source.description
-    left_out = Counter[str]()
-    if live is None:
-
-        def read() -> Iterator[Step]:
-            left_out.clear()  # the source is read from its start
-            return steps(moving.records(None), odometry=chosen.steps, losses=left_out)
-
-        cursor = Cursor(read, description.uri, StepStore())
-    else:
-        cursor = Cursor(lambda: live_steps(live, chosen, moving, left_out), description.uri)
-    warnings = (*([chosen.warning] if chosen.warning else []), *description.warnings)
-    run = Run(
-        moving,
-        lambda parameters: make_mapper(moving.description, parameters, seed, stopwatch),
-        cursor,
-        parameters,
-        stopwatch,
-        chosen.words,
-        ScanCaches(),
-        is_live=live is not None,
-        warnings=warnings,
-        left_out=left_out,
-    )
+            cursor = Cursor(read, description.uri, StepStore())
+        else:
+            cursor = Cursor(lambda: live_steps(live, chosen, moving, left_out), description.uri)
+        warnings = (*([chosen.warning] if chosen.warning else []), *description.warnings)
+        run = Run(
+            moving,
+            lambda parameters: make_mapper(moving.description, parameters, seed, stopwatch),
+            cursor,
+            parameters,
+            stopwatch,
+            chosen.words,
+            ScanCaches(),
+            is_live=live is not None,
+            warnings=warnings,
+            left_out=left_out,
+        )
+        on_error.pop_all()
     return run, warnings
 
 

@@ -195,11 +195,14 @@ class Session:
         return self._begin(source, odometry, seed)
 
     def listen(self) -> Opened | None:
-        """Return the opened run of a live robot once its data arrive; None before and after, and without a
-        live robot. The notices of the robot become warnings of the session and of the run.
+        """Process what a live robot sent, without waiting. Return its run, opened and paused before the first
+        scan, in the call in which its description becomes known; None in all other calls, and without a live
+        robot. The notices of the robot become warnings of the session and, once it is open, of the run.
 
         Raises:
-            SourceError: What it sends cannot be read.
+            SourceError: What it sends cannot be read, or the odometry is not available for it.
+            StemmapError: The forest that the parameters name does not exist. After this error, and for an
+                odometry that is not available, the source is closed.
         """
         if self._robot is None or self._requested is None:
             return None

@@ -243,7 +243,7 @@ class WorkerProcess:
                     self._status = message.status
                 await self._deliver(message)
         except asyncio.IncompleteReadError:
-            return exit_reason(await process.end(_GRACE_S))
+            return exit_reason(await process.end(self._grace_s))
         except protocol.WireError as error:
             return f"protocol error: {error}"
         self._gave_up = bool(self._opening)
@@ -353,5 +353,9 @@ class WorkerProcess:
         process, self._process = self._process, None
         if process is None:
             return
-        grace_s = _LIVE_GRACE_S if self._open is not None and is_live(self._open.uri) else _GRACE_S
-        await process.end(grace_s)
+        await process.end(self._grace_s)
+
+    @property
+    def _grace_s(self) -> float:
+        """Time in which a worker ends by itself [s]: a live one first completes its recording."""
+        return _LIVE_GRACE_S if self._open is not None and is_live(self._open.uri) else _GRACE_S

@@ -333,12 +333,13 @@ def _index(used: int, tables: _Tables) -> int:
 
 
 def corrected_voxels(memory: VoxelMap, correction: PathCorrection) -> VoxelMap:
-    """Return the voxels after a correction of the path: each moves with the last scan that saw it, and voxels
-    in the same cell are joined: returns are added, the mean is weighted by them, and the largest `scans` and
-    `latest` are kept. All tiles become due for classification.
+    """Return the voxels after a correction of the path.
 
-    Voxels that leave the limits of the map (1,000 km) are removed; heights do not change. The argument is not
-    changed.
+    The mean of each voxel moves horizontally, as `PathCorrection.moved` does for the last scan that saw it:
+    with the nearest pose of the path around that scan. Its height above the ground is kept. Voxels that are
+    then in the same cell are joined: returns are added, the mean is weighted by them, and the largest `scans`
+    and `latest` are kept. Voxels that leave the limits of the map (about 1,000 km from the origin) are
+    removed. All tiles become due for classification. Neither argument is changed.
     """
     n = memory.used
     mean = memory.mean[:n].copy()

@@ -53,11 +53,6 @@ class GrowingColumns:
         """Return the number of rows."""
         return self._length
 
-    @property
-    def nbytes(self) -> int:
-        """Size of all columns with their spare capacity [bytes]."""
-        return sum(column.nbytes for column in self._columns)
-
     def column(self, number: int) -> Column:
         """Return the column with this number, from 0, of all rows; a view that later calls may change."""
         return self._columns[number][: self._length]

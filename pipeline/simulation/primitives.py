@@ -146,10 +146,10 @@ class SolidsBuilder:
 
         Args:
             owner: Number of the object that it belongs to.
-            start, end: Ends of the axis, shape (3,) [m]; they must differ.
-            radii: Radius r of the section at `start` and at `end` [m].
+            start, end: Ends of the axis, shape (3,) [m]; they must differ, which is not checked.
+            radii: Radius r of `Section` at `start` and at `end` [m].
             section: Shape of the section.
-            reflectivity: Share of the light that is reflected.
+            reflectivity: Share of the light that is reflected, 0 to 1.
         """
         self.cone(owner, start, end, radii, reflectivity=reflectivity)
         _, shape, capsule, surface, _ = self._rows.pop()

@@ -309,15 +309,16 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
     """Return the request of `sim:NAME?key=value&...`; "sim:" may be omitted. Options that are missing have
     the defaults of the scenario.
 
-    A duration of 0 in the request for a run through a cloud means one loop. Files are not opened.
+    The duration of a run through a cloud is 0 in the request, for one loop, if the URI has none; a duration
+    in the URI is 1 s to 3600 s. Files are not opened.
 
     Args:
-        uri: As the user wrote it.
+        uri: As the user wrote it; the part after "?" is percent-encoded.
         seed: Seed of a URI that names none.
 
     Raises:
-        UsageError: No such scenario or key, a key twice, a value that is not a number or out of bounds, or a
-            run through a cloud without a file.
+        UsageError: No such scenario, key or odometry; a key twice; a part after "?" that is not pairs; a
+            value that is not a number or out of bounds; or a run through a cloud without a file.
     """
     name, _, query = uri.removeprefix(SCHEME).partition("?")
     if name != CLOUD and name not in SCENARIOS:

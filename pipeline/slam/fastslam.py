@@ -268,13 +268,13 @@ class FastSlam:
         All particles continue from the corrected pose with the map of the best one, in which landmarks at the
         same place from before and after the loop are joined.
 
+        Associations with known landmarks in the present revisit were made at the drifted pose. With the loop
+        they are left out, and landmarks that it brings together are one tree. The loop is taken if its
+        solution has the larger support (`KeyframeGraph.support`).
+
         Args:
             index: Number of the scan, which seeds the random numbers.
             loop: The loop.
-
-        Associations with known landmarks in the present revisit were made at the drifted pose. With the loop
-        they are left out, and landmarks that it brings together are one tree. The loop is taken if its
-        solution has the larger support.
 
         Returns:
             The correction; None if the graph has no solution with the loop, or if it has no more support
@@ -283,8 +283,17 @@ class FastSlam:
         state, graph = self.state, self.state.graph
         path = state.genealogy.path(state.best)
         if graph.newest_scan != len(path) - 1:
-            keyframe = self._keyframe(state, state.since_keyframe, state.detections)
-            graph = graph.with_keyframe(keyframe, path[-1])
+            # The scan may be one that was not used, after a motion that no keyframe contains.
+            motion, covariance = compounded(
+                state.keyframe_motion,
+                state.keyframe_covariance,
+                *state.motion.tolist(),
+                state.motion_covariance,
+            )
+            state = replace(state, keyframe_motion=motion, keyframe_covariance=covariance)
+            graph = graph.with_keyframe(
+                self._keyframe(state, state.since_keyframe, state.detections), path[-1]
+            )
         revisit, without = graph.revisit(loop.first), graph.solve()
         support = 0.0 if without is None else graph.support(revisit, without)
         graph = graph.without(revisit)
@@ -292,7 +301,6 @@ class FastSlam:
         solution = graph.solve(new_loop=True)
         if solution is None:
             return None
-        # Landmarks that the loop brings together are one tree.
         moved = corrected_landmarks(state.map_of(state.best), graph, solution, path)
         names = same_trees(moved, graph.first_birth_after(loop.first))
         graph = replace(graph.renamed(*names), pose=solution.pose)

@@ -124,7 +124,7 @@ class Revisit:
 
     Attributes:
         first_birth: Landmarks with a smaller birth number are known from before.
-        begin: Distance driven at its first keyframe [m].
+        begin: Driven distance from which on keyframes belong to it [m].
     """
 
     first_birth: int

@@ -97,7 +97,11 @@ class Places:
         return replace(self, inactive=inactive, contradicted=True)
 
     def is_old(self, distance: float) -> Bool:
-        """Return which places were not seen for REVISIT_DISTANCE at a distance driven [m], shape (M,)."""
+        """Return whether each place was last seen more than REVISIT_DISTANCE of driven path ago, shape (M,).
+
+        Args:
+            distance: Distance driven until now [m].
+        """
         old: Bool = self.seen < distance - REVISIT_DISTANCE
         return old
 

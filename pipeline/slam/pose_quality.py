@@ -184,8 +184,9 @@ class RunningStatistics:
 
     @property
     def is_tree_motion_reliable(self) -> bool:
-        """Whether `led` has reached the value after TREE_MOTION_SCANS scans in a row in which trees
-        determined the motion, so that it is trusted without the odometry."""
+        """Whether the motion that trees determine is trusted without the odometry: `led` is at least its
+        value after TREE_MOTION_SCANS successive scans, from 0, with a doubted odometry and enough recognised
+        trees. A doubted scan with too few trees sets `led` to 0; scans without doubt decrease it slowly."""
         return self.led >= TREE_MOTION_STEP * TREE_MOTION_SCANS
 
     def odometry_trust(self, noise: Noise) -> OdometryTrust:

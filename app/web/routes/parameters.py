@@ -97,7 +97,8 @@ async def undo(dashboard: Dash) -> Response:
 @router.post("/parameters/redo")
 async def redo(dashboard: Dash) -> Response:
     """Repeat the change that was undone last; return the parameters as `GET /api/parameters` does. 409 if
-    there is none, or a parameter was changed since."""
+    there is none, a parameter was changed since, or the forest of its values does not exist or cannot be read
+    any more; then nothing changes."""
     await dashboard.tune(lambda state: state.redo())
     return await read(dashboard)
 

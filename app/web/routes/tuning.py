@@ -95,9 +95,10 @@ async def save_found(body: SaveSet, dashboard: Dash) -> Response:
 
 @router.post("/sensitivity")
 async def start_sensitivity(body: _Sensitivity, dashboard: Dash) -> Response:
-    """POST /api/sensitivity: start to score the whole run over values of a parameter, in their order. The
-    response is empty (202) and each score is broadcast; 409 if the run cannot be scored, 422 for an unknown
-    parameter."""
+    """POST /api/sensitivity: start to score the whole run over values of a parameter, in their order, in
+    place of an analysis in progress. The response is empty (202), and the points so far are broadcast after
+    each score. 409 if no run is open, it is live or has no true trees; 422 for an unknown parameter, or no or
+    more than MOST_VALUES values."""
     dashboard.how_much_matters(body.name, list(body.values))
     return json_reply({}, 202)
 

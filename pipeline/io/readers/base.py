@@ -175,7 +175,8 @@ class FileSource:
 
 
 def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:
-    """Add a number of left-out records to the losses of one reason, in place."""
+    """Add a number of left-out records to the losses of one reason, in place. A new reason is added also with
+    the number 0, so callers check it before."""
     losses[reason] = losses.get(reason, 0) + number
 
 

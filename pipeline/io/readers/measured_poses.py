@@ -177,26 +177,30 @@ class Fix:
     def of(
         cls, stamp_ns: int, latitude: float, longitude: float, covariance: Sequence[float], kind: int
     ) -> Fix:
-        """Return a fix from the fields of its message. Its sigma is at least BEST_SIGMA, and UNKNOWN_SIGMA
-        without a covariance; the height is ignored.
+        """Return a fix from the fields of its message; the height is ignored. Its sigma is the root of the
+        mean of the variances of east and north, at least BEST_SIGMA; UNKNOWN_SIGMA if the covariance is
+        unknown.
 
         Args:
             stamp_ns: Time [ns].
             latitude, longitude: WGS84 [deg].
-            covariance: Covariance of east, north, up [m^2], nine numbers.
-            kind: Field `position_covariance_type`. The covariance is unknown if it is 0, or if the variances
-                are zero, as many drivers send it.
+            covariance: Covariance of east, north, up [m^2], nine numbers by row; only the variances of east
+                and north are used.
+            kind: Field `position_covariance_type`. The covariance is unknown if it is 0, or if the mean of
+                the two variances is 0, as many drivers send it.
 
         Raises:
-            ValueError: The position is not on Earth, or the covariance is invalid.
+            ValueError: The position is not on Earth; or `kind` is not 0 and one of the two variances is
+                negative, not finite, or 1e8 m^2 or more.
         """
         if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):
             raise ValueError("a position is not on Earth")
         sigma = UNKNOWN_SIGMA
         if kind != 0:
-            variance = 0.5 * (float(covariance[0]) + float(covariance[4]))
-            if not 0.0 <= variance < 1e8:
-                raise ValueError("a covariance is negative or not finite")
+            east, north = float(covariance[0]), float(covariance[4])
+            if not (0.0 <= east < 1e8 and 0.0 <= north < 1e8):
+                raise ValueError("a variance is negative, too large or not finite")
+            variance = 0.5 * (east + north)
             if variance > 0.0:
                 sigma = max(math.sqrt(variance), BEST_SIGMA)
         return cls(stamp_ns, latitude, longitude, sigma)

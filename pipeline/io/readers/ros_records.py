@@ -259,11 +259,18 @@ class RecordDecoder:
         return Fix.of(stamp_ns, float(decoded.latitude), float(decoded.longitude), covariance, kind), frame
 
     def other_pose(self, message: Message, stamp_ns: int) -> tuple[OtherPose, str]:
-        """Return a pose of another SLAM and the name of its frame. It is that of the base if fixed transforms
-        link the child frame of the message to the base, else that of the message.
+        """Return a pose of another SLAM, in the plane, and the frame in which it is given (`frame_id` of the
+        header, without leading slashes).
+
+        If fixed transforms link the child frame of the message to the base, it is the pose of the base.
+        Otherwise, and without a child frame, the pose of the message is taken as that of the base.
+
+        Args:
+            message: nav_msgs/Odometry, or a type with the same header and pose.
+            stamp_ns: Time of the pose [ns].
 
         Raises:
-            NoPoseError: Its covariance is invalid.
+            NoPoseError: Its covariance in the plane is not finite, not symmetric or not positive definite.
             Exception: Of many kinds, when the message is damaged.
         """
         decoded: ros2.nav_msgs__msg__Odometry = self.message(message)  # the other type has the same fields

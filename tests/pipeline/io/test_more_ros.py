@@ -165,6 +165,14 @@ def test_variances_of_zero_are_not_filled_in(variance: float, kind: int, sigma: 
     assert Fix.of(0, 60.0, 24.0, covariance, kind).sigma == pytest.approx(sigma)
 
 
+@pytest.mark.parametrize(("east", "north"), [(-0.5, 2.0), (2.0, -0.5), (float("nan"), 1.0), (1.0, 1e8)])
+def test_each_variance_of_a_fix_is_checked(east: float, north: float):
+    covariance = [east, 0, 0, 0, north, 0, 0, 0, 1]
+    with pytest.raises(ValueError, match="variance"):
+        Fix.of(0, 60.0, 24.0, covariance, 2)
+    assert Fix.of(0, 60.0, 24.0, covariance, 0).sigma == UNKNOWN_SIGMA
+
+
 def test_a_lidar_is_taken_before_the_bumper_and_info_says_why(
     tmp_path: Path, opened: Opened, capsys: pytest.CaptureFixture[str]
 ):

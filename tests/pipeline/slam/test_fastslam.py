@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from pipeline.config import preset
 from pipeline.geometry.pose_arrays import composed
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.slam import FastSlam, Motion
+from pipeline.slam import FastSlam, Loop, Motion
+from pipeline.slam.keyframe_graph import KeyframeGraph
 from pipeline.slam.motion import compound, compounded, moved_poses, noise_of, step_variances
 from pipeline.slam.particle_ancestry import low_variance_ancestors, normalised
 from pipeline.slam.particle_maps import (
@@ -574,6 +575,23 @@ def test_keyframes_at_multiples_of_a_distance_do_not_depend_on_the_number_of_sca
         if slam.is_keyframe_every(10.0):
             due.append(step * k)
     np.testing.assert_allclose(due, np.arange(1, 1 + 100.0 / max(step, 10.0)) * max(step, 10.0))
+
+
+def test_a_loop_between_two_used_scans_has_the_whole_motion(monkeypatch):
+    slam = fresh(particles=5, update_distance=5.0)
+    for k in range(4):
+        slam.process(k, Pose2(0.5 if k else 0.0, 0.0, 0.1), detections(TREES[:0]), NOTHING_SEEN)
+    graphs = list[KeyframeGraph]()
+    monkeypatch.setattr(KeyframeGraph, "solve", lambda graph, **_: graphs.append(graph))
+    assert slam.close(3, Loop(0, 0, Pose2(), np.eye(3))) is None
+    newest = graphs[0].keyframes[-1]
+    assert newest.scan == 3
+    # The last used scan is the first one; the robot turned at it and has moved since.
+    expected = Pose2()
+    for _ in range(3):
+        expected = expected @ Pose2(0.5, 0.0, 0.1)
+    np.testing.assert_allclose(newest.motion, expected.as_array(), atol=1e-9)
+    assert np.all(np.diag(newest.covariance) > 0.0)
 
 
 def test_the_covariance_after_smoothing_is_that_of_the_graph():

@@ -70,5 +70,5 @@ def test_a_scan_takes_64_bytes_and_24_of_the_estimate():
         buffer.append(number, Pose2())
         buffer.set_sigma(np.eye(3))
         buffer.path(estimate)
-    assert buffer._rows.nbytes <= 2 * 64 * scans  # the capacity doubles
+    assert sum(column.nbytes for column in buffer._rows._columns) <= 2 * 64 * scans  # the capacity doubles
     assert sum(block.nbytes for block in (*estimate.blocks, estimate.newest)) == 24 * scans
