@@ -284,11 +284,9 @@ class FastSlam:
         path = state.genealogy.path(state.best)
         if graph.newest_scan != len(path) - 1:
             # The scan may be one that was not used, after a motion that no keyframe contains.
+            x, y, yaw = state.motion.tolist()
             motion, covariance = compounded(
-                state.keyframe_motion,
-                state.keyframe_covariance,
-                *state.motion.tolist(),
-                state.motion_covariance,
+                state.keyframe_motion, state.keyframe_covariance, x, y, yaw, state.motion_covariance
             )
             state = replace(state, keyframe_motion=motion, keyframe_covariance=covariance)
             graph = graph.with_keyframe(
