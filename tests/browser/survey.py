@@ -105,6 +105,7 @@ def survey_run(browser: Browser, link: str, folder: Path, size: str, wanted: lis
     dashboard.scene.locator(".mantine-Notification-closeButton").first.click()
     page.wait_for_timeout(CLICK_MS)
     survey.picture("page")
+    page.locator("#map").press("Escape")  # the selection of the size before, which the server keeps
     if page.locator("#drawer-button").is_visible():
         page.locator("#drawer-button").click()
     page.locator("#trees tbody tr").nth(4).click()
