@@ -67,8 +67,11 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     hint = page.locator("#annotate-hint")
     expect(hint).to_contain_text(f"Tree {first['number']}, detected in")
     expect(hint).to_contain_text(re.compile(r"votes: tree [\d.]+ % \(40\.?0? % needed\)"))
+    size = canvas.bounding_box()
     canvas.press("y")
     expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} found trees reviewed")
+    expect(page.locator("#legend-annotation")).to_be_visible()
+    assert canvas.bounding_box() == size
     (row,) = rows(person)
     assert (row["kind"], row["x"], row["y"]) == ("tree", first["x"], first["y"])
     mark = page.locator("#marks .mark.annotation")
