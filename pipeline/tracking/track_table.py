@@ -9,7 +9,6 @@ import numpy as np
 
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
-from pipeline.tracking.kalman import correct, split
 from pipeline.types.records import ADDED, Bool, Int, Verdict
 
 NO_LANDMARK = -1
@@ -185,28 +184,19 @@ class Rows(NamedTuple):
 
 @compiled
 def join(rows: Rows, old: int, young: int) -> None:
-    """Fuse the track of row `young` into that of row `old`, in place.
+    """Join the track of row `young` to that of row `old`, in place.
 
-    Positions are fused by split covariance intersection, counts and sums are added (a last scan that observed
-    both counts once), and the larger score is kept. The class is tree if one is a tree; a track without class
-    gets that of the other one. The row `old` keeps its number and its landmark. The row `young` stays
-    unchanged; the caller removes it.
+    Both are parts of one trunk. The one whose landmark has the larger score gives landmark, state and
+    covariance: a part that is a branch or undergrowth can be decimetres beside the trunk. Counts and sums are
+    added (a last scan that observed both counts once). The class is tree if one is a tree; a track without
+    class gets that of the other one. The row `old` keeps its number. The row `young` stays unchanged; the
+    caller removes it.
     """
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, sides, verdict = rows.hits, rows.sides, rows.verdict
     # Two parts of one trunk in the last scan count once; earlier scans with both parts count twice.
     if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
         hits[old] -= 1
-    row, own, common = np.array([old]), np.empty((1, 2, 2)), np.empty((1, 2, 2))
-    for a in range(2):
-        for b in range(2):
-            own[0, a, b], common[0, a, b] = P[young, a, b] - shared[young, a, b], shared[young, a, b]
-    other = split(P, shared, row, own, common, np.zeros(1), 0.0)[0]
-    state, covariance = fuse(x[old], P[old], x[young], other)
-    for a in range(4):
-        x[old, a] = state[a]
-        for b in range(4):
-            P[old, a, b] = covariance[a, b]
     stamp_ns[old] = max(stamp_ns[old], stamp_ns[young])
     first_ns[old] = min(first_ns[old], first_ns[young])
     sides[old] |= sides[young]
@@ -214,24 +204,13 @@ def join(rows: Rows, old: int, young: int) -> None:
     if verdict[young] == Verdict.TREE or verdict[old] < 0:
         verdict[old] = verdict[young]
     hits[old] += hits[young]
+    if rows.landmark[young] != NO_LANDMARK and (
+        rows.landmark[old] == NO_LANDMARK or rows.score[young] > rows.score[old]
+    ):
+        rows.landmark[old] = rows.landmark[young]
+        x[old], P[old], shared[old] = x[young], P[young], shared[young]
     rows.score[old] = max(rows.score[old], rows.score[young])
     for total in (rows.eccentricity, rows.radius, rows.radius_weight, rows.radius_reach, rows.radius_above):
         total[old] += total[young]
     for number in (rows.eccentricities, rows.radii):
         number[old] += number[young]
-
-
-@compiled
-def fuse(x: Float, P: Float, other_x: Float, other_P: Float) -> tuple[Float, Float]:
-    """Return the first of two independent estimates, corrected by the position of the second (Kalman update).
-
-    Args:
-        x, other_x: States, shape (4,).
-        P, other_P: Covariances, shape (4, 4); only the position block of `other_P` is used.
-
-    Returns:
-        State, shape (4,), and covariance, shape (4, 4).
-    """
-    state, covariance = x.copy(), P.copy()
-    correct(state, covariance, other_x, other_P, np.empty((4, 2)), np.empty((4, 4)))
-    return state, covariance

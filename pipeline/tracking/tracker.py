@@ -333,6 +333,7 @@ def follow(
             for k in range(merged.shape[0]):
                 if at[k] >= 0:
                     j = taken[at[k]]
+                    rows.landmark[merged[k]] = NO_LANDMARK
                     old, young = min(owner[j], merged[k]), max(owner[j], merged[k])
                     join(rows, old, young)
                     landmark_of[old], landmark_of[young] = j, -1
@@ -418,7 +419,7 @@ def take_better_landmarks(
 def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
     """Join the tracks that are nearer than a radius to a track that moved, in place.
 
-    The lower row, which is the older track, keeps its number and its landmark.
+    The lower row, which is the older track, keeps its number, with the better landmark of both; see `join`.
 
     Args:
         rows: Tracks.

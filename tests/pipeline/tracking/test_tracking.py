@@ -14,7 +14,6 @@ from pipeline.geometry.poses import Pose2
 from pipeline.tracking import Tracker
 from pipeline.tracking.kalman import ENGINES, H, process_noise, transition
 from pipeline.tracking.observation import EDGE, SECTORS, UNEVEN, seen_sides
-from pipeline.tracking.track_table import fuse
 from tests.pipeline.strategies import detections, seeds, track
 
 FOREST = preset("forest").tracking
@@ -222,6 +221,20 @@ def test_trees_that_come_nearer_than_the_radius_are_merged():
     assert trees.observations.tolist() == [3]
 
 
+def test_a_merged_tree_follows_the_better_landmark_of_both():
+    """A bush beside a trunk is often seen first, and the trunk more often."""
+    t = tracker(proximity_radius=0.4)
+    show(t, 0, [[5.0, 0.45]], births=[0])
+    for k in range(1, 20):
+        show(t, k, [[5.0, 0.0]], births=[7], score={0: 1.0, 7: float(k)})
+    trees = show(t, 20, [[5.0, 0.3], [5.0, 0.0]], births=[0, 7], score={0: 2.0, 7: 20.0})
+    assert trees.number.tolist() == [1]
+    assert t.tracks.landmark.tolist() == [7]
+    for k in range(21, 25):
+        trees = show(t, k, [[5.0, 0.6], [5.0, 0.0]], births=[0, 7], score={0: 2.0, 7: float(k)})
+    np.testing.assert_allclose(trees.position[0], [5.0, 0.0], atol=0.02)
+
+
 def test_two_trees_farther_apart_than_the_radius_stay_two():
     t = tracker(proximity_radius=0.4)
     trees = t.trees()
@@ -244,23 +257,6 @@ def test_a_tree_whose_detection_is_beyond_the_gate_restarts_at_its_landmark():
     np.testing.assert_allclose(trees.position, [[5.8, 0.0]], atol=1e-6)
     assert trees.observations.tolist() == [21]
     assert np.linalg.eigvalsh(t.tracks.P[0]).min() > -1e-12
-
-
-@given(seeds)
-def test_fused_position_is_the_weighted_mean_of_independent_positions(seed):
-    rng = np.random.default_rng(seed)
-    P, Q = np.zeros((4, 4)), np.zeros((4, 4))
-    for C in (P, Q):
-        root = rng.normal(size=(2, 2))
-        C[:2, :2] = root @ root.T + 0.01 * np.eye(2)
-    x, y = np.r_[rng.normal(size=2), 0, 0], np.r_[rng.normal(size=2), 0, 0]
-    told_x, told_P = fuse(x, P, y, Q)
-    A, B = np.linalg.inv(P[:2, :2]), np.linalg.inv(Q[:2, :2])
-    np.testing.assert_allclose(told_P[:2, :2], np.linalg.inv(A + B), atol=1e-9)
-    np.testing.assert_allclose(told_x[:2], np.linalg.solve(A + B, A @ x[:2] + B @ y[:2]), atol=1e-9)
-
-
-# --- what is known of a tree ----------------------------------------------------------------------
 
 
 def test_positions_and_covariances_are_transformed_by_the_pose():
