@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -23,6 +24,7 @@ from pipeline.errors import StemmapError
 router = APIRouter(prefix="/api")
 
 _MOST_RECORDINGS = 500
+_LEVELS = 3  # of folders that are searched for recordings
 SHORTEST_LOOP_S = 0.5
 SLOWEST = 0.01
 
@@ -162,26 +164,41 @@ async def sources(dashboard: Dash, settings: Deployment) -> Response:
     return json_reply(
         {
             "scenarios": [{"uri": uri, "doc": doc} for uri, doc in scenarios().items()],
-            "recordings": [_listed(path, uploaded) for path in found],
+            "recordings": [_listed(path, name, uploaded) for path, name in found],
         }
     )
 
 
-def _listed(path: Path, uploaded: dict[str, dict[str, Any]]) -> str | dict[str, str]:
-    """Return the path of a recording; for an uploaded one a dict with its path (`uri`), original `name` and
-    format (`doc`)."""
+def _listed(path: Path, name: str, uploaded: dict[str, dict[str, Any]]) -> dict[str, str]:
+    """Return the path of a recording (`uri`) with its `name`, and with original name and format (`doc`) if it
+    was uploaded."""
     known = uploaded.get(path.name)
     if known is None:
-        return str(path)
+        return {"uri": str(path), "name": name, "doc": ""}
     return {"uri": str(path), "name": known["name"], "doc": f"{known['kind']}, uploaded"}
 
 
-def recordings(folders: Sequence[Path]) -> list[Path]:
-    """Return at most 500 files and folders directly in the data folders, in their order and sorted in each,
-    without hidden ones and finished maps. Their contents are not checked; folders that cannot be read are
-    skipped."""
-    found: list[Path] = []
-    for folder in folders:
-        with contextlib.suppress(OSError):
-            found += sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    return [path for path in found if not (path / "run.json").is_file()][:_MOST_RECORDINGS]
+def recordings(folders: Sequence[Path]) -> list[tuple[Path, str]]:
+    """Return at most 500 files and folders in the data folders, in their order and sorted in each, with their
+    paths inside of the data folder.
+
+    They are recognised by their names. A folder that is no recording is searched as well, at most three
+    levels deep and not through links. Hidden files, finished maps and folders that cannot be read are left
+    out.
+    """
+    found = ((path, str(path.relative_to(folder))) for folder in folders for path in _inside(folder))
+    return list(islice(found, _MOST_RECORDINGS))
+
+
+def _inside(folder: Path, levels: int = _LEVELS) -> Iterator[Path]:
+    """Yield the files and folders in a folder that may be recordings; see `recordings`."""
+    from pipeline.io.readers import expected_format, folder_opener
+
+    with contextlib.suppress(OSError):
+        for path in sorted(folder.iterdir()):
+            if path.name.startswith(".") or (path / "run.json").is_file():
+                continue
+            if folder_opener(path) if path.is_dir() else expected_format(path):
+                yield path
+            elif levels > 1 and path.is_dir() and not path.is_symlink():
+                yield from _inside(path, levels - 1)

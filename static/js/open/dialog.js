@@ -33,10 +33,7 @@ export async function openSources(begin = "") {
 
 function list({ scenarios = [], recordings = [] }) {
   const simulated = scenarios.map(({ uri, doc }) => entry(uri, uri, doc, () => withOptions(uri)));
-  const recorded = recordings.map((each) => {
-    const uri = each.uri ?? each;
-    return entry(uri, each.name ?? uri.split("/").pop(), each.doc ?? "");
-  });
+  const recorded = recordings.map(({ uri, name, doc }) => entry(uri, name, doc));
   byId("source-list").replaceChildren(
     ...(recorded.length ? [el("h3", { text: "Recordings in the data folder" }), ...recorded] : []),
     ...(simulated.length ? [el("h3", { text: "Simulated, with ground truth" }),

@@ -19,6 +19,7 @@ from app.common.settings import Files, Settings
 from app.dashboard.dashboard import Dashboard
 from app.web.auth import viewer_token
 from app.web.routes.access import permitted_uri
+from app.web.routes.run import recordings
 from app.worker.protocol import (
     Advance,
     Answer,
@@ -296,12 +297,31 @@ async def test_a_home_in_the_working_folder_is_not_the_home(
 
 
 async def test_sources_offer_scenarios_and_recordings(tmp_path: Path) -> None:
-    for name in ("b.mcap", "a.pcap", ".hidden"):
+    (tmp_path / "done").mkdir()
+    for name in ("b.mcap", "a.pcap", ".hidden", "done/run.json"):
         (tmp_path / name).touch()
     async with running(Settings(recordings=tmp_path)) as (client, _):
         answer = (await client.get("/api/sources", headers=BEARER)).json()
     assert "sim:stand" in [scenario["uri"] for scenario in answer["scenarios"]]
-    assert answer["recordings"] == [str(tmp_path / "a.pcap"), str(tmp_path / "b.mcap")]
+    assert [each["uri"] for each in answer["recordings"]] == [f"{tmp_path}/a.pcap", f"{tmp_path}/b.mcap"]
+
+
+def test_recordings_in_folders_are_named_by_their_path_in_the_data_folder(tmp_path: Path) -> None:
+    for name in (
+        "plot/day/1.mcap",
+        "plot/day/2.mcap",
+        "plot/b.pcap",
+        "plot/b.txt",
+        "kitti/velodyne/0.bin",
+        "a/b/c/d/deep.mcap",
+    ):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "loop").symlink_to(tmp_path)
+    (tmp_path / "empty").mkdir()
+    found = recordings([tmp_path, tmp_path / "nowhere"])
+    assert [name for _, name in found] == ["kitti", "plot/b.pcap", "plot/day"]
+    assert all(path == tmp_path / name for path, name in found)
 
 
 async def test_results_before_the_first_scan_are_empty(both: Running) -> None:
