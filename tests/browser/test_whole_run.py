@@ -109,7 +109,7 @@ def test_the_whole_map_and_its_score_follow_a_slider(dashboard: Dashboard):
     assert page.evaluate(f"{STATE} state.ghost)") is None
     page.evaluate(ANEW)
     expect(page.locator("[data-figure=trees]")).to_have_class(re.compile("remapping"))
-    expect(page.locator("[data-figure=trees] dt")).to_have_text("trees; re-mapping, 43 %")
+    expect(page.locator("[data-figure=trees] dt")).to_have_text("re-mapping 43 %")
     assert dashboard.errors == []
 
 

@@ -1,16 +1,17 @@
 // Annotations: what a person states about trees. Edits go to the server one at a time and come back to all browsers.
 
 import { get, put, request } from "../core/api.js";
-import { recall, remember } from "../core/dom.js";
+import { byId, recall, remember } from "../core/dom.js";
 import { count, percent } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
-import { attempted } from "../core/problem.js";
+import { attempted, showNews } from "../core/problem.js";
 import { changed, on, selectedTree, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 
 const NUDGE_WAIT = 400; // [ms] of quiet after which nudges become one edit
+const TREE_OF_ROW = 0.7; // [m] between an annotation and its tree
 const PATIENCE = 3000; // [ms] until an accepted edit must have come back
 const VOTES_EVERY = 2000; // [ms] between two requests for the votes
 export const KINDS = ["tree", "pole", "person", "bush", "other"];
@@ -125,8 +126,35 @@ export function remove(row) {
   return edit(() => call("DELETE", `/${row.id}`, { version: latest(row) }));
 }
 
-export const undo = () => settle().then(() => edit(() => call("POST", "/undo")));
-export const redo = () => settle().then(() => edit(() => call("POST", "/redo")));
+export const undo = () => turn("/undo", "Undone");
+export const redo = () => turn("/redo", "Redone");
+
+const edited = () => ({
+  annotation: [...rows(), ...skips()],
+  plot: state.annotations?.plots ?? [],
+  "coordinate system": [state.annotations?.georeference].filter(Boolean),
+});
+
+// Annotations and plots have one history: tells what the step changed, and selects the tree of a single annotation.
+async function turn(where, word) {
+  await settle();
+  const before = edited();
+  if (!await edit(() => call("POST", where))) return;
+  const after = edited();
+  const parts = Object.keys(after).map((name) => [name, differing(before[name], after[name])]).filter(([, changes]) => changes.length);
+  showNews(`${word}: ${parts.map(([name, changes]) => count(changes.length, name)).join(", ") || "nothing changed"}.`);
+  const [[name, [row, ...others]] = ["", []]] = parts;
+  if (name !== "annotation" || others.length) return;
+  const tree = nearest(trees(), (each) => distance(each, row), TREE_OF_ROW);
+  if (tree) select(tree.number);
+}
+
+// The rows that exist in one of both lists only, or in another version.
+function differing(before, after) {
+  const has = (list, { id, version }) => list.some((row) => row.id === id && row.version === version);
+  const gone = before.filter((row) => !has(after, row)), come = after.filter((row) => !has(before, row));
+  return [...come, ...gone.filter(({ id }) => !come.some((row) => row.id === id))];
+}
 export const importTable = (table, unit) => edit(() => call("POST", "/import", { table, dbh_unit: unit || null }));
 
 // --- review of the found trees -------------------------------------------------------------------------------
@@ -226,6 +254,7 @@ async function next() {
   const tree = open ?? left[(left.findIndex(({ number }) => number === state.selected) + 1) % left.length];
   draft.chosen = null;
   if (tree) select(tree.number);
+  byId("panel-annotate").scrollTop = 0;
   draft.look = tree;
   news();
 }

@@ -10,11 +10,12 @@ import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
-import { available, QUANTITIES, recorded, startHistory } from "./history.js";
+import { available, isOutdated, QUANTITIES, recorded, startHistory } from "./history.js";
 
 const EVERY = 2000; // [ms] between two updates
 const CURSOR_EVERY = 200; // [ms] between two moves of the cursor
 const LONGEST = 1200; // samples drawn of each curve
+const MOST_APART = 24; // trees whose cells have a gap; the gaps of more are drawn unevenly
 const ROW = 120; // [px] of height that a curve of its own needs
 const HEAD = 0.2; // share of its height for its name
 const FIXED = { n_eff: ["n_eff"], sigma: ["sigma", "yaw"] }; // charts of certain quantities
@@ -49,12 +50,12 @@ async function matrix(kind) {
     return kind === "distance" ? "Distances need at least two trees. Let the run play on."
       : "The error needs at least two trees that match the ground truth. Simulated runs have ground truth.";
   }
-  const labels = pairs.numbers.map(String);
+  const labels = pairs.numbers.map(String), gap = labels.length > MOST_APART ? 0 : 1;
   const { colorscale, unit } = SCALES[kind];
   const figure = layout();
   Object.assign(figure.xaxis, { type: "category", title: { text: "tree" } });
   Object.assign(figure.yaxis, { type: "category", title: { text: "tree" }, autorange: "reversed" });
-  return [[{ type: "heatmap", x: labels, y: labels, z, colorscale, colorbar: { title: { text: unit }, thickness: 12 }, xgap: 1, ygap: 1,
+  return [[{ type: "heatmap", x: labels, y: labels, z, colorscale, colorbar: { title: { text: unit }, thickness: 12 }, xgap: gap, ygap: gap,
     hovertemplate: `tree %{y} to tree %{x}<br>%{z:.3~r} ${unit}<extra></extra>` }], figure];
 }
 
@@ -65,13 +66,13 @@ function stages() {
   const time = scans.map((scan) => scan.time), names = [...new Set(scans.flatMap((scan) => Object.keys(scan.stages)))];
   const figure = layout({ showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, shapes: [cursor()] });
   figure.margin.t = 74;
-  figure.xaxis.title = { text: TIME };
+  figure.xaxis.title = { text: timeTitle() };
   Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "ms per scan" } });
   return [names.map((name) => ({ ...line(time, scans.map((scan) => scan.stages[name] ?? null), name), stackgroup: "one" })), figure];
 }
 
 const NOTHING = "Nothing to plot yet: the curves begin with the first scan that this page receives. Press play.";
-const TIME = "time in the run, s";
+const timeTitle = () => `time in the run, s${isOutdated() ? "; in part with earlier parameters: play the run again to renew them" : ""}`;
 
 // Curves of quantities below one another, with one axis of time.
 function curves(names) {
@@ -87,7 +88,7 @@ function curves(names) {
     figure[`yaxis${place ? place + 1 : ""}`] = { ...yaxis, domain: [1 - (place + 1) * height, top], nticks: 5, automargin: true };
     figure.annotations.push({ text: `${title}${unit && `, ${unit}`}`, showarrow: false, xref: "paper", x: 0, xanchor: "left", yref: "paper", y: top, yanchor: "bottom" });
   });
-  Object.assign(figure.xaxis, { title: { text: TIME }, anchor: names.length > 1 ? `y${names.length}` : "y", showspikes: true, spikemode: "across", spikethickness: 1, spikedash: "dot", spikecolor: colour("dim") });
+  Object.assign(figure.xaxis, { title: { text: timeTitle() }, anchor: names.length > 1 ? `y${names.length}` : "y", showspikes: true, spikemode: "across", spikethickness: 1, spikedash: "dot", spikecolor: colour("dim") });
   return [names.map((name, place) => ({ ...line(time, scans.map((scan) => scan.values[name]), QUANTITIES[name][0]), yaxis: place ? `y${place + 1}` : "y" })), figure];
 }
 
@@ -144,6 +145,7 @@ function showText(text) {
   byId("chart").hidden = text !== "";
   byId("chart-empty").hidden = text === "";
   setText(byId("chart-empty"), text);
+  for (const id of ["chart-png", "chart-csv"]) byId(id).disabled = text !== "";
 }
 
 async function show(Plotly, kind, traces, figure) {

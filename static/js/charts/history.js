@@ -36,26 +36,28 @@ export const QUANTITIES = {
   behind: ["scans behind", "", (map, status) => status.scans_behind],
 };
 
-let scans = new Map(); // index -> {time, stages, value of each quantity}
-let step = 1, of = ""; // every step-th scan is kept; run and parameters of the scans
+let scans = new Map(); // index -> {time, revision, stages, value of each quantity}
+let step = 1, of = ""; // every step-th scan is kept; run of the scans
 
 function record({ map, status }) {
   if (!status) return;
-  const run = `${status.source} ${status.revision}`;
-  if (!map || run !== of) {
-    of = run;
+  if (!map || status.source !== of) {
+    of = status.source;
     scans = new Map();
     step = 1;
   }
   if (!map || map.index % step) return;
   const values = Object.fromEntries(Object.entries(QUANTITIES).map(([name, [, , read]]) => [name, known(read(map, status))]));
-  scans.set(map.index, { time: map.time_s, stages: { ...status.stage_ms }, values });
+  scans.set(map.index, { time: map.time_s, revision: status.revision, stages: { ...status.stage_ms }, values });
   if (scans.size > MOST) {
     step *= 2;
     for (const index of [...scans.keys()]) if (index % step) scans.delete(index);
   }
   changed("history");
 }
+
+// Whether a recorded scan was mapped with earlier parameters: a re-mapping sends its last scan only.
+export const isOutdated = () => [...scans.values()].some(({ revision }) => revision !== state.status?.revision);
 
 // The recorded scans in the order of time, at most about `most`.
 export function recorded(most) {

@@ -1,8 +1,8 @@
-// A failed request or action: what happened and what to do, in a corner of the page until it is closed or replaced.
+// A line at the lower edge of the page until it is closed or replaced: a failed request or action and what to do, or news.
 
 import { el, setText } from "./dom.js";
 
-const SHOWN_FOR = 15_000; // [ms]
+const SHOWN_FOR = 15_000, NEWS_FOR = 5000; // [ms]
 let box = null, timer = 0;
 
 const hide = () => { box.hidden = true; };
@@ -13,15 +13,19 @@ function build() {
   document.body.append(box);
 }
 
-export function showProblem(error) {
+export const showProblem = (error) => show(typeof error === "string" ? error : error.message, true);
+export const showNews = (text) => show(text, false);
+
+function show(text, isProblem) {
   if (!box) build();
-  const text = typeof error === "string" ? error : error.message;
+  box.classList.toggle("problem", isProblem);
+  box.setAttribute("role", isProblem ? "alert" : "status");
   setText(box.firstChild, text.charAt(0).toUpperCase() + text.slice(1));
   // An open dialog covers everything outside of it.
   (document.querySelector("dialog[open]") ?? document.body).append(box);
   box.hidden = false;
   clearTimeout(timer);
-  timer = setTimeout(hide, SHOWN_FOR);
+  timer = setTimeout(hide, isProblem ? SHOWN_FOR : NEWS_FOR);
 }
 
 // Runs an asynchronous action of a person; a failure is shown. Returns its result, or undefined after a failure.

@@ -3,7 +3,7 @@
 import { block } from "./api.js";
 import { el } from "./dom.js";
 import { fileName, saveBytes } from "./download.js";
-import { attempted } from "./problem.js";
+import { attempted, showNews } from "./problem.js";
 
 const REPORTS = { "en.html": "Report (HTML)", "en.pdf": "Report (PDF)", "de.html": "Bericht (HTML)", "de.pdf": "Bericht (PDF)" };
 
@@ -22,7 +22,10 @@ export async function saveReport(key, title, choice, settings = new URLSearchPar
 export async function saveWritten(text, name, path) {
   const box = el("div", { class: "toast", role: "status" }, el("span", { text }), el("progress", { "aria-label": text }));
   document.body.append(box);
-  await attempted(async () => saveBytes(name, await block(path)));
+  await attempted(async () => {
+    saveBytes(name, await block(path));
+    showNews(`Saved ${name}.`);
+  });
   box.remove();
 }
 

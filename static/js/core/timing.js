@@ -27,7 +27,8 @@ export function oncePerFrame(draw) {
   };
 }
 
-// A function that runs the asynchronous `work` after each call, one run at a time and `pause` [ms] between two runs.
+// A function that runs the asynchronous `work` after each call, one run at a time and `pause` [ms] (a number or a function)
+// between two runs.
 export function keepFresh(work, pause) {
   let busy = false, wanted = false;
   return async () => {
@@ -37,7 +38,7 @@ export function keepFresh(work, pause) {
     while (wanted) {
       wanted = false;
       await work();
-      await new Promise((resolve) => setTimeout(resolve, pause));
+      await new Promise((resolve) => setTimeout(resolve, typeof pause === "function" ? pause() : pause));
     }
     busy = false;
   };

@@ -4,6 +4,7 @@ import { definitions, el, letterOf } from "../core/dom.js";
 import { clock, count, figure, isAssumed, NONE } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
+import { timeLink } from "../playback/time_link.js";
 import { columnFigure } from "./columns.js";
 import { gatheredFigure } from "./gathered.js";
 import { stemStory } from "./sections.js";
@@ -19,12 +20,13 @@ function verdict(story) {
   const label = story.column?.verdict ?? (story.confirmed ? "tree" : "other");
   return el("div", { class: "verdict", "data-verdict": label }, letterOf(verdictOf(label)),
     el("div", {}, el("b", { text: story.confirmed ? "tree" : `not in the map: ${label}` }),
-      el("p", { text: seen(story) })));
+      el("p", {}, ...seen(story))));
 }
 
 function seen(story) {
-  if (isAssumed(story)) return "No single scan detected it, only the accumulated scans did: its position is that of their returns, and the uncertainty is assumed, not measured.";
-  return `Detected in ${count(story.observations, "scan")}, first at ${clock(story.first_seen_s)}, last at ${clock(story.last_seen_s)}.`;
+  if (isAssumed(story)) return ["No single scan detected it, only the accumulated scans did: its position is that of their returns, and the uncertainty is assumed, not measured."];
+  // A little later, since the time of a scan may be rounded downwards.
+  return [`Detected in ${count(story.observations, "scan")}, first at `, timeLink(story.first_seen_s + 0.005), ", last at ", timeLink(story.last_seen_s + 0.005), "."];
 }
 
 function overview(story, showCluster) {

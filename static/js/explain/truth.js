@@ -1,11 +1,9 @@
 // The story of an object of the ground truth where this scan has no cluster and the map no tree.
 
-import { command } from "../core/api.js";
 import { el } from "../core/dom.js";
-import { clock, figure } from "../core/format.js";
-import { looksOnly } from "../core/permissions.js";
-import { attempted } from "../core/problem.js";
+import { figure } from "../core/format.js";
 import { isCloud, state } from "../core/store.js";
+import { timeLink } from "../playback/time_link.js";
 
 export function truthStory({ kind, x, y }) {
   const title = el("h2", { text: `${kind[0].toUpperCase()}${kind.slice(1)} of the ground truth` });
@@ -14,9 +12,8 @@ export function truthStory({ kind, x, y }) {
   const nearest = gaps.reduce((best, gap, scan) => (gap < gaps[best] ? scan : best), 0);
   // Scans follow one another evenly; half a scan keeps a rounded time from being the one before.
   const time = ((nearest + 0.5) / (state.map.index || 1)) * state.status.time_s;
-  const at = looksOnly() ? clock(time) : el("button", { class: "small", "data-edit": true, text: clock(time), title: "Go to this scan", onclick: () => attempted(() => command("seek", { time_s: time })) });
   return [title,
     el("p", { text: `No cluster of this scan and no tree of the map is at this place, ${figure(gaps.at(-1))} m from the robot. A scan has a cluster where enough points lie on an object inside of the range and the pass-through box, and no nearer object hides it.` }),
     nearest === gaps.length - 1 ? el("p", { text: "Up to now the robot was never nearer to it." })
-      : el("p", {}, `Up to now the robot was nearest to it, ${figure(gaps[nearest])} m, at `, at, ". If a cluster is at this place there, click it to see its verdict.")];
+      : el("p", {}, `Up to now the robot was nearest to it, ${figure(gaps[nearest])} m, at `, timeLink(time), ". If a cluster is at this place there, click it to see its verdict.")];
 }

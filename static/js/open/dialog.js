@@ -101,7 +101,7 @@ function finish(message) {
 function follow({ status }) {
   if (asked === null || status === left) return;
   if (status.state === "failed") finish(status.detail || `${asked} could not be opened.`);
-  else if (status.source === asked && status.scan_index >= 0) finish("");
+  else if (status.source === asked && status.state !== "starting") finish(""); // a whole cloud takes minutes until its first map
 }
 
 function say(text) {

@@ -3,6 +3,7 @@
 import { command } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { clock, count } from "../core/format.js";
+import { startPopover } from "../core/popover.js";
 import { attempted } from "../core/problem.js";
 import { on, state } from "../core/store.js";
 import { newestFirst } from "../core/timing.js";
@@ -126,11 +127,7 @@ export function startTimeline() {
     send("set_speed", { factor: Number(event.target.value) });
     event.target.blur();
   });
-  byId("warnings-button").addEventListener("click", (event) => {
-    const list = byId("warnings");
-    list.hidden = !list.hidden;
-    event.currentTarget.setAttribute("aria-expanded", String(!list.hidden));
-  });
+  startPopover(byId("warnings-button"), byId("warnings"));
   on("status", show);
   on("parameters", showPreset);
 }

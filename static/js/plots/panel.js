@@ -12,7 +12,7 @@ import { titleOf } from "../open/run_title.js";
 import { startCoordinates } from "./coordinates.js";
 import { addAlong, addPlots, changePlot, draw, drawing, finish, importPlots, plots, plotting, SHAPES, sketch, stopDrawing } from "./plots.js";
 
-const EVERY = 3000; // [ms] between two requests while the run plays
+const pause = () => (state.status?.state === "playing" ? 3000 : 300); // [ms] between two requests
 const LARGEST_FILES = 700_000; // [bytes]
 // name, label, value and bounds of the numbers of a shape; those of the server
 const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],
@@ -21,7 +21,7 @@ const HEADS = [["plot", ""], ["m²", "Area"], ["seen", "Observed part of the are
   ["N/ha", "Stems per hectare"], ["G m²/ha", "Basal area per hectare"], ["Dq cm", "Quadratic mean diameter"], ["D cm", "Arithmetic mean diameter"]];
 const VOLUME = ["V m³/ha", "Stem volume per hectare"];
 let figures = { all: null, plots: null, problem: "" };
-let shown = ""; // what the figures are of
+let shown = []; // edition and scan of the figures
 let run = null; // run of the fields and the table
 
 // --- the settings of the figures, which this browser remembers ------------------------------------------------------
@@ -30,9 +30,12 @@ const threshold = () => Number(recall("dbh-min") ?? 7);
 const formula = () => recall("volume") ?? "";
 export const settings = () => new URLSearchParams({ dbh_min: threshold() / 100, volume: formula() });
 
+// What the figures depend on apart from the scan; they are dimmed until those of the last edit are here.
+const edition = () => `${state.annotations?.run} ${state.annotations?.serial} ${state.parameters?.revision} ${state.remapped?.revision} ${settings()}`;
+
 const refresh = keepFresh(async () => {
-  const version = `${state.annotations?.run} ${state.annotations?.serial} ${state.map?.index} ${state.parameters?.revision} ${state.remapped?.revision} ${settings()}`;
-  if (!plotting() || !state.map || version === shown) return;
+  const version = [edition(), state.map?.index];
+  if (!plotting() || !state.map || version.every((part, k) => part === shown[k])) return;
   try {
     figures = await get(`/api/plots?${settings()}`);
     shown = version;
@@ -40,7 +43,7 @@ const refresh = keepFresh(async () => {
     figures = { all: null, plots: null, problem: error.message };
   }
   fill();
-}, EVERY);
+}, pause);
 
 // --- the controls ---------------------------------------------------------------------------------------------------
 
@@ -211,6 +214,7 @@ function fill() {
   setText(byId("plots-detection"), detectionText());
   setText(byId("plots-review"), reviewText());
   fillTable(another);
+  byId("plots-table").classList.toggle("old", figures.all !== null && shown[0] !== edition());
 }
 
 // Returns whether the key belonged to the tab.
@@ -231,7 +235,7 @@ export function plotKey(event) {
 export function startPlotsPanel() {
   build();
   startCoordinates();
-  on("map", () => { if (!state.map) { figures = { all: null, plots: null, problem: "" }; shown = ""; } });
+  on("map", () => { if (!state.map) { figures = { all: null, plots: null, problem: "" }; shown = []; } });
   on("tab", () => { if (!plotting()) stopDrawing(); });
   on("tab annotations annotating sketch", fill);
   on("map tab annotations parameters", refresh);

@@ -12,14 +12,17 @@ import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
 const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"], ["preset", "minor extra"]];
-let known = { runs: [], folders: [], open: null };
+const REFRESH_EVERY = 5000; // [ms]
+let known = { runs: [], folders: [], open: null }, listed = ""; // the answer of the server, and its text
 const ticked = new Set();
 let deleted = null; // the run that Undo brings back
 
 async function load() {
   try {
-    known = await get("/api/runs");
+    const answer = await get("/api/runs"), text = JSON.stringify(answer);
     byId("runs-error").hidden = true;
+    if (text === listed) return;
+    [known, listed] = [answer, text];
   } catch (error) {
     showError(error.message);
   }
@@ -140,6 +143,8 @@ byId("runs-compare").addEventListener("click", () => go([...ticked].sort((a, b) 
 byId("toast-undo").addEventListener("click", undo);
 addEventListener("hashchange", follow);
 addEventListener("focus", load);
+// The open run grows; the rows are replaced only while nobody uses one of them.
+setInterval(() => { if (!document.hidden && !byId("runs").contains(document.activeElement)) load(); }, REFRESH_EVERY);
 on("theme", repaint);
 startUpload(async ({ uri }) => {
   await open({ uri });

@@ -2,6 +2,7 @@
 
 import { patch } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
+import { startPopover } from "../core/popover.js";
 import { attempted } from "../core/problem.js";
 import { on, state } from "../core/store.js";
 import { throttled } from "../core/timing.js";
@@ -50,15 +51,8 @@ function count() {
   for (const [name, cell] of Object.entries(counts)) setText(cell, known[name] === undefined ? "" : known[name].toLocaleString("en"));
 }
 
-function open(shown) {
-  byId("layer-list").hidden = !shown;
-  byId("layers-button").setAttribute("aria-expanded", String(shown));
-  if (shown) count();
-}
-
 export function startLayers() {
-  byId("layers-button").addEventListener("click", () => open(byId("layer-list").hidden));
-  byId("layer-list").addEventListener("keydown", (event) => { if (event.key === "Escape") { open(false); byId("layers-button").focus(); event.stopPropagation(); } });
+  startPopover(byId("layers-button"), byId("layer-list"), count);
   byId("look-top").addEventListener("click", () => pressInScene("t"));
   byId("look-behind").addEventListener("click", () => pressInScene("b"));
   byId("follow").addEventListener("click", toggleFollow);

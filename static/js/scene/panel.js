@@ -69,7 +69,9 @@ function collapse() {
     ?? inner.querySelector('.mantine-Paper-root [style*="cursor: pointer"][style*="height: 3.5em"]'); // of its sheet on a phone
   if (!button) return; // not built yet, or a person has done it already
   button.click();
+  button.blur();
   collapsed = wanted;
+  document.querySelector(".scene").classList.toggle("folded", wanted); // the veil of a view-only page follows
 }
 
 export function startScenePanel() {

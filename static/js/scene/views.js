@@ -2,6 +2,7 @@
 // for each source.
 
 import { byId, el, recall, remember } from "../core/dom.js";
+import { startPopover } from "../core/popover.js";
 import { on, state } from "../core/store.js";
 import { onSceneBuilt } from "./scene.js";
 
@@ -71,19 +72,7 @@ function show() {
 }
 
 export function startViews() {
-  const button = byId("views-button"), list = byId("view-list");
-  const open = (wanted) => {
-    list.hidden = !wanted;
-    button.setAttribute("aria-expanded", String(wanted));
-    show();
-  };
-  button.addEventListener("click", () => open(list.hidden));
-  list.addEventListener("keydown", (event) => {
-    if (event.key !== "Escape") return;
-    event.stopPropagation();
-    open(false);
-    button.focus();
-  });
+  startPopover(byId("views-button"), byId("view-list"), show);
   on("source", show);
   onSceneBuilt((inner) => { scene = inner; });
 }

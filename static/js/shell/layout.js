@@ -1,6 +1,7 @@
 // Sizes and places of map, scene and tabs in a wide window: dragged, collapsed, exchanged, remembered and saved by name.
 
 import { byId, el, recall, remember } from "../core/dom.js";
+import { startPopover } from "../core/popover.js";
 
 // left: width of the left part, top: height of the upper right part, both in percent; exchanged: the scene is on the left.
 const STANDARD = { left: 45, top: 55, exchanged: false, map: true, tabs: true };
@@ -113,19 +114,8 @@ function menu() {
 }
 
 export function startLayout() {
-  const button = byId("layout-button"), box = byId("layout-menu");
-  box.replaceChildren(...menu());
-  const open = (wanted) => {
-    box.hidden = !wanted;
-    button.setAttribute("aria-expanded", String(wanted));
-  };
-  button.addEventListener("click", () => open(box.hidden));
-  box.addEventListener("keydown", (event) => {
-    if (event.key !== "Escape") return;
-    event.stopPropagation();
-    open(false);
-    button.focus();
-  });
+  byId("layout-menu").replaceChildren(...menu());
+  startPopover(byId("layout-button"), byId("layout-menu"));
   byId("map-exchange").addEventListener("click", exchange);
   startSplitter("split-left", "left", { ArrowLeft: -1, ArrowRight: 1 }, (event, box) => (100 * (event.clientX - box.left)) / box.width);
   startSplitter("split-top", "top", { ArrowUp: -1, ArrowDown: 1 }, (event, box) => (100 * (event.clientY - box.top)) / box.height);

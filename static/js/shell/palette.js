@@ -6,6 +6,7 @@ import { ACTIONS } from "./actions.js";
 import { presentActions } from "./dynamic_actions.js";
 
 const MOST = 60; // listed entries
+const FILLERS = new Set(["a", "an", "and", "fewer", "for", "in", "into", "less", "more", "of", "on", "the", "to"]);
 let found = [], chosen = 0, before = null;
 
 const dialog = () => byId("palette");
@@ -17,12 +18,13 @@ export function openPalette() {
   sift();
 }
 
-// All words must occur in the title or the keywords of an entry. Order: titles that begin with the text, titles with a word that
-// begins with the first word, other titles, keywords.
+// Entries with as many of the words as possible in title or keywords. Order: titles that begin with the text, titles with a word
+// that begins with the first word, other titles, keywords.
 function search(text) {
-  const words = text.toLowerCase().split(/\s+/).filter(Boolean);
+  const words = text.toLowerCase().split(/\s+/).filter((word) => word && !FILLERS.has(word));
   const all = [...ACTIONS.map(([title, keys, , run, , more]) => [title, keys, run, more ?? ""]), ...presentActions()].filter(([, , run]) => mayDo(run));
-  const fitting = all.filter(([title, , , more = ""]) => words.every((word) => `${title} ${more}`.toLowerCase().includes(word)));
+  const hits = all.map(([title, , , more = ""]) => words.filter((word) => `${title} ${more}`.toLowerCase().includes(word)).length);
+  const most = Math.max(...hits), fitting = most || !words.length ? all.filter((_, k) => hits[k] === most) : [];
   return fitting.map((entry, place) => ({ entry, place, rank: rankOf(entry[0], words, text) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);
 }
 

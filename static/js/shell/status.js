@@ -34,7 +34,7 @@ const rejected = () => trees().filter((tree) => reviewOf(tree) === "rejected").l
 
 // During a re-mapping the shown map is the one before.
 function labelOfTrees({ remapped }) {
-  if (remapped !== null && remapped !== undefined) return ["remapping", `trees; re-mapping, ${Math.floor(100 * remapped)} %`];
+  if (remapped !== null && remapped !== undefined) return ["remapping", `re-mapping ${Math.floor(100 * remapped)} %`];
   return rejected() ? ["", `trees, ${rejected()} rejected`] : [];
 }
 
