@@ -18,7 +18,7 @@ from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Float
 from pipeline.jit import compiled
 from pipeline.slam.motion import wrapped
-from pipeline.types.records import Int, Int32
+from pipeline.types.records import ADDED, Bool, Int, Int32
 
 APART = 0.5  # m or rad; minimum change of x, y or yaw between two reference poses
 # Two sigma of the ratio of two variances that are each estimated from N particles, times sqrt(N): the
@@ -39,7 +39,9 @@ class FrameUncertainty:
             serial, belong to the reference pose.
         scan: int64, shape (M,): number of the scan of each reference pose.
         pose: x, y [m], yaw [rad] of the reference poses, shape (M, 3).
-        covariance: Their covariances, shape (M, 3, 3).
+        covariance: Their covariances, shape (M, 3, 3). Of a smoothed one it is the part that comes from the
+            positions of its landmarks in the solution of a graph; all particles share these positions.
+        smoothed: Which reference poses are smoothed, shape (M,).
         hidden: Covariance of the error that all particles share, at the pose `at`, shape (3, 3).
         at: x, y [m], yaw [rad], shape (3,).
     """
@@ -48,6 +50,10 @@ class FrameUncertainty:
     scan: Int = field(default_factory=lambda: np.zeros(0, np.int64))
     pose: Float = field(default_factory=lambda: np.zeros((0, 3)))
     covariance: Float = field(default_factory=lambda: np.zeros((0, 3, 3)))
+    smoothed: Bool = field(
+        default_factory=lambda: np.zeros(0, np.bool_),
+        metadata={ADDED: lambda columns: np.zeros(len(columns["serial"]), np.bool_)},
+    )
     hidden: Float = field(default_factory=lambda: np.zeros((3, 3)))
     at: Float = field(default_factory=lambda: np.zeros(3))
 
@@ -66,9 +72,10 @@ class FrameUncertainty:
 
         With landmarks of reference poses in reach, the result is `at_least(spread, C)`, where C is the mean
         of the covariances of their reference poses, transported to the pose and weighted by the numbers of
-        landmarks. Otherwise it is `spread` plus the transported `hidden`. Landmarks that precede all
-        reference poses do not count. In the state after it, `hidden` is the result less `spread`, and `at` is
-        the pose.
+        landmarks. A smoothed reference pose has `spread` in this mean, and its covariance is added to the
+        result: it is an error of the map that all particles share. Without such landmarks the result is
+        `spread` plus the transported `hidden`. Landmarks that precede all reference poses do not count. In
+        the state after it, `hidden` is the result less `spread`, and `at` is the pose.
 
         Args:
             pose: x, y [m], yaw [rad], shape (3,).
@@ -84,7 +91,7 @@ class FrameUncertainty:
         """
         covariance, hidden = _with_frame(
             pose, spread, n_eff, mean, birth, hits, hits_min, reach, self.serial, self.pose, self.covariance,
-            self.hidden, self.at,
+            self.smoothed, self.hidden, self.at,
         )  # fmt: skip
         return covariance, replace(self, hidden=hidden, at=pose)
 
@@ -142,6 +149,7 @@ class FrameUncertainty:
             scan=np.append(self.scan, scan),
             pose=np.concatenate([self.pose, pose[None]]),
             covariance=np.concatenate([self.covariance, covariance[None]]),
+            smoothed=np.append(self.smoothed, False),
         )
 
     def without_unused(self, birth: Int) -> FrameUncertainty:
@@ -161,6 +169,7 @@ class FrameUncertainty:
             scan=self.scan[keep],
             pose=self.pose[keep],
             covariance=self.covariance[keep],
+            smoothed=self.smoothed[keep],
         )
 
     def scan_of(self, birth: Int) -> Int:
@@ -171,18 +180,20 @@ class FrameUncertainty:
         k = np.searchsorted(self.serial, birth, side="right") - 1
         return np.where(k >= 0, self.scan[np.maximum(k, 0)], 0)
 
-    def corrected(self, correction: PathCorrection, covariance: Float) -> FrameUncertainty:
-        """Return the state after a correction of the path: reference poses move, and their covariances are
-        replaced.
+    def smoothed_by(self, correction: PathCorrection, covariance: Float) -> FrameUncertainty:
+        """Return the state after a solution of the graph, from which all particles continue: reference poses
+        move, and all of them are smoothed.
 
         Args:
             correction: Path before and after.
-            covariance: Covariance of the corrected pose at the scan of each reference pose, shape (M, 3, 3).
+            covariance: Covariance that the positions of the landmarks cause at the scan of each reference
+                pose, shape (M, 3, 3).
 
         Raises:
             IndexError: The scan of a reference pose is not in the path.
         """
-        return replace(self, pose=correction.poses(self.pose, self.scan), covariance=covariance)
+        pose = correction.poses(self.pose, self.scan)
+        return replace(self, pose=pose, covariance=covariance, smoothed=np.ones(len(pose), np.bool_))
 
     def without_hidden(self) -> FrameUncertainty:
         """Return the state with `hidden` = 0, for particles that are drawn with the complete covariance of
@@ -241,13 +252,14 @@ def _with_frame(
     serial: Int,
     place: Float,
     covariance: Float,
+    smoothed: Bool,
     hidden: Float,
     at: Float,
 ) -> tuple[Float, Float]:
     """Return the covariance and the new `hidden`, both of shape (3, 3); see `FrameUncertainty.with_pose`.
-    `serial`, `place` and `covariance` are `serial`, `pose` and `covariance` of the reference poses, shapes
-    (M,), (M, 3) and (M, 3, 3); the other arguments are those of `with_pose` or attributes."""
-    least, known = np.zeros((3, 3)), 0
+    `place` contains the reference poses, shape (M, 3); the other arguments are those of `with_pose` or
+    attributes."""
+    least, of_map, known = np.zeros((3, 3)), np.zeros((3, 3)), 0
     counts = np.zeros(len(serial), np.int64)
     for j in range(len(hits)):
         dx, dy = mean[j, 0] - pose[0], mean[j, 1] - pose[1]
@@ -262,12 +274,14 @@ def _with_frame(
         return spread + hidden, hidden
     for m in range(len(serial)):
         if counts[m]:
-            least += (
-                counts[m]
-                / known
-                * transported_covariance(covariance[m], pose[0] - place[m, 0], pose[1] - place[m, 1])
-            )
-    both = at_least(spread, least, NOISE / np.sqrt(n_eff))
+            weight = counts[m] / known
+            part = transported_covariance(covariance[m], pose[0] - place[m, 0], pose[1] - place[m, 1])
+            if smoothed[m]:
+                least += weight * spread
+                of_map += weight * part
+            else:
+                least += weight * part
+    both = at_least(spread, least, NOISE / np.sqrt(n_eff)) + of_map
     return both, both - spread
 
 

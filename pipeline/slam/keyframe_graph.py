@@ -160,7 +160,7 @@ class Solution:
         birth: int64, shape (L,), ascending: landmarks of the graph.
         position: Their positions, shape (L, 2) [m].
         covariance: Covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3).
-        conditional: Covariance of the newest keyframe's pose given all other poses and stems, shape (3, 3).
+        conditional: Covariance of each keyframe's pose given all other poses and stems, shape (K, 3, 3).
     """
 
     pose: Float
@@ -453,8 +453,8 @@ class _Problem:
         return x, l, H
 
     def solution(self, x: Float, l: Float, H: Sparse) -> Solution:  # noqa: E741
-        """Return the record of a minimum. A diagonal block of the normal matrix H is the information of a
-        pose given all other unknowns.
+        """Return the record of a minimum. The diagonal blocks of the normal matrix H are the information of
+        each pose given all other unknowns.
 
         Args:
             x: Poses, shape (K, 3).
@@ -462,10 +462,12 @@ class _Problem:
             H: Normal matrix, sparse, shape (3K + 2L, 3K + 2L).
 
         Raises:
-            LinAlgError: Nothing observes the newest pose, or the problem is singular.
+            LinAlgError: The problem is singular.
         """
-        end = 3 * len(x)
-        conditional = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
+        a = np.arange(3 * len(x)).reshape(-1, 3)
+        row, column = np.broadcast_arrays(a[:, :, None], a[:, None, :])
+        information = np.asarray(H[row.ravel(), column.ravel()]).reshape(-1, 3, 3)
+        conditional = np.linalg.inv(information)
         return Solution(x, self.birth, l, self._marginals(H), conditional)
 
     def _triangulated(self) -> Float:

@@ -206,6 +206,7 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameUnce
         scan=np.concatenate([own.scan, other.scan + len(a.genealogy)]),
         pose=np.concatenate([own.pose, pose]),
         covariance=np.concatenate([own.covariance, moved]),
+        smoothed=np.concatenate([own.smoothed, other.smoothed]),
         at=pose[-1],
     )
 
