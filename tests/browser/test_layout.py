@@ -101,6 +101,25 @@ def test_parts_are_collapsed_and_a_layout_is_saved_by_name(wide: Dashboard):
     saved.select_option("Standard")
 
 
+def test_one_box_is_open_and_escape_or_a_press_elsewhere_closes_it(wide: Dashboard):
+    page = wide.page
+    layers, views, layout = (page.locator(f"#{name}") for name in ("layer-list", "view-list", "layout-menu"))
+    page.locator("#layers-button").click()
+    expect(layers).to_be_visible()
+    page.locator("#views-button").click()
+    expect(views).to_be_visible()
+    expect(layers).to_be_hidden()
+    page.locator("#view-name").press("Escape")
+    expect(views).to_be_hidden()
+    expect(page.locator("#views-button")).to_be_focused()
+    page.locator("#layout-button").click()
+    page.locator("#layout-name").click()
+    expect(layout).to_be_visible()
+    page.locator(".figures").click()
+    expect(layout).to_be_hidden()
+    expect(page.locator("#layout-button")).to_have_attribute("aria-expanded", "false")
+
+
 def test_a_stored_layout_that_is_not_one_is_ignored(wide: Dashboard):
     page = wide.page
     for stored in ("{", '{"left": "wide", "top": 1e9}', "[]"):

@@ -19,6 +19,7 @@ FOUND = {
     "chart time": "Chart: Time per stage",
     "label dbh": "Label the scene with DBH",
     "upload rec": "Upload a recording",
+    "fewer points in a cluster": "Minimum points",
 }
 
 
