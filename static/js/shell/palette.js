@@ -18,13 +18,12 @@ export function openPalette() {
   sift();
 }
 
-// Entries with as many of the words as possible in title or keywords. Order: titles that begin with the text, titles with a word
-// that begins with the first word, other titles, keywords.
+// All words except FILLERS must occur in the title or the keywords of an entry. Order: titles that begin with the text, titles with
+// a word that begins with the first word, other titles, keywords.
 function search(text) {
   const words = text.toLowerCase().split(/\s+/).filter((word) => word && !FILLERS.has(word));
   const all = [...ACTIONS.map(([title, keys, , run, , more]) => [title, keys, run, more ?? ""]), ...presentActions()].filter(([, , run]) => mayDo(run));
-  const hits = all.map(([title, , , more = ""]) => words.filter((word) => `${title} ${more}`.toLowerCase().includes(word)).length);
-  const most = Math.max(...hits), fitting = most || !words.length ? all.filter((_, k) => hits[k] === most) : [];
+  const fitting = all.filter(([title, , , more = ""]) => words.every((word) => `${title} ${more}`.toLowerCase().includes(word)));
   return fitting.map((entry, place) => ({ entry, place, rank: rankOf(entry[0], words, text) })).sort((a, b) => a.rank - b.rank || a.place - b.place).map(({ entry }) => entry);
 }
 
