@@ -48,7 +48,7 @@ function ofScan() {
   if (reviewProgress()) return `F1: ${reviewProgress()}`;
   if (state.evaluation?.warning) return "F1 doubtful, see Scores";
   const { right, wrong } = state.map ?? {};
-  return right === null || right === undefined ? "F1 of the map" : `F1 of the map; scan: ${right} of ${right + wrong} true trees`;
+  return right === null || right === undefined ? "F1 of the map" : `F1 of the map; this scan: ${right} of ${right + wrong} true`;
 }
 
 // Explanations of the first states.
@@ -96,7 +96,7 @@ function show() {
   document.body.classList.toggle("cloud", isCloud());
   cells.health.cell.title = healthFigures();
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
-  cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; scan: how many of its stems are at trees of the ground truth";
+  cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   const title = titleOf(status.source, show);
   showName(title || NONE);
