@@ -13,7 +13,9 @@ if TYPE_CHECKING:
     from pipeline.config.model import Value
 
 
-COMPILING = "compiling for this machine; it takes some minutes the first time, less for a new kind of source"
+COMPILING = (
+    "compiling for this machine; this takes minutes the first time, and less for each new kind of source"
+)
 
 
 def count(n: int, one: str, many: str = "") -> str:

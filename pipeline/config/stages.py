@@ -190,8 +190,8 @@ class Clustering(Stage):
     """Neighbours, including the point itself, that make a point a core point (DBSCAN min_samples)."""
 
     stem_area: float = number(0.1, "Stem area", "m²", 0.0, 10.0, 0.01)
-    """Where a stem surface of this area returns fewer points than a core point needs, points get a larger
-    weight; 0 turns the weights off."""
+    """Far stems return few points: where a stem surface of this area returns fewer points than a core point
+    needs, each point counts more; 0 turns this off."""
 
     weight_max: int = count(2, "Maximum weight", "", 1, 100)
     """Maximum weight of one point."""

@@ -139,7 +139,7 @@ SCENARIOS: dict[str, Scenario] = {
         placed=_PAPER_PLOT,
     ),
     "slope": Scenario(
-        line="A hillside of 14 degrees, in parts up to 20, where level bands of height fail",
+        line="A hillside of 14 degrees, up to 20 in parts: heights above a level plane do not work here",
         waypoints=_ring(9.5, 1.6, 3, 18),
         closed=True,
         speed=0.8,

@@ -66,10 +66,10 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     canvas.press("s")
     hint = page.locator("#annotate-hint")
     expect(hint).to_contain_text(f"Tree {first['number']}, detected in")
-    expect(hint).to_contain_text(re.compile(r"votes: tree [\d.]+ % \(40\.?0? % needed\)"))
+    expect(hint).to_contain_text(re.compile(r"votes: tree [\d.]+ % \(40 % needed\)"))
     size = canvas.bounding_box()
     canvas.press("y")
-    expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} found trees reviewed")
+    expect(page.locator("#annotate-count")).to_contain_text(f"1 of {len(found)} trees reviewed")
     expect(page.locator("#legend-annotation")).to_be_visible()
     assert canvas.bounding_box() == size
     (row,) = rows(person)
@@ -413,16 +413,16 @@ def test_annotations_survive_a_killed_server_and_are_exported(chromium: Browser,
         expect(page.locator("#annotations tbody tr")).to_have_count(2)
         assert rows(other) == before
         files = {}
-        for name in ("CSV", "GeoJSON"):
+        for name in ("Save CSV", "Save GeoJSON"):
             with page.expect_download() as download:
                 panel.get_by_role("link", name=name, exact=True).click()
             files[name] = download.value.path().read_text(encoding="utf-8")
-        head, *lines = csv.reader(files["CSV"].splitlines())
+        head, *lines = csv.reader(files["Save CSV"].splitlines())
         written = [dict(zip(head, line, strict=True)) for line in lines]
         for axis in ("x", "y"):
             places = sorted(row[axis] for row in before)
             assert sorted(float(row[f"{axis}_m"]) for row in written) == pytest.approx(places, abs=1e-3)
-        assert len(json.loads(files["GeoJSON"])["features"]) == 2
+        assert len(json.loads(files["Save GeoJSON"])["features"]) == 2
         assert other.errors == []
 
 

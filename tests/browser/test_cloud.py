@@ -65,7 +65,7 @@ def test_a_cloud_is_opened_and_its_stems_have_sections_and_heights(page: Dashboa
     expect(page.page.locator("#timeline")).to_be_hidden()
     expect(page.page.locator("[data-figure=health]")).to_be_hidden()
     heads = [text.strip(" ▲▼") for text in page.page.locator("#trees thead th:visible").all_inner_texts()]
-    assert heads == ["tree", "x m", "y m", "± cm", "DBH cm", "height m", "lean °"]
+    assert heads == ["tree", "x m", "y m", "position ± cm", "DBH cm", "height m", "lean °"]
     for found in page.ask("/api/trees")["trees"]:
         x, y, height = min(PLACES, key=lambda at: np.hypot(at[0] - found["x"], at[1] - found["y"]))
         assert np.hypot(x - found["x"], y - found["y"]) < 0.05

@@ -99,7 +99,9 @@ def test_scores_are_shown_in_centimetres(dashboard: Dashboard):
         score = dashboard.ask("/api/evaluation")
         return all(
             # Two decimals are shown.
-            unit == "cm" and float(figure) == pytest.approx(scale * score[key], rel=0.01, abs=0.006)
+            unit == "cm"
+            and float(figure.replace("\N{MINUS SIGN}", "-"))
+            == pytest.approx(scale * score[key], rel=0.01, abs=0.006)
             for (figure, unit), (scale, key) in zip(shown().values(), CENTIMETRES.values(), strict=True)
         )
 

@@ -117,7 +117,7 @@ def test_actions_are_found_and_executed(dashboard: Dashboard):
 @pytest.mark.parametrize(
     ("word", "found"),
     [
-        ("help", "Keyboard shortcuts"),
+        ("help", "Settings and keyboard shortcuts"),
         ("zoom", "Zoom in on the map"),
         ("delete", "Annotate: delete the chosen annotation"),
         ("screenshot", "Save the map as a picture (PNG)"),

@@ -49,7 +49,7 @@ def test_runs_are_stored_compared_renamed_deleted_and_replayed(own: Dashboard, t
     older = own.ask("/api/runs")["runs"][1]
     rows.nth(1).get_by_role("button").click()
     expect(page.locator("[data-figure=trees] dd")).to_have_text(str(older["trees"]))
-    expect(page.locator("[data-figure=lost] dd")).to_have_text("0 %")
+    expect(page.locator("[data-figure='pose lost'] dd")).to_have_text("0 %")
     expect(page.locator(".run-map canvas")).to_be_visible()
 
     for row in rows.all():
@@ -67,9 +67,7 @@ def test_runs_are_stored_compared_renamed_deleted_and_replayed(own: Dashboard, t
     page.route("**/api/runs/compare?*", unaligned)  # as of two places
     rows.nth(1).get_by_role("button").click()
     page.get_by_role("button", name="Compare two").click()
-    expect(page.locator("#run-detail [role=alert]")).to_contain_text(
-        "The stems of the two visits do not agree"
-    )
+    expect(page.locator("#run-detail [role=alert]")).to_contain_text("The two maps do not fit together")
     expect(page.locator("#run-detail h2")).to_contain_text("A: ")
     page.unroute("**/api/runs/compare?*")
 

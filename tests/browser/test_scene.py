@@ -253,7 +253,7 @@ def test_keys_work_on_the_page_and_in_the_scene(dashboard: Dashboard):
     expect(page.get_by_role("combobox", name="Search all actions")).to_be_focused()
     page.keyboard.press("Escape")
     page.locator("#map").press("?")
-    expect(page.get_by_role("heading", name="Keyboard shortcuts")).to_be_visible()
+    expect(page.get_by_role("heading", name="Settings and keyboard shortcuts")).to_be_visible()
 
 
 def test_a_key_of_the_page_switches_following(dashboard: Dashboard):

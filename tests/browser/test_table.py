@@ -78,7 +78,9 @@ def test_a_filter_selects_trees(dashboard: Dashboard):
         f"DBH<{middle}": lambda t: t["dbh_cm"] is not None and t["dbh_cm"] < middle,
         "dbh none": lambda t: t["dbh_cm"] is None,
         f"seen >= {often} x > 0": lambda t: t["observations"] >= often and t["x"] > 0,
+        f"scans >= {often} λ1/λ2 < 6": lambda t: t["observations"] >= often and (t["eccentricity"] or 9) < 6,
         "y ..-1": lambda t: t["y"] <= -1,
+        "x < \N{MINUS SIGN}1": lambda t: t["x"] < -1,
         "1": lambda t: str(t["number"]).startswith("1"),
         "unjudged": lambda _: True,
         "judged": lambda _: False,
@@ -89,6 +91,8 @@ def test_a_filter_selects_trees(dashboard: Dashboard):
         assert sorted(listed(page)) == sorted(fits), text
         expect(page.locator("#tree-count")).to_have_text(f"{len(fits)} of {len(held)}")
     expect(page.locator("#trees-empty")).to_contain_text("No tree matches “judged”")
+    page.locator("#find").fill("height > 10")
+    expect(page.locator("#trees-empty")).to_contain_text("measured in a whole cloud only")
     page.locator("#find").fill("as thick as my leg")
     expect(page.locator("#trees-empty")).to_contain_text("“as thick as my leg” is not a condition")
     expect(page.locator("#find")).to_have_attribute("aria-invalid", "true")

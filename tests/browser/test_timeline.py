@@ -124,7 +124,7 @@ def test_a_seek_shows_its_target_and_compiling_counts_from_its_start(dashboard: 
     }
     word, notice, _, seeking = page.evaluate(UNDER, compiling)
     assert (word, seeking) == ("Waiting", "")
-    passed = re.search(r"Compiling\. 43 % are done\. (\d+) s so far", notice)
+    passed = re.search(r"Compiling\. 43 % done after (\d+) s\.", notice)
     assert passed is not None, notice
     assert int(passed[1]) >= 98, "from its start, not from the opening of the page"
     expect(page.locator("#state b")).to_have_text("Paused")

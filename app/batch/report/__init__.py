@@ -80,9 +80,12 @@ def translated(message: str, texts: dict[str, str]) -> str:
     return message
 
 
+MINUS = "\N{MINUS SIGN}"
+
+
 @dataclass(frozen=True, slots=True)
 class Numbers:
-    """Numbers as texts of a language: decimal point and group separator."""
+    """Numbers as texts of a language, with a true minus sign: decimal point and group separator."""
 
     point: str
     group: str
@@ -92,12 +95,13 @@ class Numbers:
         if value is None or not math.isfinite(value):
             return "\N{EN DASH}"
         text = f"{value:z,.{digits}f}"  # without a sign of zero
-        return text.replace(",", "\0").replace(".", self.point).replace("\0", self.group)
+        text = text.replace(",", "\0").replace(".", self.point).replace("\0", self.group)
+        return text.replace("-", MINUS)
 
     def short(self, value: float) -> str:
         """Return a number with at most six significant digits and no zeros at its end, without group
         separators; from a million on in exponent form."""
-        return f"{value:.6g}".replace(".", self.point)
+        return f"{value:.6g}".replace(".", self.point).replace("-", MINUS)
 
 
 def report_page(

@@ -2,7 +2,7 @@
 
 import { get, put, request } from "../core/api.js";
 import { byId, recall, remember } from "../core/dom.js";
-import { count, percent } from "../core/format.js";
+import { count, share } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { distance, nearest } from "../core/nearest.js";
 import { attempted, showNews } from "../core/problem.js";
@@ -48,7 +48,8 @@ function browser() {
   return made;
 }
 const me = browser();
-export const myName = () => recall("who") ?? `browser ${me.slice(0, 4)}`;
+export const givenName = () => recall("who") ?? ""; // "" if this person gave none
+export const myName = () => givenName() || `browser ${me.slice(0, 4)}`;
 
 // The server records with each change of a parameter who made it.
 function signAs(name) {
@@ -56,7 +57,7 @@ function signAs(name) {
 }
 
 export function callMe(name) {
-  if (NAME.test(name)) remember("who", name);
+  if (!name || NAME.test(name)) remember("who", name);
   signAs(myName());
 }
 
@@ -212,7 +213,7 @@ export function reviewProgress() {
 export function votesText({ number }) {
   const of = votes.of.get(number);
   if (!of || of.votes === null) return "";
-  return `, votes: tree ${percent(of.votes)} (${percent(votes.needed)} needed), ${of.next} ${percent(of.next_votes)}`;
+  return `, votes: tree ${share(of.votes)} (${share(votes.needed)} needed), ${of.next} ${share(of.next_votes)}`;
 }
 
 const updateVotes = throttled(async () => {

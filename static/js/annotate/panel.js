@@ -1,17 +1,17 @@
 // The tab Annotate: review of the found trees, the list of annotations, and the keys of the tab.
 
 import { button, byId, el, setText } from "../core/dom.js";
-import { count, dbhText, fixed, NONE, seenText } from "../core/format.js";
-import { on, selectedTree, state, trees } from "../core/store.js";
+import { count, dbhText, figure, fixed, NONE, seenText } from "../core/format.js";
+import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, callMe, change, choose, contradictionText, draft, importTable, KINDS, myName, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, undo, unreviewed, votesText } from "./annotations.js";
+import { annotating, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, undo, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, startCard } from "./card.js";
 import { learnSection, startLearning } from "./learning.js";
 import { startSection } from "./section.js";
 
-const AGAINST = { both: "its ground truth and annotations", own: "its ground truth only", annotations: "annotations only" };
+const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
 const EVERY = 300; // [ms] between two updates while a run plays
 const LARGEST_TABLE = 900_000; // [bytes]
 const LARGEST_DBH = 1000; // [cm]
@@ -21,14 +21,14 @@ let imported = ""; // result of the last import
 function build() {
   const kind = el("select", { id: "annotate-kind", "aria-label": "Class of a rejected tree", onchange: () => { draft.kind = kind.value; } },
     ...KINDS.slice(1).map((each) => el("option", { value: each, text: each, selected: each === draft.kind })));
-  const name = el("input", { id: "annotate-name", type: "text", value: myName(), maxlength: "40", autocomplete: "off", onchange: () => {
-    const fits = NAME.test(name.value.trim());
+  const name = el("input", { id: "annotate-name", type: "text", value: givenName(), placeholder: "your name", title: "Your edits are listed under this name, else under that of this browser", maxlength: "40", autocomplete: "off", onchange: () => {
+    const fits = !name.value.trim() || NAME.test(name.value.trim());
     name.setCustomValidity(fits ? "" : "Begin with a letter or digit, then letters, digits, spaces and . @ - _");
     name.reportValidity();
     if (fits) callMe(name.value.trim());
   } });
   const unit = el("select", { id: "annotate-unit", "aria-label": "Unit of a DBH column whose header names none" },
-    ...[["", "DBH unit"], ["cm", "cm"], ["m", "m"], ["mm", "mm"]].map(([value, text]) => el("option", { value, text })));
+    ...[["", "unit of DBH in the file"], ["cm", "cm"], ["m", "m"], ["mm", "mm"]].map(([value, text]) => el("option", { value, text })));
   const file = el("input", { id: "annotate-file", type: "file", accept: ".csv,.txt,text/csv", hidden: true, "aria-label": "Table of trees", onchange: async () => {
     const [chosen] = file.files;
     file.value = "";
@@ -55,10 +55,10 @@ function build() {
       el("table", { id: "annotations", class: "plain" }, el("thead", {}, el("tr", {},
         ...["tree", "class", "DBH cm", "x m", "y m", "by"].map((text) => el("th", { scope: "col", text })), el("td"))), el("tbody"))),
     el("div", { class: "annotate-files" },
-      el("label", {}, "Your name ", name),
+      el("label", {}, "Name ", name),
       button("annotate-import", "Import CSV", "Columns x_m, y_m and optionally dbh_cm and class; headers of other tools are recognised", () => file.click()), unit, file,
-      el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "CSV", title: "Download the annotations as CSV" }),
-      el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "GeoJSON", title: "Download the annotations as GeoJSON" })),
+      el("a", { class: "small", href: "/api/annotations.csv", download: "truth.csv", text: "Save CSV", title: "Download the annotations as CSV" }),
+      el("a", { class: "small", href: "/api/annotations.geojson", download: "truth.geojson", text: "Save GeoJSON", title: "Download the annotations as GeoJSON" })),
     learnSection());
 }
 
@@ -101,6 +101,8 @@ function show(line, row) {
   }
   const [tree, , , x, y, who] = line.node.cells;
   const place = draft.moved?.id === row.id ? draft.moved : row;
+  const mapped = treeOf(treeNumberOf(row))?.dbh_cm ?? null;
+  line.dbh.placeholder = mapped === null ? NONE : `mapped ${figure(mapped)}`;
   setText(tree, String(treeNumberOf(row) ?? NONE));
   setText(x, fixed(place.x, 2));
   setText(y, fixed(place.y, 2));
@@ -114,7 +116,7 @@ function fill() {
   const problem = state.annotations?.problem || "";
   const found = trees().length, left = unreviewed();
   const selected = selectedTree();
-  setText(byId("annotate-count"), state.map ? `${found - left.length} of ${found} found trees reviewed, ${left.length} left` : "Nothing mapped yet");
+  setText(byId("annotate-count"), state.map ? `${found - left.length} of ${count(found, "tree")} reviewed` : "Nothing mapped yet");
   byId("annotate-undo").disabled = !draft.undo;
   byId("annotate-redo").disabled = !draft.redo;
   for (const id of ["add", "import"]) byId(`annotate-${id}`).disabled = Boolean(problem) || !state.annotations?.run;
@@ -138,7 +140,7 @@ function hint(tree) {
   if (draft.adding) return "Click on the map where a tree is missing; the ring shows where it will be added. Esc ends.";
   if (imported) return imported;
   if (tree) return `Tree ${tree.number}, ${seenText(tree)}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?`;
-  if (!rows().length) return "State which trees exist: press Next to review the found trees, or Add to click missed trees on the map (Shift+click in the 3D scene).";
+  if (!rows().length) return "Press Next to review the trees one by one, or Add and click on the map where a tree was missed (Shift+click in the 3D scene).";
   return truthText();
 }
 

@@ -12,6 +12,10 @@ import { visible } from "../shell/tabs.js";
 
 const EVERY = 80, EVERY_PLAYING = 800; // [ms] between two updates; a row that is replaced under the pointer takes no click
 const panel = () => byId("panel-clusters");
+
+// Texts of the counts of points where they differ from the names in the files of results.
+const COUNTS = { "without a value": "invalid", "out of range": "outside the range limits", "out of the box": "outside the pass-through box", "averaged in voxels": "merged by the voxel filter", clustered: "in clusters", noise: "in no cluster" };
+
 function show() {
   if (!visible("clusters")) return;
   if (!state.map) {
@@ -56,14 +60,14 @@ function clusterTable() {
     ...[String(k + 1), c.verdict[k], String(c.size[k]), c.eccentricity[k] === null ? "∞" : figure(c.eccentricity[k]),
       figure(c.radius_cm[k]), fixed(c.distance[k], 1)].filter(applies).map((text) => el("td", { text })));
   });
-  const heads = [["cluster"], ["verdict"], ["points"], ["e", "Eccentricity λ1/λ2"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
+  const heads = [["cluster", "Number of the cluster in this scan, as in its Story"], ["verdict", "Verdict on this cluster, from this scan only"], ["points", "Number of its points"], ["λ1/λ2", "Eccentricity λ1/λ2"], ["r cm", "Radius of the fitted circle"], ["m away", "Distance from the sensor"]];
   return el("table", { id: "cluster-table", class: "plain" }, el("thead", {}, el("tr", {}, ...heads.filter(applies).map(([text, title]) => el("th", { scope: "col", text, title })))),
     el("tbody", {}, ...rows));
 }
 
 function points() {
   const rows = Object.entries(state.map.counts ?? {}).flatMap(([name, number]) =>
-    [el("dt", { text: name.replaceAll("_", " ") }), el("dd", { text: number.toLocaleString("en") })]);
+    [el("dt", { text: COUNTS[name] ?? name.replaceAll("_", " ") }), el("dd", { text: number.toLocaleString("en") })]);
   return rows.length ? el("dl", { class: "list" }, ...rows) : "";
 }
 

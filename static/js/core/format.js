@@ -1,18 +1,35 @@
-// Numbers for people: three significant digits at most, "–" for unknown.
+// Numbers for people: three significant digits at most, a true minus sign, "–" for unknown.
 
 export const NONE = "–";
 const known = (value) => typeof value === "number" && Number.isFinite(value);
+
+// A rounded number has no negative zero.
+const withMinus = (text) => (text.startsWith("-") ? `${Number(text) === 0 ? "" : "−"}${text.slice(1)}` : text);
 
 export function figure(value, digits = 3) {
   if (!known(value)) return NONE;
   if (value === 0) return "0";
   const whole = Math.floor(Math.log10(Math.abs(value))) + 1;
-  return value.toFixed(Math.max(0, Math.min(digits - whole, digits - 1)));
+  return withMinus(value.toFixed(Math.max(0, Math.min(digits - whole, digits - 1))));
 }
 
-export const fixed = (value, decimals) => (known(value) ? value.toFixed(decimals) : NONE);
+export const fixed = (value, decimals) => (known(value) ? withMinus(value.toFixed(decimals)) : NONE);
 
 export const percent = (rate) => (known(rate) ? `${figure(100 * rate)} %` : NONE);
+
+// A share of votes, with one decimal at most: "40 %", "8.7 %".
+export const share = (rate) => (known(rate) ? `${Number((100 * rate).toFixed(1))} %` : NONE);
+
+// [value, sigma] with as many decimals for the value as for its sigma: ["2.9", "0.9"], ["12.04", "0.03"].
+export function withSigma(value, sigma) {
+  if (!known(value) || !known(sigma)) return [figure(value), NONE];
+  if (sigma < 0.0005) return [figure(value), "0"];
+  const decimals = sigma >= 9.95 ? 0 : sigma >= 0.095 ? 1 : Math.min(3, -Math.floor(Math.log10(sigma)));
+  return [fixed(value, decimals), fixed(sigma, decimals)];
+}
+
+// "12.0 ± 0.2", or the value alone where sigma is unknown.
+export const plusMinus = (value, sigma) => (known(value) && known(sigma) ? withSigma(value, sigma).join(" ± ") : figure(value));
 
 // Minutes, seconds and tenths: "2:13.4".
 export function clock(seconds) {
@@ -31,6 +48,9 @@ export function roughly(seconds) {
   return `${seconds > 10 ? 10 * Math.round(seconds / 10) : Math.max(1, Math.round(seconds))} s`;
 }
 
+// x and y of a tree [m]: rounded first as the server rounds those of the table, so that both show the same.
+export const placeText = (position) => `${position.map((value) => fixed(Number(value.toFixed(4)), 2)).join(", ")} m`;
+
 // --- trees -------------------------------------------------------------------------------------
 
 // Whether the sigma of a tree is assumed: no single scan detected it, only the accumulated scans did.
@@ -38,9 +58,9 @@ export const isAssumed = (tree) => tree.observations === 0;
 
 export function dbhText({ dbh_cm: dbh, sigma_dbh_cm: sigma }) {
   if (dbh === null) return "DBH not measured";
-  return `DBH ${figure(dbh)}${known(sigma) ? ` ± ${figure(sigma, 2)}` : ""} cm`;
+  return `DBH ${plusMinus(dbh, sigma)} cm`;
 }
 
-export const heightText = ({ height_m: height, sigma_height_m: sigma }) => (known(height) ? `${fixed(height, 1)} ± ${figure(sigma, 2)} m` : "not seen");
+export const heightText = ({ height_m: height, sigma_height_m: sigma }) => (known(height) ? `${plusMinus(height, sigma)} m` : "not seen");
 
 export const seenText = (tree) => (isAssumed(tree) ? "detected in no single scan, only in the accumulated scans" : `detected in ${count(tree.observations, "scan")}`);

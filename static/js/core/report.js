@@ -5,7 +5,7 @@ import { el } from "./dom.js";
 import { fileName, saveBytes } from "./download.js";
 import { attempted, showNews } from "./problem.js";
 
-const REPORTS = { "en.html": "Report (HTML)", "en.pdf": "Report (PDF)", "de.html": "Bericht (HTML)", "de.pdf": "Bericht (PDF)" };
+const REPORTS = { "en.html": "Report (HTML)", "en.pdf": "Report (PDF)", "de.html": "Report in German (HTML)", "de.pdf": "Report in German (PDF)" };
 
 export const reportOptions = () => Object.entries(REPORTS).map(([value, text]) => el("option", { value, text }));
 export const isReport = (choice) => choice in REPORTS;

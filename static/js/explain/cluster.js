@@ -1,7 +1,7 @@
 // The story of a cluster: its verdict, the checks that led to it, and its fit seen from above.
 
 import { definitions, el, letterOf } from "../core/dom.js";
-import { clock, figure, NONE } from "../core/format.js";
+import { clock, figure, NONE, plusMinus } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { isCloud } from "../core/store.js";
 import { verdictOf } from "../core/verdicts.js";
@@ -95,7 +95,7 @@ function figures(story) {
   const fit = story.circle;
   const rows = [["points", String(story.size)], ["λ1/λ2", story.eccentricity === null && story.size > 1 ? "∞" : figure(story.eccentricity)], ["from sensor", `${figure(story.distance)} m`]];
   if (fit) {
-    rows.push(["radius", `${figure(100 * fit.radius)} ± ${figure(100 * fit.radius_sigma, 2)} cm`], ["diameter", `${figure(200 * fit.radius)} ± ${figure(200 * fit.radius_sigma, 2)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
+    rows.push(["radius", `${plusMinus(100 * fit.radius, 100 * fit.radius_sigma)} cm`], ["diameter", `${plusMinus(200 * fit.radius, 200 * fit.radius_sigma)} cm`], ["visible arc", `${figure(fit.arc_deg)}°`],
       ["tilt of the axis", `${figure(fit.lean_deg, 2)}°`], ["centre ±", `${figure(100 * fit.ellipse[0], 2)} × ${figure(100 * fit.ellipse[1], 2)} cm`]);
   } else rows.push(["circle", "none fitted"]);
   return definitions(rows);
@@ -118,16 +118,20 @@ function residuals(story) {
       text(left - 5, y(-most), `−${figure(most, 2)}`, "small", "end"), ...dots, ...marks));
 }
 
+// Without a fitted circle the radial deviation is 0 in the data, which is no measurement.
+const noCircle = (story, check) => !story.circle && !story.sections && check.figure === "radial deviation" && check.value === 0;
+
 function checks(story) {
   if (!story.checks.length) return "";
   let decided = false;
   const rows = story.checks.map((check) => {
     const decides = check.fails && !decided;
     decided ||= check.fails;
-    const limit = check.relation ? `${check.relation} ${plain(check.limit, check.unit)}` : "no";
-    const value = check.relation ? plain(check.value, check.unit) : check.fails ? "yes" : "no";
+    const limit = check.relation ? `${check.relation} ${plain(check.limit, check.unit)}` : "must be no";
+    const given = noCircle(story, check) ? null : check.value;
+    const value = check.relation ? plain(given, check.unit) : check.fails ? "yes" : "no";
     return el("tr", { class: `${check.fails ? "fails" : ""} ${decides ? "decides" : ""}`.trim(), title: check.parameter ? `Limit: ${check.title} (${check.parameter})` : "" },
-      el("td", { text: check.fails ? "✕" : check.value === null ? "·" : "✓" }), el("td", { text: named(check) }), el("td", { text: value }),
+      el("td", { text: check.fails ? "✕" : given === null ? "·" : "✓" }), el("td", { text: named(check) }), el("td", { text: value }),
       el("td", { text: limit }), el("td", { text: check.fails ? check.verdict : "" }));
   });
   return el("figure", {}, el("figcaption", { text: "Checks; the first one that fails decides" }),

@@ -15,7 +15,7 @@ const dots = (places, cls) => svg("path", { d: places.map(([x, y]) => `M${x.toFi
 
 export function gatheredFigure({ points, dbh }) {
   const title = "Accumulated points";
-  if (!points.length) return el("figure", {}, el("figcaption", { text: title }), el("p", { class: "dim note", text: "None at this place yet. One scan per interval is accumulated (Tune, Classification), but none with a preset that does not classify, such as paper." }));
+  if (!points.length) return el("figure", {}, el("figcaption", { text: title }), el("p", { class: "dim note", text: "None at this place yet. Scans are accumulated at intervals (Tune, Classification); presets that do not classify, such as paper, accumulate none." }));
   const atBreast = ([, , z]) => z >= LOW && z < HIGH;
   const near = points.filter(atBreast), others = points.filter((point) => !atBreast(point));
   const found = dbh === null ? "the tree has no DBH yet, so no circle is fitted" : `green: the fitted circle at breast height, DBH ${figure(100 * dbh)} cm`;

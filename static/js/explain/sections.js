@@ -1,7 +1,7 @@
 // The story of a stem of a whole cloud: its height, cross-sections with the fitted circles, and the stem curve.
 
 import { definitions, el, letterOf } from "../core/dom.js";
-import { count, figure, fixed, NONE } from "../core/format.js";
+import { count, figure, fixed, NONE, placeText, plusMinus } from "../core/format.js";
 import { circle, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
 
@@ -18,10 +18,10 @@ function figures(story) {
   const [major, minor] = story.ellipse;
   const measured = story.dbh !== null, seen = story.height !== null;
   return el("div", { class: "stem-figures" }, definitions([
-    ["DBH", measured ? `${figure(100 * story.dbh)} ± ${figure(100 * story.dbh_sigma, 2)} cm` : NONE],
-    ["height", seen ? `${fixed(story.height, 1)} ± ${figure(story.height_sigma, 2)} m` : "not seen"],
+    ["DBH", measured ? `${plusMinus(100 * story.dbh, 100 * story.dbh_sigma)} cm` : NONE],
+    ["height", seen ? `${plusMinus(story.height, story.height_sigma)} m` : "not seen"],
     ["lean", `${fixed(story.lean_deg, 1)}°`], ["covered", `${figure(story.coverage_deg)}° of 360°`],
-    ["x, y", `${story.position[0].toFixed(2)}, ${story.position[1].toFixed(2)} m`], ["position ±", `${figure(100 * major, 2)} × ${figure(100 * minor, 2)} cm`]]),
+    ["x, y", placeText(story.position)], ["position ±", `${figure(100 * major, 2)} × ${figure(100 * minor, 2)} cm`]]),
   measured ? "" : el("p", { class: "dim note", text: `The DBH needs ${figure(story.dbh_arc_deg)}° of the circumference.` }),
   seen ? "" : el("p", { class: "dim note", text: `Height not seen: ${story.height_hidden}.` }));
 }
@@ -59,7 +59,7 @@ function stemCurve({ sections, dbh, dbh_sigma: sigma }) {
   const ticks = Array.from({ length: Math.floor(most / step) + 1 }, (_, k) => k * step);
   return el("figure", {}, el("figcaption", { text: `Stem curve: diameter over height${dbh === null ? "" : "; the ring is the DBH"}` }),
     picture(width, tall, "Diameter of the stem over the height above the ground", line(left, bottom, right, bottom, "zero"), line(left, top, left, bottom, "zero"),
-      ...ticks.map((value) => text(x(value), bottom + 15, figure(100 * value), "small", "middle")), text(right, bottom + 29, "diameter [cm]", "small", "end"),
+      ...ticks.map((value) => text(x(value), bottom + 15, String(Math.round(100 * value)), "small", "middle")), text(right, bottom + 29, "diameter [cm]", "small", "end"),
       ...Array.from({ length: Math.floor(high) + 1 }, (_, k) => text(left - 6, y(k) + 4, String(k), "small", "end")), text(4, top - 2, "m", "small"),
       ...bars, curve, ...breast));
 }

@@ -1,7 +1,7 @@
 // The story of a tree: verdict, diameter, observed sides, and the history of its position.
 
 import { definitions, el, letterOf } from "../core/dom.js";
-import { clock, count, figure, isAssumed, NONE } from "../core/format.js";
+import { clock, count, figure, isAssumed, NONE, placeText, plusMinus } from "../core/format.js";
 import { arc, circle, ellipse, line, picture, scaleBar, svg, text } from "../core/svg.js";
 import { verdictOf } from "../core/verdicts.js";
 import { timeLink } from "../playback/time_link.js";
@@ -30,9 +30,9 @@ function seen(story) {
 }
 
 function overview(story, showCluster) {
-  const dbh = story.dbh === null ? NONE : `${figure(100 * story.dbh)} ± ${figure(100 * story.dbh_sigma, 2)} cm`;
-  const rows = [["DBH", dbh], ["covered", `${figure(story.coverage_deg)}° of 360°`], ["x, y", `${story.position[0].toFixed(2)}, ${story.position[1].toFixed(2)} m`],
-    ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["mean λ1/λ2", figure(story.eccentricity)]];
+  const dbh = story.dbh === null ? NONE : `${plusMinus(100 * story.dbh, 100 * story.dbh_sigma)} cm`;
+  const rows = [["DBH", dbh], ["covered", `${figure(story.coverage_deg)}° of 360°`], ["x, y", placeText(story.position)],
+    ["position ±", isAssumed(story) ? `≈ ${figure(100 * story.ellipse[0], 2)} cm, assumed` : `${figure(100 * story.ellipse[0], 2)} × ${figure(100 * story.ellipse[1], 2)} cm`], ["λ1/λ2", figure(story.eccentricity)]];
   return el("div", { class: "story-fit" }, covered(story), el("div", {},
     definitions(rows),
     story.dbh === null ? el("p", { class: "dim note", text: `The DBH needs ${figure(story.dbh_arc_deg)}° of the circumference.` }) : "",

@@ -1,6 +1,6 @@
 // Paints 2D maps as in Fig. 5 of the paper: path grey, robot a red triangle, trees as circles with their numbers.
 
-import { isAssumed } from "../core/format.js";
+import { fixed, isAssumed } from "../core/format.js";
 import { nearest } from "../core/nearest.js";
 import { colours } from "../core/theme.js";
 import { verdictOf } from "../core/verdicts.js";
@@ -20,10 +20,11 @@ export const treeAt = (trees, [px, py], view) => nearest(trees, (tree) => {
   return Math.hypot(px - x, py - y) - symbolRadius(tree, view.scale);
 }, TREE_REACH);
 
-// Grid and scale bar around what `paint` draws.
+// Grid, scale bar and coordinates around what `paint` draws.
 export function drawFrame(pen, view, paint) {
-  drawGrid(pen, view);
+  const labels = drawGrid(pen, view);
   paint();
+  for (const [text, x, y, align] of labels) drawText(pen, text, x, y, { font: "10.5px", align, colour: colours.axis });
   drawScaleBar(pen, view);
 }
 
@@ -55,34 +56,34 @@ export function drawCircle(pen, x, y, radius) {
 }
 
 // Text with a margin in the colour of the surface, readable on any ground.
-export function drawText(pen, text, x, y, { font, align = "center", margin = 4 }) {
-  Object.assign(pen, { font: `${font} ${colours.font}`, textAlign: align, lineJoin: "round", strokeStyle: colours.surface, fillStyle: colours.text, lineWidth: margin });
+export function drawText(pen, text, x, y, { font, align = "center", margin = 4, colour = colours.text }) {
+  Object.assign(pen, { font: `${font} ${colours.font}`, textAlign: align, lineJoin: "round", strokeStyle: colours.surface, fillStyle: colour, lineWidth: margin });
   pen.strokeText(text, x, y);
   pen.fillText(text, x, y);
 }
 
+// Returns the coordinates of the lines as [text, x, y, alignment], which are drawn above the content.
 function drawGrid(pen, view) {
-  const step = view.step();
+  const labels = [], step = view.step();
   const [x0, y0] = view.toMap(0, view.height);
   const [x1, y1] = view.toMap(view.width, 0);
   const decimals = Math.max(0, -Math.floor(Math.log10(step)));
-  Object.assign(pen, { strokeStyle: colours.grid, lineWidth: 1, fillStyle: colours.axis, font: `10.5px ${colours.font}` });
+  Object.assign(pen, { strokeStyle: colours.grid, lineWidth: 1 });
   pen.beginPath();
   for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) {
     const px = Math.round(view.toScreen(x, 0)[0]) + 0.5;
     pen.moveTo(px, 0);
     pen.lineTo(px, view.height);
-    pen.textAlign = "center";
-    if (px > 30 && px < view.width - 120) pen.fillText(x.toFixed(decimals), px, view.height - 6);
+    if (px > 30 && px < view.width - 120) labels.push([fixed(x, decimals), px, view.height - 6, "center"]);
   }
   for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) {
     const py = Math.round(view.toScreen(0, y)[1]) + 0.5;
     pen.moveTo(0, py);
     pen.lineTo(view.width, py);
-    pen.textAlign = "left";
-    if (py > 24 && py < view.height - 22) pen.fillText(y.toFixed(decimals), 5, py - 3);
+    if (py > 24 && py < view.height - 22) labels.push([fixed(y, decimals), 5, py - 3, "left"]);
   }
   pen.stroke();
+  return labels;
 }
 
 export function drawLine(pen, view, points, colour, width) {

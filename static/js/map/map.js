@@ -3,7 +3,7 @@
 import { annotating, draft, rows as annotations } from "../annotate/annotations.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "../annotate/pointer.js";
 import { drawSection } from "../annotate/section.js";
-import { byId } from "../core/dom.js";
+import { byId, setText } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
 import { dbhText, heightText, NONE, seenText } from "../core/format.js";
 import { select, selectCluster } from "../core/live_feed.js";
@@ -62,7 +62,7 @@ function describe(at) {
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isCloud() ? `height ${heightText(tree)}` : seenText(tree));
   else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
-  if (truth) lines.push(`Ground truth: ${truth.kind}, ${truth.dbh_cm === null ? "DBH unknown" : dbhText(truth)}`);
+  if (truth) lines.push(`Ground truth: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
   return lines.join("\n") || NONE;
 }
 
@@ -84,8 +84,9 @@ function snapped(at) {
 function showLegend() {
   const kinds = (state.truth ?? []).map(({ kind }) => kind);
   const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"), plot: plots().length,
-    hollow: trees().some((tree) => tree.dbh_cm === null), annotation: annotating() && annotations().length };
+    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: !isCloud() && state.odometry.some(Boolean), ghost: Boolean(state.ghost?.ghost.length), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
+  setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");
 }
 
 function choose(at) {
@@ -122,6 +123,6 @@ export function startMap() {
   byId("map-csv").addEventListener("click", () => saveCsv("map.csv", tableOfMap()));
   byId("map-fit").addEventListener("click", () => map.fit());
   on("annotating", showNextToReview);
-  on("map truth annotations tab", throttled(showLegend, LEGEND_EVERY));
+  on("map truth annotations tab ghost", throttled(showLegend, LEGEND_EVERY));
   on("map truth filter selection measure tab annotations annotating sketch section compare ghost theme", map.redraw);
 }

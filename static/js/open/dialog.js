@@ -37,7 +37,7 @@ function list({ scenarios = [], recordings = [] }) {
   byId("source-list").replaceChildren(
     ...(recorded.length ? [el("h3", { text: "Recordings in the data folder" }), ...recorded] : []),
     ...(simulated.length ? [el("h3", { text: "Simulated, with ground truth" }),
-      el("p", { class: "source-options" }, option("seed", "Seed", "0", "1"), option("duration", "Duration s", "1", "0.1", "3600")), ...simulated] : []));
+      el("p", { class: "source-options" }, option("seed", "Seed of the stand (another seed is another stand)", "0", "1"), option("duration", "Duration s", "1", "0.1", "3600")), ...simulated] : []));
 }
 
 const option = (name, title, min, step, max) => el("label", {}, `${title} `, el("input", { id: `source-${name}`, type: "number", min, step, max, placeholder: "standard" }));

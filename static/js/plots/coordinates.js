@@ -123,7 +123,7 @@ function residualsOf(list) {
   return centred.map(([x, y, e, n]) => [e - (c * x - s * y), n - (s * x + c * y)]);
 }
 
-const residualText = (residual) => (residual ? residual.map((value) => (100 * value).toFixed(1)).join(", ") : NONE);
+const residualText = (residual) => (residual ? residual.map((value) => fixed(100 * value, 1)).join(", ") : NONE);
 
 function fillResiduals() {
   const found = dirty ? residualsOf(points) : (stored()?.frame.residuals_m ?? []).map((row) => row.slice(1));

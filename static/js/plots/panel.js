@@ -3,7 +3,7 @@
 import { draft, redo, remove, reviewOf, STATES, undo } from "../annotate/annotations.js";
 import { get } from "../core/api.js";
 import { button, byId, el, recall, remember, setText } from "../core/dom.js";
-import { count, figure, NONE, percent } from "../core/format.js";
+import { count, figure, percent, plusMinus, withSigma } from "../core/format.js";
 import { looksOnly } from "../core/permissions.js";
 import { reportMenu } from "../core/report.js";
 import { on, state, trees } from "../core/store.js";
@@ -18,8 +18,8 @@ const LARGEST_FILES = 700_000; // [bytes]
 const FIELDS = { circle: [["radius", "radius m", 5.64, 0.01, 600]],
   rectangle: [["length", "length m", 10, 0.01, 2000], ["width", "width m", 10, 0.01, 2000], ["turn_deg", "turn °", 0, -360, 360]] };
 const HEADS = [["plot", ""], ["m²", "Area"], ["seen", "Observed part of the area"], ["trees", "Trees of at least the minimum diameter in the observed part"],
-  ["N/ha", "Stems per hectare"], ["G m²/ha", "Basal area per hectare"], ["Dq cm", "Quadratic mean diameter"], ["D cm", "Arithmetic mean diameter"]];
-const VOLUME = ["V m³/ha", "Stem volume per hectare"];
+  ["stems/ha", "N/ha: stems per hectare"], ["basal area m²/ha", "G/ha: basal area per hectare"], ["Dq cm", "Dq: quadratic mean diameter"], ["mean DBH cm", "Arithmetic mean diameter"]];
+const VOLUME = ["volume m³/ha", "Stem volume per hectare"];
 let figures = { all: null, plots: null, problem: "" };
 let shown = []; // edition and scan of the figures
 let run = null; // run of the fields and the table
@@ -66,7 +66,7 @@ function typed() {
 const alongPath = () => el("form", { class: "plot-form", onsubmit: (event) => {
   event.preventDefault();
   addAlong(numberOf(event.target, "every"), numberOf(event.target, "radius"));
-} }, el("label", {}, "every", number("every", 20, "Distance along the path, m", 0.01, 10_000), "m"), el("label", {}, "radius", number("radius", 5.64, "Radius of the circles, m", 0.01, 500), "m"), el("button", { class: "small", text: "Add circles" }));
+} }, el("span", { class: "dim", text: "along the path:" }), el("label", {}, "a circle every", number("every", 20, "Distance along the path, m", 0.01, 10_000), "m"), el("label", {}, "radius", number("radius", 5.64, "Radius of the circles, m", 0.01, 500), "m"), el("button", { class: "small", text: "Add circles" }));
 
 async function base64(file) {
   const bytes = new Uint8Array(await file.arrayBuffer());
@@ -74,7 +74,7 @@ async function base64(file) {
 }
 
 function imported() {
-  const crs = el("input", { id: "plot-crs", type: "text", "aria-label": "Coordinates of a file that does not state them", placeholder: "of the file", title: "Coordinates of a file that does not state them: EPSG:25832, or local for those of the map", autocomplete: "off" });
+  const crs = el("input", { id: "plot-crs", type: "text", "aria-label": "Coordinates of a file that does not state them", placeholder: "as in the file", title: "Coordinates of a file that does not state them: EPSG:25832, or local for those of the map", autocomplete: "off" });
   const file = el("input", { id: "plot-file", type: "file", multiple: true, accept: ".gpkg,.geojson,.json,.zip,.shp,.dbf,.shx,.prj,.cpg", hidden: true, "aria-label": "File of plots", onchange: async () => {
     const files = [...file.files];
     if (files.reduce((sum, { size }) => sum + size, 0) > LARGEST_FILES) {
@@ -103,15 +103,17 @@ function build() {
     el("div", { class: "plots-list" }, el("table", { id: "plots-table", class: "plain" }, el("thead"), el("tbody"))),
     el("p", { id: "plots-detection", class: "note dim" }),
     el("ul", { id: "plots-warnings", class: "plots-warnings", "aria-label": "Warnings about the figures" }),
-    el("div", { class: "plot-form" }, setting("dbh-min", "trees from DBH", threshold(), "Minimum diameter, cm", "number"), "cm",
+    el("div", { class: "plot-form" }, setting("dbh-min", "count trees from", threshold(), "Minimum DBH, cm", "number"), "cm DBH",
       setting("volume", "volume m³ =", formula(), "Volume of a stem in m³ as a formula of dbh_cm and height_m, with + - * / ^ ( ) exp log sqrt; empty: no volume", "text", "0.00007 * dbh_cm^1.8 * height_m^0.95")),
     el("div", { class: "plot-form" }, reportMenu("plots-report", "open", () => titleOf(state.status?.source), settings), el("span", { text: "with map, plots, figures and list of trees" })));
 }
 
 // --- the table --------------------------------------------------------------------------------------------------------
 
-function estimate([value, se] = [null, null], digits = 3) {
-  return el("td", {}, value === null ? NONE : figure(value, digits), ...(se === null || value === null ? [] : [el("small", { text: ` ± ${figure(se, 2)}` })]));
+function estimate([value, se] = [null, null]) {
+  if (se === null || value === null) return el("td", { text: figure(value) });
+  const [text, error] = withSigma(value, se);
+  return el("td", {}, text, el("small", { text: ` ± ${error}` }));
 }
 
 function cells(of, withVolume) {
@@ -123,8 +125,8 @@ function cells(of, withVolume) {
 function radiusOf(plot) {
   const { kind, radius } = plot.shape;
   if (kind !== "circle") return "";
-  if (looksOnly()) return ` r ${radius} m`;
-  return el("label", { class: "plot-radius" }, " r ", el("input", { type: "number", value: radius, min: "0.01", max: "600", step: "any", required: true, "aria-label": `Radius of plot ${plot.name}, m`, onchange: ({ target }) => target.reportValidity() && changePlot(plot, { radius: target.valueAsNumber }) }), " m");
+  if (looksOnly()) return ` radius ${radius} m`;
+  return el("label", { class: "plot-radius" }, " radius ", el("input", { type: "number", value: radius, min: "0.01", max: "600", step: "any", required: true, "aria-label": `Radius of plot ${plot.name}, m`, onchange: ({ target }) => target.reportValidity() && changePlot(plot, { radius: target.valueAsNumber }) }), " m");
 }
 
 function line(plot, of, withVolume) {
@@ -149,6 +151,8 @@ function fillTable(another) {
   if (typing) table.querySelector(`[data-plot="${edited}"] input[type=${typing.type}]`)?.focus();
 }
 
+const LEFT_OUT = { outside_of_plots: "outside the plots", outside_of_observed_area: "outside the observed area", below_minimum_dbh: "below the minimum DBH" };
+
 function hint() {
   if (sketch.kind === "point") return "Click a tree or a mark on the map whose coordinates are known. Esc ends.";
   if (sketch.kind === "polygon") return "Click each corner on the map; click the first corner or press Enter to finish. Esc ends.";
@@ -156,10 +160,10 @@ function hint() {
   if (!state.map) return "Nothing mapped yet: press play, then draw plots on the map.";
   const drawn = plots().length > 0;
   const { trees_in_map: all, trees_left_out: leftOut = {} } = (drawn ? figures.plots : figures.all) ?? {};
-  const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number]) => `${number} ${reason.replaceAll("_", " ")}`);
-  const trees = all === undefined ? "" : ` ${reasons.length ? `Not counted of ${all} trees in the map: ${reasons.join(", ")}.` : `All ${all} trees in the map are counted.`}`;
-  if (!drawn) return `Draw plots on the map for their stems and basal area per hectare. Without plots, the figures are those of the whole observed area.${trees}`;
-  return `Trees of the map at the shown time.${trees} ± is the standard error: 0 where all of a plot was observed; of the mean, by the variation between plots.`;
+  const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
+  const trees = all === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${all} trees in the map are counted.`}`;
+  if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
+  return `Trees of the map at the shown time.${trees} ± is the standard error. It is 0 for a count where the whole plot was observed; for the mean it is the variation between plots.`;
 }
 
 const NO_ERROR = " ± 0 of N/ha: all of the area was observed, no diameter is near the minimum, and every tree in view counts as found; missed trees are not included.";
@@ -175,9 +179,9 @@ function correctionText({ detection_sigma_m: sigma, plots: of, mean }) {
   if (!of) return "";
   if (sigma === null) return "Detection does not decrease with distance within reach: the figures need no correction.";
   const { n_ha_corrected: stems, g_ha_corrected: basal } = mean;
-  const words = ([value, se], unit) => `${figure(value)}${se === null ? "" : ` ± ${figure(se, 2)}`} ${unit}`;
-  return `Detection decreases with distance (half-normal, sigma ${figure(sigma)} m). The figures above have no correction: use them; the corrected ones (${words(stems, "stems/ha")}, ${words(basal, "m²/ha")}) `
-    + "only where trees far from the path were missed, because they are too large where the stand is thinner there.";
+  const words = (of, unit) => `${plusMinus(...of)} ${unit}`;
+  return `Use the figures above. If trees far from the path were missed, use the corrected ones: ${words(stems, "stems/ha")}, ${words(basal, "m²/ha")} `
+    + `(detection decreases with distance: half-normal, sigma ${figure(sigma)} m). They are too large where the stand is thinner away from the path.`;
 }
 
 // How many found trees a person has reviewed; rejected ones do not count in the figures.

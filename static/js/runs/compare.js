@@ -41,21 +41,21 @@ export async function showTwo(a, b) {
 }
 
 // Without an alignment, trees are near each other only by chance, so no pairs are shown.
-const UNALIGNED = "The stems of the two visits do not agree: these are different places, or too few stems are in both. No trees are compared.";
+const UNALIGNED = "The two maps do not fit together: they show different places, or share too few trees. No trees are compared.";
 
 function head({ a, b, how, aligned, record }) {
   return el("div", { class: "run-head" },
     el("h2", {}, el("span", { text: `A: ${a.name}` }), el("span", { text: `B: ${b.name}` })),
-    el("p", { class: "dim", text: `A ${when(a.begun_s ?? a.changed_s)} · B ${when(b.begun_s ?? b.changed_s)} · frames: ${how}` }),
+    el("p", { class: "dim", text: `A ${when(a.begun_s ?? a.changed_s)} · B ${when(b.begun_s ?? b.changed_s)}${aligned ? ` · frames: ${how}` : ""}` }),
     ...(aligned ? record.warnings : [UNALIGNED]).map((text) => el("p", { class: "error", role: "alert", text })));
 }
 
-const signed = (value, digits = 2) => (value === null ? NONE : `${value > 0 ? "+" : ""}${fixed(value, digits)}`);
+const signed = (value, digits = 2) => `${value > 0 ? "+" : ""}${fixed(value, digits)}`;
 
 function figures({ record, aligned }) {
   const { counts } = record;
   if (!aligned) return figureBoxes([["trees of A", record.trees_a], ["trees of B", record.trees_b]]);
-  const growth = record.growth_mean_cm === null ? NONE : `${signed(record.growth_mean_cm)}${record.growth_se_cm === null ? "" : ` ± ${figure(record.growth_se_cm, 2)}`} cm`;
+  const growth = record.growth_mean_cm === null ? NONE : `${signed(record.growth_mean_cm)}${record.growth_se_cm === null ? "" : ` ± ${fixed(record.growth_se_cm, 2)}`} cm`;
   return figureBoxes([["in both", record.pairs], ["mean growth of DBH", growth], ["significant growth", record.significant], ["new in B", counts.new], ["missing in B", counts.missing],
     ["moved", counts.moved], ["RMS of the shifts", record.shift_rms_m === null ? NONE : `${figure(100 * record.shift_rms_m)} cm`]]);
 }

@@ -14,7 +14,7 @@ const rate = (of) => (of?.of ? `${percent(of.rate)} (${of.count} of ${of.of})` :
 export const FIGURES = [
   ["scans", scans],
   ["driven", (run) => `${figure(run.distance_m)} m`],
-  ["lost", (run) => percent(run.lost)],
+  ["pose lost", (run) => percent(run.lost)],
   ["trees", (run) => String(run.trees)],
   ["F1", (run) => figure(run.scores?.f1)],
 ];

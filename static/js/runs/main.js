@@ -11,7 +11,7 @@ import { showTwo } from "./compare.js";
 import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
-const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"], ["preset", "minor extra"]];
+const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["pose lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"], ["preset", "minor extra"]];
 const REFRESH_EVERY = 5000; // [ms]
 let known = { runs: [], folders: [], open: null }, listed = ""; // the answer of the server, and its text
 const ticked = new Set();

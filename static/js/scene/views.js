@@ -65,7 +65,7 @@ function show() {
   list.replaceChildren(
     ...views.map(([name, view]) => el("div", { class: "row" }, el("button", { class: "small grow", text: name, onclick: () => lookFrom(view) }),
       el("button", { class: "quiet small", text: "✕", title: "Delete", "aria-label": `Delete the view ${name}`, onclick: () => keep(savedViews().filter(([other]) => other !== name)) }))),
-    views.length ? "" : el("p", { class: "dim note", text: "A saved view returns to the same place of the map." }),
+    views.length ? "" : el("p", { class: "dim note", text: "Save this view of the scene under a name to return to it later." }),
     el("form", { class: "row", onsubmit: save },
       el("input", { id: "view-name", type: "text", maxlength: String(LONGEST_NAME), placeholder: "name", "aria-label": "Name of the view", autocomplete: "off" }),
       el("button", { id: "view-save", class: "small", text: "Save", title: "Save the present view of the camera under this name" })));

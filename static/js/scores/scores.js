@@ -4,7 +4,7 @@ import { contradictionText, reviewProgress, scoreAgainst, truthText } from "../a
 import { byId, definitions, el } from "../core/dom.js";
 import { nothingYet } from "../core/empty_state.js";
 import { capital, figure, NONE, percent } from "../core/format.js";
-import { on, state } from "../core/store.js";
+import { isCloud, on, state } from "../core/store.js";
 import { openSources } from "../open/dialog.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
@@ -12,8 +12,8 @@ import { visible } from "../shell/tabs.js";
 const EVERY = 300; // [ms] between two updates
 
 const RATES = {
-  TA: ["TA  trees found", "True acceptance: trees of the ground truth that are in the map"],
-  FR: ["FR  trees missed", "False rejection: trees of the ground truth that are missing in the map"],
+  TA: ["TA  trees found", "True acceptance: of the trees of the ground truth near the path, those that are in the map"],
+  FR: ["FR  trees missed", "False rejection: of the trees of the ground truth near the path, those that are missing in the map"],
   TR: ["TR  others rejected", "True rejection: poles, persons, bushes and other objects of the ground truth that are not in the map"],
   FA: ["FA  others accepted", "False acceptance: other objects of the ground truth that are in the map as trees"],
 };
@@ -21,12 +21,13 @@ const centimetres = (value) => (value === null ? NONE : `${figure(value)} cm`);
 const inCentimetres = (metres) => (metres === null ? NONE : centimetres(100 * metres));
 const percentOf = (value) => (value === null ? NONE : `${figure(value)} %`);
 
-const BY_REVIEW = ["completeness", "correctness", "F1", "trees without counterpart"]; // of a complete review only
+const SPURIOUS = "mapped trees that match no object";
+const BY_REVIEW = ["completeness", "correctness", "F1", SPURIOUS]; // of a complete review only
 const LINES = [
   ["completeness", (s) => percent(s.completeness)],
   ["correctness", (s) => percent(s.correctness)],
   ["F1", (s) => figure(s.f1)],
-  ["trees without counterpart", (s) => String(s.spurious)],
+  [SPURIOUS, (s) => String(s.spurious)],
   ["position RMSE", (s) => inCentimetres(s.position_rmse_m)],
   ["position bias", (s) => inCentimetres(s.position_bias_m)],
   ["DBH RMSE", (s) => centimetres(s.dbh_rmse_cm)],
@@ -38,7 +39,7 @@ const LINES = [
 function show() {
   if (!visible("scores")) return;
   const score = state.evaluation;
-  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthText(), contradictionText()].filter(Boolean).join(" ") }), doubt(score), rates(score), lines(score)] : [nothing()]));
+  byId("panel-scores").replaceChildren(...(score ? [el("p", { class: "lead", id: "truth-used", text: [truthText(), contradictionText()].filter(Boolean).join(" ") }), doubt(score), rates(score), counted(score), lines(score)] : [nothing()]));
 }
 
 // A warning that so few trees match that the ground truth may belong to another place.
@@ -52,6 +53,11 @@ function rates(score) {
     return el("div", { "data-rate": name, title: meaning }, el("dt", { text: words }),
       el("dd", {}, el("b", { text: of ? percent(rate ?? count / of) : NONE }), el("small", { text: `${count} of ${of}` })));
   }));
+}
+
+// A drive is scored near its path only, so the counts can be smaller than the numbers of true and mapped trees.
+function counted({ reach_m: reach }) {
+  return isCloud() ? "" : el("p", { class: "note dim", text: `Counted: what is within ${reach} m of the path (Tune, Evaluation, Reach).` });
 }
 
 function lines(score) {

@@ -54,7 +54,7 @@ export const ACTIONS = [
   ["Views: save this view of the scene, or return to a saved one", "", "", click("views-button"), null, "camera bookmark viewpoint position"],
   ["Measure a distance on the map", "m", "m", toggleMeasure],
   ["Show the whole map", "", "", click("map-fit"), null, "fit zoom reset"],
-  ["Zoom in on the map", "+", "", pressOnMap("+"), "on the map: zoom in", "enlarge magnify closer"], ["Zoom out of the map", "-", "", pressOnMap("-"), "on the map: zoom out", "shrink farther"],
+  ["Zoom in on the map", "+", "", pressOnMap("+"), null, "enlarge magnify closer"], ["Zoom out of the map", "-", "", pressOnMap("-"), null, "shrink farther"],
   ["Stages: raw, filtered, clusters and trunks side by side", "s", "s", () => openOver("stages")],
   ["Compare two sets of parameters on this scan (A | B)", "c", "c", () => openOver("compare")],
   ["Camera: trees and clusters in the picture of this scan", "v", "v", () => openOver("camera")],
@@ -91,5 +91,5 @@ export const ACTIONS = [
   ["Layout: show or hide the 2D map", "", "", toggleMap], ["Layout: show or hide the tabs and the table", "", "", toggleTabs],
   ["Layout: standard sizes and places", "", "", standardLayout],
   ["Settings: theme, large controls, sound and vibration", "", "", showSheet, null, "options preferences gloves touch tablet contrast sunlight alarm warning mute"],
-  ["Keyboard shortcuts", "?", "?", showSheet, null, "help keys hotkeys manual"],
+  ["Settings and keyboard shortcuts", "?", "?", showSheet, null, "help keys hotkeys manual"],
 ];

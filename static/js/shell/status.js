@@ -48,7 +48,7 @@ function ofScan() {
   if (reviewProgress()) return `F1: ${reviewProgress()}`;
   if (state.evaluation?.warning) return "F1 doubtful, see Scores";
   const { right, wrong } = state.map ?? {};
-  return right === null || right === undefined ? "F1 of the map" : `F1 of the map; this scan: ${right} of ${right + wrong} right`;
+  return right === null || right === undefined ? "F1 of the map" : `F1 of the map; this scan: ${right} of ${right + wrong} true`;
 }
 
 // Explanations of the first states.
@@ -96,7 +96,7 @@ function show() {
   document.body.classList.toggle("cloud", isCloud());
   cells.health.cell.title = healthFigures();
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
-  cells.f1.cell.title = state.evaluation?.warning || "F1 of the map against the ground truth; number of trees of the current scan that are at true trees";
+  cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);
   const title = titleOf(status.source, show);
   showName(title || NONE);
@@ -168,8 +168,9 @@ function compilingFor({ compiling_since_s: since, compiled }) {
   compiledAt = performance.now();
   if (ahead === null) askClock();
   const passed = Math.floor((Date.now() + ahead) / 1000 - since);
-  const done = compiled < 1 ? `. ${Math.floor(100 * compiled)} % are done` : "";
-  return passed >= 10 ? `${done}. ${passed} s so far; a slow or busy machine takes longer.` : done && `${done}.`;
+  const done = compiled < 1 ? `. ${Math.floor(100 * compiled)} % done` : "";
+  if (passed < 10) return done && `${done}.`;
+  return done ? `${done} after ${passed} s.` : `. ${passed} s so far.`;
 }
 
 // The changing part of the notice, which a screen reader does not announce.

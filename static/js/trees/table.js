@@ -4,7 +4,7 @@ import { reviewOf } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas } from "../core/download.js";
 import { nothingYet } from "../core/empty_state.js";
-import { count, figure, fixed, isAssumed, NONE } from "../core/format.js";
+import { count, figure, fixed, isAssumed, NONE, plusMinus } from "../core/format.js";
 import { select } from "../core/live_feed.js";
 import { attempted } from "../core/problem.js";
 import { isReport, reportOptions, saveReport, saveWritten } from "../core/report.js";
@@ -27,12 +27,12 @@ const COLUMNS = [
   ["number", "tree", "Number of the tree; ✓ confirmed, ✕ rejected, ↷ skipped in the review", (t) => `${t.number}${MARKS[reviewOf(t)]}`, (t) => t.number],
   ["x", "x m", "x in the frame of the map: of a drive along the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.x, 2), (t) => t.x],
   ["y", "y m", "y in the frame of the map: of a drive to the left of the first heading, of a cloud as in the file minus its offset", (t) => fixed(t.y, 2), (t) => t.y],
-  ["sigma", "± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
+  ["sigma", "position ± cm", "Standard deviation of the position; ≈: assumed, because no single scan detected the tree", sigmaText, sigma],
   ["dbh", "DBH cm", "Diameter at breast height", (t) => dbh(t), (t) => t.dbh_cm],
-  ["height", "height m", "Height of the tree; – where the cloud does not show its top", (t) => (t.height_m === null ? NONE : `${fixed(t.height_m, 1)} ± ${figure(t.sigma_height_m, 2)}`), (t) => t.height_m, true],
+  ["height", "height m", "Height of the tree; – where the cloud does not show its top", (t) => (t.height_m === null ? NONE : plusMinus(t.height_m, t.sigma_height_m)), (t) => t.height_m, true],
   ["lean", "lean °", "Angle of the stem from the vertical", (t) => fixed(t.lean_deg, 1), (t) => t.lean_deg, true],
-  ["e", "e", "Eccentricity λ1/λ2", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
-  ["seen", "seen", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
+  ["e", "λ1/λ2", "Eccentricity λ1/λ2: the mean over its scans", (t) => figure(t.eccentricity), (t) => t.eccentricity, false],
+  ["seen", "scans", "Number of scans that detected the tree; 0: found only in the accumulated scans", (t) => String(t.observations), (t) => t.observations, false],
 ];
 const SIGMA = COLUMNS.findIndex(([key]) => key === "sigma");
 const rows = new Map();
@@ -41,7 +41,7 @@ let order = { key: "number", descending: false };
 
 function dbh(tree) {
   if (tree.dbh_cm === null) return NONE;
-  return tree.sigma_dbh_cm === null ? figure(tree.dbh_cm) : `${figure(tree.dbh_cm)} ± ${figure(tree.sigma_dbh_cm, 2)}`;
+  return plusMinus(tree.dbh_cm, tree.sigma_dbh_cm);
 }
 
 function sigmaText(tree) {
@@ -153,7 +153,7 @@ function exportAs(format) {
 
 function emptyText(all, wanted, refused) {
   if (all && refused) return `“${refused}” is not a condition. ${HELP}`;
-  if (all) return `No tree matches “${wanted}”.`;
+  if (all) return `No tree matches “${wanted}”.${!isCloud() && /\b(height|lean)\b/i.test(wanted) ? " Heights and leans are measured in a whole cloud only, not in a drive." : ""}`;
   if (state.map && isCloud()) return "No tree in this cloud. The tab Clusters shows the verdict on each candidate.";
   return state.map ? "No tree yet. A tree is listed once enough scans have detected it. The tab Clusters shows the verdict on each cluster."
     : nothingYet();

@@ -228,13 +228,13 @@ function chip(name, then, now) {
 
 function truthChips(right, wrong, before) {
   if (right === null || right === undefined) return [];
-  const ring = () => el("span", { class: "letter ring", "aria-hidden": "true" });
-  return [change("true", before?.right ?? null, right, ring()), change("false", before?.wrong ?? null, wrong, ring())];
+  const ring = (cls) => el("span", { class: `letter ring ${cls}`, "aria-hidden": "true" });
+  return [change("true", before?.right ?? null, right, ring("on"), "at a true tree"), change("false", before?.wrong ?? null, wrong, ring("off"), "not at one")];
 }
 
-function change(name, then, now, sign) {
+function change(name, then, now, sign, text = name) {
   const differs = then !== null && then !== now;
-  return el("li", { "data-chip": name, class: differs ? "differs" : "" }, sign, el("span", { text: name }), el("b", { text: then === null ? String(now) : `${then} → ${now}` }),
+  return el("li", { "data-chip": name, class: differs ? "differs" : "" }, sign, el("span", { text }), el("b", { text: then === null ? String(now) : `${then} → ${now}` }),
     then === null ? "" : el("small", { text: signed(now - then) }));
 }
 

@@ -81,7 +81,8 @@ export const nameProblem = (name) => (SET_NAME.test(name) ? "" : "A name begins 
 
 export function shown(value, spec) {
   if (typeof value === "boolean") return value ? "on" : "off";
-  return spec?.unit ? `${value} ${spec.unit}` : String(value);
+  const text = typeof value === "number" ? String(value).replace(/^-/, "−") : String(value);
+  return spec?.unit ? `${text} ${spec.unit}` : text;
 }
 
 async function load() {

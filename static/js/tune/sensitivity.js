@@ -106,7 +106,7 @@ function curve(spec, points, measure) {
   const mark = (value, cls) => line(px(share(spec, value)), TOP, px(share(spec, value)), HEIGHT - BOTTOM, cls);
   const [now, usual] = [valueOf(spec.name), spec.default];
   const known = points.length > 1 && isNumber(spec) ? svg("polyline", { points: points.map(({ x, y }) => `${px(x)},${py(y)}`).join(" "), class: "score" }) : null;
-  const ends = isNumber(spec) ? [text(px(0), HEIGHT - 8, String(spec.minimum), "small"), text(px(1), HEIGHT - 8, shown(spec.maximum, spec), "small", "end")]
+  const ends = isNumber(spec) ? [text(px(0), HEIGHT - 8, shown(spec.minimum), "small"), text(px(1), HEIGHT - 8, shown(spec.maximum, spec), "small", "end")]
     : choicesOf(spec).map((value) => text(px(share(spec, value)), HEIGHT - 8, shown(value, spec), "small", "middle"));
   const node = svg("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", class: "picture", "aria-label": `${measure.words} from ${say(Math.min(...ys))} to ${say(Math.max(...ys))} over ${spec.title}` },
     line(px(0), HEIGHT - BOTTOM, px(1), HEIGHT - BOTTOM, "zero"), text(LEFT - 5, py(high) + 4, say(high), "small", "end"), text(LEFT - 5, py(low), say(low), "small", "end"), ...ends,
@@ -129,7 +129,7 @@ function namesOf(now, usual) {
 
 const anchor = (part) => (part < 0.15 ? "start" : part > 0.85 ? "end" : "middle");
 const spread = (low, high) => (high - low > 1e-9 ? [low, high] : [low - 1, high + 1]);
-const say = (y) => String(Number(y.toPrecision(3)));
+const say = (y) => shown(Number(y.toPrecision(3)));
 
 function tell(asked, spec, points, measure) {
   const [done, failed] = [asked.points.length, asked.points.filter(({ error }) => error)];

@@ -272,7 +272,7 @@ def test_a_run_without_trees_has_a_report(tmp_path, capsys):
 def test_numbers_are_those_of_the_language():
     english, german = Numbers(".", ","), Numbers(",", ".")
     assert (english(1234.56, 1), german(1234.56, 1)) == ("1,234.6", "1.234,6")
-    assert (english(-0.04, 1), german(-0.06, 1)) == ("0.0", "-0,1")
+    assert (english(-0.04, 1), german(-0.06, 1)) == ("0.0", "\N{MINUS SIGN}0,1")
     assert (english.short(7.0), german.short(7.5)) == ("7", "7,5")
     assert english(float("nan")) == english(None) == "\N{EN DASH}"
 
@@ -322,4 +322,4 @@ def test_heights_and_residuals_are_listed_where_there_are_any(run, tmp_path, cap
     points.write_text("tree,x_m,y_m,easting,northing\n,0,0,500000,5300000\n,10,0,500010.02,5300000\n")
     stemmap(capsys, "georeference", run, "--control", points, "--crs", "EPSG:25832")
     shown = Page(page_of(capsys, run, tmp_path / "full.html")).texts
-    assert {"Height m", "21.4", "0.3", "1: -1.0, 0.0; 2: 1.0, 0.0"} <= set(shown)
+    assert {"Height m", "21.4", "0.3", "1: \N{MINUS SIGN}1.0, 0.0; 2: 1.0, 0.0"} <= set(shown)
