@@ -76,9 +76,8 @@ class CloudSource(FileSource):
         """Number of points left out, by reason; not a copy."""
         return self.cloud.losses
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+    def records(self) -> Iterator[Record]:
         """Yield nothing: a whole cloud has no scans."""
-        del start_ns
         yield from ()
 
 
