@@ -332,7 +332,6 @@ def _frame_of(plot: PlotMap) -> Frame:
             weights=np.zeros(0),
             n_eff=0.0,
             landmarks=np.zeros((0, 2)),
-            resampled=False,
         ),
         T_odom_base=Pose2(),
         sensor_offset=np.zeros(3),

@@ -170,7 +170,7 @@ class FastSlam:
         health = pose_health(
             state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
         )
-        return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
+        return replace(estimate, health=health, landmark_of=landmark_of)
 
     def without_shared_error(self, pose: PoseMeasurement) -> PoseMeasurement:
         """Return a measured pose corrected by the estimated error that all poses of its source share. It is
@@ -369,7 +369,7 @@ class FastSlam:
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
         """Return the pose of the present state, for example after `place`, with the health and the
-        associations of an earlier estimate. The state is unchanged and `resampled` is False."""
+        associations of an earlier estimate. The state is unchanged."""
         weights = normalised(self.state.log_weight)
         estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
         return replace(estimate, health=before.health, landmark_of=before.landmark_of)
@@ -738,7 +738,6 @@ def _estimate(
         weights=weights,
         n_eff=n_eff,
         landmarks=landmarks.mean[landmarks.hits >= p.hits_to_weigh],
-        resampled=False,
         relative=spread,
     )
     return estimate, frame, by_trees

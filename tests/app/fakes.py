@@ -218,7 +218,6 @@ def frame(
         weights=np.full(3, 1 / 3),
         n_eff=3.0,
         landmarks=np.zeros((0, 2)),
-        resampled=False,
     )
     return Frame(
         index=index,
