@@ -168,7 +168,7 @@ class FastSlam:
             landmark_of = births[state.best]
             self.state = self._with_keyframe(state, detections, landmark_of)
         health = pose_health(
-            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
+            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.local_covariance, doubt
         )
         return replace(estimate, health=health, landmark_of=landmark_of)
 
@@ -380,7 +380,7 @@ class FastSlam:
         estimate."""
         ancestors = self.state.genealogy.distinct_ancestors
         return pose_health(
-            self.state.recent, ScanStatistics(), estimate.n_eff, ancestors, _relative(estimate)
+            self.state.recent, ScanStatistics(), estimate.n_eff, ancestors, estimate.local_covariance
         )
 
     def reset_health(self) -> None:
@@ -546,7 +546,7 @@ class FastSlam:
             x, y, yaw = state.pose[state.best].tolist()
             mean, covariance, hits, birth = known_near(state.maps, state.best, x, y, reach)
             rows = (hits >= self.parameters.hits_to_weigh) & places.of_old(birth, distance)
-            pose = pose_of(np.array([x, y, yaw]), _relative(estimate))
+            pose = pose_of(np.array([x, y, yaw]), estimate.local_covariance)
             odds, agrees, near = agreement(pose, centre, R, mean[rows], covariance[rows])
             if odds > ODDS:
                 places = places.with_seen(distance, birth[rows][agrees])
@@ -665,12 +665,6 @@ def _farthest(detections: Detections) -> float:
     """Return the distance of the farthest detection from the base [m]; 0 without detections."""
     centre = detections.centre
     return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
-
-
-def _relative(estimate: PoseEstimate) -> Float:
-    """Return the covariance of an estimate with respect to the nearby landmarks, shape (3, 3): `relative`, or
-    `covariance` if that is None."""
-    return estimate.covariance if estimate.relative is None else estimate.relative
 
 
 def rules_of(p: Slam) -> Rules:

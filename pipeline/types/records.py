@@ -585,6 +585,12 @@ class PoseEstimate:
     relative: Float | None = None
     landmark_of: Int = field(default_factory=lambda: np.zeros(0, np.int64))
 
+    @property
+    def local_covariance(self) -> Float:
+        """Covariance with respect to the nearby landmarks, shape (3, 3): `relative`, or `covariance` where
+        that is None."""
+        return self.covariance if self.relative is None else self.relative
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
