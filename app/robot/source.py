@@ -206,18 +206,13 @@ class LiveSource:
         recorder = {} if self._recorder is None else self._recorder.losses
         return {**self._link.losses, **self._inbox.losses, **recorder, **read, **kept}
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+    def records(self) -> Iterator[Record]:
         """Yield records when they arrive, until `stop`; then the recording of messages ends, and the records
         that the reader still holds are yielded, but not messages that are still queued.
 
-        Args:
-            start_ns: Must be None, because a live run cannot be read again.
-
         Raises:
-            SourceError: A message cannot be read, or `start_ns` is given.
+            SourceError: A message cannot be read.
         """
-        if start_ns is not None:
-            raise SourceError("a live run cannot be read again", where=self.uri, remedy="Open its recording.")
         while not self._ending.is_set():
             records = self.take()
             yield from records

@@ -60,7 +60,7 @@ def first_scan(question: dict[str, Any]) -> dict[str, Any]:
     request = msgspec.convert(question["request"], SourceRequest)
     with closing(open_source(request.uri, request.options())) as source:
         moving, chosen = with_odometry(source, request.odometry)
-        step = next(steps(moving.records(None), odometry=chosen.steps), None)
+        step = next(steps(moving.records(), odometry=chosen.steps), None)
         if step is None:
             raise SourceError("there is no scan in it", where=request.uri, remedy="Choose another source")
         return {"stamp_ns": step.scan.stamp_ns}

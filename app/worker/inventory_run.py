@@ -76,9 +76,8 @@ class CloudSource(FileSource):
         """Number of points left out, by reason; not a copy."""
         return self.cloud.losses
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+    def records(self) -> Iterator[Record]:
         """Yield nothing: a whole cloud has no scans."""
-        del start_ns
         yield from ()
 
 
@@ -333,7 +332,6 @@ def _frame_of(plot: PlotMap) -> Frame:
             weights=np.zeros(0),
             n_eff=0.0,
             landmarks=np.zeros((0, 2)),
-            resampled=False,
         ),
         T_odom_base=Pose2(),
         sensor_offset=np.zeros(3),

@@ -495,7 +495,7 @@ def open_run(
 
             def read() -> Iterator[Step]:
                 left_out.clear()  # the source is read from its start
-                return steps(moving.records(None), odometry=chosen.steps, losses=left_out)
+                return steps(moving.records(), odometry=chosen.steps, losses=left_out)
 
             cursor = Cursor(read, description.uri, StepStore())
         else:

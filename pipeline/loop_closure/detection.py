@@ -228,12 +228,6 @@ def _left(seen: Int, way: Float) -> int:
     return int(np.median(seen[group == np.argmax(counts >= max(LEAST_LEFT, len(seen) / 4))]))
 
 
-def nearby(estimate: PoseEstimate) -> Float:
-    """Return the covariance of a pose with respect to the landmarks around, shape (3, 3): `relative`, or
-    `covariance` where that is None."""
-    return estimate.covariance if estimate.relative is None else estimate.relative
-
-
 def _way(path: Float) -> Float:
     """Return the distance driven at each pose of a path, shape (N,) [m], 0 at the first one. `path` is x, y
     [m], yaw, shape (N, 3)."""

@@ -222,7 +222,7 @@ def _match(
     if match.pose is None:
         return None
     numbers = trees.number[trees.confirmed][match.reference]
-    relative = detection.nearby(estimate)
+    relative = estimate.local_covariance
     pose, covariance = detection.through(match.pose, match.covariance, estimate.T_map_base, relative)
     return LocalMapMatch(pose, covariance, numbers)
 

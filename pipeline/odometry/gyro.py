@@ -110,11 +110,6 @@ class Gyro:
         alike = square < ALIKE * self._turned[2] < ALIKE**2 * square
         self._proven = self._proven or (way >= PROOF and alike)
 
-    @property
-    def bias(self) -> float:
-        """Bias of the turn rate [rad/s], 0 until the robot has stood still."""
-        return self._bias
-
     def turn(self, from_ns: int, to_ns: int) -> Turn | None:
         """Return the turn between two times [ns] less the bias, with its sigma. None if readings are missing
         for more than GAP_NS or are constant, or if the times are not in order."""

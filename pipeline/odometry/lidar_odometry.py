@@ -43,7 +43,7 @@ class Matcher(Protocol):
 class LidarOdometry:
     """Estimator of odometry: each scan gets the pose of the base as an Odometry record before it.
 
-    A scan keeps its first pose, so reading again from an earlier time gives the same poses.
+    A scan keeps its first pose, so reading again gives the same poses.
 
     Args:
         T_base_lidar: Extrinsics of the LiDAR.

@@ -27,7 +27,7 @@ class OdometryEstimator(Protocol):
         """Yield the records that replace one record; may yield none."""
 
     def end(self) -> None:
-        """Finish after the last record of a complete reading; may add to `losses`."""
+        """Finish after the last record; may add to `losses`."""
 
 
 class OdometryOverride:
@@ -64,14 +64,12 @@ class OdometryOverride:
             count_loss(total, reason, count)
         return total
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield the records of the source in the order of time, from `start_ns` on, each replaced by the
-        estimator. After the last record of a reading from the beginning (`start_ns` None) the estimator is
-        finished."""
-        for record in self.source.records(start_ns):
+    def records(self) -> Iterator[Record]:
+        """Yield the records of the source in the order of time, each replaced by the estimator. After the
+        last record the estimator is finished."""
+        for record in self.source.records():
             yield from self._motion.add(record)
-        if start_ns is None:
-            self._motion.end()
+        self._motion.end()
 
     def pass_on(self, record: Record) -> Iterator[Record]:
         """Yield the records by which the estimator replaces one record; for a live source, whose records are

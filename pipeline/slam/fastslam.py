@@ -168,9 +168,9 @@ class FastSlam:
             landmark_of = births[state.best]
             self.state = self._with_keyframe(state, detections, landmark_of)
         health = pose_health(
-            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, _relative(estimate), doubt
+            state.recent, scan, estimate.n_eff, genealogy.distinct_ancestors, estimate.local_covariance, doubt
         )
-        return replace(estimate, resampled=ancestors is not None, health=health, landmark_of=landmark_of)
+        return replace(estimate, health=health, landmark_of=landmark_of)
 
     def without_shared_error(self, pose: PoseMeasurement) -> PoseMeasurement:
         """Return a measured pose corrected by the estimated error that all poses of its source share. It is
@@ -369,7 +369,7 @@ class FastSlam:
 
     def estimate(self, before: PoseEstimate) -> PoseEstimate:
         """Return the pose of the present state, for example after `place`, with the health and the
-        associations of an earlier estimate. The state is unchanged and `resampled` is False."""
+        associations of an earlier estimate. The state is unchanged."""
         weights = normalised(self.state.log_weight)
         estimate, _, _ = _estimate(self.state, weights, self.parameters, 0.0)
         return replace(estimate, health=before.health, landmark_of=before.landmark_of)
@@ -380,7 +380,7 @@ class FastSlam:
         estimate."""
         ancestors = self.state.genealogy.distinct_ancestors
         return pose_health(
-            self.state.recent, ScanStatistics(), estimate.n_eff, ancestors, _relative(estimate)
+            self.state.recent, ScanStatistics(), estimate.n_eff, ancestors, estimate.local_covariance
         )
 
     def reset_health(self) -> None:
@@ -546,7 +546,7 @@ class FastSlam:
             x, y, yaw = state.pose[state.best].tolist()
             mean, covariance, hits, birth = known_near(state.maps, state.best, x, y, reach)
             rows = (hits >= self.parameters.hits_to_weigh) & places.of_old(birth, distance)
-            pose = pose_of(np.array([x, y, yaw]), _relative(estimate))
+            pose = pose_of(np.array([x, y, yaw]), estimate.local_covariance)
             odds, agrees, near = agreement(pose, centre, R, mean[rows], covariance[rows])
             if odds > ODDS:
                 places = places.with_seen(distance, birth[rows][agrees])
@@ -679,12 +679,6 @@ def _farthest(detections: Detections) -> float:
     return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
 
 
-def _relative(estimate: PoseEstimate) -> Float:
-    """Return the covariance of an estimate with respect to the nearby landmarks, shape (3, 3): `relative`, or
-    `covariance` if that is None."""
-    return estimate.covariance if estimate.relative is None else estimate.relative
-
-
 def rules_of(p: Slam) -> Rules:
     """Return the parameters that the compiled measurement update needs. `use_proposal` is False for the
     method "fastslam1" only; `miss` is 1 / `misses_per_hit`."""
@@ -750,7 +744,6 @@ def _estimate(
         weights=weights,
         n_eff=n_eff,
         landmarks=landmarks.mean[landmarks.hits >= p.hits_to_weigh],
-        resampled=False,
         relative=spread,
     )
     return estimate, frame, by_trees

@@ -570,7 +570,6 @@ class PoseEstimate:
         weights: shape (P,), sum 1.
         n_eff: Effective number of particles, 1 / sum of squared weights.
         landmarks: shape (L, 2) [m], the landmarks of the best particle.
-        resampled: Whether the particles were resampled at this scan.
         health: Quality of the pose.
         relative: Covariance with respect to the nearby landmarks, shape (3, 3); None if it is `covariance`.
         landmark_of: Birth number of the landmark of each detection, int64, shape (D,); -1 without one.
@@ -582,10 +581,15 @@ class PoseEstimate:
     weights: Float
     n_eff: float
     landmarks: Float
-    resampled: bool
     health: Health = field(default_factory=Health)
     relative: Float | None = None
     landmark_of: Int = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    @property
+    def local_covariance(self) -> Float:
+        """Covariance with respect to the nearby landmarks, shape (3, 3): `relative`, or `covariance` where
+        that is None."""
+        return self.covariance if self.relative is None else self.relative
 
 
 @dataclass(frozen=True, slots=True, eq=False)

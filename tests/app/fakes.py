@@ -62,7 +62,7 @@ class FakeSource:
         self.scans = scans
         self.fails_at = fails_at
         self.drifts = drifts
-        self.reads: list[int | None] = []
+        self.reads = 0
         self.closed = False
         self.losses: dict[str, int] = {}
         self._truth = truth
@@ -80,12 +80,10 @@ class FakeSource:
             preset=preset,
         )
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        self.reads.append(start_ns)
-        drift = 0.01 * len(self.reads) if self.drifts else 0.0
+    def records(self) -> Iterator[Record]:
+        self.reads += 1
+        drift = 0.01 * self.reads if self.drifts else 0.0
         for k in range(self.scans):
-            if start_ns is not None and START_NS + k * PERIOD_NS < start_ns:
-                continue
             if k == self.fails_at:
                 raise SourceError("the file ends here", where=f"scan {k}")
             pose = Pose3.from_euler([0.1 * k + drift, 0, 0], 0, 0, 0)
@@ -220,7 +218,6 @@ def frame(
         weights=np.full(3, 1 / 3),
         n_eff=3.0,
         landmarks=np.zeros((0, 2)),
-        resampled=False,
     )
     return Frame(
         index=index,

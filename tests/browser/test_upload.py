@@ -78,7 +78,7 @@ def test_a_dropped_recording_is_opened_and_a_picture_is_refused(
 def test_the_files_of_one_recording_are_opened_as_one_and_others_are_refused(dashboard: Dashboard):
     page = dashboard.page
     with closing(open_source("sim:stand?duration=1")) as source:
-        clouds = [record.points for record in source.records(None) if isinstance(record, Scan)]
+        clouds = [record.points for record in source.records() if isinstance(record, Scan)]
     scans = {
         f"{k:06d}.bin": np.column_stack([points[:, :3], np.zeros(len(points))]).astype("<f4").tobytes()
         for k, points in enumerate(clouds)

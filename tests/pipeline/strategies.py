@@ -121,7 +121,7 @@ def track(tracker, stamp_ns, pose, covariance, found, *, births=None, gone=(), h
         distance_max=1.0,
     )
     estimate = PoseEstimate(
-        pose, covariance, pose.as_array()[None], np.ones(1), 1.0, position, False, landmark_of=births
+        pose, covariance, pose.as_array()[None], np.ones(1), 1.0, position, landmark_of=births
     )
     tracker.process(stamp_ns, estimate, found, landmarks, heights)
 

@@ -113,7 +113,7 @@ class SourceOptions:
 
 
 class Source(Protocol):
-    """A run that can be read from its start or from any time.
+    """A run that can be read from its start, more than once.
 
     A single bad record never raises: it is left out and counted in `losses`. `SourceError` is raised when the
     source is opened, or during reading when nothing more can be read; records that were yielded before it
@@ -129,8 +129,8 @@ class Source(Protocol):
         """Number of records left out on opening and so far in the latest reading, by reason, e.g. {"scans
         without points": 3}. Each call of `records` begins a new count; empty if nothing was left out."""
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of time, from `start_ns` on (None: all)."""
+    def records(self) -> Iterator[Record]:
+        """Yield all records in the order of time."""
 
     def truth(self) -> Truth | None:
         """Ground truth that comes with the run, None when there is none."""

@@ -67,7 +67,7 @@ class Message:
 
 
 class Container:
-    """A recording that can be read from any time. It does not decode messages.
+    """A recording of messages, which are not decoded.
 
     Attributes:
         kind: Name of the format, e.g. "ROS 2 MCAP".

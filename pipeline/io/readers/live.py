@@ -92,7 +92,6 @@ class ArrivalReader:
     Attributes:
         description: None until a second after the first scan, or until ten scans.
         losses: Records left out so far, by reason.
-        from_ns: Messages before this time are not decoded; None decodes all.
     """
 
     def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
@@ -108,7 +107,6 @@ class ArrivalReader:
         self._source: RosSource | None = None
         self.description: SourceDescription | None = None
         self.losses: dict[str, int] = {}
-        self.from_ns: int | None = None
 
     @property
     def offset_ns(self) -> int:
@@ -188,7 +186,7 @@ class ArrivalReader:
     def _records_of(self, source: RosSource, message: Message) -> list[Record]:
         """Return the records of a message, after notices of the source with the time of the first record (0
         without one)."""
-        records = list(source.records_of(message, self.losses, self.from_ns))
+        records = list(source.records_of(message, self.losses))
         if source.notices:
             stamp_ns = records[0].stamp_ns if records else 0
             records = [*(Notice(stamp_ns, text) for text in source.notices), *records]
@@ -387,13 +385,11 @@ class LiveRecording(MessageSource):
         clocks if the stamp is missing, 0 or of another clock."""
         return time_beside(stamp_ns, message.log_ns, self._offset_ns)
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of arrival, with `as_live` only those that the live run mapped. Those
-        with a stamp before `start_ns` [ns] are left out without being decoded; what cannot be used is counted
-        in `losses`."""
+    def records(self) -> Iterator[Record]:
+        """Yield records in the order of arrival, with `as_live` only those that the live run mapped.
+        What cannot be used is counted in `losses`."""
         reader = self._reader()
         self._losses = reader.losses
-        reader.from_ns = start_ns
         for message in self._messages(self._numbers, reader.losses):
             yield from reader.add(message)
         yield from reader.finish()

@@ -87,20 +87,19 @@ def open_table(path: Path) -> PointTable:
     raise ScanFileError("its contents are not those of a PLY, NumPy or PCD file")
 
 
-def read_columns(path: Path, losses: dict[str, int], *, limit: int = POINT_LIMIT) -> Columns:
+def read_columns(path: Path, losses: dict[str, int]) -> Columns:
     """Return all columns of a file by name, shape (N,) each; of a damaged file the points before the damage.
 
     Args:
         path: A PLY, NumPy or PCD file.
         losses: Counts the points that the header promises and the file does not hold; changed in place.
-        limit: A file that promises more points is refused before they are read.
 
     Raises:
-        ScanFileError: It cannot be read, or is too large.
+        ScanFileError: It cannot be read, or promises more than POINT_LIMIT points.
         OSError: It cannot be read.
     """
     table = open_table(path)
-    if table.points > limit:
+    if table.points > POINT_LIMIT:
         raise ScanFileError(f"its header promises {table.points} points, too many for one scan")
     parts = list(table.parts())
     columns = {

@@ -17,7 +17,6 @@ from pipeline.io.readers.camera import MessageSource
 from pipeline.io.readers.container import Container, Message
 from pipeline.io.readers.measured_poses import Fix, FrameAlignments
 from pipeline.io.readers.message_time import (
-    WINDOW_NS,
     Clock,
     ClockStepFilter,
     Stamped,
@@ -94,31 +93,26 @@ class RosSource(MessageSource):
             # The run starts again with its first message: the clock forgets the messages that were read here.
             self._clock = ClockStepFilter(offsets_ns, self.notices)
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield records in the order of time, scans after other records of the same time; messages before
-        `start_ns` [ns] (None: all) are not decoded. Messages that cannot be used, or come too late, are
-        counted in `losses`."""
+    def records(self) -> Iterator[Record]:
+        """Yield records in the order of time, scans after other records of the same time. Messages that
+        cannot be used, or come too late, are counted in `losses`."""
         losses: dict[str, int] = {}
         self._losses = losses
-        for stamped in in_order_of_stamps(self._arrivals(start_ns, losses), losses):
+        for stamped in in_order_of_stamps(self._arrivals(losses), losses):
             yield from self._decoded(stamped, losses)
 
-    def records_of(
-        self, message: Message, losses: dict[str, int], from_ns: int | None = None
-    ) -> Iterator[Record]:
+    def records_of(self, message: Message, losses: dict[str, int]) -> Iterator[Record]:
         """Yield the records of one message of a live run; none for a channel that is not read. Call it in the
         order of arrival. Messages for the user are added to `notices`.
 
         Args:
             message: The message.
             losses: Counts contents that cannot be used.
-            from_ns: Time of the first record [ns]; None for all.
         """
         if message.channel in self._wanted or message.channel in self._alignments.numbers:
             for stamped in self._times_of(message, losses):
                 self._alignments.add(stamped)
-                if from_ns is None or stamped.stamp_ns >= from_ns:
-                    yield from self._decoded(stamped, losses)
+                yield from self._decoded(stamped, losses)
 
     def truth(self) -> Truth | None:
         """Return the ground truth attached to a simulated recording, None when there is none."""
@@ -149,21 +143,12 @@ class RosSource(MessageSource):
         """Return the time of a message [ns] by the clock of the source, None if its stamp is impossible."""
         return self._clock.time_of(stamp_ns, message)
 
-    def _arrivals(
-        self, start_ns: int | None, losses: dict[str, int]
-    ) -> Iterator[Stamped[Message | Odometry]]:
-        """Yield the messages that are read with their times, in the order of recording.
-
-        Args:
-            start_ns: Time of the first message [ns]; None for all.
-            losses: Counts what cannot be used.
-        """
-        log_start = None if start_ns is None else start_ns - self._clock.offset_ns - WINDOW_NS
+    def _arrivals(self, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
+        """Yield the messages that are read with their times, in the order of recording; what cannot be used
+        is counted in `losses`."""
         wanted = self._wanted | self._alignments.numbers
-        for message in self._container.messages(wanted, log_start, losses):
-            for arrival in self._times_of(message, losses):
-                if start_ns is None or arrival.stamp_ns >= start_ns:
-                    yield arrival
+        for message in self._container.messages(wanted, None, losses):
+            yield from self._times_of(message, losses)
 
     def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Yield the contents of a message with their times: the message itself, or the odometry in a message

@@ -95,12 +95,11 @@ class ScanFolder(FileSource):
             warnings=tuple(self._warnings),
         )
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield scans from `start_ns` [ns] on (None: all), each after its odometry if it has a pose; earlier
-        files are not opened. Files that cannot be read, and scans without points, are counted in `losses`."""
+    def records(self) -> Iterator[Record]:
+        """Yield the scans, each after its odometry if it has a pose. Files that cannot be read, and scans
+        without points, are counted in `losses`."""
         self._losses = losses = dict[str, int]()
-        begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
-        for index in range(begin, len(self._files)):
+        for index in range(len(self._files)):
             stamp_ns = int(self._stamp[index])
             pose = None if self._poses is None else self._poses[index]
             if pose is not None:

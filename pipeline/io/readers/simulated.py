@@ -57,20 +57,18 @@ class SimulatedSource(FileSource):
             warnings=warnings,
         )
 
-    def records(self, start_ns: int | None = None, *, every: int = 1) -> Iterator[Record]:
+    def records(self, *, every: int = 1) -> Iterator[Record]:
         """Yield all records in the order of time; with equal times IMU, odometry, scan.
 
         The stamp of a scan is the start of its sweep, so readings during the sweep follow it. Readings
         continue to the end of the last sweep, so that every sweep can be undistorted.
 
         Args:
-            start_ns: Earlier times [ns] are left out; None for none.
             every: Only every n-th scan is simulated and yielded, with all other readings.
         """
         period = self.run.lidar.period_ns
         per_odometry, per_scan = IMU_HZ // ODOMETRY_HZ, period // _TICK_NS
-        first = 0 if start_ns is None else max(0, -((START_NS - start_ns) // _TICK_NS))
-        for tick in range(first, self.run.scans * per_scan + 1):
+        for tick in range(self.run.scans * per_scan + 1):
             yield self.run.imu_record(tick)
             if tick % per_odometry == 0:
                 yield self.run.odometry_record(tick // per_odometry)

@@ -199,13 +199,12 @@ class TreeManagerSource(FileSource):
             warnings=warnings,
         )
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield odometry for each row of the trajectory, then the scan of the same time, from `start_ns` [ns]
-        on; earlier files are not opened. Files and rows that cannot be read are counted in `losses`."""
+    def records(self) -> Iterator[Record]:
+        """Yield odometry for each row of the trajectory, then the scan of the same time. Files and rows
+        that cannot be read are counted in `losses`."""
         self._losses = losses = dict[str, int]()
         file_of = dict(zip(self._row.tolist(), self._files, strict=True))
-        begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
-        for row in range(begin, len(self._stamp)):
+        for row in range(len(self._stamp)):
             stamp_ns = int(self._stamp[row])
             yield Odometry(stamp_ns, self._poses[row] @ self._T_base_lidar.inverse())
             if row in file_of:

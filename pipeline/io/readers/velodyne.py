@@ -212,17 +212,15 @@ class PcapSource(FileSource):
             digest=digest_of([path]),
         )
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Yield the scans from `start_ns` [ns] on; earlier packets are not decoded. Scans without points, or
-        that cannot be decoded, are counted in `losses`.
+    def records(self) -> Iterator[Record]:
+        """Yield the scans. Those without points, or that cannot be decoded, are counted in `losses`.
 
         Raises:
             SourceError: The file cannot be read any more.
         """
         self._losses = losses = dict[str, int]()
         decoder = PacketDecoder()
-        begin = 0 if start_ns is None else int(np.searchsorted(self._stamp, start_ns))
-        for sweep in range(begin, len(self._first)):
+        for sweep in range(len(self._first)):
             rows = range(int(self._first[sweep]), int(self._last[sweep]) + 1)
             stamps = self._packets["stamp_ns"][rows.start : rows.stop].tolist()
             try:

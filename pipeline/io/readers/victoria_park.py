@@ -126,29 +126,26 @@ class VictoriaParkSource(FileSource):
             preset="laser2d",
         )
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
-        """Return the odometry and the scans in the order of time, odometry first at equal times, from
-        `start_ns` [ns] on (None: all). Scans without points are counted in `losses`."""
+    def records(self) -> Iterator[Record]:
+        """Return the odometry and the scans in the order of time, odometry first at equal times.
+        Scans without points are counted in `losses`."""
         self._losses = losses = dict[str, int]()
-        streams: list[Iterator[Record]] = [self._odometry(start_ns), self._scans(start_ns, losses)]
+        streams: list[Iterator[Record]] = [self._odometry(), self._scans(losses)]
         return heapq.merge(*streams, key=attrgetter("stamp_ns"))
 
     def truth(self) -> Truth | None:
         """Return the path by GPS, without yaw and in another frame than the map; None if the zip has none."""
         return None if self._gps is None else Truth(path=self._gps)
 
-    def _odometry(self, start_ns: int | None) -> Iterator[Record]:
-        """Yield the odometry from a time on [ns] (None: all)."""
-        begin = 0 if start_ns is None else int(np.searchsorted(self._odometry_ns, start_ns))
-        for index in range(begin, len(self._odometry_ns)):
+    def _odometry(self) -> Iterator[Record]:
+        """Yield the odometry."""
+        for index in range(len(self._odometry_ns)):
             x, y, yaw = self._poses[index].tolist()
             yield Odometry(int(self._odometry_ns[index]), Pose3.from_euler([x, y, 0.0], 0.0, 0.0, yaw))
 
-    def _scans(self, start_ns: int | None, losses: dict[str, int]) -> Iterator[Record]:
-        """Yield the scans with points from a time on [ns] (None: all); those without are counted in
-        `losses`."""
-        begin = 0 if start_ns is None else int(np.searchsorted(self._scan_ns, start_ns))
-        for index in range(begin, len(self._scan_ns)):
+    def _scans(self, losses: dict[str, int]) -> Iterator[Record]:
+        """Yield the scans with points; those without are counted in `losses`."""
+        for index in range(len(self._scan_ns)):
             scan = self._scan(index)
             if len(scan.points):
                 yield scan

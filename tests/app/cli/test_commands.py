@@ -465,8 +465,8 @@ def test_losses_are_said_and_told_by_the_exit_code(tmp_path, capsys, monkeypatch
 
     whole = SimulatedSource.records
 
-    def with_a_scan_twice(self, start_ns=None):
-        for record in whole(self, start_ns):
+    def with_a_scan_twice(self):
+        for record in whole(self):
             yield record
             yield record
 

@@ -33,7 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("live") / "run.mcap"
     with closing(open_source(f"sim:paper?duration={0.1 * SCANS:g}&odometry=poor")) as source:
         known = source.description
-        write_recording(path, source.records(None), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
+        write_recording(path, source.records(), sensor=known.sensor, T_base_lidar=known.T_base_lidar)
     return path
 
 

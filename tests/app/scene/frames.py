@@ -82,7 +82,6 @@ def make_frame(index: int = 0, *, trees: int = 25, clusters: int = 8, pose: Pose
             weights=np.full(100, 0.01),
             n_eff=80.0,
             landmarks=np.zeros((0, 2)),
-            resampled=False,
         ),
         T_odom_base=Pose2(at.x * 1.02, at.y + 0.001 * index, at.yaw),
         sensor_offset=np.array([0.12, 0.0, 0.62]),

@@ -52,7 +52,7 @@ class LoopedSource(FileSource):
             known, uri=uri, scans=scans, start_ns=start_ns, end_ns=start_ns + (scans - 1) * self._period_ns
         )
 
-    def records(self, start_ns: int | None = None) -> Iterator[Record]:
+    def records(self) -> Iterator[Record]:
         """Yield the records of all laps and breaks in the order of time."""
         of_wheels = [record.T_odom_base for record in self._records if isinstance(record, Odometry)]
         before_lap, lap_begins = Pose3.identity(), of_wheels[0].inverse()
@@ -67,15 +67,13 @@ class LoopedSource(FileSource):
                     moved = replace(moved, T_odom_base=before_lap @ lap_begins @ moved.T_odom_base)
                 if moved.stamp_ns >= end:
                     return
-                if start_ns is None or moved.stamp_ns >= start_ns:
-                    yield moved
+                yield moved
             before_lap, shift_ns, lap = before_lap @ step, shift_ns + self._lap_ns, lap + 1
             if lap % LAPS_BETWEEN_BREAKS == 0:
                 for moved in self._standing(before_lap, shift_ns):
                     if moved.stamp_ns >= end:
                         return
-                    if start_ns is None or moved.stamp_ns >= start_ns:
-                        yield moved
+                    yield moved
                 shift_ns += BREAK_SCANS * self._period_ns
 
     def _standing(self, pose: Pose3, shift_ns: int) -> Iterator[Record]:

@@ -36,8 +36,8 @@ class NoWheels(SimulatedSource):
         super().__init__(URI, inner.run)
         self._description = replace(self.description, has_odometry=False)
 
-    def records(self, start_ns: int | None = None, *, every: int = 1) -> Iterator[Record]:
-        return (r for r in super().records(start_ns, every=every) if not isinstance(r, Odometry))
+    def records(self, *, every: int = 1) -> Iterator[Record]:
+        return (r for r in super().records(every=every) if not isinstance(r, Odometry))
 
 
 def without_wheels() -> NoWheels:
@@ -80,10 +80,10 @@ def test_reading_again_gives_the_same_poses():
             if len(poses) == 12:
                 break
     again = {}
-    for record in moving.records(sorted(poses)[5]):
+    for record in moving.records():
         if isinstance(record, Odometry):
             again[record.stamp_ns] = record.T_odom_base.t.tobytes()
-            if len(again) == 20:
+            if len(again) == 25:
                 break
     fresh, _ = with_odometry(without_wheels(), "kiss-icp")
     straight = {r.stamp_ns: r.T_odom_base.t.tobytes() for r in fresh.records() if isinstance(r, Odometry)}

@@ -21,7 +21,7 @@ from pipeline.io.readers.tree_manager import (
     trajectory_text,
     write_tree_manager,
 )
-from pipeline.types.records import Odometry, Record, Scan, Stems
+from pipeline.types.records import Odometry, Scan, Stems
 from pipeline.types.records import Path as MapPath
 from tests.app import fakes
 from tests.pipeline.io.conftest import Opened
@@ -63,11 +63,6 @@ def stems(scan: Scan) -> Stems:
     return scan.stems
 
 
-def same(a: Record, b: Record) -> bool:
-    """Whether two records are of one kind and time."""
-    return type(a) is type(b) and a.stamp_ns == b.stamp_ns
-
-
 def test_each_frame_is_a_scan_with_its_stems_and_its_pose(tmp_path: Path, opened: Opened):
     source = opened(write(tmp_path))
     known = source.description
@@ -100,13 +95,6 @@ def test_the_published_frames_are_those_of_the_whole_run(shared_data: Path, tmp_
         np.testing.assert_allclose(stems(scan).dbh, evo["dbh"][rows], rtol=1e-6)
         np.testing.assert_allclose(stems(scan).axis, evo["axis_z"][rows], atol=1e-6)
     assert source.losses == {}
-
-
-def test_reading_from_a_time_on_gives_the_rest(tmp_path: Path, opened: Opened):
-    source = opened(write(tmp_path))
-    rest = list(source.records(100_700_000_000))
-    assert len(rest) == 4
-    assert all(map(same, rest, list(source.records())[4:]))
 
 
 def test_rows_without_a_file_are_odometry_alone(tmp_path: Path, opened: Opened):

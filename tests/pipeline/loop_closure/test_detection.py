@@ -140,7 +140,7 @@ def test_of_two_trees_that_were_one_the_older_number_stays_and_two_beside_it_sta
         np.array([4, 3, 12]), place, np.tile([1e-4, 0.0, 1e-4], (3, 1)), np.ones(3), 3.5, 1.0
     )
     pose = Pose2(11.0, 0.0, 0.0)
-    estimate = PoseEstimate(pose, SURE, pose.as_array()[None], np.ones(1), 1.0, place, False)
+    estimate = PoseEstimate(pose, SURE, pose.as_array()[None], np.ones(1), 1.0, place)
     tracker.correct(shifted(dx=-3.0, first=10), np.arange(60), estimate, landmarks)
     corrected = tracker.tracks
     assert corrected.number.tolist() == corrected.landmark.tolist() == [3, 4, 12]

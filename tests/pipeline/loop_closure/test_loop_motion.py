@@ -40,7 +40,7 @@ def trees(place, first_ns, last_ns):
 def mapped(path, motion, known, placed=0):
     """A run of one scan a nanosecond."""
     n = np.zeros(0)
-    estimate = PoseEstimate(Pose2(*path[-1]), SURE, path[-1:], np.ones(1), 1.0, n.reshape(0, 2), False)
+    estimate = PoseEstimate(Pose2(*path[-1]), SURE, path[-1:], np.ones(1), 1.0, n.reshape(0, 2))
     none = lambda _: (n.reshape(0, 2), n.reshape(0, 3))  # noqa: E731
     pose = Pose2(*path[-1])
     return RunHistory(np.arange(len(path)), path, known, none, pose, estimate, NOISE, motion, placed)

@@ -81,20 +81,6 @@ def test_seed_from_the_options_is_that_of_the_uri():
     assert bytes_of(by_options.run.sweep(3).scan) == bytes_of(by_uri.run.sweep(3).scan)
 
 
-@pytest.mark.parametrize("after_ns", [0, 1, 10_000_000, 10_000_001, 95_000_000, 1_234_567_890])
-def test_reading_from_any_time_gives_the_rest_of_the_run(after_ns):
-    everything = stream_of(open_simulated(SHORT).records())
-    start = START_NS + after_ns
-    rest = stream_of(open_simulated(SHORT).records(start))
-    assert rest == [row for row in everything if row[1] >= start]
-
-
-def test_reading_before_the_start_gives_all_and_after_the_end_nothing():
-    source = open_simulated("sim:paper?duration=1")
-    assert len(list(source.records(0))) == len(list(source.records()))
-    assert list(source.records(START_NS + 10_000_000_000)) == []
-
-
 def test_any_scan_can_be_made_alone():
     in_order = [record for record in open_simulated(SHORT).records() if isinstance(record, Scan)]
     alone = open_simulated(SHORT).run

@@ -321,7 +321,8 @@ def resampled():
     slam.process(0, Pose2(), detections(TREES), NOTHING_SEEN)
     slam.state.log_weight[:] = -1e9
     slam.state.log_weight[[3, 50, 97]] = 0.0
-    assert slam.process(1, Pose2(), detections(TREES), NOTHING_SEEN).resampled
+    assert slam.process(1, Pose2(), detections(TREES), NOTHING_SEEN).n_eff < 5.0
+    assert not slam.state.log_weight.any()
     return slam
 
 
