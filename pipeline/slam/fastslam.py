@@ -261,7 +261,7 @@ class FastSlam:
         if solution is None:
             self.state = replace(self.state, graph=replace(graph, revisits=0))
             return None
-        return self._corrected(index, graph, solution, solution.conditional[-1])
+        return self._corrected(index, graph, solution, solution.conditional)
 
     def close(self, index: int, loop: Loop) -> PathCorrection | None:
         """Close a loop that ends at the newest scan: solve the graph with it, and correct path and landmarks.
@@ -334,7 +334,7 @@ class FastSlam:
         self._put(index, Pose2(*after[-1].tolist()), covariance)
         particles = len(self.state.pose)
         frame = before.frame
-        frame = frame.smoothed_by(correction, _at_scans(_of_map(solution), graph, frame.scan))
+        frame = frame.smoothed_by(correction, _at_scans(solution.of_map, graph, frame.scan))
         self.state = replace(
             self.state,
             maps=shared_map(particles, moved if names is None else joined(moved, *names)),
@@ -647,29 +647,17 @@ class FastSlam:
         return shared.measured(measured)
 
 
-def _of_map(solution: Solution) -> Float:
-    """Return the part of the covariance of each keyframe's pose that comes from the positions of the stems
-    around it, shape (K, 3, 3).
-
-    By the law of total variance it is Cov(x) - Cov(x | stems). Other poses that are found by these stems
-    share it.
-    """
-    values, axes = np.linalg.eigh(solution.covariance - solution.conditional)
-    part: Float = (axes * np.maximum(values, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
-    return part
-
-
 def _at_scans(covariance: Float, graph: KeyframeGraph, scans: Int) -> Float:
-    """Return the covariance at some scans, shape (N, 3, 3): that of the last keyframe before or at the scan.
-    The second keyframe stands for the first one and earlier scans, since the first pose is fixed.
+    """Return the covariance at some scans, shape (N, 3, 3): that of the last keyframe before or at the scan,
+    or of the first keyframe for earlier scans.
 
     Args:
-        covariance: Covariance of each keyframe, shape (K, 3, 3), K > 1.
+        covariance: Covariance of each keyframe, shape (K, 3, 3), K > 0.
         graph: Graph with these keyframes.
         scans: Numbers of the scans, int64, shape (N,).
     """
     keyframe = np.searchsorted(graph.scans, scans, side="right") - 1
-    rows: Float = covariance[np.maximum(keyframe, 1)]
+    rows: Float = covariance[np.maximum(keyframe, 0)]
     return rows
 
 

@@ -5,7 +5,8 @@ ancestor they share its map and the error of that map; back at an old place they
 itself is uncertain in the frame of the map. This module therefore stores the pose covariance at reference
 poses along the path, where landmarks were begun. A pose that is found by those landmarks gets at least the
 stored covariance: an unknown common error does not shrink when estimates that share it are combined (Julier,
-Uhlmann 2001).
+Uhlmann 2001). After a solution of the graph all particles have the same landmarks; their error is stored in
+place of the covariance, and is added to the spread. Landmarks that are begun later are as before.
 """
 
 from __future__ import annotations

@@ -160,13 +160,17 @@ class Solution:
         birth: int64, shape (L,), ascending: landmarks of the graph.
         position: Their positions, shape (L, 2) [m].
         covariance: Covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3).
-        conditional: Covariance of each keyframe's pose given all other poses and stems, shape (K, 3, 3).
+        of_map: Part of these covariances that comes from the other poses and stems, shape (K, 3, 3), positive
+            semidefinite. By the law of total variance it is Cov(x) - Cov(x | all others). Another pose that
+            is found by the same stems shares it. The first keyframe, which is fixed, has that of the second.
+        conditional: Covariance of the newest keyframe's pose given all other poses and stems, shape (3, 3).
     """
 
     pose: Float
     birth: Int
     position: Float
     covariance: Float
+    of_map: Float
     conditional: Float
 
 
@@ -453,8 +457,8 @@ class _Problem:
         return x, l, H
 
     def solution(self, x: Float, l: Float, H: Sparse) -> Solution:  # noqa: E741
-        """Return the record of a minimum. The diagonal blocks of the normal matrix H are the information of
-        each pose given all other unknowns.
+        """Return the record of a minimum. A diagonal block of the normal matrix H is the information of a
+        pose given all other unknowns.
 
         Args:
             x: Poses, shape (K, 3).
@@ -462,13 +466,11 @@ class _Problem:
             H: Normal matrix, sparse, shape (3K + 2L, 3K + 2L).
 
         Raises:
-            LinAlgError: The problem is singular.
+            LinAlgError: Nothing observes the newest pose, or the problem is singular.
         """
-        a = np.arange(3 * len(x)).reshape(-1, 3)
-        row, column = np.broadcast_arrays(a[:, :, None], a[:, None, :])
-        information = np.asarray(H[row.ravel(), column.ravel()]).reshape(-1, 3, 3)
-        conditional = np.linalg.inv(information)
-        return Solution(x, self.birth, l, self._marginals(H), conditional)
+        end = 3 * len(x)
+        conditional = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
+        return Solution(x, self.birth, l, *self._marginals(H), conditional)
 
     def _triangulated(self) -> Float:
         """Return the mean position of each landmark by its detections at the poses in `pose`, shape (L, 2)
@@ -609,10 +611,10 @@ class _Problem:
         rank = splu(dominant, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).perm_c
         return np.argsort(rank[node], kind="stable")
 
-    def _marginals(self, H: Sparse) -> Float:
-        """Return the covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3). It is
-        computed from the normal matrix H for at most MARGINALS keyframes and interpolated linearly by row in
-        between.
+    def _marginals(self, H: Sparse) -> tuple[Float, Float]:
+        """Return `covariance` and `of_map` of the solution, shape (K, 3, 3) each. They are computed from the
+        normal matrix H for the second and at most MARGINALS other keyframes, and interpolated linearly by row
+        in between.
 
         Raises:
             LinAlgError: H is singular.
@@ -621,17 +623,27 @@ class _Problem:
         solve = self._factorised(H, 0.0)
         if solve is None:
             raise np.linalg.LinAlgError("the normal matrix is singular")
-        chosen = np.unique(np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64))
+        chosen = np.unique(np.r_[1, np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64)])
         unit = np.zeros((H.shape[0], 3 * len(chosen)))
         columns = (3 * chosen[:, None] + np.arange(3)).ravel()
         unit[columns, np.arange(len(columns))] = 1.0
         inverse_H = solve(unit)
         blocks = np.array([inverse_H[3 * k : 3 * k + 3, 3 * n : 3 * n + 3] for n, k in enumerate(chosen)])
         blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
-        at = np.arange(K)
-        return np.stack(
-            [np.interp(at, chosen, blocks[:, a, b]) for a in range(3) for b in range(3)], axis=1
-        ).reshape(-1, 3, 3)
+        given_others = [
+            np.linalg.inv(H[3 * k : 3 * k + 3, 3 * k : 3 * k + 3].toarray() + REGULAR * np.eye(3))
+            for k in chosen
+        ]
+        values, axes = np.linalg.eigh(blocks - np.array(given_others))
+        of_map = (axes * np.maximum(values, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
+        return _interpolated(chosen, blocks, K), _interpolated(chosen[1:], of_map[1:], K)
+
+
+def _interpolated(rows: Int, matrices: Float, count: int) -> Float:
+    """Return matrices for the rows 0 to `count` - 1, shape (count, 3, 3), interpolated linearly between those
+    of some rows, shape (N, 3, 3), and constant before and after them."""
+    flat, at = matrices.reshape(-1, 9), np.arange(count)
+    return np.column_stack([np.interp(at, rows, column) for column in flat.T]).reshape(-1, 3, 3)
 
 
 def _root_information(covariance: Float) -> Float:

@@ -186,18 +186,17 @@ class Rows(NamedTuple):
 def join(rows: Rows, old: int, young: int) -> None:
     """Join the track of row `young` to that of row `old`, in place.
 
-    Both are parts of one trunk. The one whose landmark has the larger score gives landmark, state and
-    covariance: a part that is a branch or undergrowth can be decimetres beside the trunk. Counts and sums are
-    added (a last scan that observed both counts once). The class is tree if one is a tree; a track without
-    class gets that of the other one. The row `old` keeps its number. The row `young` stays unchanged; the
-    caller removes it.
+    Both are parts of one trunk. The one whose landmark has the larger score gives landmark, state, covariance
+    and time of the last observation: a part that is a branch or undergrowth can be decimetres beside the
+    trunk. Counts and sums are added (a last scan that observed both counts once). The class is tree if one is
+    a tree; a track without class gets that of the other one. The row `old` keeps its number. The row `young`
+    stays unchanged; the caller removes it.
     """
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, sides, verdict = rows.hits, rows.sides, rows.verdict
     # Two parts of one trunk in the last scan count once; earlier scans with both parts count twice.
     if stamp_ns[old] == stamp_ns[young] and min(hits[old], hits[young]) > 0:
         hits[old] -= 1
-    stamp_ns[old] = max(stamp_ns[old], stamp_ns[young])
     first_ns[old] = min(first_ns[old], first_ns[young])
     sides[old] |= sides[young]
     # A track without class does not change the class of the other one.
@@ -208,7 +207,7 @@ def join(rows: Rows, old: int, young: int) -> None:
         rows.landmark[old] == NO_LANDMARK or rows.score[young] > rows.score[old]
     ):
         rows.landmark[old] = rows.landmark[young]
-        x[old], P[old], shared[old] = x[young], P[young], shared[young]
+        x[old], P[old], shared[old], stamp_ns[old] = x[young], P[young], shared[young], stamp_ns[young]
     rows.score[old] = max(rows.score[old], rows.score[young])
     for total in (rows.eccentricity, rows.radius, rows.radius_weight, rows.radius_reach, rows.radius_above):
         total[old] += total[young]

@@ -320,8 +320,9 @@ def follow(
         )
         for k in range(lost.shape[0]):
             if at[k] >= 0:
-                owner[free[at[k]]] = lost[k]
-                landmark_of[lost[k]] = free[at[k]]
+                j = free[at[k]]
+                owner[j], landmark_of[lost[k]] = lost[k], j
+                rows.landmark[lost[k]], rows.score[lost[k]] = birth[j], score[j]
         # A landmark that is gone while another track has the one at its position was merged with it.
         merged = lost[(landmark_of[lost] < 0) & (before[lost] != NO_LANDMARK)]
         if merged.shape[0] > 0:

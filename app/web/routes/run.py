@@ -25,6 +25,7 @@ router = APIRouter(prefix="/api")
 
 _MOST_RECORDINGS = 500
 _LEVELS = 3  # of folders that are searched for recordings
+_MOST_ENTRIES = 5000  # of them together
 SHORTEST_LOOP_S = 0.5
 SLOWEST = 0.01
 
@@ -183,22 +184,43 @@ def recordings(folders: Sequence[Path]) -> list[tuple[Path, str]]:
     paths inside of the data folder.
 
     They are recognised by their names. A folder that is no recording is searched as well, at most three
-    levels deep and not through links. Hidden files, finished maps and folders that cannot be read are left
-    out.
+    levels deep and not through links; the search ends after 5,000 entries. Hidden files, finished maps, and
+    what cannot be read are left out.
     """
-    found = ((path, str(path.relative_to(folder))) for folder in folders for path in _inside(folder))
-    return list(islice(found, _MOST_RECORDINGS))
+    entries = ((folder, *entry) for folder in folders for entry in _entries(folder))
+    found = {
+        path: str(path.relative_to(folder))
+        for folder, path, kind in islice(entries, _MOST_ENTRIES)
+        if kind == "recording"
+    }
+    return list(islice(found.items(), _MOST_RECORDINGS))
 
 
-def _inside(folder: Path, levels: int = _LEVELS) -> Iterator[Path]:
-    """Yield the files and folders in a folder that may be recordings; see `recordings`."""
+_Kind = Literal["recording", "folder", "other"]
+
+
+def _entries(folder: Path, levels: int = _LEVELS) -> Iterator[tuple[Path, _Kind]]:
+    """Yield the entries of a folder, sorted, and those of folders in it that are no recording."""
+    inside: list[Path] = []
+    with contextlib.suppress(OSError):
+        inside = sorted(folder.iterdir())
+    for path in inside:
+        kind = _kind_of(path)
+        yield path, kind
+        if kind == "folder" and levels > 1:
+            yield from _entries(path, levels - 1)
+
+
+def _kind_of(path: Path) -> _Kind:
+    """Return whether a file or folder is a recording by its name or the names in it, or a folder that may
+    contain some."""
     from pipeline.io.readers import expected_format, folder_opener
 
     with contextlib.suppress(OSError):
-        for path in sorted(folder.iterdir()):
-            if path.name.startswith(".") or (path / "run.json").is_file():
-                continue
-            if folder_opener(path) if path.is_dir() else expected_format(path):
-                yield path
-            elif levels > 1 and path.is_dir() and not path.is_symlink():
-                yield from _inside(path, levels - 1)
+        if path.name.startswith(".") or (path / "run.json").is_file():
+            return "other"
+        if path.is_file():
+            return "recording" if expected_format(path) else "other"
+        if path.is_dir():
+            return "recording" if folder_opener(path) else "other" if path.is_symlink() else "folder"
+    return "other"

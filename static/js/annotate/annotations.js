@@ -11,7 +11,6 @@ import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 
 const NUDGE_WAIT = 400; // [ms] of quiet after which nudges become one edit
-const TREE_OF_ROW = 0.7; // [m] between an annotation and its tree
 const PATIENCE = 3000; // [ms] until an accepted edit must have come back
 const VOTES_EVERY = 2000; // [ms] between two requests for the votes
 export const KINDS = ["tree", "pole", "person", "bush", "other"];
@@ -139,14 +138,18 @@ const edited = () => ({
 // Annotations and plots have one history: tells what the step changed, and selects the tree of a single annotation.
 async function turn(where, word) {
   await settle();
-  const before = edited();
-  if (!await edit(() => call("POST", where))) return;
+  let before = null, run = null;
+  const done = await edit(() => {
+    [before, run] = [edited(), state.annotations?.run];
+    return call("POST", where);
+  });
+  if (!done || run !== state.annotations?.run) return;
   const after = edited();
   const parts = Object.keys(after).map((name) => [name, differing(before[name], after[name])]).filter(([, changes]) => changes.length);
   showNews(`${word}: ${parts.map(([name, changes]) => count(changes.length, name)).join(", ") || "nothing changed"}.`);
   const [[name, [row, ...others]] = ["", []]] = parts;
   if (name !== "annotation" || others.length) return;
-  const tree = nearest(trees(), (each) => distance(each, row), TREE_OF_ROW);
+  const tree = nearest(trees(), (each) => distance(each, row), state.annotations.same_thing_m);
   if (tree) select(tree.number);
 }
 

@@ -72,7 +72,7 @@ function stages() {
 }
 
 const NOTHING = "Nothing to plot yet: the curves begin with the first scan that this page receives. Press play.";
-const timeTitle = () => `time in the run, s${isOutdated() ? "; in part with earlier parameters: play the run again to renew them" : ""}`;
+const timeTitle = () => `time in the run, s${isOutdated() ? "; partly mapped with earlier parameters: play the run again to renew the curves" : ""}`;
 
 // Curves of quantities below one another, with one axis of time.
 function curves(names) {

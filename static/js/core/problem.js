@@ -1,4 +1,4 @@
-// A line at the lower edge of the page until it is closed or replaced: a failed request or action and what to do, or news.
+// A line at the lower edge of the page for some seconds: a failed request or action and what to do, or news.
 
 import { el, setText } from "./dom.js";
 
@@ -14,7 +14,7 @@ function build() {
 }
 
 export const showProblem = (error) => show(typeof error === "string" ? error : error.message, true);
-export const showNews = (text) => show(text, false);
+export const showNews = (text) => { if (!box || box.hidden || !box.classList.contains("problem")) show(text, false); };
 
 function show(text, isProblem) {
   if (!box) build();

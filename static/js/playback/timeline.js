@@ -86,10 +86,12 @@ function showSeeking(status) {
   line.firstElementChild.style.width = `${percent}%`;
 }
 
+let closeWarnings = () => {};
+
 function showWarnings(warnings) {
   const button = byId("warnings-button");
   button.hidden = !warnings.length;
-  if (!warnings.length) byId("warnings").hidden = true;
+  if (!warnings.length) closeWarnings();
   setText(button, `⚠ ${count(warnings.length, "warning")}`);
   const list = byId("warnings");
   if (list.dataset.shown === warnings.join("\n")) return;
@@ -127,7 +129,7 @@ export function startTimeline() {
     send("set_speed", { factor: Number(event.target.value) });
     event.target.blur();
   });
-  startPopover(byId("warnings-button"), byId("warnings"));
+  closeWarnings = startPopover(byId("warnings-button"), byId("warnings"));
   on("status", show);
   on("parameters", showPreset);
 }

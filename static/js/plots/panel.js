@@ -87,7 +87,7 @@ function imported() {
 }
 
 function setting(name, label, value, title, type, placeholder = "") {
-  return el("label", { title }, label, el("input", { type, value, title, placeholder, step: "any", min: "0", max: "100", onchange: (event) => { remember(name, event.target.value.trim()); refresh(); } }));
+  return el("label", { title }, label, el("input", { type, value, title, placeholder, step: "any", min: "0", max: "100", onchange: (event) => { remember(name, event.target.value.trim()); fill(); refresh(); } }));
 }
 
 function build() {
@@ -241,6 +241,6 @@ export function startPlotsPanel() {
   startCoordinates();
   on("map", () => { if (!state.map) { figures = { all: null, plots: null, problem: "" }; shown = []; } });
   on("tab", () => { if (!plotting()) stopDrawing(); });
-  on("tab annotations annotating sketch", fill);
-  on("map tab annotations parameters", refresh);
+  on("tab annotations annotating sketch parameters remapped", fill);
+  on("map tab annotations parameters remapped", refresh);
 }

@@ -14,14 +14,15 @@ import { scans, shortSource, when } from "./figures.js";
 const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["pose lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"], ["preset", "minor extra"]];
 const REFRESH_EVERY = 5000; // [ms]
 let known = { runs: [], folders: [], open: null }, listed = ""; // the answer of the server, and its text
+let requests = 0;
 const ticked = new Set();
 let deleted = null; // the run that Undo brings back
 
 async function load() {
+  const request = requests += 1;
   try {
     const answer = await get("/api/runs"), text = JSON.stringify(answer);
-    byId("runs-error").hidden = true;
-    if (text === listed) return;
+    if (request !== requests || text === listed) return; // a later request knows more
     [known, listed] = [answer, text];
   } catch (error) {
     showError(error.message);

@@ -41,6 +41,7 @@ from app.worker.protocol import (
     WorkerBusyError,
 )
 from pipeline.config import field_specs, preset
+from pipeline.io import readers
 from tests.app.explain.stories import cluster_story
 from tests.app.fakes import FakeWorker, frame, opened, path, truth_trees
 from tests.app.server_for_tests import BEARER, PORT, TOKEN, Running, running
@@ -306,7 +307,9 @@ async def test_sources_offer_scenarios_and_recordings(tmp_path: Path) -> None:
     assert [each["uri"] for each in answer["recordings"]] == [f"{tmp_path}/a.pcap", f"{tmp_path}/b.mcap"]
 
 
-def test_recordings_in_folders_are_named_by_their_path_in_the_data_folder(tmp_path: Path) -> None:
+def test_recordings_in_folders_are_named_by_their_path_in_the_data_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in (
         "plot/day/1.mcap",
         "plot/day/2.mcap",
@@ -319,6 +322,18 @@ def test_recordings_in_folders_are_named_by_their_path_in_the_data_folder(tmp_pa
         (tmp_path / name).touch()
     (tmp_path / "loop").symlink_to(tmp_path)
     (tmp_path / "empty").mkdir()
+    (tmp_path / "gone.mcap").symlink_to(tmp_path / "nowhere.mcap")
+    (tmp_path / "done").mkdir()
+    for name in ("done/run.json", "done/a.laz"):
+        (tmp_path / name).touch()
+    opener = readers.folder_opener
+
+    def refused(folder: Path) -> object:
+        if folder.name == "a":
+            raise PermissionError
+        return opener(folder)
+
+    monkeypatch.setattr(readers, "folder_opener", refused)
     found = recordings([tmp_path, tmp_path / "nowhere"])
     assert [name for _, name in found] == ["kitti", "plot/b.pcap", "plot/day"]
     assert all(path == tmp_path / name for path, name in found)

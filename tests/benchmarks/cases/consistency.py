@@ -94,8 +94,8 @@ def summary(particles: int, errors: Errors) -> list[tuple[Cell, ...]]:
 
 
 def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = None) -> None:
-    """Drive once (the ring) among trees, with errors and with a filter of this seed, which its graph of
-    keyframes smooths as in the mapper."""
+    """Drive once (the ring) among trees, with errors and with a filter of this seed, whose map the
+    graph of keyframes smooths as in the mapper."""
     import numpy as np
 
     from pipeline.config import Parameters
@@ -111,7 +111,7 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
     drive = stand or RING
     trees_there = drive.trees(random)
     slam, tracker = FastSlam(parameters.slam, seed), Tracker(parameters.tracking)
-    truth, pose, position, nis = Pose2(), [], [], []
+    truth, pose, position, nis, stamps = Pose2(), [], [], [], list[int]()
     free = np.zeros(BINS)
     for k, stride in enumerate((None, *drive.strides)):
         told = Pose2()
@@ -123,10 +123,11 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
             told = Pose2(stride.x + noise[0], stride.y + noise[1], stride.yaw + noise[2])
         found = _detections(truth, trees_there, random)
         at = slam.process(k, told, found, free)
-        if slam.is_smoothing_due and slam.smooth(k) is not None:
+        stamps.append(k * 100_000_000)
+        tracker.process(stamps[-1], at, found, slam.landmarks())
+        if slam.is_smoothing_due and (correction := slam.smooth(k)) is not None:
             at = slam.estimate(at)
-        stamp_ns = k * 100_000_000
-        tracker.process(stamp_ns, at, found, slam.landmarks())
+            tracker.correct(correction, np.array(stamps), at, slam.landmarks())
         if k >= WARM:
             error = at.T_map_base.as_array() - truth.as_array()
             error[2] = wrap_angle(error[2])

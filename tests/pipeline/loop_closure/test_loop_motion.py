@@ -170,8 +170,8 @@ def test_mean_and_covariance_of_a_landmark_turn_with_the_correction(angle):
     none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
     frames = [Keyframe(k, 10 * k, 4.0 * k, path[k], np.eye(3), *none) for k in range(2)]
     graph = KeyframeGraph(tuple(frames), path)
-    turned = np.column_stack([path[:, :2] @ C.T, np.full(2, angle)])
-    solution = Solution(turned, *none[:2], np.zeros((2, 3, 3)), np.zeros((3, 3)))
+    turned, zeros = np.column_stack([path[:, :2] @ C.T, np.full(2, angle)]), np.zeros((2, 3, 3))
+    solution = Solution(turned, *none[:2], zeros, zeros, np.zeros((3, 3)))
     mean, flat = np.array([[1.0, 1.0], [20.0, 1.0]]), np.array([[0.04, 0.01, 0.01]] * 2)
     known = MapColumns(mean, flat, np.full(2, 5, np.int32), np.full(2, 5.0, np.float32), np.array([0, 15]))
     moved = corrected_landmarks(known, graph, solution, path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -124,6 +126,17 @@ def test_the_covariance_at_known_landmarks_is_that_of_their_reference_pose():
     older = (np.array([[2.0, 0.0]]), np.array([-1]), np.array([5], np.int32), 3)
     told, _ = FrameUncertainty().with_pose(here, thin, MANY, *older, 10.0)
     np.testing.assert_allclose(told, thin)
+
+
+def test_the_error_of_a_smoothed_map_is_added_to_the_spread():
+    """All particles share the map of a solution, so that their spread does not show its error."""
+    thin, of_map, here = np.eye(3) * 1e-4, np.diag([4e-4, 4e-4, 1e-6]), np.zeros(3)
+    memory = FrameUncertainty().with_reference(0, 0, here, np.eye(3))
+    memory = replace(memory, covariance=of_map[None], smoothed=np.ones(1, np.bool_))
+    landmarks = (np.array([[2.0, 0.0]]), np.array([3]), np.array([5], np.int32), 3)
+    for n_eff in (20.0, MANY):
+        told, _ = memory.with_pose(np.array([5.0, 0.0, 0.0]), thin, n_eff, *landmarks, 10.0)
+        np.testing.assert_allclose(told, thin + transported_covariance(of_map, 5.0, 0.0), atol=1e-12)
 
 
 @given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))

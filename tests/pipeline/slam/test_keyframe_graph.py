@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 
 from pipeline.geometry.pose_arrays import composed, inverse
 from pipeline.geometry.poses import Pose2, wrap_angle
+from pipeline.slam import keyframe_graph
 from pipeline.slam.keyframe_graph import (
     CAUCHY,
     KEYFRAMES_MAX,
@@ -178,6 +179,39 @@ def test_a_loop_corrects_the_drift_of_the_way_between():
     loop = bare.with_loop(0, Pose2(*true[-1]), 1e-6 * np.eye(3), bare.pose).solve(new_loop=True)
     assert off(loop.pose, true)[-1] < 0.01
     assert off(loop.pose, true).mean() < 0.7 * off(bare.pose, true).mean()
+
+
+def test_the_covariance_of_a_pose_is_that_given_all_others_and_that_of_the_map():
+    solution = graph_of(arc(10), np.random.default_rng(4)).solve()
+    np.testing.assert_allclose(solution.of_map[-1] + solution.conditional, solution.covariance[-1], atol=1e-9)
+    np.testing.assert_array_equal(solution.of_map[0], solution.of_map[1])
+    assert np.linalg.eigvalsh(solution.of_map).min() > -1e-15
+
+
+def test_the_part_of_the_map_is_interpolated_from_the_second_keyframe_on(monkeypatch):
+    """The covariance of the first keyframe is zero, because it is fixed; that of its stems is not."""
+    graph = graph_of(arc(80, radius=40.0, turn=0.02), np.random.default_rng(2))
+    told = graph.solve().of_map
+    monkeypatch.setattr(keyframe_graph, "MARGINALS", len(graph.keyframes))
+    exact = graph.solve().of_map
+    np.testing.assert_allclose(told[1], exact[1], rtol=1e-6)
+    sigma, expected = (np.sqrt(np.trace(part[:, :2, :2], axis1=1, axis2=2)) for part in (told, exact))
+    np.testing.assert_allclose(sigma, expected, rtol=0.25)
+
+
+def test_a_keyframe_without_odometry_and_detections_does_not_prevent_a_solution():
+    graph = graph_of(arc(6))
+    lost = replace(
+        graph.keyframes[3],
+        covariance=np.full((3, 3), np.inf),
+        birth=np.zeros(0, np.int64),
+        centre=np.zeros((0, 2)),
+        R=np.zeros((0, 3)),
+    )
+    after = replace(graph.keyframes[4], covariance=np.full((3, 3), np.inf))
+    assert (
+        replace(graph, keyframes=(*graph.keyframes[:3], lost, after, graph.keyframes[5])).solve() is not None
+    )
 
 
 def test_the_covariance_of_a_loop_is_turned_into_the_axes_of_its_first_keyframe():
