@@ -13,9 +13,11 @@ from __future__ import annotations
 
 import argparse
 import ast
+import gc
 import hashlib
 import importlib
 import json
+import math
 import multiprocessing
 import os
 import random
@@ -369,9 +371,10 @@ class Coverage:
         return [test for file in files for test in chosen if test.startswith(f"{file}::")]
 
 
-def recorded(folder: Path, tree: Path) -> Coverage:
+def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
     """Return the lines that quick tests execute. A file of tests is recorded once for each state of the
-    sources, of the helpers of the tests, and of itself."""
+    sources, of the helpers of the tests, and of itself. Those that mention ROOMS most come first; files that
+    are left after so many minutes are not used."""
     folder.mkdir(exist_ok=True)
     blobs = [line.split() for line in _git("ls-tree", "-r", "HEAD", "app", "pipeline", "tests").splitlines()]
     files = [
@@ -379,19 +382,19 @@ def recorded(folder: Path, tree: Path) -> Coverage:
         for _, _, blob, path in blobs
         if Path(path).name.startswith("test_") and not path.startswith("tests/browser/")
     ]
-    state = hashlib.sha256(
-        repr(
-            [blob for blob in blobs if (blob[3], blob[2]) not in files and blob[3] != "tests/mutation.py"]
-        ).encode()
-    )
-    names = {Path(room).stem for room in ROOMS} | {"io", "test_auth.py"}
-    files.sort(key=lambda file: names.isdisjoint(Path(file[0]).parts))
-    found = Coverage()
+    others = [(path, blob) for _, _, blob, path in blobs if path != "tests/mutation.py"]
+    state = hashlib.sha256(repr(sorted(set(others) - set(files))).encode())
+    rooms = re.compile("|".join(room.removesuffix(".py").replace("/", r"\.") for room in ROOMS))
+    files.sort(key=lambda file: -len(rooms.findall((_ROOT / file[0]).read_text())))
+    found, end = Coverage(), time.monotonic() + 60.0 * minutes
     for number, (path, blob) in enumerate(files):
         key = state.copy()
         key.update(blob.encode())
         lines = folder / f"{path.replace('/', '-')}-{key.hexdigest()[:16]}.json"
         if not lines.exists():
+            if time.monotonic() > end:
+                print(f"not recorded: {path}", flush=True)
+                continue
             begin = time.monotonic()
             code = _exit_code(
                 f"{path} -m 'not slow and not browser'",
@@ -417,11 +420,14 @@ def main() -> None:
     parser.add_argument("--only", default="", help="run only mutants whose file or change contains this text")
     parser.add_argument("--minutes", type=float, help="run generated mutants for so long")
     parser.add_argument("--seed", type=int, default=0, help="of their order")
+    parser.add_argument("--record-minutes", type=float, default=math.inf, help="record lines for so long")
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[name] = "1"
     for library in _LIBRARIES:
         importlib.import_module(library)
+    gc.freeze()  # a fork does not search them for garbage
     given.folder.mkdir(exist_ok=True)
     results = given.folder / "results.jsonl"
     commit = _git("rev-parse", "HEAD").strip()
@@ -443,8 +449,12 @@ def main() -> None:
             (tree / kernel.relative_to(_ROOT)).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(kernel, tree / kernel.relative_to(_ROOT))
         try:
-            lines = Coverage() if given.minutes is None else recorded(given.folder / "lines", tree)
-            end = time.monotonic() + 60.0 * (given.minutes or float("inf"))
+            lines = (
+                Coverage()
+                if given.minutes is None
+                else recorded(given.folder / "lines", tree, given.record_minutes)
+            )
+            end = time.monotonic() + 60.0 * (given.minutes or math.inf)
             for number, mutant in enumerate(wanted):
                 if time.monotonic() > end:
                     break
@@ -551,6 +561,7 @@ def _exit_code(
     else:
         # A test that is skipped in the middle may leave an exception in a destructor.
         words += ["-W", "ignore::pytest.PytestUnraisableExceptionWarning"]
+        words += ["-W", "ignore::coverage.exceptions.CoverageWarning"]  # no line of ROOMS is executed
     settings = {
         "PYTHONPATH": str(tree),
         "NUMBA_DISABLE_JIT": str(int(not compiled)),
@@ -561,16 +572,19 @@ def _exit_code(
         target=_run_pytest, args=([*words, *shlex.split(tests)], tree, settings)
     )
     process.start()
-    process.join(limit_s)
-    with suppress(ProcessLookupError):
-        os.killpg(process.pid or 0, signal.SIGKILL)  # also the processes that its tests started
-    process.join()
+    try:
+        process.join(limit_s)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid or 0, signal.SIGKILL)  # also the processes that its tests started
+        process.join()
     return TIMEOUT if process.exitcode == -signal.SIGKILL else process.exitcode or 0
 
 
 def _run_pytest(words: list[str], tree: Path, settings: dict[str, str]) -> None:
     """Run pytest in a worktree, in a process of its own group, and end the process with its exit code."""
     os.setpgid(0, 0)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     os.chdir(tree)
     with (tree.parent / "pytest.log").open("w") as log:
         os.dup2(log.fileno(), 1)
