@@ -34,7 +34,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 _ROOT = Path(__file__).parents[1]
@@ -43,7 +43,7 @@ _LIMIT_S = 900.0
 TIMEOUT = 9
 #: Computing time of a test or its fixtures, while lines are recorded and with a generated mutant; sum of the
 #: times of the tests of a generated mutant.
-_RECORDED_S, _MUTATED_S, _TESTS_S = 2.0, 30.0, 60.0
+_RECORDED_S, _MUTATED_S, _TESTS_S = 1.0, 30.0, 60.0
 #: Imported once. Each run is a fork, which imports only the project and its tests.
 _LIBRARIES = (
     "pytest", "numpy", "numba", "scipy.optimize", "scipy.stats", "sklearn.cluster", "sklearn.ensemble",
@@ -63,8 +63,7 @@ class Mutant:
         at: Position of the text [bytes]; -1 if it occurs once in the file.
         place: Its line and column, if it is generated, so that the name of the mutant remains when other
             lines of the file change.
-        lines: First and last line of its statement, without the body.
-        defines: What the statement defines, if it runs at import.
+        statement: The statement that it belongs to.
     """
 
     path: str
@@ -73,8 +72,7 @@ class Mutant:
     tests: str = ""
     at: int = -1
     place: str = ""
-    lines: tuple[int, int] = (0, 0)
-    defines: str | None = None
+    statement: tuple[int, int, str | None] = (0, 0, None)
 
 
 _SLAM = "tests/pipeline/slam"
@@ -234,94 +232,88 @@ _OPERATORS = {
 }  # fmt: skip
 
 
+#: First and last line of a statement without its body, and what it defines: None in a function, "" if it
+#: has no name.
+_Statement = tuple[int, int, str | None]
+
+
 def generated() -> Iterator[Mutant]:
     """Yield the mutants of all operators, numbers and truth values of ROOMS."""
     for room in ROOMS:
-        files = [_ROOT / room] if room.endswith(".py") else sorted((_ROOT / room).rglob("*.py"))
-        for file in files:
+        for file in [_ROOT / room] if room.endswith(".py") else sorted((_ROOT / room).rglob("*.py")):
             source = file.read_bytes()
             lines = source.splitlines(keepends=True)
-            starts = [0]
-            for line in lines:
-                starts.append(starts[-1] + len(line))
-            for row, at, old, new, statement in _changes(ast.parse(source), source, starts):
-                same = lines[: row - 1].count(lines[row - 1])
-                place = (
-                    f"{lines[row - 1].decode().strip()} [{at - starts[row - 1]}{f' #{same}' * bool(same)}]"
-                )
-                yield Mutant(
-                    str(file.relative_to(_ROOT)), old, new, at=at, place=place,
-                    lines=statement.lines, defines=statement.defines,
-                )  # fmt: skip
+            starts = [0, *accumulate(map(len, lines))]
+            for at, old, new, statement in _changes(ast.parse(source), source, starts, (0, 0, "")):
+                row = source.count(b"\n", 0, at)
+                earlier = lines[:row].count(lines[row])
+                number = f" #{earlier}" if earlier else ""
+                place = f"{lines[row].decode().strip()} [{at - starts[row]}{number}]"
+                yield Mutant(str(file.relative_to(_ROOT)), old, new, "", at, place, statement)
 
 
-@dataclass(frozen=True, slots=True)
-class _Statement:
-    lines: tuple[int, int] = (0, 0)
-    defines: str | None = ""
-    in_function: bool = False
-
-
-def _statement(node: ast.AST, around: _Statement) -> _Statement:
+def _inner(node: ast.AST, around: _Statement) -> _Statement:
     """Return the innermost statement that a node belongs to."""
+    name = around[2]
     match node:
         case ast.match_case(pattern, guard):
-            last = (guard or pattern).end_lineno or 0
-            return _Statement((pattern.lineno, last), around.defines, around.in_function)
+            return pattern.lineno, (guard or pattern).end_lineno or 0, name
+        case ast.Match(subject):
+            return node.lineno, subject.end_lineno or 0, name
         case ast.stmt():
-            inner = node.subject.end_lineno if isinstance(node, ast.Match) else node.end_lineno
             body = getattr(node, "body", None)
-            last = max(node.lineno, body[0].lineno - 1) if body else inner or node.lineno
+            last = max(node.lineno, body[0].lineno - 1) if body else node.end_lineno or 0
             target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
-            name = target.id if isinstance(target, ast.Name) else getattr(node, "name", "")
-            return _Statement((node.lineno, last), None if around.in_function else name, around.in_function)
+            defined = target.id if isinstance(target, ast.Name) else getattr(node, "name", "")
+            return node.lineno, last, None if name is None else defined
     return around
 
 
 def _changes(
-    node: ast.AST, source: bytes, starts: list[int], around: _Statement = _Statement()
-) -> Iterator[tuple[int, int, str, str, _Statement]]:
-    """Yield line, position, text, replacement and statement of each change of a syntax tree. Types,
-    decorators, texts and error messages are left out."""
-    statement = _statement(node, around)
+    node: ast.AST, source: bytes, starts: list[int], around: _Statement
+) -> Iterator[tuple[int, str, str, _Statement]]:
+    """Yield position, text, replacement and statement of each change of a syntax tree. Types, decorators,
+    texts and error messages are left out."""
+    statement = _inner(node, around)
 
     def begin(part: ast.expr) -> int:
         return starts[part.lineno - 1] + part.col_offset
 
-    def between(
-        left: ast.expr, right: ast.expr, operator: ast.AST
-    ) -> Iterator[tuple[int, int, str, str, _Statement]]:
-        old, new = _OPERATORS.get(type(operator), ("", ""))
-        end = starts[(left.end_lineno or 1) - 1] + (left.end_col_offset or 0)
-        at = source.find(old.encode(), end, begin(right))
-        if old and at >= 0:
-            yield source.count(b"\n", 0, at) + 1, at, old, new, statement
+    def end(part: ast.expr) -> int:
+        return starts[(part.end_lineno or 1) - 1] + (part.end_col_offset or 0)
 
-    match node:
-        case ast.Raise() | ast.JoinedStr():
-            return
-        case ast.BinOp(left, operator, right):
-            yield from between(left, right, operator)
-        case ast.Compare(left, comparisons, rights):
-            for one, comparison, other in zip((left, *rights), comparisons, rights, strict=False):
-                yield from between(one, other, comparison)
-        case ast.BoolOp(operator, values):
-            for one, other in pairwise(values):
-                yield from between(one, other, operator)
-        case ast.UnaryOp(ast.Not() | ast.USub() as operator):
-            yield node.lineno, begin(node), *_OPERATORS[type(operator)], statement
-        case ast.Constant(bool() as value):
-            yield node.lineno, begin(node), str(value), str(not value), statement
-        case ast.Constant(int() | float() as value):
-            length = (node.end_col_offset or 0) - node.col_offset
-            old = source[begin(node) : begin(node) + length].decode()
-            new = str(value + 1 if isinstance(value, int) else 2 * value or 1.0)
-            yield node.lineno, begin(node), old, new, statement
+    def between(left: ast.expr, right: ast.expr, operator: ast.AST) -> Iterator[tuple[int, str, str]]:
+        old, new = _OPERATORS.get(type(operator), ("", ""))
+        at = source.find(old.encode(), end(left), begin(right))
+        if old and at >= 0:
+            yield at, old, new
+
+    def here() -> Iterator[tuple[int, str, str]]:
+        match node:
+            case ast.BinOp(left, operator, right):
+                yield from between(left, right, operator)
+            case ast.Compare(left, comparisons, rights):
+                for one, comparison, other in zip((left, *rights), comparisons, rights, strict=False):
+                    yield from between(one, other, comparison)
+            case ast.BoolOp(operator, values):
+                for one, other in pairwise(values):
+                    yield from between(one, other, operator)
+            case ast.UnaryOp(ast.Not() | ast.USub() as operator):
+                yield begin(node), *_OPERATORS[type(operator)]
+            case ast.Constant(bool() as value):
+                yield begin(node), str(value), str(not value)
+            case ast.Constant(int() | float() as value):
+                old = source[begin(node) : end(node)].decode()
+                yield begin(node), old, str(value + 1 if isinstance(value, int) else 2 * value or 1.0)
+
+    if isinstance(node, ast.Raise | ast.JoinedStr):
+        return
+    yield from ((*change, statement) for change in here())
     for name, child in ast.iter_fields(node):
         if name in ("annotation", "returns", "decorator_list"):
             continue
         if name == "body" and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            statement = _Statement(in_function=True)
+            statement = (0, 0, None)
         for part in child if isinstance(child, list) else [child]:
             if isinstance(part, ast.AST):
                 yield from _changes(part, source, starts, statement)
@@ -352,15 +344,15 @@ class Coverage:
         """Return the tests of a mutant: those that execute its statement. A statement that runs at import has
         those that execute a line that mentions what it defines, or else any line of its file. The quickest
         tests are chosen, in the order of their files."""
-        first, last = mutant.lines
+        first, last, name = mutant.statement
         lines = self.tests[mutant.path]
         found = set().union(*(lines.get(line, ()) for line in range(first, last + 1)))
-        if mutant.defines:
-            word = re.compile(rf"\b{mutant.defines}\b")
+        if name:
+            word = re.compile(rf"\b{name}\b")
             for path, by_line in self.tests.items():
                 text = (_ROOT / path).read_text().splitlines()
                 found.update(*(tests for line, tests in by_line.items() if word.search(text[line - 1])))
-        if mutant.defines is not None and not found:
+        if name is not None and not found:
             found.update(*lines.values())
         chosen, left_s = [], _TESTS_S
         for test in sorted(found, key=lambda test: (self.seconds[test], test)):
@@ -373,7 +365,7 @@ class Coverage:
 
 def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
     """Return the lines that quick tests execute. A file of tests is recorded once for each state of the
-    sources, of the helpers of the tests, and of itself. Those of the folders of ROOMS come first; files that
+    sources, of the helpers of the tests, and of itself. Those of ROOMS come first, in this order; files that
     are left after so many minutes are not used."""
     folder.mkdir(exist_ok=True)
     blobs = [line.split() for line in _git("ls-tree", "-r", "HEAD", "app", "pipeline", "tests").splitlines()]
@@ -384,8 +376,8 @@ def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
     ]
     others = [(path, blob) for _, _, blob, path in blobs if path != "tests/mutation.py"]
     state = hashlib.sha256(repr(sorted(set(others) - set(files))).encode())
-    near = {Path(room).stem for room in ROOMS} | {"io", "test_auth.py"}
-    files.sort(key=lambda file: near.isdisjoint(Path(file[0]).parts))
+    near = [room.split("/")[1].removesuffix(".py") for room in ROOMS]
+    files.sort(key=lambda file: min((k for k, name in enumerate(near) if name in file[0]), default=len(near)))
     found, end = Coverage(), time.monotonic() + 60.0 * minutes
     for number, (path, blob) in enumerate(files):
         key = state.copy()
