@@ -34,8 +34,10 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import accumulate, pairwise
+from itertools import accumulate, chain, pairwise
 from pathlib import Path
+
+from _pytest.config import default_plugins
 
 _ROOT = Path(__file__).parents[1]
 _LIMIT_S = 900.0
@@ -48,7 +50,8 @@ _RECORDED_S, _MUTATED_S, _TESTS_S = 1.0, 30.0, 60.0
 _LIBRARIES = (
     "pytest", "numpy", "numba", "scipy.optimize", "scipy.stats", "sklearn.cluster", "sklearn.ensemble",
     "hypothesis", "open3d", "fastapi", "sqlalchemy", "rosbags.highlevel", "shapely", "viser", "optuna",
-    "filterpy.kalman", "laspy",
+    "filterpy.kalman", "laspy", "coverage", "xdist.plugin", "pytest_asyncio.plugin", "anyio.pytest_plugin",
+    *(f"_pytest.{name}" for name in default_plugins),
 )  # fmt: skip
 
 
@@ -365,8 +368,8 @@ class Coverage:
 
 def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
     """Return the lines that quick tests execute. A file of tests is recorded once for each state of the
-    sources, of the helpers of the tests, and of itself. Those of ROOMS come first, in this order; files that
-    are left after so many minutes are not used."""
+    sources, of the helpers of the tests, and of itself. Those that mention one of ROOMS most come
+    first; files that are left after so many minutes are not used."""
     folder.mkdir(exist_ok=True)
     blobs = [line.split() for line in _git("ls-tree", "-r", "HEAD", "app", "pipeline", "tests").splitlines()]
     files = [
@@ -376,8 +379,12 @@ def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
     ]
     others = [(path, blob) for _, _, blob, path in blobs if path != "tests/mutation.py"]
     state = hashlib.sha256(repr(sorted(set(others) - set(files))).encode())
-    near = [room.split("/")[1].removesuffix(".py") for room in ROOMS]
-    files.sort(key=lambda file: min((k for k, name in enumerate(near) if name in file[0]), default=len(near)))
+    text = {path: (_ROOT / path).read_text() for path, _ in files}
+    groups = [
+        sorted(files, key=lambda file: -text[file[0]].count(room.removesuffix(".py").replace("/", ".")))
+        for room in ROOMS
+    ]
+    files = list(dict.fromkeys(chain.from_iterable(zip(*groups, strict=True))))
     found, end = Coverage(), time.monotonic() + 60.0 * minutes
     for number, (path, blob) in enumerate(files):
         key = state.copy()
