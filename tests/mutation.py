@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import ast
 import gc
-import hashlib
 import importlib
 import json
 import math
@@ -34,7 +33,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import accumulate, chain, pairwise
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 from _pytest.config import default_plugins
@@ -368,45 +367,27 @@ class Coverage:
 
 def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
     """Return the lines that quick tests execute. A file of tests is recorded once for each state of the
-    sources, of the helpers of the tests, and of itself. Those that mention one of ROOMS most come
-    first; files that are left after so many minutes are not used."""
-    folder.mkdir(exist_ok=True)
-    blobs = [line.split() for line in _git("ls-tree", "-r", "HEAD", "app", "pipeline", "tests").splitlines()]
+    sources and of itself. Files that mention ROOMS come first; what is left after so many minutes is not
+    used."""
+    folder /= "-".join(name[:12] for name in _git("rev-parse", "HEAD:app", "HEAD:pipeline").split())
+    folder.mkdir(parents=True, exist_ok=True)
     files = [
-        (path, blob)
-        for _, _, blob, path in blobs
-        if Path(path).name.startswith("test_") and not path.startswith("tests/browser/")
+        line.split()[2:] for line in _git("ls-tree", "-r", "HEAD", "tests/app", "tests/pipeline").splitlines()
     ]
-    others = [(path, blob) for _, _, blob, path in blobs if path != "tests/mutation.py"]
-    state = hashlib.sha256(repr(sorted(set(others) - set(files))).encode())
-    text = {path: (_ROOT / path).read_text() for path, _ in files}
-    groups = [
-        sorted(files, key=lambda file: -text[file[0]].count(room.removesuffix(".py").replace("/", ".")))
-        for room in ROOMS
-    ]
-    files = list(dict.fromkeys(chain.from_iterable(zip(*groups, strict=True))))
-    found, end = Coverage(), time.monotonic() + 60.0 * minutes
-    for number, (path, blob) in enumerate(files):
-        key = state.copy()
-        key.update(blob.encode())
-        lines = folder / f"{path.replace('/', '-')}-{key.hexdigest()[:16]}.json"
-        if not lines.exists():
-            if time.monotonic() > end:
-                print(f"not recorded: {path}", flush=True)
-                continue
-            begin = time.monotonic()
-            code = _exit_code(
-                f"{path} -m 'not slow and not browser'",
-                tree,
-                limit_s=1800.0,
-                test_limit_s=_RECORDED_S,
-                lines=lines,
-            )
-            print(f"{number + 1}/{len(files)} {path}: {code}, {time.monotonic() - begin:.0f} s", flush=True)
-            if not lines.exists():
-                continue
-        found.add(lines)
-    print(f"{len(found.seconds)} quick tests are recorded", flush=True)
+    files = [(blob, path) for blob, path in files if Path(path).name.startswith("test_")]
+    rooms = re.compile("|".join(room.removesuffix(".py").replace("/", r"\.") for room in ROOMS))
+    files.sort(key=lambda file: -len(rooms.findall((tree / file[1]).read_text())))
+    found, used, end = Coverage(), 0, time.monotonic() + 60.0 * minutes
+    for blob, path in files:
+        lines = folder / f"{blob}.json"
+        if not lines.exists() and time.monotonic() < end:
+            begin, words = time.monotonic(), f"{path} -m 'not slow and not browser'"
+            code = _exit_code(words, tree, test_limit_s=_RECORDED_S, lines=lines)
+            print(f"recorded: {path}: {code}, {time.monotonic() - begin:.0f} s", flush=True)
+        if lines.exists():
+            found.add(lines)
+            used += 1
+    print(f"{len(found.seconds)} quick tests are recorded, of {used} of {len(files)} files", flush=True)
     return found
 
 
