@@ -40,6 +40,7 @@ from _pytest.config import default_plugins
 
 _ROOT = Path(__file__).parents[1]
 _LIMIT_S = 900.0
+_KILLED = ("killed", "timeout")
 #: Exit code of a run whose test computes too long; those of pytest are 0 to 5.
 TIMEOUT = 9
 #: Computing time of a test or its fixtures, while lines are recorded and with a generated mutant; sum of the
@@ -429,39 +430,38 @@ def main() -> None:
             (tree / kernel.relative_to(_ROOT)).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(kernel, tree / kernel.relative_to(_ROOT))
         try:
-            lines = (
-                Coverage()
-                if given.minutes is None
-                else recorded(given.folder / "lines", tree, given.record_minutes)
-            )
+            lines = Coverage()
+            if given.minutes is not None:
+                lines = recorded(given.folder / "lines", tree, given.record_minutes)
             end = time.monotonic() + 60.0 * (given.minutes or math.inf)
+            done: dict[Mutant, str] = {}
             for number, mutant in enumerate(wanted):
-                if time.monotonic() > end:
-                    break
-                if _key(mutant) in known:
-                    continue
-                known[_key(mutant)] = outcome = _outcome(mutant, tree, lines)
-                print(f"{number + 1}/{len(wanted)} {outcome}: {_key(mutant)}", flush=True)
-                with results.open("a") as file:
-                    file.write(json.dumps([_key(mutant), outcome, commit]) + "\n")
+                key = _key(mutant)
+                if key not in known:
+                    if time.monotonic() > end:
+                        break
+                    known[key] = _outcome(mutant, tree, lines)
+                    print(f"{number + 1}/{len(wanted)} {known[key]}: {key}", flush=True)
+                    with results.open("a") as file:
+                        file.write(json.dumps([key, known[key], commit]) + "\n")
+                done[mutant] = known[key]
         finally:
             _git("worktree", "remove", "--force", str(tree))
-    _report([mutant for mutant in wanted if _key(mutant) in known], known)
+    _report(done)
 
 
-_KILLED = ("killed", "timeout")
-
-
-def _report(done: list[Mutant], known: dict[str, str]) -> None:
-    for room in (*ROOMS, ""):
-        outcomes = Counter(known[_key(m)] for m in done if m.path.startswith(room))
-        killed, all_ = sum(outcomes[name] for name in _KILLED), outcomes.total()
-        print(f"{room or 'all'}: {killed} of {all_} killed, {outcomes['timeout']} of them by a timeout")
-    low, high = _wilson(killed, all_)
-    print(f"share killed with an interval of 95 %: {low:.3f} to {high:.3f}")
-    for mutant in done:
-        if known[_key(mutant)] not in _KILLED:
-            print(f"{known[_key(mutant)]}: {_key(mutant)}")
+def _report(done: dict[Mutant, str]) -> None:
+    """Print the outcomes by package, the share of killed mutants, and the other mutants."""
+    for room in ROOMS:
+        print(
+            room, dict(Counter(outcome for mutant, outcome in done.items() if mutant.path.startswith(room)))
+        )
+    killed = sum(outcome in _KILLED for outcome in done.values())
+    low, high = _wilson(killed, len(done))
+    print(f"{killed} of {len(done)} mutants killed, 95 % interval {low:.1%} to {high:.1%}")
+    for mutant, outcome in done.items():
+        if outcome not in _KILLED:
+            print(f"{outcome}: {_key(mutant)}")
 
 
 def _wilson(successes: int, trials: int, z: float = 1.96) -> tuple[float, float]:
@@ -492,7 +492,7 @@ def _outcome(mutant: Mutant, tree: Path, lines: Coverage) -> str:
         chosen = tree / "tests.txt"
         chosen.write_text("\n".join(names) + "\n")
         tests, test_limit_s = f"@{chosen}", _MUTATED_S
-        limit_s = 120.0 + 5.0 * sum(lines.seconds[name] for name in names)
+        limit_s = _LIMIT_S + 5.0 * sum(lines.seconds[name] for name in names)
         if text[at : at + len(old)] != old:
             return "not applicable"
     elif text.count(old) != 1:
@@ -504,10 +504,9 @@ def _outcome(mutant: Mutant, tree: Path, lines: Coverage) -> str:
         code = _exit_code(tests, tree, tests in _WITH_NUMBA, limit_s, test_limit_s)
     finally:
         file.write_bytes(text)
-    # A test fails, or a module cannot be imported; other codes are errors of the call.
-    return {0: "survived", 1: "killed", 2: "killed", 4: "killed", TIMEOUT: "timeout"}.get(
-        code, f"pytest ends with {code}"
-    )
+    if code == 4 and _exit_code(f"{tests} --collect-only", tree) == 0:
+        return "killed"  # the module of a test cannot be imported
+    return {0: "survived", 1: "killed", 2: "killed", TIMEOUT: "timeout"}.get(code, f"pytest ends with {code}")
 
 
 @cache
@@ -544,6 +543,7 @@ def _exit_code(
         words += ["-W", "ignore::coverage.exceptions.CoverageWarning"]  # no line of ROOMS is executed
     settings = {
         "PYTHONPATH": str(tree),
+        "STEMMAP_DATA": os.environ.get("STEMMAP_DATA", str(_ROOT.parent / "shared" / "data")),
         "NUMBA_DISABLE_JIT": str(int(not compiled)),
         "STEMMAP_TEST_LIMIT_S": str(test_limit_s),
         "STEMMAP_TEST_LINES": str(lines.resolve() if lines else ""),
