@@ -372,10 +372,8 @@ def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
     used."""
     folder /= "-".join(name[:12] for name in _git("rev-parse", "HEAD:app", "HEAD:pipeline").split())
     folder.mkdir(parents=True, exist_ok=True)
-    files = [
-        line.split()[2:] for line in _git("ls-tree", "-r", "HEAD", "tests/app", "tests/pipeline").splitlines()
-    ]
-    files = [(blob, path) for blob, path in files if Path(path).name.startswith("test_")]
+    listed = _git("ls-tree", "-r", "HEAD", "tests/app", "tests/pipeline").splitlines()
+    files = [(blob, path) for _, _, blob, path in map(str.split, listed) if "/test_" in path]
     rooms = re.compile("|".join(room.removesuffix(".py").replace("/", r"\.") for room in ROOMS))
     files.sort(key=lambda file: -len(rooms.findall((tree / file[1]).read_text())))
     found, used, end = Coverage(), 0, time.monotonic() + 60.0 * minutes
