@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import preset
+from pipeline.detection.free_space import BEHIND
 from pipeline.geometry.pose_arrays import composed
 from pipeline.geometry.poses import Pose2, wrap_angle
 from pipeline.slam import FastSlam, Loop, Motion
@@ -217,6 +218,23 @@ def test_a_missed_landmark_goes_and_the_others_stay():
     for landmarks in maps_of(slam):
         left = {tuple(row) for row in np.round(landmarks.mean, 3).tolist()}
         assert left == {(6.0, -3.0), (3.0, 5.0)}
+
+
+def test_trees_are_missed_by_their_distance_from_the_robot():
+    """The view is free as far as between the second and the third tree from a robot off the origin."""
+    start = Pose2(2.0, -1.5, 0.7)
+    away = np.hypot(*(TREES - [start.x, start.y]).T)
+    between = np.sort(away)[1:3].mean()
+    slam = fresh(particles=4, view_range=20.0, misses_per_hit=1)
+    for k in range(3):
+        slam.process(k, Pose2(), detections(TREES), NOTHING_SEEN)
+    slam.state.pose[:] = start.as_array()
+    farther = TREES[away > between]
+    for k in range(3, 8):
+        seen = detections(start.inverse().apply(farther))
+        slam.process(k, Pose2(), seen, np.full_like(ALL_FREE, between + BEHIND))
+    for landmarks in maps_of(slam):
+        np.testing.assert_allclose(sorted(landmarks.mean.tolist()), sorted(farther.tolist()), atol=0.1)
 
 
 @pytest.mark.parametrize("hidden", ["where nothing was seen", "out of view range"])

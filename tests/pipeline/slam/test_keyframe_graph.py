@@ -311,6 +311,15 @@ def test_a_keyframe_replaces_that_of_the_same_scan():
     assert again.pose[-1].tolist() == [1.0, 1.0, 1.0]
 
 
+def test_the_first_birth_after_a_scan_is_that_of_the_next_keyframe_or_of_the_newest():
+    graph = KeyframeGraph()
+    none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))
+    for scan, first_birth in ((2, 0), (5, 3), (9, 7)):
+        keyframe = Keyframe(scan, first_birth, float(scan), np.zeros(3), Q, *none)
+        graph = graph.with_keyframe(keyframe, np.zeros(3))
+    assert [graph.first_birth_after(scan) for scan in (0, 2, 4, 5, 8, 9, 20)] == [0, 3, 3, 7, 7, 7, 7]
+
+
 def test_the_graph_stays_bounded_and_keeps_its_motion():
     graph = KeyframeGraph()
     none = np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, 3))

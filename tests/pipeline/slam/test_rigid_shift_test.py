@@ -187,21 +187,25 @@ def test_unmatched_detections_count_against_the_motion_if_landmarks_are_expected
     assert not shift_test(known, np.concatenate([seen[:FEWEST], others[:5]]))[0]
 
 
-def tree_motion(motion, known, seen, *, covariance=1e-4, alone=0.0, driven=0.0, distrust=0.0):
-    """Return `motion_by_trees` for a robot at the origin; all landmarks have ten hits."""
+def tree_motion(
+    motion, known, seen, *, before=(0.0, 0.0, 0.0), covariance=1e-4, alone=0.0, driven=0.0, distrust=0.0
+):
+    """Return `motion_by_trees` for a robot at `before`, with `known` in its frame; all landmarks have ten
+    hits."""
     rows = np.array([SIGMA**2, 0.0, SIGMA**2])
     return motion_by_trees(
-        np.zeros(3), np.array(motion), covariance * np.eye(3), driven,
+        np.array(before), np.array(motion), covariance * np.eye(3), driven,
         OdometryTrust(SURE, distrust, alone, 1.0), seen,
-        np.tile(rows, (len(seen), 1)), known, np.tile(rows, (len(known), 1)),
+        np.tile(rows, (len(seen), 1)), Pose2(*before).apply(known), np.tile(rows, (len(known), 1)),
         np.full(len(known), 10, np.int32), 3, 3.5, clear_of(seen),
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("before", [(0.0, 0.0, 0.0), (4.0, -7.0, 2.0)])
 @pytest.mark.parametrize("true", [Pose2(0.1), Pose2(0.3, 0.0, 0.02), Pose2(3.0, 2.0, 0.1), Pose2(-6.0, 1.0)])
-def test_the_motion_of_stuck_wheels_is_recovered_at_any_distance(true):
+def test_the_motion_of_stuck_wheels_is_recovered_at_any_distance(true, before):
     known, _ = scene(7)
-    result = tree_motion([0.0, 0.0, 0.0], known, true.inverse().apply(known))
+    result = tree_motion([0.0, 0.0, 0.0], known, true.inverse().apply(known), before=before)
     assert result.slipped
     np.testing.assert_allclose(result.motion, true.as_array(), atol=0.15)
     assert slip_message(np.zeros(3), result.slipped, False) == STUCK
