@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Position, expect
+from playwright.sync_api import Browser, Position, Route, expect
 
 from pipeline.io.readers import open_source
 from tests.browser.conftest import opened, opened_by_another
@@ -259,6 +259,25 @@ def test_the_card_shows_the_evidence_on_the_selected_tree(person: Dashboard):
     page.locator("#annotate-no").click()
     person.until_server("/api/annotations", "it.trees.length === 1 && it.trees[0].kind === 'other'")
     assert person.errors == []
+
+
+def test_a_tree_that_is_selected_again_while_its_evidence_loads_is_shown(person: Dashboard):
+    page = person.page
+    tree = doubted(person)[0]["number"]
+    select = "tree => import('/static/js/core/live_feed.js').then(({ select }) => select(tree))"
+    page.evaluate(select, None)
+    expect(page.locator("#review-title")).to_be_hidden()
+    held: list[Route] = []
+    page.route(f"**/api/story/tree/{tree}", lambda route: held.append(route))
+    page.evaluate(select, tree)
+    person.eventually(lambda: len(held) == 1, lambda: held)
+    page.evaluate(select, None)
+    with page.expect_response(f"**/api/story/tree/{tree}"):
+        held[0].continue_()
+    page.unroute_all()
+    page.evaluate(select, tree)
+    expect(page.locator(f"#review-evidence[data-tree='{tree}'] svg")).to_have_count(2)
+    expect(page.locator("#review-title")).to_have_text(f"Tree {tree}")
 
 
 def test_accumulated_points_lie_under_the_map_of_the_tab(person: Dashboard):

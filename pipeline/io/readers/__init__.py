@@ -62,7 +62,7 @@ def check_existence(uri: str) -> None:
 
 
 def _no_such_file(uri: str) -> SourceError:
-    return SourceError("there is no such file or folder", where=uri)
+    return SourceError("there is no such file or folder", where=uri, remedy="Look at the path.")
 
 
 def _open_scheme(scheme: str, uri: str, options: SourceOptions) -> Source:

@@ -28,16 +28,17 @@ const refresh = keepFresh(async () => {
   if (!tree) return;
   const { number } = tree, version = `${number} ${state.map.index} ${state.parameters?.revision}`;
   if (version === shown) return;
-  let points, votes = "";
+  let points, votes = "", loaded = "";
   try {
     const story = await get(`/api/story/tree/${number}`);
     points = story.sections ? sectionsFigure(story.sections) : gatheredFigure(story);
     if (!story.sections) votes = columnFigure(story.column, "Votes on the accumulated scans");
-    shown = version;
+    loaded = version;
   } catch (error) {
     points = el("p", { class: "empty", text: capital(error.message) });
   }
-  if (state.selected !== number) return; // another tree was selected meanwhile
+  if (state.selected !== number) return; // another tree was selected meanwhile, or none
+  shown = loaded;
   evidence().replaceChildren(points);
   byId("review-votes").replaceChildren(votes);
   evidence().dataset.tree = String(number);

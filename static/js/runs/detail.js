@@ -3,7 +3,7 @@
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
-import { clock, count, fixed, NONE } from "../core/format.js";
+import { clock, count, NONE } from "../core/format.js";
 import { reportMenu } from "../core/report.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";

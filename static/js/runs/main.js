@@ -144,7 +144,7 @@ byId("runs-compare").addEventListener("click", () => go([...ticked].sort((a, b) 
 byId("toast-undo").addEventListener("click", undo);
 addEventListener("hashchange", follow);
 addEventListener("focus", load);
-// The open run grows; the rows are replaced only while nobody uses one of them.
+// The open run gets more scans and trees. The rows are not replaced while the keyboard focus is in one of them.
 setInterval(() => { if (!document.hidden && !byId("runs").contains(document.activeElement)) load(); }, REFRESH_EVERY);
 on("theme", repaint);
 startUpload(async ({ uri }) => {

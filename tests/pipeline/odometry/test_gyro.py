@@ -38,7 +38,7 @@ def shaken(ms, rate):
     return reading(ms, rate + 1e-9 * (ms % 7))
 
 
-def told(rate_at, until_ms, *, standing=False, tilt=(0.0, 0.0)):
+def gyro_of(rate_at, until_ms, *, standing=False, tilt=(0.0, 0.0)):
     gyro = Gyro()
     for ms in range(0, until_ms, 10):
         record = reading(ms, rate_at(ms * 1e-3) + 1e-9 * (ms % 70), tilt)
@@ -48,7 +48,7 @@ def told(rate_at, until_ms, *, standing=False, tilt=(0.0, 0.0)):
 
 @given(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.integers(5, 180), st.integers(50, 200))
 def test_a_turn_is_the_integral_of_its_rate(a, b, first, span):
-    gyro = told(lambda t: a + b * t, 500)
+    gyro = gyro_of(lambda t: a + b * t, 500)
     turn = gyro.turn(START + first * MS, START + (first + span) * MS)
     assert turn is not None
     t0, t1 = first * 1e-3, (first + span) * 1e-3
@@ -58,12 +58,12 @@ def test_a_turn_is_the_integral_of_its_rate(a, b, first, span):
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-1.0, 1.0))
 def test_only_the_turn_about_the_vertical_counts(roll, pitch, rate):
-    rate_told = told(lambda _: rate, 200, tilt=(roll, pitch)).rate(START + 100 * MS)
-    assert rate_told == pytest.approx(rate, abs=1e-6)
+    measured = gyro_of(lambda _: rate, 200, tilt=(roll, pitch)).rate(START + 100 * MS)
+    assert measured == pytest.approx(rate, abs=1e-6)
 
 
 def test_a_bias_is_learnt_while_the_robot_stands_and_never_while_it_moves():
-    moving, standing = told(lambda _: 0.02, 2000), told(lambda _: 0.02, 2000, standing=True)
+    moving, standing = gyro_of(lambda _: 0.02, 2000), gyro_of(lambda _: 0.02, 2000, standing=True)
     assert moving.rate(START + 1000 * MS) == pytest.approx(0.02, abs=1e-6)
     assert standing.rate(START + 1000 * MS) == pytest.approx(0.0, abs=1e-6)
     before, after = moving.turn(START, START + 100 * MS), standing.turn(START, START + 100 * MS)
@@ -90,7 +90,7 @@ def test_the_sigma_of_a_turn_knows_how_well_the_bias_was_learnt(blocks):
 @pytest.mark.parametrize("steps", [1, 10, 50])
 def test_the_scale_error_is_the_same_in_all_steps_of_a_turn(steps):
     """One percent of 90 degrees is 0.9 degrees, however many scans the turn takes."""
-    gyro = told(lambda _: np.radians(90.0) / 5.0, 5100)
+    gyro = gyro_of(lambda _: np.radians(90.0) / 5.0, 5100)
     times = [START + 5000 * MS * k // steps for k in range(steps + 1)]
     turns = [gyro.turn(*pair) for pair in pairwise(times)]
     others = NOISE**2 * 5.0 + steps * BIAS_UNKNOWN**2 * (5.0 / steps) * max(5.0 / steps, WANDERS)
@@ -100,12 +100,12 @@ def test_the_scale_error_is_the_same_in_all_steps_of_a_turn(steps):
 
 def test_a_robot_that_is_turned_by_hand_teaches_no_bias():
     for rate_at in (lambda _: 0.5, lambda t: 0.09 * np.sign(np.sin(40 * t))):
-        by_hand, driven = told(rate_at, 2000, standing=True), told(rate_at, 2000)
+        by_hand, driven = gyro_of(rate_at, 2000, standing=True), gyro_of(rate_at, 2000)
         assert by_hand.turn(START, START + 1000 * MS) == driven.turn(START, START + 1000 * MS)
 
 
 def test_holes_and_dead_units_tell_nothing():
-    gyro = told(lambda _: 0.1, 300)
+    gyro = gyro_of(lambda _: 0.1, 300)
     assert gyro.turn(START + 200 * MS, START + 500 * MS) is None
     assert gyro.turn(START + 200 * MS, START + 200 * MS) is None
     assert gyro.rate(START + 900 * MS) is None
@@ -165,7 +165,7 @@ def test_a_known_turn_scatters_the_heading_by_its_own_sigma():
 # --- a run ----------------------------------------------------------------------------------------
 
 
-def told_by_robot(wheel_turn, rate, *, bias=0.01):
+def records_of_robot(wheel_turn, rate, *, bias=0.01):
     """Two seconds of standing and two of driving a circle of which the wheels tell another turn."""
     records = [shaken(ms, bias + (rate if ms > 2000 else 0.0)) for ms in range(0, 4000, 10)]
     for ms in range(0, 4001, 20):
@@ -177,7 +177,7 @@ def told_by_robot(wheel_turn, rate, *, bias=0.01):
 
 
 def run(wheel_turn, rate):
-    return list(steps(told_by_robot(wheel_turn, rate)))
+    return list(steps(records_of_robot(wheel_turn, rate)))
 
 
 def headings(parameters, run_steps):
@@ -214,7 +214,7 @@ def test_a_gyroscope_that_never_turned_as_the_wheels_is_not_asked(seen):
 
 
 def test_one_mad_reading_turns_no_robot():
-    records = told_by_robot(0.3, 0.3)
+    records = records_of_robot(0.3, 0.3)
     at = next(k for k, r in enumerate(records) if isinstance(r, Imu) and r.stamp_ns == START + 3000 * MS)
     records[at] = shaken(3000, 100.0)
     losses = Counter[str]()
@@ -234,7 +234,7 @@ def test_a_unit_that_has_said_but_one_number_tells_nothing():
 
 @pytest.mark.parametrize("ahead_ms", [2_000, 86_400_000])
 def test_a_reading_from_the_future_is_counted_and_silences_nobody(ahead_ms):
-    records = told_by_robot(0.32, 0.3)
+    records = records_of_robot(0.32, 0.3)
     k = next(i for i, r in enumerate(records) if isinstance(r, Imu) and r.stamp_ns > START + 2_000 * MS)
     wrong = replace(records[k], stamp_ns=records[k].stamp_ns + ahead_ms * MS)
     losses = Counter[str]()
@@ -248,13 +248,13 @@ def test_a_reading_from_the_future_is_counted_and_silences_nobody(ahead_ms):
 
 
 def test_an_imu_reading_that_comes_late_or_twice_is_counted():
-    records = told_by_robot(0.32, 0.3)
+    records = records_of_robot(0.32, 0.3)
     of_imu = [i for i, r in enumerate(records) if isinstance(r, Imu)]
     losses = Counter[str]()
     twice = [*records[: of_imu[60]], records[of_imu[40]], records[of_imu[59]], *records[of_imu[60] :]]
-    told, wanted = list(steps(twice, losses=losses)), list(steps(records))
+    found, wanted = list(steps(twice, losses=losses)), list(steps(records))
     assert losses == {"IMU readings that were not later than the one before": 2}
-    assert [s.turn for s in told] == [s.turn for s in wanted]
+    assert [s.turn for s in found] == [s.turn for s in wanted]
 
 
 def test_scans_are_deskewed_by_the_rate_of_the_gyroscope():

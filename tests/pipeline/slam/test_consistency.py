@@ -43,13 +43,13 @@ def joined(own, shared, R, B, x, z):
 def test_the_fused_covariance_bounds_the_true_one_for_any_correlation(seed, r):
     rng = np.random.default_rng(seed)
     own, shared, R, B = spd(rng, 2), spd(rng, 2, 3.0), spd(rng, 2), spd(rng, 2, 3.0)
-    _, told, part, K = joined(own, shared, R, B, np.zeros(2), np.zeros(2))
+    _, result, part, K = joined(own, shared, R, B, np.zeros(2), np.zeros(2))
     cross = r * np.linalg.cholesky(shared) @ np.linalg.cholesky(B).T  # of the shared errors, as strong as r
     rest = np.eye(2) - K
     true = rest @ (own + shared) @ rest.T + K @ (R + B) @ K.T + rest @ cross @ K.T + K @ cross.T @ rest.T
-    assert np.linalg.eigvalsh(told - true).min() > -1e-9
+    assert np.linalg.eigvalsh(result - true).min() > -1e-9
     own_after = rest @ own @ rest.T + K @ R @ K.T
-    np.testing.assert_allclose(told, own_after + part, atol=1e-9)
+    np.testing.assert_allclose(result, own_after + part, atol=1e-9)
 
 
 @given(seeds)
@@ -57,9 +57,9 @@ def test_without_a_shared_part_it_is_the_kalman_filter(seed):
     rng = np.random.default_rng(seed)
     own, R, nothing = spd(rng, 2), spd(rng, 2), np.zeros((2, 2))
     x, z = rng.normal(size=2), rng.normal(size=2)
-    place, told, part, _ = joined(own, nothing, R, nothing, x, z)
+    place, result, part, _ = joined(own, nothing, R, nothing, x, z)
     A, B = np.linalg.inv(own), np.linalg.inv(R)
-    np.testing.assert_allclose(told, np.linalg.inv(A + B), atol=1e-9)
+    np.testing.assert_allclose(result, np.linalg.inv(A + B), atol=1e-9)
     np.testing.assert_allclose(place, np.linalg.solve(A + B, A @ x + B @ z), atol=1e-9)
     np.testing.assert_array_equal(part, 0.0)
 
@@ -116,16 +116,16 @@ def test_the_covariance_at_known_landmarks_is_that_of_their_reference_pose():
     here = np.zeros(3)
     memory = FrameUncertainty().with_reference(0, 0, here, wide)
     landmarks = (np.array([[2.0, 0.0]]), np.array([3]), np.array([5], np.int32), 3)
-    told, memory = memory.with_pose(here, thin, MANY, *landmarks, 10.0)
-    np.testing.assert_allclose(told, wide, atol=1e-9)
+    result, memory = memory.with_pose(here, thin, MANY, *landmarks, 10.0)
+    np.testing.assert_allclose(result, wide, atol=1e-9)
     away = np.array([5.0, 0.0, 0.0])
-    told, _ = memory.with_pose(
+    result, _ = memory.with_pose(
         away, thin, MANY, *landmarks, 1.0
     )  # no landmark near: what was hidden stays hidden
-    np.testing.assert_allclose(told, thin + transported_covariance(wide - thin, 5.0, 0.0), atol=1e-9)
+    np.testing.assert_allclose(result, thin + transported_covariance(wide - thin, 5.0, 0.0), atol=1e-9)
     older = (np.array([[2.0, 0.0]]), np.array([-1]), np.array([5], np.int32), 3)
-    told, _ = FrameUncertainty().with_pose(here, thin, MANY, *older, 10.0)
-    np.testing.assert_allclose(told, thin)
+    result, _ = FrameUncertainty().with_pose(here, thin, MANY, *older, 10.0)
+    np.testing.assert_allclose(result, thin)
 
 
 def test_the_error_of_a_smoothed_map_is_added_to_the_spread():
@@ -135,8 +135,8 @@ def test_the_error_of_a_smoothed_map_is_added_to_the_spread():
     memory = replace(memory, covariance=of_map[None], smoothed=np.ones(1, np.bool_))
     landmarks = (np.array([[2.0, 0.0]]), np.array([3]), np.array([5], np.int32), 3)
     for n_eff in (20.0, MANY):
-        told, _ = memory.with_pose(np.array([5.0, 0.0, 0.0]), thin, n_eff, *landmarks, 10.0)
-        np.testing.assert_allclose(told, thin + transported_covariance(of_map, 5.0, 0.0), atol=1e-12)
+        result, _ = memory.with_pose(np.array([5.0, 0.0, 0.0]), thin, n_eff, *landmarks, 10.0)
+        np.testing.assert_allclose(result, thin + transported_covariance(of_map, 5.0, 0.0), atol=1e-12)
 
 
 @given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))

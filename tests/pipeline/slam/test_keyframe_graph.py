@@ -191,11 +191,11 @@ def test_the_covariance_of_a_pose_is_that_given_all_others_and_that_of_the_map()
 def test_the_part_of_the_map_is_interpolated_from_the_second_keyframe_on(monkeypatch):
     """The covariance of the first keyframe is zero, because it is fixed; that of its stems is not."""
     graph = graph_of(arc(80, radius=40.0, turn=0.02), np.random.default_rng(2))
-    told = graph.solve().of_map
+    interpolated = graph.solve().of_map
     monkeypatch.setattr(keyframe_graph, "MARGINALS", len(graph.keyframes))
     exact = graph.solve().of_map
-    np.testing.assert_allclose(told[1], exact[1], rtol=1e-6)
-    sigma, expected = (np.sqrt(np.trace(part[:, :2, :2], axis1=1, axis2=2)) for part in (told, exact))
+    np.testing.assert_allclose(interpolated[1], exact[1], rtol=1e-6)
+    sigma, expected = (np.sqrt(np.trace(part[:, :2, :2], axis1=1, axis2=2)) for part in (interpolated, exact))
     np.testing.assert_allclose(sigma, expected, rtol=0.25)
 
 
