@@ -30,10 +30,11 @@ def test_a_saved_view_returns_to_the_same_place_of_the_map(dashboard: Dashboard)
     dashboard.until_shown()
     dashboard.settled_places("/world/trees")
     assert scene.evaluate(CAMERA) != before
+    page.locator("#views-button").click()  # the press on Top has closed the list
     page.get_by_role("button", name="<b>gate</b>", exact=True).click()
     dashboard.eventually(lambda: scene.evaluate(CAMERA) == before, lambda: scene.evaluate(CAMERA))
 
     page.get_by_role("button", name="Delete the view <b>gate</b>").click()
-    expect(page.locator("#view-list")).to_contain_text("A saved view returns")
+    expect(page.locator("#view-list")).to_contain_text("Save this view of the scene")
     page.locator("#view-name").press("Escape")
     expect(page.locator("#view-list")).to_be_hidden()

@@ -10,7 +10,7 @@ from app.worker.cursor import Cursor, StepStore
 from pipeline.io.block_file import BlockFile
 from pipeline.io.checkpoints import encode
 from pipeline.odometry.synchroniser import steps
-from tests.pipeline.odometry.test_gyro import told_by_robot
+from tests.pipeline.odometry.test_gyro import records_of_robot
 
 
 class Recording:
@@ -21,7 +21,7 @@ class Recording:
 
     def read(self):
         self.reads += 1
-        return steps(told_by_robot(0.32, 0.3))
+        return steps(records_of_robot(0.32, 0.3))
 
 
 def taken(cursor):
