@@ -87,6 +87,8 @@ def test_trees_are_reviewed_added_edited_and_undone(person: Dashboard):
     page.locator("#annotate-kind").select_option("pole")
     canvas.press("n")
     expect(page.locator("#annotations tbody tr")).to_have_count(2)
+    expect(page.locator("#legend-rejected")).to_be_visible()  # its tree is crossed out on the map
+    assert canvas.bounding_box() == size
     person.until_server("/api/evaluation", f"it.FA.count === {before['FA']['count'] + 1}")
     person.tab("Scores")
     expect(page.locator("#truth-used")).to_contain_text("corrected by 2 annotations")
@@ -278,6 +280,30 @@ def test_a_tree_that_is_selected_again_while_its_evidence_loads_is_shown(person:
     page.evaluate(select, tree)
     expect(page.locator(f"#review-evidence[data-tree='{tree}'] svg")).to_have_count(2)
     expect(page.locator("#review-title")).to_have_text(f"Tree {tree}")
+
+
+def test_a_dbh_on_the_card_confirms_an_open_tree_and_corrects_a_reviewed_one(person: Dashboard):
+    page = person.page
+    number = next(tree["number"] for tree in person.ask("/api/trees")["trees"] if tree["dbh_cm"] is not None)
+    page.evaluate(f"import('/static/js/core/live_feed.js').then(({{ select }}) => select({number}))")
+    field = page.locator("#review-dbh")
+    expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
+    expect(field).to_have_attribute("placeholder", re.compile(r"mapped [\d.]+"))
+    field.fill("wide")
+    field.press("Enter")
+    expect(page.locator("#annotate-error")).to_contain_text("“wide” is not a DBH")
+    assert rows(person) == []
+
+    field.fill("25,4")
+    field.press("Enter")
+    expect(page.locator("#review-state")).to_have_text("confirmed")
+    expect(page.locator("#review-title")).to_have_text(f"Tree {number}")
+    assert [(row["kind"], row["dbh_cm"]) for row in rows(person)] == [("tree", 25.4)]
+
+    field.fill("")
+    field.press("Enter")
+    person.until_server("/api/annotations", "it.trees[0].dbh_cm === null")
+    expect(page.locator("#annotate-error")).to_be_hidden()
 
 
 def test_accumulated_points_lie_under_the_map_of_the_tab(person: Dashboard):

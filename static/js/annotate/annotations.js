@@ -16,6 +16,7 @@ const VOTES_EVERY = 2000; // [ms] between two requests for the votes
 export const KINDS = ["tree", "pole", "person", "bush", "other"];
 const SKIPPED = "skipped"; // class of an annotation that states nothing
 export const STATES = ["open", "confirmed", "rejected", "skipped"]; // of a found tree in the review
+const LARGEST_DBH = 1000; // [cm]
 export const NAME = /^[\p{L}\p{N}_][\p{L}\p{N}_ .@-]{0,39}$/u;
 
 export const draft = {
@@ -180,7 +181,7 @@ function paired() {
   return pairs;
 }
 
-const annotationOf = (tree) => paired().ofTree.get(tree.number) ?? null;
+export const annotationOf = (tree) => paired().ofTree.get(tree.number) ?? null;
 export const treeNumberOf = (row) => paired().treeOf.get(row.id) ?? null;
 
 // One of STATES.
@@ -237,6 +238,22 @@ export async function review(kind) {
   if (row) await change(row, row.kind === SKIPPED ? { x: tree.x, y: tree.y, kind } : { kind });
   else await add({ x: tree.x, y: tree.y, kind });
   if (!draft.error && state.selected === tree.number) await next();
+}
+
+// The DBH that a person typed [cm], null for an empty text, or undefined and an error for the person.
+export function typedDbh(typed) {
+  const text = typed.trim().replace(",", "."), value = text === "" ? null : Number(text);
+  if (value === null || (value > 0 && value <= LARGEST_DBH)) return value;
+  draft.error = `“${text.slice(0, 30)}” is not a DBH: enter centimetres above 0 and up to ${LARGEST_DBH}, or nothing if it was not measured.`;
+  news();
+  return undefined;
+}
+
+// Stores the DBH of a found tree [cm]; who measures a tree confirms it, unless it was rejected.
+export function measureDbh(tree, dbh) {
+  const row = annotationOf(tree);
+  if (row) return change(row, { dbh_cm: dbh, ...(row.kind === SKIPPED ? { kind: "tree" } : {}) });
+  return dbh === null ? null : add({ x: tree.x, y: tree.y, dbh_cm: dbh });
 }
 
 // Marks the selected tree as skipped if it is open, then goes to the next one.

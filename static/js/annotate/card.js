@@ -2,13 +2,13 @@
 
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { capital } from "../core/format.js";
-import { on, selectedTree, state } from "../core/store.js";
+import { capital, figure } from "../core/format.js";
+import { on, selectedTree, state, treeOf } from "../core/store.js";
 import { keepFresh, throttled } from "../core/timing.js";
 import { columnFigure } from "../explain/columns.js";
 import { gatheredFigure } from "../explain/gathered.js";
 import { sectionsFigure } from "../explain/sections.js";
-import { annotating, reviewOf } from "./annotations.js";
+import { annotating, annotationOf, measureDbh, reviewOf, typedDbh } from "./annotations.js";
 
 const EVERY = 1000; // [ms] between two updates while the run plays
 const PAUSE = 100; // [ms] between two requests
@@ -19,6 +19,7 @@ const evidence = () => byId("review-evidence");
 // The card around `hint`, which is visible without a selected tree, too.
 export const card = (hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
   el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" })),
+  el("label", { class: "review-dbh" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
   el("div", { id: "review-evidence" }), hint,
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));
@@ -44,6 +45,21 @@ const refresh = keepFresh(async () => {
   evidence().dataset.tree = String(number);
   fillCard();
 }, PAUSE);
+
+// The selection may have changed when a person leaves the field: its DBH belongs to the tree that the field shows.
+function takeDbh({ target }) {
+  const tree = treeOf(Number(target.dataset.tree)), dbh = typedDbh(target.value);
+  if (tree && dbh !== undefined) measureDbh(tree, dbh);
+}
+
+function fillDbh(tree) {
+  const input = byId("review-dbh"), isOther = input.dataset.tree !== String(tree.number);
+  if (!isOther && input === document.activeElement) return; // a person types
+  const dbh = annotationOf(tree)?.dbh_cm ?? null;
+  input.dataset.tree = String(tree.number);
+  input.value = dbh === null ? "" : String(dbh);
+  input.placeholder = tree.dbh_cm === null ? "" : `mapped ${figure(tree.dbh_cm)}`;
+}
 
 // The camera picture is requested once for each selection.
 function requestPicture(number) {
@@ -72,6 +88,7 @@ export function fillCard() {
   byId("review-state").dataset.state = review;
   byId("review").classList.toggle("loading", old);
   byId("review").setAttribute("aria-busy", String(old));
+  fillDbh(tree);
   requestPicture(tree.number);
 }
 

@@ -6,7 +6,7 @@ import { on, selectedTree, state, treeOf, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 import { showTrees } from "../trees/table.js";
-import { annotating, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, undo, unreviewed, votesText } from "./annotations.js";
+import { annotating, callMe, change, choose, contradictionText, draft, givenName, importTable, KINDS, NAME, nudge, redo, remove, review, reviewOf, rowOf, rows, scoreAgainst, skip, STATES, toggleAdding, treeNumberOf, truthText, typedDbh, undo, unreviewed, votesText } from "./annotations.js";
 import { card, fillCard, startCard } from "./card.js";
 import { learnSection, startLearning } from "./learning.js";
 import { startSection } from "./section.js";
@@ -14,7 +14,6 @@ import { startSection } from "./section.js";
 const AGAINST = { both: "the ground truth of the run and annotations", own: "the ground truth of the run only", annotations: "annotations only" };
 const EVERY = 300; // [ms] between two updates while a run plays
 const LARGEST_TABLE = 900_000; // [bytes]
-const LARGEST_DBH = 1000; // [cm]
 const lines = new Map(); // rows of the table by the id of the annotation
 let imported = ""; // result of the last import
 
@@ -83,13 +82,8 @@ function lineOf(row) {
 }
 
 function takeDbh(line, input) {
-  const text = input.value.trim().replace(",", ".");
-  const value = text === "" ? null : Number(text);
-  if (value !== null && !(value > 0 && value <= LARGEST_DBH)) {
-    draft.error = `“${text.slice(0, 30)}” is not a DBH: enter centimetres above 0 and up to ${LARGEST_DBH}, or nothing if it was not measured.`;
-    return fill();
-  }
-  return change(line.row, { dbh_cm: value });
+  const dbh = typedDbh(input.value);
+  return dbh === undefined ? null : change(line.row, { dbh_cm: dbh });
 }
 
 function show(line, row) {

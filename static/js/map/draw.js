@@ -28,9 +28,10 @@ export function drawFrame(pen, view, paint) {
   drawScaleBar(pen, view);
 }
 
-export const drawMap = (pen, view, state) => drawFrame(pen, view, () => drawContent(pen, view, state));
+// `isRejected` tells whether a person rejected a found tree.
+export const drawMap = (pen, view, state, isRejected) => drawFrame(pen, view, () => drawContent(pen, view, state, isRejected));
 
-function drawContent(pen, view, state) {
+function drawContent(pen, view, state, isRejected) {
   drawLine(pen, view, alignedOdometry(state), colours.odometry, 1.2);
   drawLine(pen, view, state.path, colours.path, 2);
   for (const truth of state.truth ?? []) drawTruth(pen, view, truth);
@@ -40,7 +41,7 @@ function drawContent(pen, view, state) {
   const isLeftOut = (tree) => state.holds?.(tree) === false && tree.number !== state.selected;
   for (const tree of trees) {
     pen.globalAlpha = isLeftOut(tree) ? LEFT_OUT : 1;
-    drawTree(pen, view, tree, tree.number === state.selected);
+    drawTree(pen, view, tree, tree.number === state.selected, isRejected(tree));
   }
   pen.globalAlpha = 1;
   state.compare?.forEach((clusters, k) => drawHalves(pen, view, clusters, k === 0));
@@ -182,16 +183,17 @@ function drawRing(pen, view, { x, y }) {
   pen.strokeRect(px - 8, py - 8, 16, 16);
 }
 
-export function drawTree(pen, view, tree, selected) {
-  const [px, py] = view.toScreen(tree.x, tree.y);
+export function drawTree(pen, view, tree, selected, rejected = false) {
+  const [px, py] = view.toScreen(tree.x, tree.y), colour = rejected ? colours.other : colours.tree;
   drawCircle(pen, px, py, symbolRadius(tree, view.scale));
   if (tree.dbh_cm === null) { // DBH not measured: hollow
-    Object.assign(pen, { strokeStyle: colours.tree, lineWidth: 2 });
+    Object.assign(pen, { strokeStyle: colour, lineWidth: 2 });
     pen.stroke();
   } else {
-    pen.fillStyle = colours.tree;
+    pen.fillStyle = colour;
     pen.fill();
   }
+  if (rejected) drawCross(pen, px, py, symbolRadius(tree, view.scale) + 2);
   const [major, minor, angle] = tree.ellipse;
   if (major * view.scale > 2) {
     Object.assign(pen, { strokeStyle: colours.text, lineWidth: 1 });
@@ -206,6 +208,16 @@ export function drawTree(pen, view, tree, selected) {
     drawCircle(pen, px, py, symbolRadius(tree, view.scale) + 5);
     pen.stroke();
   }
+}
+
+function drawCross(pen, px, py, reach) {
+  Object.assign(pen, { strokeStyle: colours.text, lineWidth: 2 });
+  pen.beginPath();
+  for (const side of [-1, 1]) {
+    pen.moveTo(px - reach, py - side * reach);
+    pen.lineTo(px + reach, py + side * reach);
+  }
+  pen.stroke();
 }
 
 function drawRobot(pen, view, { pose: [x, y, yaw], sigma_xy: sigma }) {

@@ -1,6 +1,6 @@
 // The 2D map of the dashboard: hover, select, measure and annotate.
 
-import { annotating, draft, rows as annotations } from "../annotate/annotations.js";
+import { annotating, draft, reviewOf, rows as annotations } from "../annotate/annotations.js";
 import { clickAt, drag, drawAnnotations, drop, grab, hoverAt } from "../annotate/pointer.js";
 import { drawSection } from "../annotate/section.js";
 import { byId, setText } from "../core/dom.js";
@@ -29,7 +29,7 @@ const map = new MapCanvas(canvas, {
   describe,
   paint(pen, view) {
     drawSection(pen, view);
-    drawMap(pen, view, state);
+    drawMap(pen, view, state, isRejected);
     drawPlots(pen, view);
     drawAnnotations(pen, view);
     const measured = state.measure?.to ? ` Measured: ${measuredText(state.measure)}.` : "";
@@ -80,11 +80,13 @@ function snapped(at) {
   return { x, y };
 }
 
+const isRejected = (tree) => reviewOf(tree) === "rejected";
+
 // The legend names what the map shows.
 function showLegend() {
   const kinds = (state.truth ?? []).map(({ kind }) => kind);
   const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"), plot: plots().length,
-    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: !isCloud() && state.odometry.some(Boolean), ghost: Boolean(state.ghost?.ghost.length), annotation: annotating() && annotations().length };
+    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: !isCloud() && state.odometry.some(Boolean), ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
   setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");
 }
