@@ -524,7 +524,9 @@ class Mapper:
         if correction is None:
             return False
         estimate = self._slam.estimate(before)
-        self._tracker.correct(correction, self._path.stamp_ns, estimate, self._slam.landmarks())
+        landmarks = self._slam.landmarks()
+        of_map = self._slam.map_error(landmarks)
+        self._tracker.correct(correction, self._path.stamp_ns, estimate, landmarks, of_map)
         self._delayed = correction if self._delayed is None else self._delayed.followed_by(correction)
         if self._delayed.largest(self.parameters.classification.range_max) >= CORRECTION_MIN:
             self._columns.correct(self._delayed)

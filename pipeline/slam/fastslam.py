@@ -405,6 +405,11 @@ class FastSlam:
         score = hits_less_misses(known.hits, known.score, p.misses_per_hit)
         return Landmarks(known.birth, known.mean, known.covariance, score, p.gate, p.distance_max)
 
+    def map_error(self, landmarks: Landmarks) -> Float:
+        """Return the covariance of the error of the map at each landmark, which all particles share, shape
+        (L, 2, 2) [m^2]; see `FrameUncertainty.at_landmarks`."""
+        return self.state.frame.at_landmarks(landmarks.birth, landmarks.position)
+
     def _usable_landmarks(self) -> Landmarks:
         """Return `landmarks` without those of inactive places, which take no part in the data association."""
         known, places = self.landmarks(), self.state.places

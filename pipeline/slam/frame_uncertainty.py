@@ -181,6 +181,24 @@ class FrameUncertainty:
         k = np.searchsorted(self.serial, birth, side="right") - 1
         return np.where(k >= 0, self.scan[np.maximum(k, 0)], 0)
 
+    def at_landmarks(self, birth: Int, position: Float) -> Float:
+        """Return the covariance of the reference pose of each landmark, transported to its position, shape
+        (L, 2, 2) [m^2]; zeros without reference poses. Landmarks that precede all reference poses belong to
+        the first one.
+
+        Args:
+            birth: Birth numbers of the landmarks, int64, shape (L,).
+            position: Their positions [m], shape (L, 2).
+        """
+        if not len(self.serial):
+            return np.zeros((len(birth), 2, 2))
+        m = np.maximum(np.searchsorted(self.serial, birth, side="right") - 1, 0)
+        x, y = (position - self.pose[m, :2]).T
+        J = np.zeros((len(birth), 2, 3))
+        J[:, 0, 0] = J[:, 1, 1] = 1.0
+        J[:, 0, 2], J[:, 1, 2] = -y, x
+        return J @ self.covariance[m] @ J.transpose(0, 2, 1)
+
     def smoothed_by(self, correction: PathCorrection, covariance: Float) -> FrameUncertainty:
         """Return the state after a solution of the graph, from which all particles continue: reference poses
         move, and all of them are smoothed.

@@ -108,10 +108,16 @@ class Tracker:
             self.tracks = self.tracks.take(kept)
 
     def correct(
-        self, correction: PathCorrection, stamps_ns: Int, estimate: PoseEstimate, landmarks: Landmarks
+        self,
+        correction: PathCorrection,
+        stamps_ns: Int,
+        estimate: PoseEstimate,
+        landmarks: Landmarks,
+        of_map: Float,
     ) -> None:
-        """Move the trees in place with a corrected path, and those with a landmark to its corrected position.
-        Trees without a landmark within LOOP_DISTANCE and without a tree column are removed.
+        """Move the trees in place with a corrected path. Those with a landmark get its corrected position,
+        and the error of the map there in place of the errors of the poses that observed them. Trees without a
+        landmark within LOOP_DISTANCE and without a tree column are removed.
 
         Trees that share a landmark afterwards are joined. Velocities and covariances are rotated with the
         path.
@@ -121,6 +127,7 @@ class Tracker:
             stamps_ns: Time of each scan of the path [ns], int64, shape (N,).
             estimate: Pose after the correction.
             landmarks: Landmarks after the correction.
+            of_map: Covariance of the error of the map at each landmark, shape (L, 2, 2) [m^2].
         """
         t = self.tracks
         t.x[:, :2], turn = correction.moved(t.x[:, :2], np.searchsorted(stamps_ns, t.first_ns))
@@ -136,7 +143,10 @@ class Tracker:
         at = np.minimum(np.searchsorted(landmarks.birth[order], t.landmark), max(len(order) - 1, 0))
         if len(order):
             known = landmarks.birth[order][at] == t.landmark
-            t.x[known, :2] = landmarks.position[order[at[known]]]
+            at = order[at[known]]
+            t.x[known, :2] = landmarks.position[at]
+            t.P[known, :2, :2] += of_map[at] - t.shared[known]
+            t.shared[known] = of_map[at]
         self._follow(self._scan.stamp_ns, estimate, landmarks, np.inf, LOOP_DISTANCE)
 
     def classify(self, stamp_ns: int, columns: Columns, parameters: Classification) -> Columns:

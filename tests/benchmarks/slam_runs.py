@@ -95,7 +95,9 @@ def mapped(rows: Sequence[Seen], truth: Truth, parameters: Parameters, seed: int
         at = slam.process(k, motion, seen.detections, seen.clear)
         tracker.process(seen.stamp_ns, at, seen.detections, slam.landmarks())
         if slam.is_smoothing_due and (correction := slam.smooth(k)):
-            tracker.correct(correction, stamps[: k + 1], slam.estimate(at), slam.landmarks())
+            landmarks = slam.landmarks()
+            of_map = slam.map_error(landmarks)
+            tracker.correct(correction, stamps[: k + 1], slam.estimate(at), landmarks, of_map)
         sigma[k] = np.sqrt(0.5 * (at.covariance[0, 0] + at.covariance[1, 1]))
     poses = slam.path()
     path = Path(stamps, poses[:, 0], poses[:, 1], poses[:, 2], sigma)

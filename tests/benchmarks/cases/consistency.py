@@ -127,7 +127,8 @@ def one_run(seed: int, particles: int, errors: Errors, stand: Stand | None = Non
         tracker.process(stamps[-1], at, found, slam.landmarks())
         if slam.is_smoothing_due and (correction := slam.smooth(k)) is not None:
             at = slam.estimate(at)
-            tracker.correct(correction, np.array(stamps), at, slam.landmarks())
+            landmarks = slam.landmarks()
+            tracker.correct(correction, np.array(stamps), at, landmarks, slam.map_error(landmarks))
         if k >= WARM:
             error = at.T_map_base.as_array() - truth.as_array()
             error[2] = wrap_angle(error[2])

@@ -141,11 +141,14 @@ def test_of_two_trees_that_were_one_the_older_number_stays_and_two_beside_it_sta
     )
     pose = Pose2(11.0, 0.0, 0.0)
     estimate = PoseEstimate(pose, SURE, pose.as_array()[None], np.ones(1), 1.0, place)
-    tracker.correct(shifted(dx=-3.0, first=10), np.arange(60), estimate, landmarks)
+    of_map = np.array([1.0, 2.0, 3.0])[:, None, None] * np.diag([4e-4, 1e-4])
+    tracker.correct(shifted(dx=-3.0, first=10), np.arange(60), estimate, landmarks, of_map)
     corrected = tracker.tracks
     assert corrected.number.tolist() == corrected.landmark.tolist() == [3, 4, 12]
     assert corrected.hits.tolist() == [10, 10, 5]
     np.testing.assert_allclose(corrected.x[:, :2], [[5.0, 1.0], [5.0, 1.5], [11.0, 2.0]], atol=0.05)
+    np.testing.assert_allclose(corrected.shared, of_map[[1, 0, 2]])  # in place of those of the poses
+    np.testing.assert_allclose(corrected.P[:, :2, :2], 1e-3 * np.eye(2) + of_map[[1, 0, 2]])
 
 
 @given(seeds)

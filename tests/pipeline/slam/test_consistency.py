@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.config import preset
+from pipeline.geometry.gaussian import spread_by_pose
 from pipeline.geometry.poses import Pose2
 from pipeline.slam.frame_uncertainty import FrameUncertainty, at_least, transported_covariance
 from pipeline.tracking import Tracker
@@ -137,6 +138,25 @@ def test_the_error_of_a_smoothed_map_is_added_to_the_spread():
     for n_eff in (20.0, MANY):
         result, _ = memory.with_pose(np.array([5.0, 0.0, 0.0]), thin, n_eff, *landmarks, 10.0)
         np.testing.assert_allclose(result, thin + transported_covariance(of_map, 5.0, 0.0), atol=1e-12)
+
+
+@given(seeds)
+def test_the_error_of_the_map_at_a_landmark_is_that_of_its_reference_pose(seed):
+    rng = np.random.default_rng(seed)
+    poses, covariances, position = (
+        rng.normal(size=(3, 3)),
+        [spd(rng, 3) for _ in range(3)],
+        rng.normal(size=(5, 2)),
+    )
+    memory = replace(
+        FrameUncertainty(), serial=np.array([10, 20, 30]), pose=poses, covariance=np.array(covariances)
+    )
+    birth, of = np.array([5, 10, 19, 20, 99]), [0, 0, 0, 1, 2]
+    found = memory.at_landmarks(birth, position)
+    for landmark, m in enumerate(of):
+        wanted = spread_by_pose(position[landmark, None], poses[m], covariances[m])[0]
+        np.testing.assert_allclose(found[landmark], wanted, atol=1e-9)
+    assert not FrameUncertainty().at_landmarks(birth, position).any()
 
 
 @given(seeds, st.sampled_from([1.0, 30.0, 1000.0]))
