@@ -86,9 +86,10 @@ def _table(steps: list[dict[str, Any]]) -> Table:
         tuple(rows),
         (
             "A fault: a lost acknowledged edit, a recording that cannot be read or has a hole, another map "
-            "than without the disturbance, an answer 5xx other than 503 and 507 or after more than 10 s "
-            "(60 s for the cloud of a run, for which the source is read again), a traceback, a process that remains, a server that does not go on. Longest: an answer of the "
-            "server, or the reading of a file. Peak: the server, or the reader.",
+            "than without the disturbance, an answer 5xx other than 503 and 507 or after more than 10 s (60 "
+            "s for the cloud of a run, for which the source is read again), a traceback, a process that "
+            "remains, a server that does not go on. Longest: an answer of the server, or the reading of a "
+            "file. Peak: the server, or the reader.",
             f"Required: no fault, {verdict(not faults)}; less than {MOST_MIB:g} MiB of a reader, "
             f"{verdict(peak < MOST_MIB)}.",
             *sorted(set(faults))[:20],
