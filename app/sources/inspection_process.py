@@ -338,9 +338,10 @@ def _scores(evaluation: object) -> dict[str, Any] | None:
         return None
 
 
-#: A robot's topics are listened for so long, and so long after the last new one.
-LISTEN_S, SETTLE_S = 8.0, 1.5
-#: So long they are counted.
+#: Longest wait for the topics of a robot, and wait after the last new one. Discovery takes less than 2 s on a
+#: local network.
+LISTEN_S, SETTLE_S = 5.0, 1.5
+#: Time for which messages are counted.
 COUNT_S = 3.0
 _LOOK_S = 0.05
 MOST_TOPICS = 500
@@ -375,8 +376,8 @@ def recorded(uri: str) -> dict[str, Any]:
 
 def heard(uri: str) -> dict[str, Any]:
     """Return the topics of a live robot, at most MOST_TOPICS, in the form of `recorded`: see `_counted`; the
-    kind is "live" and `mount` None. It waits for topics, up to 8 s or 1.5 s after the last new one, then
-    counts messages of the usable topics for 3 s. Without topics the list is empty and there is a warning.
+    kind is "live" and `mount` None. It waits for topics, up to LISTEN_S or 1.5 s after the last new one, then
+    counts messages of the usable topics for COUNT_S. Without topics the list is empty and there is a warning.
 
     Raises:
         SourceError: The address is invalid.
