@@ -373,7 +373,9 @@ class Dashboard:
 
     def _remapped(self, changes: protocol.MapChanges) -> None:
         """Broadcast the differences after the run was mapped again, replace the events of trees and pose
-        quality, and clear the selection of a tree that vanished."""
+        quality, clear the selection of a tree that vanished, and discard the observed area of the old map;
+        the views of the new map follow."""
+        self.seen = SeenRecorder()
         self.live.publish("remapped", msgspec.to_builtins(changes))
         self.events.remapped(changes.confirmed, changes.time_s)
         self._broadcast_events()

@@ -443,7 +443,7 @@ class Rough(msgspec.Struct, frozen=True, tag="rough"):
 
 
 class View(msgspec.Struct, frozen=True, tag="view"):
-    """A scan for the observed area.
+    """A scan for the observed area of the present map; after `Remapped` all views are sent again.
 
     Attributes:
         run: As in `Shown`.

@@ -36,6 +36,7 @@ from pipeline.io.block_file import BlockFile
 from pipeline.mapper import Mapper
 from pipeline.remapping import ClusterTable, Rerun
 from pipeline.remapping.rerun import Segment
+from pipeline.stand.seen_area import ViewSelection
 from pipeline.types.records import Columns, Float, Float32, Frame, Path, Step, Trees, Verdict
 
 MOST_FRAME_BYTES = 1 << 30  # of the frames of one map; a scan takes 20 to 100 kB
@@ -248,6 +249,8 @@ class RunMap:
         confirmed_s: Time at which each tree was first confirmed, by its number [s since the first scan].
         clusters: Clusters of all scans.
         counts: Counts of all scans.
+        views: Time [ns] and free range by direction [m], see `SegmentedScan.free`, of the scans that
+            `ViewSelection` takes for the observed area, in the order of their times.
     """
 
     def __init__(
@@ -265,12 +268,19 @@ class RunMap:
         self.snapshots = Snapshots(self.before, 0 if is_live else _MOST_STATES)
         self.history, self.clusters, self.counts = TreeHistory(), ClusterTable(), ScanCounts()
         self.confirmed_s: dict[int, float] = {}
+        self.views: list[tuple[int, Float]] = []
+        self._view_selection, self._newest_ns = ViewSelection(), -1
         self._start_ns, self._time_s = start_ns, -math.inf
 
-    def add(self, frame: Frame) -> None:
+    def add(self, frame: Frame, free: Float) -> None:
         """Add the results of the scan that was mapped last. If the run went back, the entries of this scan
-        and of later ones are replaced. A tree keeps the time of its first confirmation, unless the run went
-        back to or before it."""
+        and of later ones are replaced, except views. A tree keeps the time of its first confirmation, unless
+        the run went back to or before it.
+
+        Args:
+            frame: The results.
+            free: Free range of the scan by direction, shape (BINS,) [m].
+        """
         start_ns = self._start_ns()
         self.history.record(frame, start_ns)
         self.clusters.record(frame)
@@ -283,6 +293,10 @@ class RunMap:
             self.confirmed_s.setdefault(number, time_s)
         if self.frames is not None:
             self.frames.put(frame, self.mapper.path, time_s, self.confirmed(frame.trees))
+        if frame.stamp_ns > self._newest_ns:
+            self._newest_ns = frame.stamp_ns
+            if self._view_selection.take(frame.estimate.T_map_base):
+                self.views.append((frame.stamp_ns, free))
 
     def confirmed(self, trees: Trees) -> Float:
         """Return the time at which each tree was first confirmed [s since the first scan], shape (T,); NaN
@@ -350,7 +364,7 @@ class Remapping:
         if rerun.done < until:
             if snapshots.is_due(rerun.done):
                 snapshots.offer(rerun.done, rerun.mapper.snapshot())
-            self.map.add(rerun.map_next())
+            self.map.add(rerun.map_next(), rerun.free)
         return rerun.done == until
 
     def finish(self) -> RunMap:

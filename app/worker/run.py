@@ -35,7 +35,6 @@ from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
 from pipeline.remapping import KnownMap, Rerun, ScanCaches, needs_sample, preview_trees, sample_scans
-from pipeline.stand.seen_area import ViewSelection
 from pipeline.types.records import Float, Float32, Frame, Path, Step, Trees
 
 #: Returns a mapper of a source for parameters and a seed, see `mapper_of`.
@@ -99,9 +98,7 @@ class Run:
         self._caches = caches
         self._cache = caches.of(parameters)
         self._numbers = TreeNumbers()
-        self._views: list[tuple[int, Float]] = []
-        self._newest_ns = -1  # of the scans that were asked for a view
-        self._view_selection = ViewSelection()
+        self._views_sent = 0
         self._remapping: Remapping | None = None
         self._previous: RunMap | None = None  # the map before the last change of parameters, for undo
 
@@ -221,13 +218,13 @@ class Run:
             mapper.parameters, self._cache = wanted, self._caches.of(wanted)
         self._broken = True
         with self.stopwatch.whole_scan():
-            frame = self._process(mapper, step, hurried=hurried)
+            frame, free = self._process(mapper, step, hurried=hurried)
         self._broken = False
         if new_map:
             self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))
         self.frame = replace(frame, trees=self._numbers.renumber(frame.trees))
         self._step, self.current = step, step.index
-        self._map.add(frame)
+        self._map.add(frame, free)
         self.confirmed_s = self._map.confirmed(frame.trees)
         return self.frame
 
@@ -249,9 +246,8 @@ class Run:
         confirmed_s = None if shown.confirmed_s is None else shown.confirmed_s[rows]
         return msgspec.structs.replace(shown, frame=frame, confirmed_s=confirmed_s)
 
-    def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> Frame:
-        """Return the result of a step, cache its segmented scan, and add its view if one is due (see
-        `take_views`).
+    def _process(self, mapper: Mapper, step: Step, *, hurried: bool) -> tuple[Frame, Float]:
+        """Return the result of a step and the free range of its scan, and cache the segmented scan.
 
         Args:
             mapper: The mapper.
@@ -262,18 +258,12 @@ class Run:
         self.is_bare = cached is not None
         scan = mapper.segment(step) if cached is None else cached[1]
         self._cache.put(step, scan)
-        frame = mapper.process(step, scan)
-        if frame.stamp_ns > self._newest_ns:
-            self._newest_ns = frame.stamp_ns
-            if self._view_selection.take(frame.estimate.T_map_base):
-                self._views.append((frame.stamp_ns, scan.free))
-        return frame
+        return mapper.process(step, scan), scan.free
 
     def take_views(self) -> list[tuple[int, Float]]:
-        """Return the time [ns] and the free range by direction [m], see `SegmentedScan.free`, of the scans
-        that are due for the observed area, and that were not returned before. A scan that is mapped again
-        gives no other view."""
-        taken, self._views = self._views, []
+        """Return the `RunMap.views` of the present map that were not returned before."""
+        taken = self._map.views[self._views_sent :]
+        self._views_sent += len(taken)
         return taken
 
     def remap(self, parameters: Parameters, on_preview: Callable[[Trees], None]) -> None:
@@ -382,7 +372,7 @@ class Run:
         if not finished:
             return None
         self._previous = self._map
-        self._remapping, self._map = None, remapping.finish()
+        self._remapping, self._map, self._views_sent = None, remapping.finish(), 0
         self._cache = self._caches.of(self._map.parameters.at(self.current))
         frame = self._map_step(self._step, new_map=True)
         confirmed_s = {self._numbers.known(n): at for n, at in self._map.confirmed_s.items()}

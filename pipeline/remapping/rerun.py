@@ -179,6 +179,7 @@ class Rerun:
 
     Attributes:
         done: Number of scans that are mapped.
+        free: Free range by direction of the last one, see `SegmentedScan.free`; empty before the first.
     """
 
     def __init__(
@@ -193,6 +194,7 @@ class Rerun:
         """Prepare a rerun; nothing is read."""
         self.mapper = mapper
         self.done = done
+        self.free: Float = np.zeros(0)
         self._cache, self._reread, self._segment_steps = cache, reread, segment_steps
         self._segmented: Iterator[tuple[Step, SegmentedScan]] | None = None
 
@@ -207,6 +209,7 @@ class Rerun:
         step, scan = self._cache.read(self.done) or self._read_again(self.done)
         frame = self.mapper.process(step, scan)
         self.done += 1
+        self.free = scan.free
         return frame
 
     def go_back(self, scans: int, state: MapperState) -> None:

@@ -105,6 +105,24 @@ def test_the_map_is_that_of_these_parameters_from_the_start(session, parameters)
     assert not any(thread.name.startswith("segment") for thread in threading.enumerate()), "none is left"
 
 
+def test_the_observed_area_is_that_of_the_new_map(session):
+    """The free ranges depend on the filters."""
+    near = BASE.replace({"filters.x_max": 5.0})
+    old = dict(session.run.take_views())
+    for revision, wanted in enumerate([near, BASE, near], 1):
+        session.set_parameters(wanted, revision, whole=True)
+        remapped(session)
+        views = session.run.take_views()
+        with mapped_from_start(wanted, LAST - 1) as other:
+            expected = other.run.take_views()
+        assert [(stamp, free.tobytes()) for stamp, free in views] == [
+            (stamp, free.tobytes()) for stamp, free in expected
+        ]
+        assert session.run.take_views() == []
+        same = all(np.array_equal(old[stamp], free) for stamp, free in views)
+        assert same == (wanted == BASE)
+
+
 @pytest.mark.parametrize("parameters", [FEWER, WIDER])
 def test_undo_and_redo_bring_the_maps_back_that_were_on_the_page(session, parameters):
     maps: dict[int, object] = {}
