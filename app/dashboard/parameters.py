@@ -359,13 +359,15 @@ class ParameterSets:
 
     def name_of(self, preset_name: str, parameters: Parameters) -> str:
         """Return the name of the saved set with these values and preset, the first by name of equal ones;
-        empty if there is none. Presets are not considered.
+        empty if there is none, or if the values are those of the preset.
 
         Args:
             preset_name: Name of the preset.
             parameters: The values.
         """
         wanted = (preset_name, parameters)
+        if parameters == preset(preset_name):
+            return ""
         return next((name for name, values in self._values.items() if values == wanted), "")
 
     def as_plain(self) -> dict[str, Any]:

@@ -64,6 +64,8 @@ def test_a_distance_is_measured_between_two_trees(dashboard: Dashboard):
     expect(page.locator("#map-measure")).to_have_attribute("aria-pressed", "true")
     box = page.locator("#map").bounding_box()
     assert box is not None
+    page.mouse.move(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
+    expect(page.locator("#map-tip")).to_have_text("Click where the distance begins")
     page.mouse.click(box["x"] + 0.3 * box["width"], box["y"] + 0.5 * box["height"])
     page.mouse.move(box["x"] + 0.7 * box["width"], box["y"] + 0.6 * box["height"])
     page.mouse.click(box["x"] + 0.7 * box["width"], box["y"] + 0.6 * box["height"])

@@ -7,7 +7,7 @@ import { byId, setText } from "../core/dom.js";
 import { saveCanvas, saveCsv } from "../core/download.js";
 import { dbhText, heightText, NONE, seenText } from "../core/format.js";
 import { select, selectCluster } from "../core/live_feed.js";
-import { nearest } from "../core/nearest.js";
+import { distance, nearest } from "../core/nearest.js";
 import { clusters, isCloud, on, state, trees } from "../core/store.js";
 import { throttled } from "../core/timing.js";
 import { openStory } from "../explain/story.js";
@@ -55,14 +55,17 @@ const gapTo = (at) => (place) => {
 const clusterAt = (at) => nearest(clusters(), gapTo(at), POINT_REACH);
 const truthAt = (at) => nearest(state.truth ?? [], gapTo(at), POINT_REACH);
 
+const SAME = 0.01; // [m] between an annotation and its copy in the ground truth
+
 function describe(at) {
   const [tree, truth, cluster] = [treeAt(trees(), at, map.view), truthAt(at), clusterAt(at)];
   canvas.classList.toggle("hits", Boolean(tree ?? cluster ?? truth));
+  if (measuring()) return state.measure.from === null ? "Click where the distance begins" : "";
   if (draft.adding || drawing() || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isCloud() ? `height ${heightText(tree)}` : seenText(tree));
   else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
-  if (truth) lines.push(`Ground truth: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
+  if (truth) lines.push(`${annotations().some((row) => distance(row, truth) < SAME) ? "Annotation" : "Ground truth"}: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
   return lines.join("\n") || NONE;
 }
 

@@ -1,6 +1,6 @@
 // The tab Plots: draw, type, import and list plots, with the stand figures of each plot and of all.
 
-import { draft, redo, remove, reviewOf, STATES, undo } from "../annotate/annotations.js";
+import { draft, redo, remove, reviewOf, rows as annotations, STATES, treeNumberOf, undo } from "../annotate/annotations.js";
 import { get } from "../core/api.js";
 import { button, byId, el, recall, remember, setText } from "../core/dom.js";
 import { count, figure, percent, plusMinus, withSigma } from "../core/format.js";
@@ -110,8 +110,11 @@ function build() {
 
 // --- the table --------------------------------------------------------------------------------------------------------
 
+const SMALL_ERROR = 0.001; // of the value; smaller errors are not shown as a number
+
 function estimate([value, se] = [null, null]) {
   if (se === null || value === null) return el("td", { text: figure(value) });
+  if (se < SMALL_ERROR * value) return el("td", {}, figure(value), el("small", { text: " ± < 0.1 %" }));
   const [text, error] = withSigma(value, se);
   return el("td", {}, text, el("small", { text: ` ± ${error}` }));
 }
@@ -163,16 +166,16 @@ function hint() {
   const reasons = Object.entries(leftOut).filter(([, number]) => number).map(([reason, number], k) => `${number}${k ? "" : ` of ${count(all, "tree")}`} ${number === 1 ? "is" : "are"} ${LEFT_OUT[reason] ?? reason.replaceAll("_", " ")}`);
   const trees = all === undefined ? "" : ` ${reasons.length ? `${reasons.join(", ")}, and not counted.` : `All ${all} trees in the map are counted.`}`;
   if (!drawn) return `${looksOnly() ? "" : "Draw plots on the map for their stems and basal area per hectare. "}Without plots, the figures are those of the whole observed area.${trees}`;
-  return `Trees of the map at the shown time.${trees} ± is the standard error. It is 0 for a count where the whole plot was observed; for the mean it is the variation between plots.`;
+  return `Trees of the map at the shown time.${trees} ± is the standard error. That of a count does not contain missed trees, and is about 0 where the whole plot was observed; for the mean it is the variation between plots.`;
 }
 
-const NO_ERROR = " ± 0 of N/ha: all of the area was observed, no diameter is near the minimum, and every tree in view counts as found; missed trees are not included.";
+const NO_ERROR = " The error of N/ha is small because all of the area was observed and few diameters are near the minimum; trees that the map lacks are not included.";
 
-// Which of the figures with and without correction to use, as `stemmap stand` prints it, and what an error of 0 means.
+// Which of the figures with and without correction to use, as `stemmap stand` prints it, and what a small error means.
 function detectionText() {
   const { all, plots: own } = figures;
   const shownPlots = [all, own].flatMap((each) => Object.values(each?.plots ?? {}));
-  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: stems, trees, seen_m2: seen, area_m2: area }) => stems[1] === 0 && trees > 0 && seen >= area) ? NO_ERROR : "");
+  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: [stems, se], trees }) => trees > 0 && se !== null && se < SMALL_ERROR * stems) ? NO_ERROR : "");
 }
 
 function correctionText({ detection_sigma_m: sigma, plots: of, mean }) {
@@ -184,12 +187,17 @@ function correctionText({ detection_sigma_m: sigma, plots: of, mean }) {
     + `(detection decreases with distance: half-normal, sigma ${figure(sigma)} m). They are too large where the stand is thinner away from the path.`;
 }
 
-// How many found trees a person has reviewed; rejected ones do not count in the figures.
+// How many found trees a person has reviewed, and what of the annotations counts in the figures.
 function reviewText() {
   const of = Object.fromEntries(STATES.map((name) => [name, 0]));
   for (const tree of trees()) of[reviewOf(tree)] += 1;
   const all = trees().length;
-  return all ? `Review: ${all - of.open} of ${count(all, "found tree")} reviewed${all === of.open ? "" : ` (${STATES.slice(1).map((name) => `${of[name]} ${name}`).join(", ")})`}.` : "";
+  if (!all) return "";
+  const states = STATES.slice(1).filter((name) => of[name]).map((name) => `${of[name]} ${name}`);
+  const references = annotations().some((row) => row.kind === "tree" && (row.dbh_cm !== null || treeNumberOf(row) === null));
+  return [`Review: ${of.confirmed + of.rejected} of ${count(all, "found tree")} reviewed${states.length ? ` (${states.join(", ")})` : ""}.`,
+    of.rejected && "Rejected trees do not count here.",
+    references && "Diameters by tape and trees that the map lacks are references for the scores; they do not count here."].filter(Boolean).join(" ");
 }
 
 // Returns whether another run is open, which begins with empty fields.

@@ -43,10 +43,12 @@ export async function showTwo(a, b) {
 // Without an alignment, trees are near each other only by chance, so no pairs are shown.
 const UNALIGNED = "The two maps do not fit together: they show different places, or share too few trees. No trees are compared.";
 
+const aboutRun = (run) => [when(run.begun_s ?? run.changed_s), run.preset, run.scores && `F1 ${figure(run.scores.f1)}`].filter(Boolean).join(", ");
+
 function head({ a, b, how, aligned, record }) {
   return el("div", { class: "run-head" },
     el("h2", {}, el("span", { text: `A: ${a.name}` }), el("span", { text: `B: ${b.name}` })),
-    el("p", { class: "dim", text: `A ${when(a.begun_s ?? a.changed_s)} · B ${when(b.begun_s ?? b.changed_s)}${aligned ? ` · frames: ${how}` : ""}` }),
+    el("p", { class: "dim", text: `A ${aboutRun(a)} · B ${aboutRun(b)}${aligned ? ` · frames: ${how}` : ""}` }),
     ...(aligned ? record.warnings : [UNALIGNED]).map((text) => el("p", { class: "error", role: "alert", text })));
 }
 

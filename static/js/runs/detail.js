@@ -64,7 +64,7 @@ function head(run, { replay, rename, remove }) {
   const title = el("h2", { text: run.name });
   const own = run.id !== undefined; // folders are renamed and deleted outside of stemmap
   return el("div", { class: "run-head" }, title,
-    el("button", { class: "primary", id: "run-replay", "data-edit": true, text: "Replay", title: "Open the recording with the parameters of this run", onclick: guarded(() => replay(run)) }),
+    el("button", { class: "primary", id: "run-replay", "data-edit": true, text: "Replay", title: "Open the recording in the dashboard, where it is mapped again with the parameters of this run", onclick: guarded(() => replay(run)) }),
     ...(own ? [
       el("button", { id: "run-rename", "data-edit": true, text: "Rename", onclick: () => edit(title, run, guarded, rename) }),
       el("button", { id: "run-delete", "data-edit": true, text: "Delete", title: "Delete this run; it can be restored", onclick: guarded(() => remove(run)) })] : []),
@@ -92,17 +92,17 @@ function more(run, map) {
       el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(fileName(title, "map.png"), map.canvas) }),
       reportMenu("run-report", run.key, () => title),
       el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(fileName(title, "trees.csv"), treeRows(run.map.trees)) })),
-    ...(run.scores ? [el("div", {}, el("h3", { text: "Against the ground truth" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
+    ...(run.scores ? [el("div", {}, el("h3", { text: run.annotated ? "Against ground truth and annotations" : "Against the ground truth" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
     el("div", {}, el("h3", { text: "Differences from the preset" }), Object.keys(run.differences).length
       ? table(["parameter", "value"], Object.entries(run.differences).map(([name, value]) => [name, String(value)]))
       : el("p", { class: "note", text: `None: all parameters are those of the preset ${run.preset}.` })),
-    el("div", {}, el("h3", { text: "Changes of parameters during the run" }), ...changes(run)),
+    el("div", {}, el("h3", { text: "Changes of parameters" }), ...changes(run)),
     el("details", {}, el("summary", { text: `All ${Object.keys(run.parameters).length} parameters` }),
       table(["parameter", "value"], Object.entries(run.parameters).map(([name, value]) => [name, String(value)]))));
 }
 
 function changes({ revisions }) {
-  if (!revisions.length) return [el("p", { class: "note", text: "None: the parameters were not changed during the run." })];
+  if (!revisions.length) return [el("p", { class: "note", text: "None: the parameters were not changed." })];
   const rows = revisions.map((each) => [each.who, when(each.at_s), clock(each.time_s),
     Object.entries(each.changes).slice(0, 4).map(([name, [before, after]]) => `${name}: ${before} → ${after}`).join(", ") + (Object.keys(each.changes).length > 4 ? `, ${count(Object.keys(each.changes).length - 4, "more", "more")}` : "")]);
   return [table(["by", "when", "time in the run", "change"], rows)];

@@ -11,7 +11,7 @@ import { showTwo } from "./compare.js";
 import { repaint, say, showRun } from "./detail.js";
 import { scans, shortSource, when } from "./figures.js";
 
-const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["pose lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"], ["preset", "minor extra"]];
+const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["pose lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"]];
 const REFRESH_EVERY = 5000; // [ms]
 let known = { runs: [], folders: [], open: null }, listed = ""; // the answer of the server, and its text
 let requests = 0;
@@ -57,9 +57,9 @@ function showError(words) {
 function row(run) {
   const name = el("td", {}, el("button", { text: run.name, onclick: (event) => { event.stopPropagation(); go(addressOf(run)); } }),
     el("small", {}, ...(run.id === known.open && run.id !== undefined ? [el("span", { class: "badge", text: "open now" })] : []),
-      run.uri && shortSource(run.uri) !== run.name ? shortSource(run.uri) : run.kind ?? ""));
-  const texts = run.id === undefined ? [when(run.changed_s), "", "", "", "", "", "", ""]
-    : [when(run.begun_s), scans(run), figure(run.distance_m), percent(run.lost), String(run.trees), figure(run.scores?.f1), run.annotated ? String(run.annotated) : NONE, run.preset];
+      [run.uri && shortSource(run.uri) !== run.name ? shortSource(run.uri) : run.kind, run.preset].filter(Boolean).join(" · ")));
+  const texts = run.id === undefined ? [when(run.changed_s), "", "", "", "", "", ""]
+    : [when(run.begun_s), scans(run), figure(run.distance_m), percent(run.lost), String(run.trees), figure(run.scores?.f1), run.annotated ? String(run.annotated) : NONE];
   return el("tr", { "data-run": run.key, onclick: () => go(addressOf(run)) },
     el("td", { onclick: (event) => event.stopPropagation() }, el("input", { type: "checkbox", "aria-label": `Compare ${run.name}`, checked: ticked.has(run.key), onchange: (event) => tick(run.key, event.target.checked) })),
     name, ...texts.map((text, k) => el("td", { class: HEADS[k + 2][1], text })));
