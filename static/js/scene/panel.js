@@ -59,7 +59,9 @@ const nameWidgets = throttled(() => {
 }, NAMING_PAUSE);
 
 const narrow = matchMedia("(max-width: 1180px)"), phone = matchMedia("(max-width: 700px)");
-const isCovered = () => phone.matches || (narrow.matches && byId("side").classList.contains("open")); // no room is left beside the panel
+const LEAST_WIDTH = 560; // [px] of the scene with its panel
+// Whether no room is left beside the panel.
+const isCovered = () => phone.matches || (narrow.matches && byId("side").classList.contains("open")) || byId("scene").clientWidth < LEAST_WIDTH;
 
 // viser keeps the panel open or closed in each browser; its button is the only way to change that here.
 function collapse() {
@@ -86,4 +88,5 @@ export function startScenePanel() {
   on("tab", collapse);
   new MutationObserver(collapse).observe(byId("side"), { attributeFilter: ["class"] });
   narrow.addEventListener("change", collapse);
+  new ResizeObserver(collapse).observe(byId("scene"));
 }

@@ -1,12 +1,13 @@
 // The frame with viser's 3D scene. It has the same origin as the page, which shares keys and reconnects it.
 
-import { byId } from "../core/dom.js";
+import { byId, recall, remember } from "../core/dom.js";
 import { on } from "../core/store.js";
 import { isDark } from "../core/theme.js";
 
 const frame = byId("scene");
 const loaders = [];
-const builders = [drawWorldWithItsContent];
+const builders = [drawWorldWithItsContent, closeRenderingNotice];
+const NOTICE_MS = 8000, LOOK_MS = 250, LOOKS = 40;
 
 export const onSceneLoad = (listener) => loaders.push(listener);
 export const onSceneBuilt = (listener) => builders.push(listener); // once its nodes and camera are there
@@ -63,6 +64,18 @@ function drawWorldWithItsContent({ __viserMutable: viser }) {
     world.updateMatrix();
     world.updateMatrixWorld(true);
   };
+}
+
+// viser's notice about rendering in software covers a part of the scene. It closes by itself, and at once where this browser has
+// shown it before.
+function closeRenderingNotice(inner, looks = LOOKS) {
+  const notice = [...inner.document.querySelectorAll("[class*=mantine-Notification-root]")].find(({ textContent }) => textContent.includes("Software WebGL"));
+  if (!notice) {
+    if (looks) setTimeout(() => closeRenderingNotice(inner, looks - 1), LOOK_MS);
+    return;
+  }
+  setTimeout(() => notice.querySelector("button")?.click(), recall("rendering-notice") ? 0 : NOTICE_MS);
+  remember("rendering-notice", "shown");
 }
 
 function whenBuilt(frame, act) {
