@@ -66,7 +66,7 @@ function healthFigures() {
   if (state.status.health === "static") return SOON.static;
   return [h.reason && `${h.state}: ${h.reason}`, `N_eff ${figure(h.n_eff)}, ${h.ancestors} ancestors`,
     `${h.detections} detections, ${figure(h.recognised)} associated, ${figure(h.ambiguous)} ambiguous`,
-    `normalised innovation ${figure(h.innovation)} (1 expected)`, `pose sigma ${figure(100 * h.sigma_xy_m)} cm, ${figure(h.sigma_yaw_deg)}°`,
+    `normalised innovation ${figure(h.innovation)} (1 expected)`, `pose sigma ${figure(100 * state.map.sigma_xy)} cm, ${figure(h.sigma_yaw_deg)}°`,
     `${figure(h.odometry_sigmas)} sigma from the odometry`].filter(Boolean).join("\n");
 }
 

@@ -70,7 +70,7 @@ function show() {
     changed("ghost");
   }
   if (share !== null) setText(note, progressText(share, preview));
-  else setText(note, newest ? resultText(newest) : box.checked ? "Each change re-maps the run from its start." : "Changes apply from the current scan onwards.");
+  else setText(note, newest ? resultText(newest) : box.checked ? "Each change re-maps the run from its start to the shown scan." : "Changes apply from the current scan onwards.");
 }
 
 const lineOf = (kind, sign, node, why) => el("li", { "data-kind": kind }, el("b", { text: sign, "aria-hidden": "true" }), node, el("small", { text: why }));
