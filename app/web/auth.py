@@ -9,6 +9,7 @@ but not another site).
 from __future__ import annotations
 
 import base64
+import hashlib
 import hmac
 import html
 import ipaddress
@@ -52,13 +53,16 @@ _FORWARDING = (
 _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 _ANY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - compared with, not bound to
 
-_LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
-<style>body{font:1.1rem/1.6 system-ui,sans-serif;max-width:36rem;margin:15vh auto;padding:0 1.5rem}</style>
+_LOGIN_STYLE = "body{font:1.1rem/1.6 system-ui,sans-serif;max-width:36rem;margin:15vh auto;padding:0 1.5rem}"
+_LOGIN_PAGE = f"""<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
+<style>{_LOGIN_STYLE}</style>
 <h1>Open the link that stemmap printed</h1>
 <p>This dashboard needs the link that <code>stemmap</code> printed in the terminal when it was started.
 The link ends in <code>?token=</code> and some letters. It changes at every start, and a session ends after a
 week.</p></html>"""
-
+_LOGIN_STYLE_HASH = base64.b64encode(hashlib.sha256(_LOGIN_STYLE.encode()).digest()).decode()
+#: The hash permits the style of this page and no other one.
+_LOGIN_POLICY = f"default-src 'none'; style-src 'sha256-{_LOGIN_STYLE_HASH}'; frame-ancestors 'self'"
 
 _LEAD_ON = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
 <meta http-equiv="refresh" content="0;url={target}"><p><a href="{target}">Open the dashboard</a></p></html>"""
@@ -292,7 +296,8 @@ class Guard:
         if is_health or self._role(headers) is not None:
             return None
         if scope["type"] == "http" and "text/html" in headers.get("accept", ""):
-            return HTMLResponse(_LOGIN_PAGE, 401, {"Cache-Control": "no-store"})
+            headers_of_page = {"Cache-Control": "no-store", "Content-Security-Policy": _LOGIN_POLICY}
+            return HTMLResponse(_LOGIN_PAGE, 401, headers_of_page)
         return error_reply(401, "the token is missing or wrong", remedy="Open the link that stemmap printed")
 
     def _welcome(self, role: Role, query: list[tuple[str, str]], *, from_elsewhere: bool) -> Response:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import hashlib
 import json
 import socket
 import time
@@ -487,3 +489,15 @@ async def test_a_ticket_opens_the_page_once(client: httpx.AsyncClient, role: Rol
     assert (await client.get(f"/?ticket={once}")).status_code == 401
     for wrong in (ticket(TOKEN, PORT + 1, role), ticket("x" * 20, PORT, role), once[:-1], "", "a.b.c.d"):
         assert (await client.get(f"/?ticket={wrong}")).status_code == 401
+
+
+async def test_the_page_for_an_invalid_link_permits_its_own_style_only(client: httpx.AsyncClient) -> None:
+    answer = await client.get("/?token=old", headers={"Accept": "text/html"})
+    assert answer.status_code == 401
+    style = answer.text.partition("<style>")[2].partition("</style>")[0]
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    assert answer.headers.get_list("content-security-policy") == [
+        f"default-src 'none'; style-src 'sha256-{digest}'; frame-ancestors 'self'"
+    ]
+    other = await client.get("/api/status", headers=BEARER)
+    assert other.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'self'"
