@@ -14,6 +14,15 @@ export const looksOnly = () => access.role === "viewer";
 export const edits = (run) => Object.assign((...args) => (looksOnly() ? undefined : run(...args)), { edits: true });
 export const mayDo = (run) => !(run.edits && looksOnly());
 
+export async function refreshAccess() {
+  access = await get("/api/access");
+}
+
+// For a page that the server refuses.
+export const refusedText = () => looksOnly()
+  ? "This view-only link is no longer valid. Ask the owner of this dashboard for a new link."
+  : "The server does not accept this page any more: it was started again with a new link, or the session is older than a week. Open the link that stemmap printed in the terminal.";
+
 function disableContents(panel) {
   const disable = () => { for (const node of panel.children) node.inert = true; };
   new MutationObserver(disable).observe(panel, { childList: true });
@@ -22,7 +31,7 @@ function disableContents(panel) {
 
 export async function startAccess() {
   try {
-    access = await get("/api/access");
+    await refreshAccess();
   } catch (error) {
     showProblem(`It is not known whether this page may change the run: ${error.message}`);
     return;
