@@ -34,7 +34,7 @@ from app.robot.link import Inbox
 from app.robot.zenoh import ZenohLink
 from app.sources import inspection
 from app.web.app import FleetLink, MakeScene, MakeWorker, build, guarded
-from app.web.auth import role_of
+from app.web.auth import AccessTokens, role_of
 from app.web.responses import error_reply
 from app.web.routes.access import ConnectionLimit
 from app.web.routes.page import access, lead_on, page_answer, page_file, page_folder, telling
@@ -316,7 +316,7 @@ class Fleet:
     Args:
         settings: Settings of the deployment.
         port: Port of the page of the fleet.
-        token: Access token of browsers, also for the dashboards.
+        tokens: Tokens of the links, also for the dashboards.
         make_parameters: Returns the initial parameters of a dashboard.
         make_scene, make_worker: Replacements of viser and of the worker process, for tests.
         warm: Task after which the dashboards start; None starts them at once.
@@ -332,7 +332,7 @@ class Fleet:
         self,
         settings: Settings,
         port: int,
-        token: str,
+        tokens: AccessTokens,
         make_parameters: Callable[[], ParameterState] = ParameterState,
         make_scene: MakeScene | None = None,
         make_worker: MakeWorker = WorkerProcess,
@@ -341,7 +341,7 @@ class Fleet:
         self.live, self.pages = Broadcast(), ConnectionLimit()
         self.members: dict[str, Member] = {}
         self.notice = ""
-        self._settings, self._port, self._token = settings, port, token
+        self._settings, self._port, self._tokens = settings, port, tokens
         self._make_parameters = make_parameters
         self._make = (make_scene, make_worker)
         self._frames = Frames()
@@ -373,7 +373,7 @@ class Fleet:
         app = build(
             self._settings,
             port=listening.getsockname()[1],
-            token=self._token,
+            tokens=self._tokens,
             source=source,
             parameter_state=self._make_parameters(),
             make_scene=self._make[0],
@@ -615,7 +615,7 @@ def build_fleet(
     settings: Settings,
     *,
     port: int,
-    token: str,
+    tokens: AccessTokens,
     fleet: Fleet,
     watching: RobotWatch | None = None,
 ) -> FastAPI:
@@ -625,7 +625,7 @@ def build_fleet(
     Args:
         settings: Settings of the deployment.
         port: Port on which it is served, to check Host and Origin.
-        token: Access token of browsers.
+        tokens: Tokens of the links.
         fleet: The robots.
         watching: What adds further robots; None for nothing.
     """
@@ -642,7 +642,7 @@ def build_fleet(
                 await watching.close()
             await fleet.close()
 
-    app = guarded(settings, port=port, token=token, lifespan=lifespan)
+    app = guarded(settings, port=port, tokens=tokens, lifespan=lifespan)
     app.state.fleet, app.state.fleet_port = fleet, None
     app.include_router(router)
     app.add_api_route("/api/access", access, methods=["GET"])
@@ -709,14 +709,14 @@ def serve_fleet(
         SystemExit: The page fails at its start.
     """
 
-    async def make_app(port: int, token: str) -> FastAPI:
-        fleet = Fleet(replace(settings, port=port), port, token, make_parameters, warm=warm_kernels)
+    async def make_app(port: int, tokens: AccessTokens) -> FastAPI:
+        fleet = Fleet(replace(settings, port=port), port, tokens, make_parameters, warm=warm_kernels)
         for name, source in sources.items():
             fleet.add(name, source)
         watching: RobotWatch | None = None
         if watched is not None:
             address, source = watched
             watching = RobotWatch(fleet, address, source)
-        return build_fleet(settings, port=port, token=token, fleet=fleet, watching=watching)
+        return build_fleet(settings, port=port, tokens=tokens, fleet=fleet, watching=watching)
 
     return run_server(settings, make_app, open_browser=open_browser, viewer=viewer)

@@ -27,7 +27,7 @@ from app.store.async_store import AsyncStore, StoreBusyError
 from app.store.forests import Forests
 from app.store.records import UnknownError
 from app.web import uploads
-from app.web.auth import Guard, viewer_token
+from app.web.auth import AccessTokens, Guard
 from app.web.responses import BadRequestError, error_reply, failure_reply, invalid_reply
 from app.web.routes import annotations as annotation_routes
 from app.web.routes import page, parameters, plots, results, run, runs, tuning
@@ -77,7 +77,7 @@ def build(
     settings: Settings,
     *,
     port: int,
-    token: str,
+    tokens: AccessTokens,
     source: Open,
     parameter_state: ParameterState,
     make_scene: MakeScene | None = None,
@@ -90,7 +90,7 @@ def build(
     Args:
         settings: Settings of the deployment.
         port: Port on which it is served, to check Host and Origin.
-        token: Token of the owner's link.
+        tokens: Tokens of the links.
         source: Source that is opened at the start.
         parameter_state: Parameters at the start; its `check` is set.
         make_scene: Replaces viser in tests.
@@ -117,7 +117,7 @@ def build(
             await learning.close()
             await dashboard.close()
 
-    app = guarded(settings, port=port, token=token, lifespan=lifespan)
+    app = guarded(settings, port=port, tokens=tokens, lifespan=lifespan)
     app.state.dashboard, app.state.settings = dashboard, settings
     app.state.fleet_port = None if fleet is None else fleet.port
     app.state.open_records = fleet.open_records if fleet else lambda: {dashboard.run_recorder.record}
@@ -127,18 +127,18 @@ def build(
     return app
 
 
-def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) -> FastAPI:
+def guarded(settings: Settings, *, port: int, tokens: AccessTokens, lifespan: Lifespan) -> FastAPI:
     """Return an application without routes that checks access and answers errors as JSON.
 
     Args:
         settings: Hosts and size limits.
         port: Port on which the server listens.
-        token: Token of the owner; that of viewers is derived from it.
+        tokens: Tokens of the links.
         lifespan: Context in which the application runs.
     """
     guard = Middleware(
         Guard,
-        token=token,
+        tokens=tokens,
         host=settings.host,
         port=port,
         further_hosts=settings.hosts,
@@ -154,7 +154,7 @@ def guarded(settings: Settings, *, port: int, token: str, lifespan: Lifespan) ->
         openapi_url="/api/openapi.json",
         redirect_slashes=False,
     )
-    app.state.token, app.state.viewer_token = token, viewer_token(token)
+    app.state.tokens = tokens
     _answer_errors(app)
     return app
 

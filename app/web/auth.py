@@ -8,16 +8,20 @@ but not another site).
 
 from __future__ import annotations
 
+import asyncio
 import base64
+import contextlib
+import hashlib
 import hmac
 import html
 import ipaddress
 import secrets
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from http.cookies import CookieError, SimpleCookie
-from typing import Literal
+from pathlib import Path
+from typing import Literal, Self
 from urllib.parse import parse_qsl, urlencode, urlsplit
 
 from starlette.datastructures import Headers
@@ -25,15 +29,18 @@ from starlette.exceptions import HTTPException
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from app.common.settings import is_loopback
+from app.common.settings import Settings, is_loopback
 from app.common.user import current_user, user_of_cookies
 from app.web.responses import error_reply
+from pipeline.errors import StemmapError
+from pipeline.io.atomic_files import write_beside
 
 # The only route whose bodies may be as large as a recording.
 UPLOADS = "/api/uploads"
 # The only route without a token: for the supervisor of a service.
 HEALTH = "/health"
 Role = Literal["owner", "viewer"]
+_ROLES: tuple[Role, ...] = ("owner", "viewer")
 #: A session lasts so long; each page load in its second half starts a new one.
 SESSION_S = 7 * 86_400
 TICKET_S = 60
@@ -51,14 +58,22 @@ _FORWARDING = (
 )
 _LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 _ANY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - compared with, not bound to
+_SCENES = frozenset({"/viser", "/viser/"})
+_POLICY_VIOLATION = 1008
+_CLOSE_S = 1.0
 
-_LOGIN_PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
-<style>body{font:1.1rem/1.6 system-ui,sans-serif;max-width:36rem;margin:15vh auto;padding:0 1.5rem}</style>
+_LOGIN_STYLE = "body{font:1.1rem/1.6 system-ui,sans-serif;max-width:36rem;margin:15vh auto;padding:0 1.5rem}"
+_LOGIN_PAGE = f"""<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
+<style>{_LOGIN_STYLE}</style>
 <h1>Open the link that stemmap printed</h1>
 <p>This dashboard needs the link that <code>stemmap</code> printed in the terminal when it was started.
 The link ends in <code>?token=</code> and some letters. It changes at every start, and a session ends after a
-week.</p></html>"""
-
+week.</p>
+<p>If you had a view-only link, the owner of the dashboard may have ended it: ask the owner for a new one.</p>
+</html>"""
+_LOGIN_STYLE_HASH = base64.b64encode(hashlib.sha256(_LOGIN_STYLE.encode()).digest()).decode()
+#: The hash permits the style of this page and no other one.
+_LOGIN_POLICY = f"default-src 'none'; style-src 'sha256-{_LOGIN_STYLE_HASH}'; frame-ancestors 'self'"
 
 _LEAD_ON = """<!doctype html><html lang="en"><meta charset="utf-8"><title>stemmap</title>
 <meta http-equiv="refresh" content="0;url={target}"><p><a href="{target}">Open the dashboard</a></p></html>"""
@@ -69,11 +84,112 @@ def new_token() -> str:
     return secrets.token_urlsafe(24)
 
 
-def viewer_token(token: str) -> str:
+def viewer_token(token: str, salt: bytes = b"") -> str:
     """Return the token of the view-only link, 32 characters. It is derived from the owner's token, so that it
-    stays valid after a restart with the same token, and does not reveal that one."""
-    made = hmac.new(token.encode(), b"stemmap viewer", "sha256").digest()
+    stays valid after a restart with the same token, and does not reveal that one.
+
+    Args:
+        token: Token of the owner.
+        salt: Changes with each view-only link that was ended; empty for the first link.
+    """
+    made = hmac.new(token.encode(), b"stemmap viewer" + salt, "sha256").digest()
     return base64.urlsafe_b64encode(made[:24]).decode()
+
+
+class AccessTokens:
+    """The tokens of the owner's link and of the view-only link, and the open websockets of viewers. The
+    dashboards of a fleet share them.
+
+    Args:
+        owner: Token of the owner's link.
+        salt_file: File of the salt of the view-only link, so that an ended link stays invalid after a restart
+            with the same owner's token; None if the owner's token changes at each start.
+
+    Attributes:
+        owner, viewer: The tokens.
+
+    Raises:
+        StemmapError: The file exists and cannot be read.
+    """
+
+    def __init__(self, owner: str, salt_file: Path | None = None) -> None:
+        self.owner, self._salt_file = owner, salt_file
+        self._salt, self._saving = _read_salt(salt_file), asyncio.Lock()
+        self.viewer = viewer_token(owner, self._salt)
+        self._websockets: dict[asyncio.Timeout, str] = {}  # of viewers, with their path
+
+    @classmethod
+    def of(cls, settings: Settings) -> Self:
+        """Return the tokens of a deployment; without a token in the settings, that of the owner is new."""
+        if not settings.token:
+            return cls(new_token())
+        return cls(settings.token, settings.folder and settings.folder / "view-only-link")
+
+    def token(self, role: Role) -> str:
+        """Return the token of a role."""
+        return self.owner if role == "owner" else self.viewer
+
+    @property
+    def viewer_pages(self) -> int:
+        """Number of open pages of viewers."""
+        return sum(path not in _SCENES for path in self._websockets.values())
+
+    @contextlib.contextmanager
+    def viewer_websocket(self, timeout: asyncio.Timeout, path: str) -> Iterator[None]:
+        """Count a websocket of a viewer inside the context. Its timeout expires when the view-only link is
+        ended.
+
+        Args:
+            timeout: Timeout around the websocket, which is entered and has no deadline.
+            path: Path of the websocket.
+        """
+        self._websockets[timeout] = path
+        try:
+            yield
+        finally:
+            self._websockets.pop(timeout, None)
+
+    async def end_viewer_link(self) -> None:
+        """Replace the token of the view-only link. The old link, its sessions and tickets become invalid, and
+        open websockets of viewers are closed.
+
+        Raises:
+            StemmapError: The link has ended, but this could not be saved for the next start.
+        """
+        self._salt = secrets.token_hex(16).encode()
+        self.viewer = viewer_token(self.owner, self._salt)
+        websockets, self._websockets = self._websockets, {}
+        for timeout in websockets:
+            timeout.reschedule(asyncio.get_running_loop().time())
+        if self._salt_file is not None:
+            async with self._saving:
+                await asyncio.to_thread(_write_salt, self._salt_file, self._salt)
+
+
+def _read_salt(file: Path | None) -> bytes:
+    """Return the content of the file of a salt, empty without a file; see `AccessTokens`."""
+    try:
+        return b"" if file is None else file.read_bytes()
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise StemmapError(
+            f"the state of the view-only link cannot be read: {error.strerror}", where=str(file)
+        ) from None
+
+
+def _write_salt(file: Path, salt: bytes) -> None:
+    """Write the file of a salt; StemmapError if this fails."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with write_beside(file) as partial:
+            partial.write_bytes(salt)
+    except (OSError, StemmapError) as error:
+        raise StemmapError(
+            "the view-only link has ended, but this cannot be saved; a restart would make the old link valid",
+            where=str(file),
+            remedy="Make the folder writable and end the link again",
+        ) from error
 
 
 def role_of(scope: Scope) -> Role:
@@ -101,7 +217,7 @@ def ticket(token: str, port: int, role: Role) -> str:
     """Return a code that opens a dashboard once, within TICKET_S seconds, as `/?ticket=CODE`.
 
     Args:
-        token: Token of the owner.
+        token: Token of the role.
         port: Port of the dashboard.
         role: Role that the code gives.
     """
@@ -153,7 +269,7 @@ class Guard:
 
     Args:
         app: The guarded application.
-        token: Token of the owner.
+        tokens: Tokens of the owner and of viewers.
         host, port: Address on which the server listens.
         further_hosts: Further accepted host names.
         body_limit: Maximum size of the body of a request [bytes].
@@ -164,7 +280,7 @@ class Guard:
         self,
         app: ASGIApp,
         *,
-        token: str,
+        tokens: AccessTokens,
         host: str,
         port: int,
         further_hosts: Iterable[str] = (),
@@ -172,7 +288,6 @@ class Guard:
         upload_limit: int = 0,
     ) -> None:
         self._app = app
-        tokens: tuple[tuple[Role, str], ...] = (("owner", token), ("viewer", viewer_token(token)))
         self._tokens = tokens
         self._used_tickets: dict[str, int] = {}  # with the time at which they expire
         self._port = port
@@ -202,8 +317,26 @@ class Guard:
             await self._app(
                 scope, _limited(receive, self._limit_of(scope)), self._renewing(scope, headers, send)
             )
-        else:
+        elif role_of(scope) == "owner":
             await self._app(scope, receive, send)
+        else:
+            await self._serve_viewer(scope, receive, send)
+
+    async def _serve_viewer(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Call the application for a websocket of a viewer. The websocket is closed (1008) when the view-only
+        link is ended."""
+        timeout = asyncio.timeout(None)
+        try:
+            async with timeout:
+                with self._tokens.viewer_websocket(timeout, scope["path"]):
+                    await self._app(scope, receive, send)
+        except TimeoutError:
+            if not timeout.expired():
+                raise
+            # Without the time limit, a browser that does not read would delay the end of the connection.
+            with contextlib.suppress(TimeoutError, OSError, RuntimeError):
+                async with asyncio.timeout(_CLOSE_S):
+                    await send({"type": "websocket.close", "code": _POLICY_VIOLATION})
 
     def _renewing(self, scope: Scope, headers: Headers, send: Send) -> Send:
         """Return `send` with a new session cookie in the response, if the page "/" is loaded in the second
@@ -292,7 +425,8 @@ class Guard:
         if is_health or self._role(headers) is not None:
             return None
         if scope["type"] == "http" and "text/html" in headers.get("accept", ""):
-            return HTMLResponse(_LOGIN_PAGE, 401, {"Cache-Control": "no-store"})
+            headers_of_page = {"Cache-Control": "no-store", "Content-Security-Policy": _LOGIN_POLICY}
+            return HTMLResponse(_LOGIN_PAGE, 401, headers_of_page)
         return error_reply(401, "the token is missing or wrong", remedy="Open the link that stemmap printed")
 
     def _welcome(self, role: Role, query: list[tuple[str, str]], *, from_elsewhere: bool) -> Response:
@@ -317,7 +451,7 @@ class Guard:
 
     def _set_session(self, reply: Response, role: Role) -> None:
         """Add the cookie of a new session for a role to a response."""
-        value = session_value(dict(self._tokens)[role], self._port, int(time.time()) + SESSION_S)
+        value = session_value(self._tokens.token(role), self._port, int(time.time()) + SESSION_S)
         reply.set_cookie(self.cookie, value, max_age=SESSION_S, path="/", httponly=True, samesite="strict")
 
     def _knows_host(self, headers: Headers) -> bool:
@@ -372,7 +506,7 @@ class Guard:
         expires_s = _seconds(value.partition(".")[0])
         if expires_s is None or expires_s < time.time():
             return None
-        sessions = ((role, session_value(token, self._port, expires_s)) for role, token in self._tokens)
+        sessions = ((role, session_value(self._tokens.token(role), self._port, expires_s)) for role in _ROLES)
         return next((role for role, session in sessions if _same(value, session)), None)
 
     def _role_by_ticket(self, value: str) -> Role | None:
@@ -384,12 +518,14 @@ class Guard:
         now = time.time()
         if expires_s is None or expires_s < now or signed in self._used_tickets:
             return None
-        owner_token = dict(self._tokens)["owner"]
-        if not _same(signature, _signature(owner_token, f"stemmap ticket {self._port} {signed}")):
+        role: Role = "owner" if parts[0] == "owner" else "viewer"
+        if not _same(
+            signature, _signature(self._tokens.token(role), f"stemmap ticket {self._port} {signed}")
+        ):
             return None
         self._used_tickets = {k: end for k, end in self._used_tickets.items() if end >= now}
         self._used_tickets[signed] = expires_s
-        return "owner" if parts[0] == "owner" else "viewer"
+        return role
 
     def _role_by_bearer(self, headers: Headers) -> Role | None:
         """Return the role of the header `Authorization: Bearer TOKEN`; None without a valid one."""
@@ -398,7 +534,7 @@ class Guard:
 
     def _role_by_token(self, given: str) -> Role | None:
         """Return the role of a token; None for a wrong one."""
-        return next((role for role, token in self._tokens if _same(given, token)), None)
+        return next((role for role in _ROLES if _same(given, self._tokens.token(role))), None)
 
 
 def _same(given: str, secret: str) -> bool:

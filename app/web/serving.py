@@ -24,7 +24,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from app.common.settings import DEFAULT_PORT, MESSAGE_LIMIT, Settings
 from app.dashboard.parameters import ParameterState
-from app.web.auth import new_token, viewer_token
+from app.web.auth import AccessTokens
 from app.worker.protocol import Open
 from app.worker.supervisor import WorkerProcess
 from pipeline.errors import StemmapError
@@ -144,7 +144,7 @@ def serve(
         SystemExit: The dashboard fails at its start.
     """
 
-    async def make_app(port: int, token: str) -> ASGIApp:
+    async def make_app(port: int, tokens: AccessTokens) -> ASGIApp:
         worker = WorkerProcess()
         await worker.spawn()  # first: it imports its modules while this process imports those of the page
         from app.web.app import build
@@ -152,7 +152,7 @@ def serve(
         return build(
             settings,
             port=port,
-            token=token,
+            tokens=tokens,
             source=source,
             parameter_state=parameter_state,
             make_worker=lambda: worker,
@@ -163,7 +163,7 @@ def serve(
 
 def run_server(
     settings: Settings,
-    make_app: Callable[[int, str], Awaitable[ASGIApp]],
+    make_app: Callable[[int, AccessTokens], Awaitable[ASGIApp]],
     *,
     open_browser: bool,
     viewer: bool,
@@ -173,7 +173,7 @@ def run_server(
 
     Args:
         settings: Settings of the deployment; without a token a random one is used.
-        make_app: Awaited with port and token; returns the application. Its exceptions pass through.
+        make_app: Awaited with port and tokens; returns the application. Its exceptions pass through.
         open_browser: Whether to open the page in the browser of this machine.
         viewer: Whether to print the view-only link.
 
@@ -183,12 +183,12 @@ def run_server(
     """
     listening = bind(settings)
     port = listening.getsockname()[1]
-    token = settings.token or new_token()
+    tokens = AccessTokens.of(settings)
     if viewer:
-        print(f"View-only link: {link_of(settings, port, viewer_token(token))}", flush=True)  # noqa: T201
+        print(f"View-only link: {link_of(settings, port, tokens.viewer)}", flush=True)  # noqa: T201
 
     async def served() -> bool:
-        config, link = uvicorn_config(await make_app(port, token)), link_of(settings, port, token)
+        config, link = uvicorn_config(await make_app(port, tokens)), link_of(settings, port, tokens.owner)
         server = LinkedServer(config, settings, link, open_browser=open_browser)
         await server.serve(sockets=[listening])
         return server.started

@@ -15,7 +15,7 @@ from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.web.app import ROUTERS, build
-from app.web.auth import session_value
+from app.web.auth import AccessTokens, session_value
 from app.web.serving import bind, uvicorn_config
 from app.worker.protocol import Open
 from tests.app.fake_scene import FakeScene
@@ -38,7 +38,7 @@ def build_app(
     return build(
         settings or Settings(),
         port=port,
-        token=TOKEN,
+        tokens=AccessTokens(TOKEN),
         source=Open("fake:"),
         parameter_state=ParameterState(),
         make_scene=lambda _dashboard, _loop: scene or FakeScene(),

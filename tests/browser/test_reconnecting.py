@@ -1,4 +1,4 @@
-"""A page that loses its server reports it and reconnects."""
+"""A page that loses its server reports it, and reconnects if the server still accepts it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POINTS = """() => {
 }"""
 
 
-def test_a_lost_server_is_reported_and_the_page_reconnects(chromium: Browser):
+def test_a_lost_server_is_reported_and_the_page_reconnects_unless_it_is_refused(chromium: Browser):
     first = Server(token=TOKEN)
     with first, opened(chromium, first.link, scene=True) as dashboard:
         page = dashboard.page
@@ -35,3 +35,14 @@ def test_a_lost_server_is_reported_and_the_page_reconnects(chromium: Browser):
             )  # the frame came back without being loaded again
         finally:
             second.stop()
+        expect(page.locator("#state b")).to_have_text("No connection")
+        with Server(port=first.port, token=f"another-{TOKEN}"):
+            expect(page.locator("#state b")).to_have_text("No access")
+            expect(page.locator("#notice")).to_contain_text(
+                "started again with a new link, or the session is older than a week."
+                " Open the link that stemmap printed"
+            )
+            attempts: list[str] = []
+            page.on("websocket", lambda socket: attempts.append(socket.url))
+            page.wait_for_timeout(6000)  # longer than the pause between attempts without an answer
+            assert [url for url in attempts if url.endswith("/api/live")] == []

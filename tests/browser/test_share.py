@@ -46,6 +46,55 @@ def test_a_link_restores_a_moment_and_a_view_only_link_changes_nothing(chromium:
     looks(chromium, viewers, scan)
 
 
+def test_an_ended_view_only_link_closes_its_pages_and_the_box_shows_the_new_one(
+    chromium: Browser, server: Server
+):
+    with opened(chromium, server.link) as owner:
+        page = owner.page
+        page.locator("#share-button").click()
+        old = page.locator("#share-viewer").input_value()
+        expect(page.locator("#share-viewers")).to_have_text("No page is open with this link.")
+        page.get_by_role("button", name="Close").click()
+        with opened_by_another(chromium, old) as viewer:
+            expect(viewer.page.locator("#trees tbody tr").first).to_be_visible()
+            page.locator("#map").press("Control+k")
+            find = page.get_by_role("combobox", name="Search all actions")
+            for word in ("end", "access", "revoke"):
+                find.fill(word)
+                entry = page.get_by_role("option", name="Share: end the view-only link")
+                expect(entry).to_be_visible()
+            find.press("Enter")
+            end = page.get_by_role("button", name="End this link")
+            expect(end).to_be_focused()
+            assert "lose access at once" in str(end.get_attribute("title"))
+            expect(page.locator("#share-viewers")).to_have_text("1 page is open with this link.")
+            end.click()
+            expect(page.locator("#share-viewers")).to_contain_text("The previous link has ended")
+            new = page.locator("#share-viewer").input_value()
+            assert new != old
+            expect(viewer.page.locator("#notice")).to_contain_text("This view-only link is no longer valid")
+            expect(viewer.page.locator("#state b")).to_have_text("No access")
+        assert owner.ask("/api/access")["role"] == "owner"
+        assert owner.errors == []
+    an_old_link_shows_a_styled_page(chromium, old)
+    with opened_by_another(chromium, new) as viewer:
+        expect(viewer.page.locator("#looks-only")).to_be_visible()
+
+
+def an_old_link_shows_a_styled_page(chromium: Browser, link: str) -> None:
+    context = chromium.new_context()
+    page = context.new_page()
+    messages: list[str] = []
+    page.on("console", lambda message: messages.append(message.text))
+    answer = page.goto(link)
+    assert answer is not None
+    assert answer.status == 401
+    expect(page.get_by_role("heading", name="Open the link that stemmap printed")).to_be_visible()
+    assert page.locator("body").evaluate("node => getComputedStyle(node).maxWidth") != "none"
+    assert [text for text in messages if "Content Security Policy" in text or "violates" in text] == []
+    context.close()
+
+
 def looks(chromium: Browser, link: str, scan: int) -> None:
     with opened_by_another(chromium, link) as viewer:
         page = viewer.page

@@ -23,7 +23,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from app.common.user import current_user
 from app.dashboard.broadcast import Broadcast, Listener
 from app.dashboard.dashboard import Dashboard
-from app.web.auth import HEALTH, role_of, ticket
+from app.web.auth import HEALTH, AccessTokens, role_of, ticket
 from app.web.responses import LARGEST_NUMBER, error_reply, json_reply
 from app.web.routes.access import Bounds, CallerRole, Dash
 from app.web.viser_proxy import bridge, client_page
@@ -81,12 +81,31 @@ def all_robots(request: Request) -> Response:
 
 @router.get("/api/access")
 def access(request: Request) -> Response:
-    """GET /api/access: return `role`, `viewer_link` (for an owner, else null) and `robots`, the address of
-    the fleet's page (null without a fleet)."""
-    role = role_of(request.scope)
-    link = f"/?token={request.app.state.viewer_token}" if role == "owner" else None
-    robots = None if request.app.state.fleet_port is None else "/robots"
-    return json_reply({"role": role, "viewer_link": link, "robots": robots})
+    """GET /api/access: return `role`, `viewer_link` and `viewers`, the number of pages that are open with it
+    (both for an owner, else null), and `robots`, the address of the fleet's page (null without a fleet)."""
+    role, tokens = role_of(request.scope), _tokens(request)
+    owns = role == "owner"
+    return json_reply(
+        {
+            "role": role,
+            "viewer_link": f"/?token={tokens.viewer}" if owns else None,
+            "viewers": tokens.viewer_pages if owns else None,
+            "robots": None if request.app.state.fleet_port is None else "/robots",
+        }
+    )
+
+
+@router.delete("/api/access/viewer-link")
+async def end_viewer_link(request: Request) -> Response:
+    """DELETE /api/access/viewer-link: end the view-only link, its sessions and its websockets, and return the
+    access with the new link, as GET /api/access."""
+    await _tokens(request).end_viewer_link()
+    return access(request)
+
+
+def _tokens(request: Request) -> AccessTokens:
+    tokens: AccessTokens = request.app.state.tokens
+    return tokens
 
 
 @router.get("/static/plotly.min.js")
@@ -113,7 +132,8 @@ def viser_page(request: Request) -> Response:
 def lead_on(request: Request, port: int) -> Response:
     """Redirect (303) to another port of this host, with a ticket that opens it once for the same role.
     Redirects are kept in histories and logs, so they must not contain the token."""
-    once = ticket(request.app.state.token, port, role_of(request.scope))
+    role = role_of(request.scope)
+    once = ticket(_tokens(request).token(role), port, role)
     hostname = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
     host = f"[{hostname}]" if ":" in hostname else hostname
     answer = RedirectResponse(f"{request.url.scheme}://{host}:{port}/?ticket={once}", 303)

@@ -58,12 +58,16 @@ export function connect() {
     },
     onOpen() {
       chosen = null; // a message sent over the lost connection may not have arrived
-      Object.assign(state, { connected: true, lostAt: 0, heardAt: performance.now() });
+      Object.assign(state, { connected: true, lostAt: 0, refused: false, heardAt: performance.now() });
       state.odometry.length = 0;
       changed("connection");
     },
     onClose() {
       Object.assign(state, { connected: false, lostAt: state.lostAt || performance.now() });
+      changed("connection");
+    },
+    onRefused() {
+      state.refused = true;
       changed("connection");
     },
   });

@@ -1,6 +1,6 @@
 // Whether this browser may change the run or only view it. The server enforces this; the page shows it.
 
-import { get } from "./api.js";
+import { get, remove } from "./api.js";
 import { byId, el } from "./dom.js";
 import { showProblem } from "./problem.js";
 
@@ -8,11 +8,25 @@ import { showProblem } from "./problem.js";
 const CONTROLS = [".transport .buttons", ".transport .line", "#loop", ".transport .speed", "#layers-button", "#layer-list", "#follow", "#look-top", "#look-behind", "#source-button", "#notice-open", "#plots-edit"];
 const PANELS = ["panel-annotate", "panel-tune"];
 
-export let access = { role: "owner", viewer_link: null, robots: null };
+export let access = { role: "owner", viewer_link: null, viewers: null, robots: null };
 export const looksOnly = () => access.role === "viewer";
 // Marks an action that changes something: in a view-only page it is not listed and its key does nothing.
 export const edits = (run) => Object.assign((...args) => (looksOnly() ? undefined : run(...args)), { edits: true });
 export const mayDo = (run) => !(run.edits && looksOnly());
+
+export async function refreshAccess() {
+  access = await get("/api/access");
+}
+
+// Ends the view-only link for everybody who has it; `access` then has the new link.
+export async function endViewerLink() {
+  access = await remove("/api/access/viewer-link");
+}
+
+// For a page that the server refuses.
+export const refusedText = () => looksOnly()
+  ? "This view-only link is no longer valid. Ask the owner of this dashboard for a new link."
+  : "The server does not accept this page any more: it was started again with a new link, or the session is older than a week. Open the link that stemmap printed in the terminal.";
 
 function disableContents(panel) {
   const disable = () => { for (const node of panel.children) node.inert = true; };
@@ -22,7 +36,7 @@ function disableContents(panel) {
 
 export async function startAccess() {
   try {
-    access = await get("/api/access");
+    await refreshAccess();
   } catch (error) {
     showProblem(`It is not known whether this page may change the run: ${error.message}`);
     return;

@@ -2,6 +2,7 @@
 
 import { byId, el, setText } from "../core/dom.js";
 import { count, figure, NONE } from "../core/format.js";
+import { refreshAccess, refusedText } from "../core/permissions.js";
 import { connectTo } from "../core/socket.js";
 import { on } from "../core/store.js";
 import { startTheme } from "../core/theme.js";
@@ -12,6 +13,7 @@ const places = new Map(); // colour and letter by name; a robot keeps them when 
 let maps = {};
 let members = [];
 let lostAt = 0; // when the connection was lost [ms], 0 while it is open
+let refused = false; // whether the server refuses this page
 
 function showMembers(message) {
   members = message.members;
@@ -123,6 +125,7 @@ connectTo("/api/fleet", {
   onMessage: (message) => receivers[message.type]?.(message),
   onOpen() {
     lostAt = 0;
+    refused = false;
     document.body.classList.remove("lost");
     byId("fleet-notice").classList.remove("bad");
   },
@@ -130,13 +133,17 @@ connectTo("/api/fleet", {
     lostAt ||= performance.now();
     document.body.classList.add("lost");
   },
+  onRefused() {
+    refused = true;
+  },
 });
 setInterval(() => {
   if (!lostAt) return;
   const notice = byId("fleet-notice");
   notice.hidden = false;
   notice.classList.add("bad");
-  setText(notice, `No connection for ${Math.floor((performance.now() - lostAt) / 1000)} s. The last state is shown; the page reconnects by itself.`);
+  setText(notice, refused ? refusedText() : `No connection for ${Math.floor((performance.now() - lostAt) / 1000)} s. The last state is shown; the page reconnects by itself.`);
 }, 1000);
 on("theme", repaint);
 startTheme();
+refreshAccess().catch(() => {}); // the text of a refusal depends on the role

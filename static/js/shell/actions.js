@@ -16,6 +16,7 @@ import { pressInScene } from "../scene/scene.js";
 import { openSearch } from "../tune/panel.js";
 import { redo, reset, undo } from "../tune/parameters.js";
 import { exchange, showTabs, standardLayout, toggleMap, toggleTabs } from "./layout.js";
+import { showShareAtEnd } from "./share.js";
 import { openTab } from "./tabs.js";
 
 const click = (id) => () => byId(id).click();
@@ -71,6 +72,7 @@ export const ACTIONS = [
   ["Open another run", "", "", edits(openSources), null, "load file recording upload source robot live"],
   ["All runs: show, compare, replay or delete them", "", "", click("runs-link"), null, "history remove rename"],
   ["Share: link to this moment, view-only link", "", "", click("share-button")],
+  ["Share: end the view-only link (revoke access)", "", "", edits(showShareAtEnd), null, "remove stop withdraw invalidate viewers"],
   ["Save the map as a picture (PNG)", "", "", click("map-png"), null, "screenshot image export"], ["Save the map as a table (CSV)", "", "", click("map-csv")],
   ["Save the table of trees as a picture (PNG)", "", "", () => { toTab("trees")(); byId("trees-png").click(); }],
   ["Download the trees as CSV", "", "", () => byId("trees-csv").click(), null, "export table spreadsheet"],

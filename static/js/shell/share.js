@@ -2,9 +2,9 @@
 
 import { command, open } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
-import { clock } from "../core/format.js";
-import { access, looksOnly, startAccess } from "../core/permissions.js";
-import { showProblem } from "../core/problem.js";
+import { clock, count } from "../core/format.js";
+import { access, endViewerLink, looksOnly, refreshAccess, startAccess } from "../core/permissions.js";
+import { attempted, showProblem } from "../core/problem.js";
 import { on, state } from "../core/store.js";
 
 const PATIENCE = 120_000; // [ms] for a run to open
@@ -49,7 +49,7 @@ function optionsOf(text) {
 const isOpen = ({ uri, ...options }) => state.status?.source === uri
   && Object.entries(options).every(([name, value]) => JSON.stringify(state.source?.[name]) === JSON.stringify(value));
 
-function row(id, label, hint, value) {
+function row(id, label, hint, value, ...more) {
   const box = el("input", { id, type: "text", readonly: true, value, onfocus: () => box.select() });
   const copy = el("button", { type: "button", text: "Copy", "aria-label": `Copy: ${label}`, onclick: async () => {
     box.select();
@@ -60,7 +60,7 @@ function row(id, label, hint, value) {
       setText(copy, "Press Ctrl+C"); // without HTTPS the clipboard is not accessible
     }
   } });
-  return el("div", {}, el("label", { for: id, text: label }), el("div", { class: "row" }, box, copy), el("p", { class: "dim", text: hint }));
+  return el("div", {}, el("label", { for: id, text: label }), el("div", { class: "row" }, box, copy, ...more), el("p", { class: "dim", text: hint }));
 }
 
 const LOOPBACK = ["localhost", "127.0.0.1", "[::1]"];
@@ -69,14 +69,34 @@ function reach() {
   return LOOPBACK.includes(location.hostname) ? [el("p", { class: "note", text: "The links work on this computer only. Start stemmap with --host to open the dashboard to other computers." })] : [];
 }
 
-function show() {
+const viewerLink = () => `${location.origin}${access.viewer_link}`;
+const viewers = () => (access.viewers ? `${count(access.viewers, "page")} ${access.viewers === 1 ? "is" : "are"} open with this link.` : "No page is open with this link.");
+
+function viewOnly() {
+  const note = el("p", { id: "share-viewers", role: "status", text: viewers() });
+  const end = el("button", { id: "share-end", type: "button", text: "End this link", title: "The link and all pages that were opened with it lose access at once. A new view-only link replaces it. Your access does not change.",
+    onclick: () => attempted(async () => {
+      await endViewerLink();
+      byId("share-viewer").value = viewerLink();
+      setText(note, "The previous link has ended. The new view-only link is shown above.");
+    }) });
+  return [row("share-viewer", "View-only link", "It shows everything and changes nothing. In one browser the last opened link applies: try it in another browser or a private window.", viewerLink(), end), note];
+}
+
+async function show() {
+  await attempted(refreshAccess); // the link may have been ended in another page
   const dialog = byId("share-dialog");
   dialog.replaceChildren(el("h2", { id: "share-title", text: "Share" }),
     row("share-here", "This run at this time with this camera", `${state.status?.source ?? ""} at ${clock(state.status?.time_s)}. Opening it needs access to this dashboard.`, hereLink()),
-    ...(access.viewer_link ? [row("share-viewer", "View-only link", "It shows everything and changes nothing. In one browser the last opened link applies: try it in another browser or a private window.", `${location.origin}${access.viewer_link}`)] : []),
+    ...(access.viewer_link ? viewOnly() : []),
     ...reach(),
     el("form", { method: "dialog", class: "row end" }, el("button", { text: "Close" })));
-  dialog.showModal();
+  if (!dialog.open) dialog.showModal();
+}
+
+export async function showShareAtEnd() {
+  await show();
+  byId("share-end")?.focus();
 }
 
 // Follows the link in the address once and removes it from the address, so that a reload stays at the run.

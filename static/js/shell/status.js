@@ -3,6 +3,7 @@
 import { reviewOf, reviewProgress } from "../annotate/annotations.js";
 import { byId, el, setText } from "../core/dom.js";
 import { capital, figure, NONE } from "../core/format.js";
+import { refusedText } from "../core/permissions.js";
 import { changed, isCloud, on, state, trees } from "../core/store.js";
 import { titleOf } from "../open/run_title.js";
 import { isGoing } from "../playback/timeline.js";
@@ -132,7 +133,7 @@ function showState() {
     changed("phase");
   }
   box.classList.toggle("going", state.connected && isGoing(state.status));
-  setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.lostAt ? "No connection" : "Connecting");
+  setText(box.querySelector("b"), state.connected ? (state.status ? stateWord(state.status) : WORDS[name]) : state.refused ? "No access" : state.lostAt ? "No connection" : "Connecting");
   box.title = robotsTitle(state.status);
   const recording = state.status?.recording ?? "";
   byId("recording").hidden = !recording;
@@ -193,7 +194,8 @@ async function askClock() {
 function showNotice(quiet) {
   const notice = byId("notice");
   const status = state.status;
-  const text = !state.connected && state.lostAt
+  const text = state.refused ? refusedText()
+    : !state.connected && state.lostAt
     ? `No connection for ${seconds(state.lostAt)} s. The last state is shown; the page reconnects by itself.`
     : quiet ? `No data for ${seconds(state.heardAt)} s. The last state is shown.`
     : isGoing(status) ? "" : status?.detail ?? ""; // the line above the timeline shows the progress of a seek

@@ -21,7 +21,7 @@ from app.dashboard.run_recorder import _Page
 from app.fleet import Fleet, Frames, build_fleet, named, warm_kernels
 from app.sources.request import SourceRequest
 from app.store.records import NewRun
-from app.web.auth import viewer_token
+from app.web.auth import AccessTokens, viewer_token
 from app.web.serving import bind
 from app.worker.protocol import Open
 from tests.app.fake_scene import FakeScene
@@ -31,11 +31,11 @@ from tests.app.server_for_tests import TOKEN
 SETTINGS = Settings(port=0)
 
 
-def make(port: int, settings: Settings = SETTINGS) -> Fleet:
+def make(port: int, settings: Settings = SETTINGS, tokens: AccessTokens | None = None) -> Fleet:
     return Fleet(
         settings,
         port,
-        TOKEN,
+        tokens or AccessTokens(TOKEN),
         make_scene=lambda _dashboard, _loop: FakeScene(),
         make_worker=FakeWorker,
     )
@@ -50,10 +50,11 @@ async def served(*names: str) -> AsyncIterator[tuple[str, Fleet]]:
 
     listening = bind(SETTINGS)
     port = listening.getsockname()[1]
-    fleet = make(port)
+    tokens = AccessTokens(TOKEN)
+    fleet = make(port, tokens=tokens)
     for name in names:
         assert fleet.add(name, Open(f"fake:{name}"))
-    app = build_fleet(SETTINGS, port=port, token=TOKEN, fleet=fleet)
+    app = build_fleet(SETTINGS, port=port, tokens=tokens, fleet=fleet)
     server = uvicorn.Server(uvicorn_config(app))
     task = asyncio.create_task(server._serve([listening]))
     async with asyncio.timeout(60):
@@ -125,6 +126,30 @@ async def test_only_who_holds_the_token_comes_in():
         assert browser.close_code == 1003
 
 
+async def test_the_view_only_link_of_a_fleet_ends_on_all_its_pages():
+    async with served("red", "blue") as (host, fleet), httpx.AsyncClient() as client:
+        dashboards = [f"127.0.0.1:{fleet.members[name].port}" for name in ("red", "blue")]
+        bearer = {"Authorization": f"Bearer {TOKEN}"}
+        looking = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
+        lead = await client.get(f"http://{host}/robots/red", headers=looking)
+        async with (
+            connect(f"ws://{host}/api/fleet", additional_headers=looking) as page,
+            connect(f"ws://{host}/api/fleet", additional_headers=bearer) as page_of_owner,
+        ):
+            access = (await client.get(f"http://{dashboards[0]}/api/access", headers=bearer)).json()
+            assert access["viewers"] == 1
+            url = f"http://{dashboards[0]}/api/access/viewer-link"
+            assert (await client.delete(url, headers=bearer)).status_code == 200
+            async with asyncio.timeout(30):
+                await page.wait_closed()
+            assert page.close_code == 1008
+            await (await page_of_owner.ping())
+        assert (await client.get(lead.headers["location"])).status_code == 401, "a ticket of a viewer"
+        for place in (host, *dashboards):
+            assert (await client.get(f"http://{place}/api/access", headers=looking)).status_code == 401
+            assert (await client.get(f"http://{place}/api/access", headers=bearer)).status_code == 200
+
+
 async def test_all_end_with_the_page_and_free_their_ports():
     async with served("red", "blue") as (_, fleet):
         ports = [member.port for member in fleet.members.values()]
@@ -171,7 +196,7 @@ async def test_robots_begin_when_what_they_need_is_compiled():
     fleet = Fleet(
         SETTINGS,
         40000,
-        TOKEN,
+        AccessTokens(TOKEN),
         make_scene=lambda _dashboard, _loop: FakeScene(),
         make_worker=FakeWorker,
         warm=warm,
@@ -186,7 +211,7 @@ async def test_robots_begin_when_what_they_need_is_compiled():
     assert "compiles" in card["detail"]
     assert not card["answers"]
     assert not fleet.members["red"].started
-    app = build_fleet(SETTINGS, port=40000, token=TOKEN, fleet=fleet)
+    app = build_fleet(SETTINGS, port=40000, tokens=AccessTokens(TOKEN), fleet=fleet)
     bearer = {"Authorization": f"Bearer {TOKEN}"}
     page = httpx.ASGITransport(app)
     async with httpx.AsyncClient(transport=page, base_url="http://127.0.0.1:40000", headers=bearer) as client:
@@ -209,7 +234,7 @@ async def test_compiling_may_fail_and_is_waited_for(code: str):
 
 async def test_a_fleet_that_ends_while_it_compiles_leaves_nothing():
     forever = [sys.executable, "-c", "import time; time.sleep(1000)"]
-    waiting = Fleet(SETTINGS, 40000, TOKEN, warm=lambda: warm_kernels(forever))
+    waiting = Fleet(SETTINGS, 40000, AccessTokens(TOKEN), warm=lambda: warm_kernels(forever))
     waiting.add("red", Open("fake:red"))
     waiting.start()
     await asyncio.sleep(0.05)

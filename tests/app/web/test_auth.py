@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import base64
+import hashlib
 import json
 import socket
 import time
 from collections.abc import AsyncIterator
 from contextlib import suppress
+from pathlib import Path
 
 import httpx
 import pytest
@@ -16,9 +19,11 @@ from starlette.datastructures import Headers
 from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosedError, InvalidStatus
 
+from app.common.settings import Settings
 from app.web.auth import (
     HEALTH,
     SESSION_S,
+    AccessTokens,
     Guard,
     Role,
     allowed_hosts,
@@ -27,6 +32,7 @@ from app.web.auth import (
     ticket,
     viewer_token,
 )
+from pipeline.errors import StemmapError
 from tests.app.server_for_tests import (
     BEARER,
     COOKIE,
@@ -45,6 +51,7 @@ ROUTES = [
     ("GET", "/runs"),
     ("GET", "/robots"),
     ("GET", "/api/access"),
+    ("DELETE", "/api/access/viewer-link"),
     ("GET", "/static/plotly.min.js"),
     ("GET", "/static/index.html"),
     ("GET", "/static/no-such-file.js"),
@@ -224,6 +231,7 @@ async def test_our_own_origin_may(client: httpx.AsyncClient) -> None:
     assert answer.status_code == 202
 
 
+END = "/api/access/viewer-link"
 VIEWER = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
 VIEWERS_COOKIE = {"Cookie": f"stemmap_{PORT}={session_value(viewer_token(TOKEN), PORT, ENDS)}"}
 
@@ -243,11 +251,12 @@ async def test_who_may_look_changes_nothing(client: httpx.AsyncClient, who: dict
 
 async def test_the_viewers_link_becomes_a_cookie_that_looks(client: httpx.AsyncClient) -> None:
     link = (await client.get("/api/access", headers=BEARER)).json()
-    assert link == {"role": "owner", "viewer_link": f"/?token={viewer_token(TOKEN)}", "robots": None}
+    viewer_link = f"/?token={viewer_token(TOKEN)}"
+    assert link == {"role": "owner", "viewer_link": viewer_link, "viewers": 0, "robots": None}
     answer = await client.get(link["viewer_link"])
     assert answer.status_code == 303
     cookie = {"Cookie": answer.headers["set-cookie"].split(";")[0]}
-    looks = {"role": "viewer", "viewer_link": None, "robots": None}
+    looks = {"role": "viewer", "viewer_link": None, "viewers": None, "robots": None}
     assert (await client.get("/api/access", headers=cookie)).json() == looks
     assert viewer_token(viewer_token(TOKEN)) not in (TOKEN, viewer_token(TOKEN))
     # Who has both may do what the stronger one may.
@@ -391,7 +400,7 @@ async def test_what_the_page_does_not_say_ends_the_connection() -> None:
 
 
 def test_an_open_address_is_called_by_number_or_own_name_only() -> None:
-    guard = Guard(build_app(), token=TOKEN, host="0.0.0.0", port=PORT, body_limit=10)  # noqa: S104
+    guard = Guard(build_app(), tokens=AccessTokens(TOKEN), host="0.0.0.0", port=PORT, body_limit=10)  # noqa: S104
     assert guard._is_own_address(f"192.168.1.4:{PORT}")
     assert not guard._is_own_address(f"rebound.example:{PORT}")
     assert not guard._is_own_address(f"192.168.1.4:{PORT + 1}")
@@ -432,7 +441,7 @@ async def test_who_comes_from_elsewhere_is_led_on_by_a_page_of_our_own(client: h
     ],
 )
 async def test_a_host_that_resembles_ours_is_refused(client: httpx.AsyncClient, host: str) -> None:
-    guard = Guard(refusing_app, token=TOKEN, host="127.0.0.1", port=PORT, body_limit=1000)
+    guard = Guard(refusing_app, tokens=AccessTokens(TOKEN), host="127.0.0.1", port=PORT, body_limit=1000)
     assert not guard._knows_host(Headers({"host": host}))
 
 
@@ -477,7 +486,8 @@ async def test_a_session_expires_and_is_renewed_by_a_page_load(client: httpx.Asy
 
 @pytest.mark.parametrize("role", ["owner", "viewer"])
 async def test_a_ticket_opens_the_page_once(client: httpx.AsyncClient, role: Role) -> None:
-    once = ticket(TOKEN, PORT, role)
+    token = AccessTokens(TOKEN).token(role)
+    once = ticket(token, PORT, role)
     assert TOKEN not in once
     answer = await client.get(f"/?ticket={once}")
     assert (answer.status_code, answer.headers["location"]) == (303, "/")
@@ -485,5 +495,94 @@ async def test_a_ticket_opens_the_page_once(client: httpx.AsyncClient, role: Rol
     assert (await client.get("/api/access", headers=cookie)).json()["role"] == role
     client.cookies.clear()
     assert (await client.get(f"/?ticket={once}")).status_code == 401
-    for wrong in (ticket(TOKEN, PORT + 1, role), ticket("x" * 20, PORT, role), once[:-1], "", "a.b.c.d"):
+    as_owner = ticket(viewer_token(TOKEN), PORT, "owner")  # what a viewer could sign
+    for wrong in (
+        ticket(token, PORT + 1, role),
+        ticket("x" * 20, PORT, role),
+        as_owner,
+        once[:-1],
+        "",
+        "a.b.c.d",
+    ):
         assert (await client.get(f"/?ticket={wrong}")).status_code == 401
+
+
+async def test_an_ended_link_and_its_sessions_are_refused_and_the_new_one_works(
+    client: httpx.AsyncClient,
+) -> None:
+    once = ticket(viewer_token(TOKEN), PORT, "viewer")
+    assert (await client.delete(END, headers=VIEWER)).status_code == 403
+    assert (await client.get("/api/status", headers=VIEWER)).status_code == 200, "a viewer ends nothing"
+    ended = await client.delete(END, headers=COOKIE)
+    assert ended.status_code == 200
+    assert ended.json() == (await client.get("/api/access", headers=COOKIE)).json()
+    for who in (VIEWER, VIEWERS_COOKIE):
+        assert (await client.get("/api/status", headers=who)).status_code == 401
+        assert (await client.delete(END, headers=who)).status_code == 401
+    for old in (f"/?token={viewer_token(TOKEN)}", f"/?ticket={once}"):
+        assert (await client.get(old)).status_code == 401
+    for who in (COOKIE, BEARER):
+        assert (await client.get("/api/access", headers=who)).json()["role"] == "owner"
+    opened = await client.get(ended.json()["viewer_link"])
+    assert opened.status_code == 303
+    cookie = {"Cookie": opened.headers["set-cookie"].split(";")[0]}
+    assert (await client.get("/api/access", headers=cookie)).json()["role"] == "viewer"
+
+
+async def test_pages_of_an_ended_link_are_closed_and_those_of_owners_stay() -> None:
+    async with served() as (host, _), httpx.AsyncClient(base_url=f"http://{host}", headers=BEARER) as client:
+        url = f"ws://{host}/api/live"
+        async with (
+            connect(url, additional_headers=VIEWER, proxy=None) as viewer,
+            connect(url, additional_headers=BEARER, proxy=None) as owner,
+        ):
+            await viewer.recv()
+            assert (await client.get("/api/access")).json()["viewers"] == 1
+            ended = (await client.delete(END)).json()
+            assert ended["viewers"] == 0
+            async with asyncio.timeout(10):
+                await viewer.wait_closed()
+            assert viewer.close_code == 1008
+            await (await owner.ping())
+        with pytest.raises(InvalidStatus) as refused:
+            await connect(url, additional_headers=VIEWER, proxy=None)
+        assert refused.value.response.status_code == 403  # without an Origin and a valid token
+        again = {"Authorization": f"Bearer {ended['viewer_link'].partition('=')[2]}"}
+        async with connect(url, additional_headers=again, proxy=None) as viewer:
+            await viewer.recv()
+
+
+async def test_an_ended_link_stays_ended_after_a_restart_with_the_same_token(tmp_path: Path) -> None:
+    settings = Settings(token=TOKEN, folder=tmp_path / "new")
+    tokens = AccessTokens.of(settings)
+    assert (tokens.owner, tokens.viewer) == (TOKEN, viewer_token(TOKEN))
+    await asyncio.gather(tokens.end_viewer_link(), tokens.end_viewer_link())
+    assert tokens.viewer != viewer_token(TOKEN)
+    again = AccessTokens.of(settings)
+    assert (again.owner, again.viewer) == (TOKEN, tokens.viewer)
+    # A new owner's token has a new view-only link.
+    fresh = AccessTokens.of(Settings(folder=tmp_path))
+    await fresh.end_viewer_link()
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+
+async def test_a_link_ends_even_if_this_cannot_be_saved(tmp_path: Path) -> None:
+    tokens = AccessTokens(TOKEN, tmp_path / "file" / "view-only-link")
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(StemmapError, match="cannot be saved"):
+        await tokens.end_viewer_link()
+    assert tokens.viewer != viewer_token(TOKEN)
+    with pytest.raises(StemmapError, match="cannot be read"):
+        AccessTokens(TOKEN, tmp_path)
+
+
+async def test_the_page_for_an_invalid_link_permits_its_own_style_only(client: httpx.AsyncClient) -> None:
+    answer = await client.get("/?token=old", headers={"Accept": "text/html"})
+    assert answer.status_code == 401
+    style = answer.text.partition("<style>")[2].partition("</style>")[0]
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    assert answer.headers.get_list("content-security-policy") == [
+        f"default-src 'none'; style-src 'sha256-{digest}'; frame-ancestors 'self'"
+    ]
+    other = await client.get("/api/status", headers=BEARER)
+    assert other.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'self'"

@@ -7,6 +7,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
+import httpx
 import msgspec
 import pytest
 from hypothesis import given
@@ -179,6 +180,30 @@ async def test_a_viewers_messages_stop_at_the_bridge() -> None:
             async with asyncio.timeout(10):
                 assert await heard.get() == pack(SLIDER)
     assert users == ["somebody", "Ann"]
+
+
+async def test_the_scene_of_an_ended_view_only_link_is_closed() -> None:
+    gone = asyncio.Event()
+
+    async def handler(connection: ServerConnection) -> None:
+        await connection.send(b"hello")
+        await closed(connection)
+        gone.set()
+
+    looks = {"Authorization": f"Bearer {viewer_token(TOKEN)}"}
+    async with (
+        fake_viser(handler) as scene,
+        served(scene) as (host, _),
+        connect(f"ws://{host}/viser", additional_headers=looks, proxy=None, subprotocols=[VERSION]) as page,
+    ):
+        assert await page.recv() == b"hello"
+        async with httpx.AsyncClient(headers=BEARER) as client:
+            assert (await client.get(f"http://{host}/api/access")).json()["viewers"] == 0, "not a page"
+            await client.delete(f"http://{host}/api/access/viewer-link")
+        await closed(page)
+        assert page.close_code == 1008
+        async with asyncio.timeout(10):
+            await gone.wait()
 
 
 async def closed(connection: ClientConnection | ServerConnection) -> None:

@@ -22,7 +22,7 @@ from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.scene.scene import RENEW_AFTER, Scene
 from app.web.app import build
-from app.web.auth import new_token
+from app.web.auth import AccessTokens, new_token
 from app.web.serving import bind, uvicorn_config
 from app.worker.protocol import FromWorker, Open, Shown
 from app.worker.supervisor import OnMessage, WorkerProcess
@@ -46,7 +46,7 @@ class Served:
         app = build(
             settings,
             port=self._port,
-            token=self._token,
+            tokens=AccessTokens(self._token),
             source=Open(source),
             parameter_state=ParameterState(),
             make_worker=self._worker,
