@@ -211,7 +211,8 @@ class RunCounts(msgspec.Struct, frozen=True):
     """Counts of a run up to a scan, as in run.json, or of a whole cloud, with the cells that it covers.
 
     Attributes:
-        health: Number of scans by the state of the pose quality; empty for a whole cloud.
+        health: Number of scans by state of the pose quality ("good", "weak", "lost"); empty for a whole
+            cloud.
         sigma_xy_m: Largest standard deviation of the position [m]; None if unknown.
         verdicts: Number of clusters by verdict.
         losses: Number of messages or points that were left out, by reason.
@@ -447,8 +448,8 @@ class View(msgspec.Struct, frozen=True, tag="view"):
 
     Attributes:
         run: As in `Shown`.
-        stamp_ns: Its time [ns].
-        free: Free range by direction in the base frame [m].
+        stamp_ns: Time of the scan [ns].
+        free: Free range by azimuth in the base frame, shape (bins,) [m].
     """
 
     run: int
@@ -562,7 +563,7 @@ def from_worker() -> MessageCodec[FromWorker]:
 
 
 def _read_exactly(stream: BinaryIO, size: int) -> bytes:
-    """Read `size` bytes; fewer where the stream ends before."""
+    """Return the next `size` bytes of a blocking stream; fewer if the stream ends before."""
     parts: list[bytes] = []
     while size > 0 and (part := stream.read(size)):
         parts.append(part)
@@ -571,7 +572,8 @@ def _read_exactly(stream: BinaryIO, size: int) -> bytes:
 
 
 def _to_plain(value: object) -> object:
-    """Return an array as dtype, shape and bytes (see `_EncodedArray`), a NumPy scalar as a Python number.
+    """Return an array as a tuple of dtype, shape and bytes (see `_EncodedArray`), and a NumPy scalar as a
+    Python number.
 
     Raises:
         WireError: The array has a dtype or number of dimensions that cannot be sent.

@@ -61,8 +61,8 @@ class Run:
 
     Attributes:
         frame: Result of the current scan; None before the first.
-        confirmed_s: Time at which each of its trees was first confirmed [s since the first scan], NaN for
-            trees that never were; None before the first scan.
+        confirmed_s: Time of the first confirmation of each tree of `frame`, shape (T,) [s since the first
+            scan], NaN for trees that were never confirmed; None before the first scan.
         current: Index of the current scan; -1 before the first.
         is_bare: Whether the frame has no points, see `map_next`.
         warnings: Warnings about the source, to which those of a robot are added.
@@ -110,7 +110,8 @@ class Run:
         return RunMap(mapper, mapper.parameters, lambda: self.start_ns, is_live=self._is_live)
 
     def history(self, number: int, scan: int) -> History:
-        """Return the estimates of a tree up to a scan, see `TreeHistory.of`; empty for an unknown number."""
+        """Return the estimates of the tree `number` up to the scan `scan`, see `TreeHistory.of`; empty for an
+        unknown number."""
         in_map = self._numbers.in_map(number)
         return self._map.history.of(-1 if in_map is None else in_map, scan)
 
@@ -344,8 +345,8 @@ class Run:
 
     @property
     def remapped(self) -> float | None:
-        """Share of the scans up to the current one that are mapped again, from 0 to 1; None without a
-        rerun, or if the mapper does not have the state after the current scan."""
+        """Share of the scans before the current one that are mapped again, from 0 to 1; None without a rerun,
+        or if the mapper does not have the state after the current scan."""
         remapping = self._remapping
         if remapping is None or not self.is_whole:
             return None
@@ -363,9 +364,9 @@ class Run:
         the run continues with the new map, as if its parameters had been in force from the start.
 
         Returns:
-            The current scan in the new map, and the time at which each tree was confirmed, by its number [s];
-            None while scans are left, without a rerun, and if the mapper does not have the state after the
-                current scan.
+            The frame of the current scan in the new map, and a dict from the number of each tree to the time
+            of its first confirmation [s since the first scan]; None while scans are left, without a rerun,
+            and if the mapper does not have the state after the current scan.
 
         Raises:
             StemmapError: A scan cannot be read again. The map does not change.

@@ -431,8 +431,8 @@ class Session:
         return self._run.map_with(sets)
 
     def fail(self, detail: str) -> None:
-        """Set the state of the run to failed, with the reason; a seek and a rerun are cancelled. The run
-        stays open until `play` or `open`."""
+        """Set the state "failed" with the reason `detail`; a seek and a rerun are cancelled. The run stays
+        open until `play` or `open`."""
         self._state, self._detail = "failed", detail
         self._target.forget()
         self._kept = None
@@ -685,8 +685,8 @@ def has_camera(description: SourceDescription) -> bool:
 
 
 def pictures_of(source: Source | None) -> PictureSource:
-    """Return an open source as the reader of its camera pictures, without a wrapper for its odometry; raises
-    StemmapError without a source or a camera."""
+    """Return the source that reads the camera pictures: `source`, or the source inside of an
+    OdometryOverride. Raises StemmapError if it is None or has no camera."""
     origin: object = source.source if isinstance(source, OdometryOverride) else source
     if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
         raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
@@ -698,7 +698,7 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     known.
 
     Args:
-        source: The open source; None where no run is open.
+        source: The open source; None if no run is open.
         stamp_ns: The time [ns].
 
     Raises:
@@ -722,7 +722,7 @@ def tree_picture(run: Run | InventoryRun | None, number: int) -> CameraPicture:
     would need the whole recording.
 
     Args:
-        run: The run; None where none is open.
+        run: The run; None if none is open.
         number: Number of the tree.
 
     Raises:
