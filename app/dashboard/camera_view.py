@@ -51,11 +51,13 @@ class CameraView:
         return self._kept.get(stamp_ns)
 
     async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
-        """Return the camera picture at the time of a scan as JSON values: `index` of the scan, `of`, a number
-        of the run, `stamp_ns` as text, for `jpeg`, `later_ms`, by how much the picture is later, `marks`, see
-        `marks_of`, `why`, the reason if the camera is unknown and there are no marks, and `received`, see
-        `CameraPicture`. Calls wait for one another, so that there are at most about three pictures per
-        second.
+        """Return the description of the camera picture nearest to a scan as a dict of JSON values; `jpeg`
+        returns the picture itself. Calls wait for one another, so that there are at most about three pictures
+        per second.
+
+        The keys are `index` of the scan; `of`, a number of the run; `stamp_ns`, the time of the picture as a
+        string; `later_ms`, this time minus that of the scan; `marks`, the result of `marks_of`, empty if the
+        camera is unknown; `why`, the reason why it is unknown, else ""; and `received`, see `CameraPicture`.
 
         Args:
             frame: Results of the scan.
@@ -132,8 +134,9 @@ _MARGIN = 0.6
 
 
 def drawn_tree(found: CameraPicture, number: int, trees: Trees, path: Path | None) -> bytes | None:
-    """Return the part of a picture around a tree as JPEG; None if the tree is not in it, camera or path are
-    unknown, or it cannot be decoded. Raises StemmapError if no process can be started.
+    """Return the part of a picture around a tree as JPEG, with a frame around the stem. None if the tree is
+    not in `trees` or not in the picture, the camera is unknown, the path has fewer than two poses, or the
+    picture cannot be decoded. Raises StemmapError if no process can be started.
 
     Args:
         found: The picture with its camera.
@@ -226,9 +229,9 @@ def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]
 
 
 def _box(camera: Camera, points: Float) -> dict[str, float] | None:
-    """Return the box around points of the base frame, shape (N, 3), N >= 1 [m], as "left", "top", "width" and
-    "height", shares of the size of the picture, clipped to it; None if it is not in view or a point is at
-    most NEAREST in front of the camera plane."""
+    """Return the box around points of the base frame, shape (N, 3), N >= 1 [m], as a dict with "left", "top",
+    "width" and "height", shares of the size of the picture from 0 to 1, clipped to the picture. None if the
+    box is outside of the picture, or a point is at most NEAREST in front of the camera plane."""
     pixels, depth = camera.project(points)
     if not (depth > NEAREST).all():
         return None
