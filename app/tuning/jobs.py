@@ -136,7 +136,8 @@ T = TypeVar("T")
 
 
 class LostError(StemmapError):
-    """Every process that computed a job ended before it sent a result."""
+    """A job has no result: MOST_LOSSES processes ended or sent damaged messages during it, or the processes
+    were closed."""
 
 
 class ResultStore:
@@ -246,7 +247,7 @@ class ScoringProcesses(Generic[T]):
     Attributes:
         count: Number of processes.
         kept: The stored results.
-        lost: Number of processes that ended during a job, by reason.
+        lost: Counter from the reason to the number of processes that were lost during a job.
     """
 
     def __init__(self, count: int, command: Sequence[str] = (), kept: ResultStore | None = None) -> None:
@@ -262,12 +263,12 @@ class ScoringProcesses(Generic[T]):
     def advance(
         self, next_job: Callable[[int], tuple[T, Job] | None], wait_s: float | None = None
     ) -> list[tuple[T, JobResult]]:
-        """Give a job to each free process, wait for the first result, and return the results since the last
-        call, in any order. A job whose processes were lost has an error as result.
+        """Give a job to each free process, wait for the first result, and return the jobs that are done as
+        tuples of identifier and result, in any order. A job with LostError has a result with `error`.
 
         Args:
-            next_job: Returns the next job for the process with this number, and what identifies it in the
-                result; None if there is none now.
+            next_job: Returns an identifier and the next job for the process with this number; None if there
+                is no job now.
             wait_s: Longest wait [s]; None for no limit. Without jobs in progress there is no wait.
 
         Raises:

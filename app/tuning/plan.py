@@ -163,7 +163,7 @@ def pool(scores: Sequence[MapScores]) -> Pooled:
 
 
 def _mean(weighed: list[tuple[int, float]]) -> float | None:
-    """Return the weighted mean of (weight, value) pairs; None if the weights sum to 0."""
+    """Return the weighted mean of (weight, value) pairs; None if the sum of the weights is 0."""
     whole = sum(weight for weight, _ in weighed)
     return sum(weight * value for weight, value in weighed) / whole if whole else None
 
@@ -297,18 +297,18 @@ def check(axes: Iterable[SearchAxis], start: Parameters) -> None:
 
 
 def values_of(axes: Iterable[SearchAxis], suggested: Mapping[str, Any]) -> dict[str, Value]:
-    """Return the parameter values of a trial by name, rounded and clipped by `SearchAxis.value_of`.
+    """Return a dict from the name of each axis to its value in a trial, see `SearchAxis.value_of`.
 
     Args:
         axes: The search space.
-        suggested: Values of Optuna by name, one for each axis.
+        suggested: Dict from the name of each axis to the value of Optuna.
     """
     return {axis.name: axis.value_of(suggested[axis.name]) for axis in axes}
 
 
 def _axis(text: str) -> SearchAxis:
-    """Parse one text of `axes_of`; raises its errors. A switch without values has both values as choices, a
-    name needs at least two."""
+    """Parse one text of `axes_of`; raises its errors. A bool without values has both as choices. Choices and
+    names need at least two values, and a parameter of kind "name" has no default values."""
     name, given, bounds = (part.strip() for part in text.partition("="))
     spec = spec_of(name)
     why = _NO_PART_OF_THE_MAP.get(name.partition(".")[0])
@@ -330,8 +330,8 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
     """Parse "LOW..HIGH" for a numeric parameter.
 
     Raises:
-        ParameterError: The text is not two numbers (whole numbers for kind "int"), the lower one is not below
-            the upper one, or one is outside of the bounds of the declaration.
+        ParameterError: The text is not two numbers (integers for kind "int"), the first one is not below the
+            second one, or one is outside of the bounds of the declaration.
     """
     first, dots, last = bounds.partition("..")
     if not dots:
@@ -420,7 +420,7 @@ class Trial(msgspec.Struct, frozen=True):
 
     Attributes:
         number: Trials are numbered in the order in which they are suggested; -1 is the start of the search.
-        values: The values that were tried, by parameter name.
+        values: Dict from the names of the searched parameters to the values of the set.
         loss: See `Goal.loss`; None where the values contradict one another.
         training, held_out: Scores by run. Held-out runs are scored only for a set that is the best so far.
     """

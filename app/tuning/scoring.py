@@ -64,7 +64,7 @@ class OpenDrive:
         source: What is mapped, and how.
 
     Attributes:
-        digest: Digest of the source with its odometry; recording_digest: without.
+        digest, recording_digest: Digest of the source with and without the odometry.
         own_truth: True trees of the source; None if it has none.
         preset: Name of the preset that suits the source.
 
@@ -245,9 +245,9 @@ def prepare_run(planned: PlannedRun) -> PreparedRun:
 
 
 def _source_of(source: SourceRequest) -> SourceRequest:
-    """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with the seed,
-    topics and mounting of the folder, the requested odometry, and topics and mounting of the request where
-    given, without preset and parameters.
+    """Return the request of a run: `source` itself, unless its URI is a folder that `stemmap map` wrote. For
+    a folder, the request has the URI and the seed of the run in it, the odometry of `source`, and topics and
+    mounting of `source` if given, else of the folder; preset and parameters are empty.
 
     Raises:
         SourceError: The map of the folder was made of several sources, or its files are damaged.
@@ -321,8 +321,8 @@ class Scorer:
 
 
 def main(words: list[str]) -> None:
-    """Receive jobs and send their results until the parent ends, which ends this process; the program of a
-    child process. It never returns.
+    """Run the program of a scoring process: receive jobs and send their results until the parent ends, which
+    ends this process. It never returns.
 
     Args:
         words: Arguments of the command line: --low-priority, --runs N.
