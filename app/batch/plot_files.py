@@ -80,7 +80,7 @@ def placed(contents: Sequence[Content], offset: Sequence[float]) -> list[SampleP
 
     Args:
         contents: Annotations; those that are no plots are left out.
-        offset: Offset x, y of the frame of the map in these coordinates [m].
+        offset: Offset x, y of the frame of the map in these coordinates [m]; further values are ignored.
     """
     plots = [plot_of(**content.plot) for content in contents if content.plot]
     by = np.array(offset[:2], np.float64)
@@ -99,7 +99,7 @@ def stored_plots(store: Store, source: Mapping[str, Any]) -> list[SamplePlot]:
 
 
 def stored_frame(store: Store, source: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the reference system that a recording got on the page, in the form of `MapFrame.record`; None
+    """Return the reference system that the store has for a recording, in the form of `MapFrame.record`; None
     without one. Arguments as in `stored_plots`."""
     contents = store.contents(str(source.get("sha256") or source.get("uri")), FRAME)
     return contents[0].plot["frame"] if contents and contents[0].plot else None
