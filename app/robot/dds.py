@@ -31,7 +31,7 @@ def idl_type(msgtype: str) -> Any:  # noqa: ANN401 - cyclonedds is an extra, and
         A class of cyclonedds, named e.g. "sensor_msgs.msg.dds_.PointCloud2_".
 
     Raises:
-        KeyError: The type is not known to rosbags.
+        KeyError: rosbags does not know the type.
     """
     from cyclonedds.idl import make_idl_struct
 
@@ -99,8 +99,8 @@ def offer_of(topic: str, type_name: str, robot: str, *, reliable: bool, latched:
 
 
 def common_offer(alive: Iterable[Publisher], topic: str, msgtype: str) -> Offer | None:
-    """Return what all writers of a topic offer: reliable if all of them are, latched if all of them are both;
-    None if there is no writer of this topic and type."""
+    """Return the offer that all writers of a topic satisfy: `reliable` if all writers are reliable, `latched`
+    if all are reliable and latched; None if there is no writer of this topic and type."""
     there = [o for o in alive if isinstance(o, Offer) and (o.topic, o.msgtype) == (topic, msgtype)]
     if not there:
         return None
@@ -281,7 +281,7 @@ class _Reader:
     Args:
         participant: Participant of cyclonedds.
         channel: The channel.
-        offer: What all writers of its topic offer.
+        offer: Result of `common_offer` for the topic.
         lost: Called with the channel and a number of lost messages, in a thread of cyclonedds.
     """
 

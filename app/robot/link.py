@@ -101,12 +101,13 @@ class Inbox:
         self._recorder, self._fixed_channels = recorder, frozenset(fixed)
 
     def put(self, message: Message, *, is_scan: bool) -> None:
-        """Record and queue a message; without room, the oldest messages are skipped: first scans, then
-        others, but not fixed transforms, see `begin`. It never waits.
+        """Record and queue a message; never wait. The oldest scans are skipped beyond MAX_SCANS, the oldest
+        other messages beyond MAX_OTHERS. Beyond MAX_BYTES in all, the oldest scans are skipped first, then
+        the oldest other messages. Fixed transforms are not skipped, see `begin`.
 
         Args:
             message: The message.
-            is_scan: Whether it is a scan; other messages are skipped last.
+            is_scan: Whether the message is a scan.
         """
         with self._lock:
             if self._recorder is not None:
@@ -141,8 +142,8 @@ class Inbox:
             return True
 
     def put_picture(self, message: Message) -> None:
-        """Record and queue an accepted picture; where there is no room, the oldest ones are removed and
-        counted in `losses`, but not recorded as skipped."""
+        """Record and queue an accepted picture. Beyond MAX_PICTURES or MAX_PICTURE_BYTES, the oldest pictures
+        are removed and counted in `losses`, but not recorded as skipped."""
         with self._lock:
             if self._recorder is not None:
                 self._recorder.add(message)
@@ -221,7 +222,7 @@ class CountingInbox(Inbox):
         self._heard: dict[int, Heard] = {}
 
     def heard(self, number: int) -> Heard:
-        """Return a copy of the count of a channel so far; no messages for an unknown channel."""
+        """Return a copy of the count of the channel with this number; 0 messages for an unknown channel."""
         with self._guard:
             known = self._heard.get(number, Heard())
             return Heard(known.messages, known.first_ns, known.last_ns)
@@ -269,7 +270,8 @@ class Link(ABC):
 
     Attributes:
         problem: Reason why there is no connection, "" while there is one.
-        alive: What is published now, by the identifier of the writer; `lock` guards it.
+        alive: Dict from the identifier of each present writer to the topic that it publishes; guarded by
+            `lock`.
         losses: Number of messages lost before the inbox, by reason.
         scans: Number of scans that arrived.
         version: Number of changes of `alive` so far.

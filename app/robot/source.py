@@ -70,12 +70,12 @@ class PictureStore:
         return math.hypot(here[0] - x, here[1] - y) >= STEP_M or turned >= TURN_RAD
 
     def add(self, picture: Picture, path: Path) -> None:
-        """Store a picture. A picture that cannot be stored (limit, disk) is counted in `losses`; one with a
-        known time is ignored. In any case `is_due` counts the motion from this pose on.
+        """Store a picture, unless one with the same time is stored. A picture that cannot be stored (limit,
+        disk) is counted in `losses`. In any case `is_due` counts the motion from this pose on.
 
         Args:
             picture: The picture.
-            path: Path up to the pose at which it was taken, at least one.
+            path: Path, of at least one pose, up to the pose at which the picture was taken.
         """
         self._last = float(path.x[-1]), float(path.y[-1]), float(path.yaw[-1])
         if picture.stamp_ns in self._kept:
@@ -111,7 +111,7 @@ MakeLink = Callable[[Any, Inbox], Link]
 
 
 def link_for(address: Address) -> MakeLink:
-    """Return the class of the connection for an address."""
+    """Return the class of the connection for an address: VelodyneLink, DdsLink or ZenohLink."""
     if isinstance(address, VelodyneAddress):
         return VelodyneLink
     return DdsLink if isinstance(address, DdsAddress) else ZenohLink
@@ -199,8 +199,8 @@ class LiveSource:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of messages left out, by reason: lost on the network, skipped by the mapping, not recorded,
-        or not readable."""
+        """New dict from a reason to the number of messages that were left out for it: lost on the network,
+        skipped by the mapping, not recorded, or not readable."""
         read = {} if self._reader is None else self._reader.losses
         kept = {} if self._kept is None else self._kept.losses
         recorder = {} if self._recorder is None else self._recorder.losses
@@ -246,7 +246,8 @@ class LiveSource:
     # --- camera ------------------------------------------------------------------------------
 
     def camera(self) -> tuple[Camera | None, str]:
-        """Return the camera model; None with the reason where it is unknown, or with "" without a camera."""
+        """Return the camera model and "". If the model is unknown, return None and the reason; without a
+        camera, None and ""."""
         return (None, "") if self._camera is None else self._camera.camera(self._base)
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:

@@ -24,9 +24,9 @@ _LONGEST_TOKEN = 1000
 
 
 def publisher_of(token: str) -> Publisher | None:
-    """Return robot (the namespace), topic and message type of the liveliness token of a publisher. None for
-    tokens of other entities, for invalid names, without a type `<package>::msg::dds_::<name>_`, and for
-    tokens that are too long.
+    """Return the publisher that a liveliness token describes: robot (the namespace), topic and message type.
+    None for tokens of other entities, for invalid names, without a type `<package>::msg::dds_::<name>_`, and
+    for tokens that are too long.
 
     A token is `@ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>`, followed for
     an endpoint by `/<topic>/<type>/<hash>/<qos>`. A slash inside of a part is written `%`.
@@ -262,8 +262,9 @@ class RosPublisher:
         return f"{self._prefix}/{topic}"
 
     def publish(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Publish messages in CDR by topic, see `pipeline.io.recording.messages`. It does not wait for slow
-        subscribers; KeyError for an unknown topic."""
+        """Publish messages, a dict from the topic to the message in CDR, see
+        `pipeline.io.recording.messages`. It does not wait for slow subscribers; KeyError for an unknown
+        topic."""
         for topic, payload in messages_by_topic.items():
             self._publishers[topic].put(payload)
 
