@@ -269,8 +269,8 @@ class Guard:
         )
 
     def _limit_of(self, scope: Scope) -> int:
-        """Return the maximum size of the body of a request [bytes]; uploads of recordings have a larger
-        one."""
+        """Return the maximum size of the body of a request [bytes]: `body_limit`, or for an upload of a
+        recording the maximum of `body_limit` and `upload_limit`."""
         is_upload = scope.get("path") == UPLOADS and scope.get("method") == "POST"
         return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
 
@@ -417,13 +417,13 @@ def _cookie_value(part: str, name: str) -> str | None:
 
 
 def _seconds(text: str) -> int | None:
-    """Return a time as int; None unless the text consists of at most 12 digits."""
+    """Return the integer in a text; None unless the text consists of 1 to 12 digits."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= 12 else None
 
 
 def _limited(receive: Receive, limit: int) -> Receive:
-    """Return a `receive` that limits the body, also where the request does not announce its length; it raises
-    HTTPException 413 beyond `limit` [bytes]."""
+    """Return a `receive` that passes on messages and raises HTTPException 413 once the body exceeds `limit`
+    [bytes], whether or not the request announces its length."""
     seen = 0
 
     async def counted() -> dict[str, object]:

@@ -81,8 +81,9 @@ def all_robots(request: Request) -> Response:
 
 @router.get("/api/access")
 def access(request: Request) -> Response:
-    """GET /api/access: return `role`, `viewer_link` (for an owner, else null) and `robots`, the address of
-    the fleet's page (null without a fleet)."""
+    """GET /api/access: return an object with `role`, "owner" or "viewer"; `viewer_link`, the address
+    "/?token=..." (null for a viewer); and `robots`, the address of the page of the fleet (null without a
+    fleet)."""
     role = role_of(request.scope)
     link = f"/?token={request.app.state.viewer_token}" if role == "owner" else None
     robots = None if request.app.state.fleet_port is None else "/robots"
@@ -111,8 +112,8 @@ def viser_page(request: Request) -> Response:
 
 
 def lead_on(request: Request, port: int) -> Response:
-    """Redirect (303) to another port of this host, with a ticket that opens it once for the same role.
-    Redirects are kept in histories and logs, so they must not contain the token."""
+    """Return a redirect (303) to another port of this host, with a ticket that opens it once for the same
+    role."""
     once = ticket(request.app.state.token, port, role_of(request.scope))
     hostname = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
     host = f"[{hostname}]" if ":" in hostname else hostname
