@@ -36,7 +36,7 @@ class TookTooLongError(StemmapError):
 
 
 class InspectionResult(msgspec.Struct, frozen=True):
-    """Answer of the child process, or the error: what, where, remedy."""
+    """Answer of the child process, or the error (what, where, remedy); None without an error."""
 
     content: dict[str, Any] = {}
     error: tuple[str, str, str] | None = None
