@@ -39,8 +39,9 @@ class Circle(msgspec.Struct, frozen=True):
     """The fitted stem seen from above: its axis is at the origin and the sensor is below the picture.
 
     Attributes:
-        radius, radius_sigma: [m].
-        arc_deg: Visible arc; arc_start, arc_end: counter-clockwise from the right of the picture [rad].
+        radius, radius_sigma: Radius and its standard deviation [m].
+        arc_deg: Visible arc [deg].
+        arc_start, arc_end: Ends of the visible arc, counter-clockwise from the right of the picture [rad].
         lean: Shift of the axis per metre of height, to the right and up in the picture.
         lean_deg: Angle of the axis from the vertical.
         ellipse: 1-sigma ellipse of the centre: half axes [m], direction of the major axis [rad].
@@ -70,7 +71,7 @@ class ColumnStory(msgspec.Struct, frozen=True):
     Attributes:
         verdict: Label of the verdict.
         distance: Distance from the requested place to the axis of the column [m].
-        votes: Share of the votes by class.
+        votes: Dict from the label of each class to its share of the votes.
         tree_share: Share of the votes that a tree needs.
         tree_in_free_air: For an object with a free upper end, the share of votes for a tree of the decision
             trees that separate trees from poles; None otherwise. Where they vote for a pole, `effects`
@@ -100,7 +101,7 @@ class CrossSection(msgspec.Struct, frozen=True):
     Attributes:
         height: Height of its middle above the ground [m].
         x, y: Centre of the circle relative to the axis at breast height [m].
-        radius, radius_sigma: Of the circle [m]; NaN without one.
+        radius, radius_sigma: Radius of the circle and its standard deviation [m]; NaN without a circle.
         coverage_deg: Part of the circumference with points on it.
         scatter: Standard deviation of the points from the circle [m].
         points: Points relative to the centre of the circle [m]; empty where the section has no picture.
@@ -190,17 +191,18 @@ class TreeStory(msgspec.Struct, frozen=True):
     """A tree of the map.
 
     Attributes:
-        tree: Its number.
+        tree: Number of the tree.
         scan, time_s: The estimates are those after this scan.
         confirmed: Whether it is shown in the map.
-        position, ellipse: [m]; half axes [m] and direction of the major axis [rad].
+        position: Position x, y in the map [m].
+        ellipse: Half axes [m] and direction of the major axis [rad] of the 1-sigma ellipse of the position.
         dbh, dbh_sigma: [m]; NaN if the DBH was not measured.
         coverage_deg: Observed part of the circumference.
         dbh_arc_deg: Part of the circumference that a DBH needs.
         sides: Observed sectors of 36, counted from x to y; empty if unknown.
         eccentricity: Mean over the observations.
         observations: Number of scans that detected it.
-        first_seen_s, last_seen_s: [s].
+        first_seen_s, last_seen_s: Times of the first and the last detection [s since the first scan].
         cluster: Row of its cluster in the current scan; None without one.
         column: Classification of the accumulated scans at its place; None without them.
         points: Accumulated points around it: x, y from its position in the frame of the map and height above
