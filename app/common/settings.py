@@ -100,7 +100,7 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
 
     Args:
         settings: Settings of the deployment.
-        now_s: Time in its name [s since 1970].
+        now_s: Time in the name of the recording [s since 1970].
 
     Raises:
         StemmapError: There is no data folder.
