@@ -38,10 +38,10 @@ class Places:
     """M places along the path. Instances are immutable.
 
     Attributes:
-        birth: int64, shape (M,), ascending. Landmarks with this birth number or a later one, up to the next
-            row, belong to the place.
+        birth: First birth number of each place, int64, shape (M,), ascending. Landmarks with birth numbers
+            from it up to that of the next row belong to the place.
         distance: Distance driven at each place, shape (M,) [m].
-        seen: Distance driven when the place was last seen for certain, shape (M,) [m].
+        seen: Distance driven when the place was last seen, see `with_scan` and `with_seen`, shape (M,) [m].
         inactive: Which places the detections contradict, shape (M,).
         contradicted: Whether the last scan contradicts a place; then a loop is searched for.
     """
@@ -191,9 +191,9 @@ def agreement(
     Args:
         pose: Pose with its covariance relative to the active landmarks.
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         mean: Positions of the landmarks, shape (L, 2) [m].
-        covariance: Their covariances xx, xy, yy, shape (L, 3) [m^2].
+        covariance: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2].
     """
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
     n = mean.shape[0]

@@ -35,9 +35,10 @@ class ScanStatistics:
     Attributes:
         detections: Number of detections.
         recognised: Number of detections of well-known landmarks.
-        ambiguous: Number of detections with two likely landmarks.
-        found: Hits of the recognised landmarks, each limited to MOST_HITS.
-        missed: Hits of the well-known landmarks in free view that were not detected, limited likewise.
+        ambiguous: Number of detections whose two best pairs differ by less than `proposal.LIKELY`.
+        found: Sum of the hits, each at most MOST_HITS, of the well-known landmarks that were detected.
+        missed: Sum of the hits, each at most MOST_HITS, of the well-known landmarks in free view that were
+            not detected.
         innovation: Normalised innovation squared per degree of freedom; NaN without a recognised landmark.
         odometry: Mahalanobis distance between the motion by SLAM and the odometry [sigma].
     """
@@ -74,8 +75,8 @@ def named_statistics(mean: Float, odometry: float, detections: int) -> ScanStati
 
 @compiled
 def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float) -> tuple[Float, float]:
-    """Return the weighted mean of the columns, shape (STATISTICS,), and the Mahalanobis norm of its SHIFT
-    [sigma], with SIGMA_FLOOR squared added to the variances of the motion.
+    """Return the weighted mean of the columns over the particles, shape (STATISTICS,), and the Mahalanobis
+    norm of the mean SHIFT [sigma], with SIGMA_FLOOR squared added to the variances of the motion.
 
     Args:
         statistics: Statistics by particle, shape (P, STATISTICS).
@@ -94,7 +95,7 @@ def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> floa
     """Return the Mahalanobis distance of two motions [sigma]. The yaw difference is wrapped.
 
     Args:
-        by_trees, by_odometry: x, y [m], yaw [rad], shape (3,).
+        by_trees, by_odometry: Motions x, y [m], yaw [rad], shape (3,).
         covariance: Covariance of the odometry, shape (3, 3); SIGMA_FLOOR squared is added to its diagonal.
     """
     shift = by_trees - by_odometry
@@ -155,11 +156,11 @@ class RunningStatistics:
             free view.
         ambiguous: Running mean of the share of detections with two likely landmarks.
         odometry: Largest deviation from an odometry without doubt [sigma], decaying by FADING per scan.
-        alone: Distance driven since two known trees were last recognised in one scan [m].
+        alone: Distance driven since the last scan in which FEWEST well-known landmarks were detected [m].
         mapped: Whether any well-known landmark was ever recognised.
         distrust: 1 when the trees contradict the odometry, decaying with the time since (`decayed_distrust`).
         strange: Number of strange scans in a row, see STRANGE_LOST.
-        missed: Most hits of well-known landmarks that one of these scans missed.
+        missed: Maximum of `ScanStatistics.missed` over the present strange scans.
         familiar: Running mean of the share of detections that belong to well-known landmarks.
         led: Counter of the scans in which trees determined the motion while the odometry was doubted: plus
             TREE_MOTION_STEP for each, minus one for each scan without doubt.
@@ -249,8 +250,8 @@ def update_statistics(
 
 @compiled
 def distance_without_trees(alone: float, recognised: float, driven: float) -> float:
-    """Return the distance driven since two known trees were last recognised in one scan [m]: 0 after a scan
-    with FEWEST recognised trees.
+    """Return the distance driven since the last scan with at least FEWEST recognised trees [m]: 0 after such
+    a scan, else `alone` plus `driven`.
 
     Args:
         alone: The distance before [m].
@@ -354,9 +355,8 @@ def pose_health(
 ) -> Health:
     """Return the quality of the pose after a scan.
 
-    The pose is lost if its sigma is too large or the known trees are not found, and weak if any figure
-    exceeds its limit. A doubted odometry makes it weak until trees have determined the motion for long
-    enough.
+    The state is "lost" if the standard deviation of the position exceeds SIGMA_WEAK or `is_lost` is True, and
+    "weak" if another rule of `_state_and_reason` applies, else "good".
 
     Args:
         recent: Running statistics after the scan.
@@ -415,13 +415,14 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
 
 
 def is_lost(recent: RunningStatistics) -> bool:
-    """Return whether less than FOUND_LOST of the known trees (running mean) are found where they should be
-    visible, or whether nearly all of them were missed in STRANGE_LOST scans in a row. Before any tree is well
-    known the result is False."""
+    """Return whether `recent.found`, the share of landmarks in free view that were detected (running mean),
+    is below FOUND_LOST, or `recent.strange`, the number of strange scans in a row, is at least STRANGE_LOST.
+    False before any landmark with `hits_to_weigh` hits was detected."""
     return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)
 
 
 def is_supported(recent: RunningStatistics) -> bool:
-    """Return whether the last scan showed trees where the map has them, and at least FOUND_WEAK of the known
-    trees (running mean) are found where they should be visible. It is True before any tree is known."""
+    """Return whether the last scan was not strange (`recent.strange` is 0) and `recent.found`, the share of
+    landmarks in free view that were detected (running mean), is at least FOUND_WEAK. True for initial
+    statistics."""
     return recent.strange == 0 and recent.found >= FOUND_WEAK

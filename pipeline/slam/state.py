@@ -156,7 +156,7 @@ class SlamState:
     def _drawn(self, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> SlamState:
         """Return the state with copies of the poses, weights, maps and shared errors of the given rows,
         int64, shape (P,), which may repeat. The ancestry and the row `best` remain those of the state; the
-        caller redraws them."""
+        caller replaces them."""
         return replace(
             self,
             pose=self.pose[rows],
