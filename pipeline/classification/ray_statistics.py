@@ -22,7 +22,7 @@ class ScanView:
     """Pose and visibility of a scan.
 
     Attributes:
-        T_map_base: Pose of the base.
+        T_map_base: Pose of the base in the map.
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
         clear_range: Free range by direction in the base frame, shape (BINS,) [m].
         steepest: Tangent of the steepest elevation of a return by direction, shape (BINS,).
@@ -89,8 +89,9 @@ def update_visibility(
     Args:
         axis: Axes of the columns, shape (K, 5).
         viewed, present, absent: Statistics of the columns, shape (K,), changed in place.
-        pose: x, y [m], yaw [rad] of the base.
-        clear_range, steepest: By direction in the base frame, shape (BINS,).
+        pose: Pose x, y [m], yaw [rad] of the base in the map, shape (3,).
+        clear_range, steepest: Free range [m] and tangent of the steepest elevation by direction in the base
+            frame, shape (BINS,); see `ScanView`.
         offset: Position of the sensor in the base frame, shape (3,) [m].
         terrain: Terrain of this scan, as `Terrain.height`.
         range_max: Columns farther from the base are skipped [m].
