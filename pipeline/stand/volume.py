@@ -38,7 +38,7 @@ class VolumeFormula:
 
     Attributes:
         text: The formula as it was written.
-        expression: Its syntax tree, which contains nothing else.
+        expression: Syntax tree of the formula, which has only elements of the grammar.
     """
 
     text: str
@@ -81,7 +81,8 @@ class VolumeFormula:
         Unknown standard deviations count as 0; where the volume is NaN, its standard deviation is 0.
 
         Args:
-            dbh, dbh_sigma, height, height_sigma: Shape (T,) [m]; NaN where unknown.
+            dbh, dbh_sigma, height, height_sigma: Diameters, heights and their standard deviations, shape (T,)
+                [m]; NaN where unknown.
         """
         d, h = np.nan_to_num(dbh_sigma), np.nan_to_num(height_sigma)
         volume = self(dbh, height)
@@ -113,7 +114,7 @@ def _check(node: ast.AST, levels: int) -> None:
         levels: Number of nested operations that it may have.
 
     Raises:
-        FormulaError: It has more, or something else.
+        FormulaError: The expression has more levels, or an element that is not of the grammar.
     """
     if levels < 0:
         raise FormulaError(f"the formula is nested deeper than {DEEPEST} operations")
