@@ -29,7 +29,7 @@ class Camera:
     """A pinhole camera on the robot, without lens distortion.
 
     Attributes:
-        topic: Topic of its pictures.
+        topic: Topic of the pictures.
         width, height: Size of a picture [pixels].
         K: Camera matrix, shape (3, 3) [pixels].
         T_base_camera: Extrinsics; the axes of the camera are x right, y down, z ahead.
@@ -60,10 +60,10 @@ class Picture:
     """One picture as it was recorded.
 
     Attributes:
-        stamp_ns: Time of the picture.
+        stamp_ns: Time of the picture [ns].
         encoding: "" for a file (JPEG, PNG), else the encoding of raw pixels, e.g. "rgb8".
         width, height, step: Size of raw pixels and bytes per row; 0 for a file.
-        data: Bytes.
+        data: Bytes of the file or of the raw pixels.
     """
 
     stamp_ns: int
@@ -78,13 +78,13 @@ def find_camera(
     container: Container, tree: TransformTree, base: str, topic: str
 ) -> tuple[Camera | None, str]:
     """Return the camera of a topic and "", or None and the reason. Of the CameraInfo topics, the one with the
-    most similar name is used, and of its first 20 messages the first valid one. Its distortion is ignored.
+    most similar name is used, and of its first 20 messages the first valid one. The distortion is ignored.
 
     Args:
         container: The recording.
         tree: Fixed transforms.
         base: Name of the base frame.
-        topic: Topic of its pictures.
+        topic: Topic of the pictures.
     """
     channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
     near = sorted(
@@ -124,7 +124,7 @@ def picture_of(message: Message, channels: Mapping[int, Channel], stamp_ns: int)
 
     Args:
         message: Image or CompressedImage.
-        channels: Channels by number.
+        channels: dict from numbers to channels.
         stamp_ns: Time of the picture [ns].
     """
     if len(message.payload) > BYTES_LIMIT:
@@ -154,8 +154,8 @@ def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:
     """Return the stamp nearest to each time, and whether it is close enough to be of the same place.
 
     Args:
-        stamps: Stamps in ascending order [ns], shape (N,), N >= 1.
-        wanted_ns: Times [ns], shape (M,).
+        stamps: Stamps of pictures in ascending order, shape (N,), N >= 1 [ns].
+        wanted_ns: Times for which stamps are searched, shape (M,) [ns].
 
     Returns:
         The nearest stamps [ns], shape (M,), the earlier one of two that are equally near; and whether each
