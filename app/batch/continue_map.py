@@ -73,7 +73,7 @@ class SavedRun:
         seed: Random seed.
         start_ns: Time of the first scan [ns].
         tally: Counts so far.
-        losses: Number of messages that were left out, by reason.
+        losses: Dict from reasons to numbers of messages that were left out.
         map: State of the mapper.
     """
 
@@ -183,7 +183,8 @@ class RunStart:
         Args:
             source: Source of the run.
             odometry: Choice of the odometry.
-            left_out: Counter by reason to which the records that the synchroniser leaves out are added.
+            left_out: Counter from reasons to numbers of records that the synchroniser leaves out; increased
+                in place.
 
         Raises:
             SourceError: The source cannot be read.
@@ -283,7 +284,7 @@ def _in_another_run(
         source: Source of the new run.
         start: Where the user starts it.
         pose: Pose of its first scan in the map.
-        found: The match by stems; None without one.
+        found: The match by stems; None if there is none.
         warnings: Messages for the user that are added to the totals.
     """
     known, after_ns = source.description, begin.after_ns or 0

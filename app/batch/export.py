@@ -144,14 +144,14 @@ class ExportedRun:
 
     Attributes:
         uri: URI of the source.
-        trees: Its confirmed trees.
-        frame: Its reference system.
-        place: East, north of the trees, or x, y of a local map, shape (T, 2) [m].
+        trees: Confirmed trees of the run.
+        frame: Reference system of the run.
+        place: Positions of the trees: east, north, or x, y for a local map, shape (T, 2) [m].
         columns: Dict from each name of TREE_FIELDS to the rounded values of the trees, shape (T,); NaN for
             unknown values.
         path: The path in the coordinates of `place`, shape (N, 2) [m].
-        plots: Name, shape in the coordinates of `place`, and a dict from the names of PLOT_FIELDS except
-            "plot" to values, of each plot.
+        plots: Tuples, one per plot, of name, shape in the coordinates of `place`, and a dict from the names
+            of PLOT_FIELDS except "plot" to values.
         terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
     """
 
@@ -533,9 +533,9 @@ def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # n
 def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
     """Return the heights of the terrain as a north-up raster in the coordinates of the files, shape (rows
     from north to south, columns from west to east) [m], NaN where unknown, with west and north of its corner
-    [m]; None without terrain. Cells have TERRAIN_CELL metres. A map that is turned or whose cells are not
-    those of the raster is resampled linearly between the centres of its cells, beyond them from the nearest
-    one, and only within 0.75 cells of one.
+    [m]; None if there is no terrain. Cells have TERRAIN_CELL metres. A map that is turned or whose cells are
+    not those of the raster is resampled linearly between the centres of its cells, beyond them from the
+    nearest one, and only within 0.75 cells of one.
 
     Raises:
         SourceError: The raster would have more than 25 million cells.
@@ -574,8 +574,8 @@ def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
 
 def contours(run: ExportedRun) -> list[tuple[float, Float]]:
     """Return (height [m], line, shape (N, 2) [m]) of each contour line, at multiples of CONTOUR_STEP, in the
-    coordinates of the files; [] without terrain or with a single row or column of cells. Lines of fewer than
-    three points are omitted.
+    coordinates of the files; [] if there is no terrain or with a single row or column of cells. Lines of
+    fewer than three points are omitted.
 
     Raises:
         StemmapError: contourpy is not installed, or the raster would be too large.

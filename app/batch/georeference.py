@@ -129,11 +129,11 @@ class ControlPoint:
     """A point that is known in the map and in a reference system.
 
     Attributes:
-        name: For messages.
-        east, north: Its position in the reference system [m].
-        tree: Number of the tree that it is; None for another mark.
-        x, y: Its position in the map [m]; None for a tree.
-        z: Its height in the reference system [m]; None if unknown.
+        name: Name of the point, for messages.
+        east, north: Position in the reference system [m].
+        tree: Number of the tree at the point; None for another mark.
+        x, y: Position in the map [m]; None for a tree.
+        z: Height in the reference system [m]; None if unknown.
     """
 
     name: str
@@ -149,11 +149,11 @@ def gis_package(module: str, purpose: str) -> Any:  # noqa: ANN401 - a module
     """Import a package of the extra `gis` and return it.
 
     Args:
-        module: Its name.
+        module: Name of the package.
         purpose: What needs it, a plural for the message, such as "GIS files".
 
     Raises:
-        StemmapError: It, or a module that it needs, is not installed.
+        StemmapError: The package, or a module that it needs, is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -171,8 +171,8 @@ def projected(crs: str) -> str:
         crs: A code such as "25832" or "EPSG:25832", or any text that pyproj reads.
 
     Raises:
-        StemmapError: It is unknown, not projected (geographic, geocentric, vertical, local) or has another
-            unit than metres. The message states which.
+        StemmapError: The reference system is unknown, not projected (geographic, geocentric, vertical, local)
+            or has another unit than metres. The message states which.
     """
     import pyproj
 
@@ -366,8 +366,8 @@ NAME_MAX = 60  # characters of the name of a control point
 
 
 def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
-    """Return the control points of a table, in its order. A point with a tree has no x and y; one without a
-    name is called by its tree or its place in the table.
+    """Return the control points of a table, in its order. A point with a tree has no x and y. A point without
+    a name gets the number of its tree or of its row as name.
 
     Args:
         file: CSV with a header: easting and northing (or lon and lat), tree or x_m and y_m, optionally name
@@ -375,8 +375,8 @@ def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
         crs: Reference system, see `projected`, to which longitudes and latitudes are converted.
 
     Raises:
-        SourceError: It cannot be read, is larger than 1 MB, has an incomplete header or row, a cell that is
-            not a number, a name of more than NAME_MAX characters, no rows or more than POINTS_MAX.
+        SourceError: The file cannot be read, is larger than 1 MB, has an incomplete header or row, a cell
+            that is not a number, a name of more than NAME_MAX characters, no rows or more than POINTS_MAX.
     """
     table = CsvTable.read(file, "table of control points", _LARGEST_FILE)
     if len(table.rows) > POINTS_MAX:
@@ -576,7 +576,7 @@ def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
     Args:
         terrain: x, y, z of the terrain cells in the map, shape (K, 3) [m].
         points: Positions x, y in the map, shape (N, 2) [m].
-        reach: Largest distance of the cell [m].
+        reach: Maximum distance of the cell [m].
     """
     from scipy.spatial import cKDTree
 

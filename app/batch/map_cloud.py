@@ -115,7 +115,7 @@ _OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}
 
 
 def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
-    """Return longitude and latitude (WGS84) [deg], shape (N, 2), of positions. None without a reference
+    """Return longitude and latitude (WGS84) [deg], shape (N, 2), of positions. None if there is no reference
     system, and, with a warning, if it is unknown or a position is outside of its area.
 
     Args:
@@ -208,12 +208,13 @@ def _run_record(
     and `crs` (None if unknown); `seed` and `scans`, both 0; `preset`, `changed` and `parameters`; `trees`
     (number); `points`, a dict from the stage to the number of points; `verdicts`, a dict from the label to
     the number of candidates; `voxel_size_m`; `ground_m`, [minimum, maximum] of the height of the terrain in
-    the coordinates of the cloud; `evaluation` (a dict, None without ground truth); `warnings` and `losses`.
+    the coordinates of the cloud; `evaluation` (a dict, None if there is no ground truth); `warnings` and
+    `losses`.
 
     Args:
         cloud, plot: The cloud and its map.
         preset, parameters: With which it was mapped.
-        evaluation: Scores; None without ground truth.
+        evaluation: Scores; None if there is no ground truth.
         warnings: Messages for people.
         losses: Dict from a reason to the number of points that were left out for it.
     """
@@ -251,7 +252,7 @@ def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None
         uri: URI of the cloud.
         plot: The map.
         trees: Trees of the map.
-        evaluation: Scores; None without ground truth.
+        evaluation: Scores; None if there is no ground truth.
     """
     dbh = 100.0 * trees.dbh[np.isfinite(trees.dbh)]
     wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} measured)" if len(dbh) else ", no DBH"

@@ -376,7 +376,7 @@ def _run_record(
     there are any; `recorded`, see `recorded_time`; `seed`, `odometry`, `preset`, `changed` and `parameters`;
     `revisions`, see `_changes`; the numbers `scans`, `duration_s`, `distance_m` and `trees`; `points` and
     `verdicts`, dicts of counts; `health`, see `RunHealth.record`; `evaluation` and `path_error`, dicts, None
-    without ground truth; `warnings` and `losses`.
+    if there is no ground truth; `warnings` and `losses`.
 
     Args:
         plan: The run with its parameters.
@@ -384,7 +384,7 @@ def _run_record(
         frame: The last frame.
         driven_s_m: Duration [s] and length [m] of the path.
         start_ns: Time of the first scan [ns].
-        evaluation, error: Scores of map and path; None without ground truth.
+        evaluation, error: Scores of map and path; None if there is no ground truth.
         losses: Dict from a reason to the number of records that were left out for it.
     """
     description, tally = plan.source.description, begun.tally

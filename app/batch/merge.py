@@ -109,7 +109,7 @@ def _joined(
 
     Args:
         a, b: The runs.
-        merged: Their merged map.
+        merged: Merged map of the two runs.
         match: Pose of the map of b in that of a.
         shift: Offset that is added to the times of run b [ns].
         parameters: Parameters of the merged map.

@@ -100,7 +100,7 @@ def stored_plots(store: Store, source: Mapping[str, Any]) -> list[SamplePlot]:
 
 def stored_frame(store: Store, source: Mapping[str, Any]) -> dict[str, Any] | None:
     """Return the reference system that the store has for a recording, in the form of `MapFrame.record`; None
-    without one. Arguments as in `stored_plots`."""
+    if there is none. Arguments as in `stored_plots`."""
     contents = store.contents(str(source.get("sha256") or source.get("uri")), FRAME)
     return contents[0].plot["frame"] if contents and contents[0].plot else None
 
@@ -137,11 +137,11 @@ def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN4
 
     Args:
         file: The file, for messages and for the members of a GeoJSON.
-        table: Its GeoDataFrame.
+        table: GeoDataFrame of the file.
         given: The system that the user gives, or None.
 
     Raises:
-        StemmapError: It is unknown, or there is none.
+        StemmapError: The reference system is unknown, or there is none.
     """
     import pyproj
 

@@ -83,10 +83,10 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
     Args:
         path: The folder or the table.
         dbh_unit: Unit of a diameter column of a table without a unit.
-        may_be_empty: Whether it may have no trees.
+        may_be_empty: Whether the folder or table may have no trees.
 
     Raises:
-        StemmapError: It cannot be read or has no trees.
+        StemmapError: The folder or table cannot be read, or has no trees.
     """
     if path.is_dir():
         trees = read_run(path).trees
@@ -143,7 +143,7 @@ def compare(
         a, b: The earlier and the later visit.
         same_frame: Whether their coordinates are taken as equal; then there is no alignment, `T_a_b` is the
             identity, and nothing is raised.
-        reach: Largest distance of the two positions of a tree in the frame of `a` [m].
+        reach: Maximum distance of the two positions of a tree in the frame of `a` [m].
         dbh_sigma: Standard deviation of a known diameter that has none [m].
 
     Raises:

@@ -228,7 +228,7 @@ def _text(file: FilePath) -> str:
     """Return the text of a file.
 
     Raises:
-        SourceError: It cannot be read, is larger than 256 MB, or is not UTF-8.
+        SourceError: The file cannot be read, is larger than 256 MB, or is not UTF-8.
     """
     try:
         if file.stat().st_size > LARGEST_FILE:

@@ -29,13 +29,13 @@ ALL = "all"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandResult:
-    """Stand figures of a run.
+    """Stand parameters of a run.
 
     Attributes:
         run, frame: The run and the frame of its map.
-        trees: Its trees.
-        parameters: Parameters of the figures.
-        plots: The plots; the whole observed area without plots.
+        trees: Trees of the run.
+        parameters: Parameters of the computation.
+        plots: The plots; if there are none, the whole observed area.
         whole: Whether there are no plots, and the only one is the whole observed area.
         seen: Observed area within reach.
         figures: Dict from the name of each plot to its stand parameters.
@@ -63,12 +63,12 @@ class StandResult:
 
 
 def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = ()) -> StandResult:
-    """Return the stand figures of a finished run; rejected trees do not count. Nothing is written.
+    """Return the stand parameters of a finished run; rejected trees do not count. Nothing is written.
     Diameters that look like those of another unit, and few trees, are warnings.
 
     Args:
-        folder: Its folder.
-        parameters: Parameters of the figures.
+        folder: Folder of the run.
+        parameters: Parameters of the computation.
         plots: Plots in the frame of the map; without any, the whole observed area is one plot.
 
     Raises:
@@ -286,9 +286,9 @@ def _numbers(values: Sequence[float]) -> list[str]:
 
 
 def stand_summary(result: StandResult) -> list[str]:
-    """Return the figures over all plots as lines for people: the number of trees and the area, trees that are
-    not counted if there are any, the figures that have a value, detection, and the meaning of the standard
-    errors. Warnings are not included."""
+    """Return the stand parameters over all plots as lines for people: the number of trees and the area, trees
+    that are not counted if there are any, the stand parameters that have a value, detection, and the meaning
+    of the standard errors. Warnings are not included."""
     seen = sum(f.seen for f in result.figures.values())
     area = sum(f.area for f in result.figures.values())
     trees = sum(f.trees for f in result.figures.values())

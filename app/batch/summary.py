@@ -185,7 +185,7 @@ class RunTotals:
 
     Attributes:
         warned: Counter from each warning to the number of times that it was given.
-        points: Sums of `Frame.counts` over the scans, by name.
+        points: Dict from the names in `Frame.counts` to sums over the scans.
         verdicts: Number of clusters by label of the verdict.
         health: Quality of the poses.
     """
@@ -208,7 +208,7 @@ class RunTotals:
 
 
 def lost_share(health: Mapping[str, int]) -> float | None:
-    """Return the share of scans in which the pose was lost, from 0 to 1; None without scans.
+    """Return the share of scans in which the pose was lost, from 0 to 1; None if there are no scans.
 
     Args:
         health: Dict from the state of the pose quality, see `Health`, to its number of scans.
@@ -255,7 +255,7 @@ def far_map(scores: MapScores, match_distance: float) -> str:
 
     Args:
         scores: Scores of the map.
-        match_distance: Largest distance between a tree and its ground truth [m].
+        match_distance: Maximum distance between a tree and its ground truth [m].
     """
     if scores.TA.count or not scores.TA.of:
         return ""
@@ -294,7 +294,7 @@ def summary_lines(
         uri: URI of the source.
         frame: Result of the last scan.
         driven_s_m: Duration [s] and distance [m].
-        evaluation, error: Scores of trees and path; None without ground truth.
+        evaluation, error: Scores of trees and path; None if there is no ground truth.
     """
     seconds, metres = driven_s_m
     trees = int(np.count_nonzero(frame.trees.confirmed))

@@ -38,7 +38,7 @@ class StemPicture:
 
 def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[StemPicture]:
     """Return the best view of each tree that the camera saw, of the first MOST confirmed ones, ordered by
-    time and then by number; [] without pictures.
+    time and then by number; [] if there are no pictures.
 
     Args:
         camera: The camera.

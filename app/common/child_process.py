@@ -78,7 +78,7 @@ class ChildProcess:
 
     Attributes:
         pid: Process number.
-        stdin, stdout: Its standard input and output, for other messages than lines of JSON.
+        stdin, stdout: Standard input and output of the process, for other messages than lines of JSON.
     """
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
@@ -291,7 +291,7 @@ class ParentConnection:
         """Return the next message, of type `kind`; waits for it without a time limit.
 
         Raises:
-            ProtocolError: It is not of this type.
+            ProtocolError: The message is not of this type.
         """
         message = _decoded(self._lines.get(), kind)
         assert message is not None  # noqa: S101 - only whole lines are queued

@@ -91,8 +91,8 @@ class Broadcast:
 
         Args:
             count: Number of the message with the map.
-            path_xy: Its path, shape (N, 2) [m].
-            start: First row.
+            path_xy: Positions x, y of the path of this map, shape (N, 2) [m].
+            start: First row of the result.
         """
         if self._path_json[:2] != (count, start):
             rows = {"start": start, "points": np.round(path_xy[start:], 3).tolist()}

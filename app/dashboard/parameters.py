@@ -150,7 +150,7 @@ class ParameterState:
         """Use the parameters of another run, as one undo step.
 
         Args:
-            preset_name: Its preset; an unknown or empty name means the preset in force.
+            preset_name: Preset of the other run; an unknown or empty name means the preset in force.
             values: Dict from dotted names to the values that differ from the preset.
 
         Raises:

@@ -184,8 +184,8 @@ def _finite(values: Float) -> list[float | None]:
 def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
     """Return a dict with `verdicts`, the result of `verdict_counts` for the scan; `right`, the number of
     detections that are paired one to one with a true tree (see `match`); and `wrong`, the number of other
-    detections, also of those paired with an object that is no tree. `right` and `wrong` are None without
-    ground truth.
+    detections, also of those paired with an object that is no tree. `right` and `wrong` are None if there is
+    no ground truth.
 
     Args:
         frame: Results of the scan.
@@ -281,7 +281,7 @@ def binary_payload(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> b
     Args:
         header: A dict of JSON values. The key `arrays` is added, a list of dicts with `name`, `type` (as
             `numpy.dtype.str`), `shape` and `at`, the offset of the array from the end of the header [bytes].
-        arrays: Arrays by name.
+        arrays: Dict from names to arrays.
     """
     table, parts, place = [], [], 0
     for name, array in arrays.items():

@@ -263,8 +263,8 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
-    """Return the figures of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
-    (see `thinned`) and `truth` (the list of `truth_payload`; None without ground truth).
+    """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
+    (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth).
 
     Args:
         state: The state.

@@ -29,8 +29,8 @@ class Scores:
     """Computes scores in the background; of several requests only the newest is computed.
 
     Args:
-        tell: Called on the event loop with each score for the page, and with None when there is no map any
-            more.
+        tell: Called on the event loop with each score for the browsers, and with None when there is no map
+            any more.
 
     Attributes:
         latest: The newest score, or None.
@@ -106,8 +106,8 @@ def score_payload(score: MapScores) -> dict[str, Any]:
 def pairs_payload(trees: Trees, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
     """Return the distances between the confirmed trees as a dict. The keys are `numbers`, a list of the
     numbers of T trees; `distance_m`, nested lists of shape (T, T); `error_percent`, nested lists of shape (T,
-    T) with the error of each distance if both trees are matched with true trees, else NaN (None without
-    ground truth); and `left_out`, the number of confirmed trees that are not included.
+    T) with the error of each distance if both trees are matched with true trees, else NaN (None if there is
+    no ground truth); and `left_out`, the number of confirmed trees that are not included.
 
     Only the first MOST_PAIRED confirmed trees are included.
 

@@ -116,7 +116,7 @@ class WorkerClient:
 
         Args:
             kind: Type of the question.
-            values, named: Its fields after `ticket` and `run`.
+            values, named: Fields of the question after `ticket` and `run`.
 
         Raises:
             NothingMappedError: No run is shown.
@@ -194,8 +194,8 @@ class Selector:
         worker_client: Requests the explanations.
         live: Broadcast to the browsers.
         mark: Highlights a tree and a ring in the scene, and returns x, y and height of the ground there [m].
-        run: Returns the number of the present run, None without one.
-        newest: Returns the index of the newest shown scan, None without one.
+        run: Returns the number of the present run, None if there is none.
+        newest: Returns the index of the newest shown scan, None if there is none.
     """
 
     def __init__(

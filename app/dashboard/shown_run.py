@@ -56,10 +56,11 @@ class ShownRun:
         path: The estimated path.
         start_ns: Time of the first scan [ns].
         preset, parameters: In force.
-        truth: Ground truth in the coordinates of the files; None without one.
+        truth: Ground truth in the coordinates of the files; None if there is none.
         seen: Views of the observed area; those of later scans may be added.
         edits: The annotations of trees and the plots.
-        frame: The reference system that the map got on the page, as annotation; None without one.
+        frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
+            none.
     """
 
     request: SourceRequest
@@ -158,7 +159,7 @@ class ShownRun:
     def _record(self) -> dict[str, Any]:
         """Return the content of run.json as a dict, without what only `stemmap map` knows, and with
         `rejected`, the number of rejected trees, which `trees` does not count. Reviews do not change the
-        scores `evaluation`, which are None without ground truth."""
+        scores `evaluation`, which are None if there is no ground truth."""
         status, truth = self.status, self.truth
         trees = in_file(self.shown.frame.trees, self.cloud)
         rejected = sum(review == REJECTED for review in self.reviews().values())
@@ -194,7 +195,7 @@ class ShownRun:
         unknown.
 
         Args:
-            scores: Scores of the map as a dict, see `MapScores`; None without ground truth.
+            scores: Scores of the map as a dict, see `MapScores`; None if there is no ground truth.
         """
         counts = self.shown.counts
         if counts is None:

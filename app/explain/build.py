@@ -314,7 +314,7 @@ def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
 
 def _axes(points: Float, to_picture: Float) -> list[tuple[float, float]]:
     """Return one standard deviation along the major and the minor principal axis of points, in this order, as
-    (right, up) in the picture [m], with arbitrary sign; [] without points.
+    (right, up) in the picture [m], with arbitrary sign; [] if there are no points.
 
     Args:
         points: x, y in level sensor coordinates, shape (N, 2) [m].

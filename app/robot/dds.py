@@ -141,7 +141,7 @@ class DdsLink(Link):
 
     Args:
         address: Address of the domain.
-        inbox: Receives the messages.
+        inbox: Inbox to which the messages are added.
     """
 
     def __init__(self, address: DdsAddress, inbox: Inbox) -> None:
@@ -323,8 +323,8 @@ class _Reader:
         self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
 
     def take(self) -> list[bytes]:
-        """Return the messages that arrived since the last call, in CDR; [] without one. Does not wait. At
-        most `depth` messages are kept between two calls: a result of that length means that older ones may
+        """Return the messages that arrived since the last call, in CDR; [] if there is none. Does not wait.
+        At most `depth` messages are kept between two calls: a result of that length means that older ones may
         have been overwritten."""
         found = self._reader.take(self.depth)
         return [sample.payload for sample in found if isinstance(sample, _Sample)]

@@ -63,7 +63,7 @@ class Inbox:
     it may be the robot's own driver. Pictures have a queue of their own.
 
     Attributes:
-        losses: Number of skipped messages, by reason.
+        losses: Dict from reasons to numbers of skipped messages.
         early_scans: Number of scans that were skipped before the first call of `take`.
         pictures_arrived, pictures_accepted: Number of pictures that arrived, and that the rate limit
             accepted.
@@ -265,14 +265,14 @@ class Link(ABC):
     A subclass starts `thread` at the end of its constructor.
 
     Args:
-        inbox: Receives the messages.
+        inbox: Inbox to which the messages are added.
         name: Name of the thread.
 
     Attributes:
         problem: Reason why there is no connection, "" while there is one.
         alive: Dict from the identifier of each present writer to the topic that it publishes; guarded by
             `lock`.
-        losses: Number of messages lost before the inbox, by reason.
+        losses: Dict from reasons to numbers of messages lost before the inbox.
         scans: Number of scans that arrived.
         version: Number of changes of `alive` so far.
         session: Session on which results can be published, None if there is none.

@@ -43,7 +43,7 @@ class Recorder:
     Attributes:
         path: The file that is written.
         problem: Reason why the recording ended before the run; "" otherwise.
-        losses: Number of messages that were not recorded, by reason.
+        losses: Dict from reasons to numbers of messages that were not recorded.
 
     Raises:
         SourceError: The file cannot be created.
@@ -207,8 +207,8 @@ class RawFile:
         path: The file.
 
     Raises:
-        FileExistsError: It exists.
-        OSError: It cannot be created.
+        FileExistsError: The file exists.
+        OSError: The file cannot be created.
     """
 
     def __init__(self, path: FilePath) -> None:
@@ -219,7 +219,7 @@ class RawFile:
         """Write all bytes and return their number.
 
         Raises:
-            OSError: The disk refuses; a part may be written.
+            OSError: The bytes cannot be written; a part of them may be written.
         """
         rest = memoryview(data)
         while rest:

@@ -44,7 +44,7 @@ class PictureStore:
     """Pictures of a run in a temporary file.
 
     Attributes:
-        losses: Number of pictures that were not stored, by reason.
+        losses: Dict from reasons to numbers of pictures that were not stored.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class PictureStore:
 
     def is_due(self, path: Path) -> bool:
         """Return whether the robot has moved STEP_M or turned TURN_RAD since the last picture; True for the
-        first one, False without a pose.
+        first one, False if there is no pose.
 
         Args:
             path: Path up to the present pose.
@@ -265,7 +265,7 @@ class LiveSource:
 
     @property
     def picture_counts(self) -> str:
-        """Numbers of pictures that arrived and were accepted, as text; "" without a camera."""
+        """Numbers of pictures that arrived and were accepted, as text; "" if there is no camera."""
         if self._camera is None:
             return ""
         lost = sum(self._inbox.losses.get(reason, 0) for reason in (PICTURES_SKIPPED, PICTURES_TOO_LARGE))
@@ -302,7 +302,7 @@ class LiveSource:
 
     @property
     def recording(self) -> str:
-        """State of the recording in one line, "" without one."""
+        """State of the recording in one line, "" if there is none."""
         return "" if self._recorder is None else self._recorder.status
 
     def mapped(self, frame: Frame, path: Path) -> None:

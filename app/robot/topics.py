@@ -154,7 +154,7 @@ def _of_role(
     rank: Callable[[Publisher], tuple[object, ...]],
     where: str,
 ) -> Publisher | None:
-    """Return the publisher of a role: that of the named topic, else the first by rank; None without one.
+    """Return the publisher of a role: that of the named topic, else the first by rank; None if there is none.
 
     Args:
         there: Publishers of the robot.

@@ -93,7 +93,7 @@ class VelodyneLink(Link):
 
     Args:
         address: Address on which it listens, and address of the sender.
-        inbox: Receives the sweeps.
+        inbox: Inbox to which the sweeps are added.
     """
 
     def __init__(self, address: VelodyneAddress, inbox: Inbox) -> None:

@@ -69,7 +69,7 @@ def configuration(endpoint: str, files: Mapping[str, str] | None = None) -> str:
 
     Args:
         endpoint: Endpoint of the router.
-        files: Paths of certificates by role, see `ZenohAddress`.
+        files: Dict from roles to paths of certificates, see `ZenohAddress`.
     """
     tls: dict[str, Any] = {_TLS[name]: path for name, path in (files or {}).items()}
     if "connect_certificate" in tls:
@@ -94,7 +94,7 @@ class ZenohLink(Link):
 
     Args:
         address: Address of the router.
-        inbox: Receives the messages.
+        inbox: Inbox to which the messages are added.
     """
 
     def __init__(self, address: ZenohAddress, inbox: Inbox) -> None:

@@ -144,7 +144,7 @@ class Layer(NamedTuple):
     """A layer of the scene.
 
     Attributes:
-        title: Name on the page.
+        title: Name on the dashboard.
         colour: Colour while the scene is coloured by verdict; None for several colours.
         on: Whether it is visible at the start. Layers that are slow or cover others are not.
     """

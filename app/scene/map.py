@@ -286,7 +286,7 @@ def _near(way: object, places: Float, reach: float) -> NDArray[np.bool_]:
     Args:
         way: KD-tree of the path.
         places: Positions, shape (N, 2) [m].
-        reach: Largest distance [m].
+        reach: Maximum distance [m].
     """
     if not len(places):
         return np.zeros(0, np.bool_)

@@ -105,8 +105,8 @@ class Node(Generic[N]):
 
         Args:
             on: Whether it is visible.
-            content: The same properties in each call, by name; those that are unchanged are not sent. Arrays
-                are kept and must not be modified.
+            content: Dict from names of properties, the same in each call, to values; unchanged ones are not
+                sent. Arrays are kept and must not be modified.
         """
         changed = [
             name

@@ -151,9 +151,9 @@ def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
     """Let clicks on the copies of a batch call `on_cluster`.
 
     Args:
-        batch: Receives the clicks.
-        markers: Batch whose copies are the clusters in order; only for it the number of the copy is passed
-            on.
+        batch: Batch whose clicks are reported.
+        markers: Batch whose copies are the clusters in order; only for this batch the number of the copy is
+            passed to `on_cluster`.
         on_cluster: Called in the thread of viser, see `ScanNodes`.
     """
 
@@ -171,7 +171,8 @@ def cloud_point_size(frame: Frame) -> float:
 
 
 def extent(frame: Frame) -> float:
-    """Return the longer side of the bounding box of the filtered points in x and y [m]; 0 without points."""
+    """Return the longer side of the bounding box of the filtered points in x and y [m]; 0 if there are no
+    points."""
     return float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
 
 
@@ -261,7 +262,7 @@ class ClusterNumbers:
         self._next = 0
 
     def follow(self, places: Float) -> Int:
-        """Return a number for each cluster at these places: that of the cluster of the previous call with
+        """Return a number for each cluster at these positions: that of the cluster of the previous call with
         which it is paired within REACH (one to one, see `match`), else the next unused one, from 0 on.
 
         Args:

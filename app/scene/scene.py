@@ -92,7 +92,7 @@ class Scene:
 
         Args:
             parameters: The values.
-            preset_name: Their preset.
+            preset_name: Name of the preset of the parameters.
         """
         self._parameters, self._preset = parameters, preset_name
         with self._server.atomic():

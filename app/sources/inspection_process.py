@@ -40,7 +40,7 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
         question: The key "path" has the path.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The recording cannot be read.
     """
     if is_cloud(question["path"]):
         return {"kind": f"whole cloud, {open_cloud(question['path']).description.kind}"}
@@ -74,7 +74,7 @@ def inside(question: dict[str, Any]) -> dict[str, Any]:
         question: The key "path" has the path of the recording or the address of the robot.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The recording or the robot cannot be read.
     """
     return (heard if is_live(question["path"]) else recorded)(question["path"])
 
@@ -354,8 +354,8 @@ _ROLES = {kind: role for role, kinds in reversed(TYPES_BY_ROLE.items()) for kind
 def recorded(uri: str) -> dict[str, Any]:
     """Return the description of a file, folder or simulated run as a dict: `kind`, the format; `topics`, a
     list of at most MOST_TOPICS dicts with the fields of `RecordedTopic` and `rate_hz`; `mount`, [x, y, z [m],
-    roll, pitch, yaw [deg]] of the LiDAR on the robot (None without topics); and `warnings`, at most 20
-    strings.
+    roll, pitch, yaw [deg]] of the LiDAR on the robot (None if there are no topics); and `warnings`, at most
+    20 strings.
 
     Raises:
         SourceError: The source cannot be read, or is a whole cloud.

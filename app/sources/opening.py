@@ -158,7 +158,7 @@ def check_address(uri: str) -> bool:
         True for a file or folder; False for the address of a live robot or a simulated run.
 
     Raises:
-        StemmapError: It does not exist, or the address is wrong.
+        StemmapError: The source does not exist, or the address is wrong.
     """
     if is_live(uri):
         parse_address(uri)
@@ -175,7 +175,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     ground truth, in a child process with limits, so that it is read twice.
 
     Raises:
-        SourceError: It cannot be read, or takes more time or memory than a file of its size should.
+        SourceError: The source cannot be read, or takes more time or memory than a file of its size should.
     """
     if is_cloud(uri):
         open_cloud(uri)

@@ -46,7 +46,7 @@ def name_of(data: dict[str, Any]) -> str:
 
 
 class Forests:
-    """The forests of a data folder, and the forest of the package.
+    """The random forests of a data folder, and the random forest of the package.
 
     Args:
         folder: The data folder; None where there is none.

@@ -173,7 +173,7 @@ class RunRecords:
             return record
 
     def update(self, record: int, figures: RunFigures) -> None:
-        """Update figures and map of a record; nothing happens if it does not exist.
+        """Update results and map of a record; nothing happens if it does not exist.
 
         Args:
             record: Number of the record.
@@ -229,7 +229,7 @@ class RunRecords:
 
         Raises:
             UnknownError: The run does not exist or was deleted.
-            NoFilesError: It has none.
+            NoFilesError: The record has no files.
         """
         with self._engine.begin() as connection:
             _found(connection, record)
@@ -574,7 +574,7 @@ class Store:
             run: Number of the source.
             step: Number of the step.
             author: Author of the edit.
-            content: Its content.
+            content: Content of the annotation.
         """
         edit = {"who": author.who, "at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
         id_ = _inserted(connection, insert(_annotations).values(run=run, **asdict(content), **edit))
@@ -709,7 +709,7 @@ def _row(connection: Connection, id_: int) -> Row[Any]:
 
 
 def _frame(connection: Connection, run: int) -> Row[Any] | None:
-    """Return the row of the reference system of a run that is not deleted; None without one."""
+    """Return the row of the reference system of a run that is not deleted; None if there is none."""
     a = _annotations.c
     return connection.execute(
         select(_annotations).where(a.run == run, a.kind == FRAME, a.deleted.is_(False)).limit(1)

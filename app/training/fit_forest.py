@@ -25,7 +25,7 @@ DEEPER = 4  # largest number of additional splits on a path
 
 @dataclass(frozen=True, slots=True)
 class ForestSettings:
-    """Settings of the forest for a kind of sensor.
+    """Settings of the random forest for a kind of sensor.
 
     Attributes:
         figures: Share of the features that is tried at each split.

@@ -73,8 +73,8 @@ class Rates:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Scores of the present and the new forest on the same objects. The new forest of each fold is trained
-    without its objects.
+    """Scores of the present and the new random forest on the same objects. The new random forest of each fold
+    is trained without the objects of the fold.
 
     Attributes:
         by: Groups that are left out as a whole: "run" or "place", see `groups_of`.
@@ -90,15 +90,15 @@ class Validation:
 def validate(
     examples: Sequence[Examples], base: dict[str, Any], kind: str, old: Forest, share: float, seed: int
 ) -> Validation:
-    """Cross-validate the training. The new forest decides on each object in the fold that left it out; only
-    the last example of each object counts.
+    """Cross-validate the training. The new random forest decides on each object in the fold that left it out;
+    only the last example of each object counts.
 
     Args:
         examples: Examples of one kind of sensor, from at least two groups of `groups_of`; those of an object
             follow one another, the newest last.
         base: JSON of the random forest that is extended.
         kind: Kind of the sensor, ALL_AROUND or ONE_WAY.
-        old: The present forest.
+        old: The present random forest.
         share: Minimum share of votes for a tree.
         seed: Random seed of the folds and the training.
     """
@@ -126,7 +126,8 @@ def validate(
 
 def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
     """Return the kind of the groups, "run" or "place", and the group number of each of N examples, int64,
-    shape (N,). The groups are runs if there are at least LEAST_RUNS groups of runs, otherwise places.
+    shape (N,). The groups are runs if there are at least LEAST_RUNS groups of runs, otherwise places
+    (clusters of objects).
 
     A place is a cluster of objects, of any run, each within SAME_PLACE of another one. Runs that share a
     place form one group.
@@ -189,7 +190,7 @@ _ABOUT = "Random forest of the package, extended with annotations."
 
 @dataclass(frozen=True, slots=True)
 class LearningResult:
-    """A trained forest with its scores.
+    """A trained random forest with its scores.
 
     Attributes:
         data: JSON of the new forest, with its provenance.
@@ -214,8 +215,8 @@ def learn(
     seed: int = 0,
     progress: Progress = lambda _: None,
 ) -> LearningResult:
-    """Extend the forest of the package with the annotations of runs. Nothing is stored except the examples of
-    the runs.
+    """Extend the random forest of the package with the annotations of runs. Nothing is stored except the
+    examples of the runs.
 
     Args:
         runs: The annotated runs. One that cannot be read is left out with a warning.

@@ -209,11 +209,11 @@ def _rounded(spec: FieldSpec, value: float) -> Value:
 
 
 def checked_value(spec: FieldSpec, text: str) -> Value:
-    """Parse a value, with or without its unit. Contradictions between two values depend on the other
-    parameters and are not checked.
+    """Return the value of a text, with or without its unit. Contradictions between two values depend on the
+    other parameters and are not checked.
 
     Raises:
-        ParameterError: It is invalid, or outside of the bounds or choices of the parameter.
+        ParameterError: The value is invalid, or outside of the bounds or choices of the parameter.
     """
     bare = text.strip()
     if spec.kind in ("int", "float") and spec.unit:

@@ -37,14 +37,14 @@ _GRACE_S = 3.0
 
 
 class TuneSearch:
-    """The newest search of the page.
+    """The newest search that the dashboard started.
 
     Args:
         tell: Called with the state for the browsers whenever it changes, see `as_plain`.
         command: Program and arguments of the child process.
 
     Attributes:
-        plan, request: The search, and the request of the browser from which it was made; None without a
+        plan, request: The search, and the request of the browser from which it was made; None if there is no
             search.
         result: The result, once the search has ended.
     """
@@ -214,11 +214,11 @@ class OtherRun(msgspec.Struct, frozen=True):
     """A run in the list of runs that is not open.
 
     Attributes:
-        records: Numbers of its records, the newest first.
+        records: Numbers of the records of the run, the newest first.
         name: Name in the list.
-        digest: Digest of its source.
+        digest: Digest of the source.
         opened: Request with which it was opened last.
-        annotations: Its annotations.
+        annotations: Annotations of the run.
         why_not: Reason why it cannot be scored; empty if it can.
     """
 

@@ -38,7 +38,7 @@ class RunWithTruth(msgspec.Struct, frozen=True):
 
     Attributes:
         source: Source, and how it is mapped.
-        digest: SHA-256 of the source, by which another recording at the same path is recognised.
+        digest: SHA-256 of the source; another digest means that another recording is at the path.
         truth: True trees in the frame of the map.
     """
 
@@ -52,7 +52,7 @@ class Job(msgspec.Struct, frozen=True):
 
     Attributes:
         run: The run.
-        parameters: All values, by stage and name.
+        parameters: Dict from stages to dicts from names to values, with all parameters.
     """
 
     run: RunWithTruth
@@ -111,9 +111,9 @@ def check_run(digest: str, uri: str, truth: TruthTrees | None) -> list[Content]:
     scored.
 
     Args:
-        digest: Digest of the run; empty where none is open.
-        uri: URI of its source.
-        truth: Its true trees, with the annotations; None where none are known.
+        digest: Digest of the run; empty if none is open.
+        uri: URI of the source.
+        truth: True trees of the run, with the annotations; None if none are known.
 
     Raises:
         StemmapError: No run is open, it is live, or its truth has no tree.

@@ -75,7 +75,7 @@ class Goal:
 
     Attributes:
         name: See `GOALS`.
-        false_max: Largest share of false trees that the goal "ta" allows.
+        false_max: Maximum share of false trees that the goal "ta" allows.
     """
 
     name: GoalName = "f1"
@@ -247,10 +247,11 @@ class SearchAxis(msgspec.Struct, frozen=True):
 
 
 def axes_of(texts: Sequence[str]) -> tuple[SearchAxis, ...]:
-    """Return the axes of a search, in the order of the texts.
+    """Return the axes of a search, in the order of `texts`.
 
     Args:
-        texts: `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`; without bounds those of the declaration are used.
+        texts: Strings `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`; for `NAME` alone, the bounds of the declaration
+            are used.
 
     Raises:
         ParameterError: A name is unknown or given twice, belongs to a stage that does not change the map, or
@@ -381,7 +382,8 @@ class Plan(msgspec.Struct, frozen=True):
     Attributes:
         runs: At least one that is not held out.
         axes: The parameters that are searched, with their bounds.
-        start: All parameters with which the search begins, by stage. They are the first trial.
+        start: Dict from stages to dicts from names to values, with all parameters with which the search
+            begins. They are the first trial.
         kept: Folder of stored results; empty keeps them in memory.
         preset: Name of the preset from which the parameters come.
         goal, false_max: See `app.tuning.plan.Goal`.

@@ -158,9 +158,9 @@ class Row:
     Attributes:
         set_number: Number of the set, from 1 on.
         run: Number of the run, from 1 on; 0 for the mean.
-        figures: Scores by name, see COLUMNS; empty for a failure.
+        figures: Dict from the names of COLUMNS to scores; empty for a failure.
         seconds: Computing time [s]; for a mean the sum.
-        looked: Whether the front end ran in this time.
+        looked: Whether the front end (segmentation of scans) ran in this time.
         error: Reason of the failure.
     """
 
@@ -269,13 +269,13 @@ def _figures(answer: JobResult, scores: MapScores) -> Figures:
 
 
 def _mean(set_number: int, rows: Sequence[Row]) -> Row:
-    """Return the row of a set over all runs. Counts are summed over the runs; all other figures are means of
-    the runs that have them, with equal weights, and None without any. A set that failed on a run has the
-    error of the first failure and no figures, because it could not be compared with the others.
+    """Return the row of a set over all runs. Counts are summed over the runs; all other scores are means over
+    the runs that have them, with equal weights, or None if no run has one. A set that failed on a run has the
+    error of the first failure and no scores.
 
     Args:
         set_number: Number of the set, from 1 on.
-        rows: Its rows, one per run.
+        rows: Rows of the set, one per run.
     """
     failed = [row for row in rows if row.error]
     seconds = sum(row.seconds for row in rows)

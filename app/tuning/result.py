@@ -90,7 +90,7 @@ def toml_of(plan: Plan, result: Result, date: str) -> str:
 
     Args:
         plan: The search.
-        result: Its result.
+        result: Result of the search.
         date: Date of the search, as it is written.
     """
     parameters = best_parameters(plan, result)
@@ -116,7 +116,7 @@ def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
 
     Args:
         plan: The search.
-        result: Its result.
+        result: Result of the search.
         date: Date of the search, as it is written.
     """
     return {
@@ -241,8 +241,8 @@ def _decimal(value: float | None) -> str:
 
 
 def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
-    """Return the trial with the smallest loss, the one with the smallest number among equals; None without a
-    scored trial.
+    """Return the trial with the smallest loss, the one with the smallest number among equals; None if there
+    is no scored trial.
 
     Args:
         trials: Trials of the search.

@@ -69,7 +69,7 @@ class OpenDrive:
         preset: Name of the preset that suits the source.
 
     Raises:
-        StemmapError: It cannot be read; nothing remains open.
+        StemmapError: The source cannot be read; nothing remains open.
     """
 
     def __init__(self, source: SourceRequest) -> None:
@@ -207,7 +207,7 @@ def open_run(source: SourceRequest) -> OpenRun:
     """Open a source. The caller closes it.
 
     Raises:
-        StemmapError: It cannot be read.
+        StemmapError: The source cannot be read.
     """
     return OpenCloud(source) if is_cloud(source.uri) else OpenDrive(source)
 
@@ -219,8 +219,8 @@ def prepare_run(planned: PlannedRun) -> PreparedRun:
         planned: The run; its URI may be a folder that `stemmap map` wrote, which names its source.
 
     Raises:
-        StemmapError: It cannot be read, is another recording than the annotated one, or has no true trees; or
-            the folder's map was made of several sources.
+        StemmapError: The run cannot be read, is another recording than the annotated one, or has no true
+            trees; or the map of the folder was made of several sources.
     """
     name, source = planned.source.uri, _source_of(planned.source)
     with closing(open_run(source)) as run:
@@ -306,7 +306,7 @@ class Scorer:
         are too many.
 
         Raises:
-            StemmapError: It cannot be opened, or is another recording than that of the job.
+            StemmapError: The run cannot be opened, or is another recording than that of the job.
         """
         key = msgspec.json.encode([requested.source, requested.digest])
         if key not in self._open:

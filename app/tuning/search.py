@@ -39,7 +39,7 @@ def check_start(uri: str, scores: MapScores, match_distance: float) -> None:
     Args:
         uri: URI of the run.
         scores: Scores of its first map.
-        match_distance: Largest distance between a tree and its ground truth [m].
+        match_distance: Maximum distance between a tree and its ground truth [m].
 
     Raises:
         StemmapError: No true tree is near the path, or no tree of the map is near a true tree.
@@ -62,8 +62,9 @@ class _Attempt:
     """A set of parameters that is being scored.
 
     Attributes:
-        values: Its values by parameter name.
-        parameters: All parameters, by stage; None where the values contradict one another.
+        values: Dict from parameter names to the values of the set.
+        parameters: Dict from stages to dicts from names to values, with all parameters; None if the values
+            contradict one another.
         runs: Numbers of the runs on which it is scored.
         begun: Number of runs that were given to a process, the first ones of `runs`.
         scores: Dict from the number of a run to its scores.

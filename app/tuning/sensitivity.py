@@ -57,10 +57,10 @@ def question_of(
 
     Args:
         source, digest: The open run; the digest is empty if none is open.
-        truth: True trees, with the annotations; None where none are known.
+        truth: True trees, with the annotations; None if none are known.
         parameters: The parameters in force.
         name: Dotted name of the parameter.
-        values: Its values, in the order in which they are computed.
+        values: Values of the parameter, in the order in which they are computed.
 
     Raises:
         StemmapError: No run is open, it is live, or it has no true trees.

@@ -211,8 +211,8 @@ class Guard:
 
         Args:
             scope: The request.
-            headers: Its headers.
-            send: Sends the response.
+            headers: Headers of the request.
+            send: Function that sends the response.
         """
         if scope["path"] != "/" or not self._is_half_over(headers):
             return send
@@ -348,12 +348,12 @@ class Guard:
         return len(origins) == 1 and origins[0].lower() in (f"http://{host}", f"https://{host}")
 
     def _role(self, headers: Headers) -> Role | None:
-        """Return the role of a request by its session cookie, else by its header Authorization; None without
-        a valid one."""
+        """Return the role of a request by its session cookie, else by its header Authorization; None if there
+        is no valid one."""
         return self._role_by_cookie(headers) or self._role_by_bearer(headers)
 
     def _role_by_cookie(self, headers: Headers) -> Role | None:
-        """Return the highest role of all valid session cookies; None without one."""
+        """Return the highest role of all valid session cookies; None if there is none."""
         roles = {self._role_by_session(value) for value in self._cookies(headers)}
         return "owner" if "owner" in roles else "viewer" if "viewer" in roles else None
 
@@ -392,7 +392,7 @@ class Guard:
         return "owner" if parts[0] == "owner" else "viewer"
 
     def _role_by_bearer(self, headers: Headers) -> Role | None:
-        """Return the role of the header `Authorization: Bearer TOKEN`; None without a valid one."""
+        """Return the role of the header `Authorization: Bearer TOKEN`; None if there is no valid one."""
         scheme, _, given = headers.get("authorization", "").partition(" ")
         return self._role_by_token(given.strip()) if scheme.lower() == "bearer" else None
 

@@ -214,8 +214,8 @@ def _file_list(line: bytes) -> list[tuple[PurePosixPath, int]]:
         line: JSON, a list of [path, size].
 
     Raises:
-        UploadError: It is no such list, has no or too many files, two of one path, or a path that leaves the
-            folder, is hidden, too deep or too long.
+        UploadError: The value is not such a list, has no or too many files, two of one path, or a path that
+            leaves the folder, is hidden, too deep or too long.
     """
     try:
         listed = msgspec.json.decode(line, type=list[tuple[str, Annotated[int, msgspec.Meta(ge=0)]]])
@@ -299,7 +299,7 @@ async def _look_at(part: Path, name: str) -> str:
 
     Args:
         part: The incomplete file.
-        name: Its original name, for errors.
+        name: Original name of the file, for errors.
 
     Raises:
         UploadError: The file cannot be read.

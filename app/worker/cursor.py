@@ -187,7 +187,7 @@ def live_steps(
         source: The robot.
         chosen: Selected source of the motion.
         moving: The source with the odometry that was selected, see `with_odometry`.
-        losses: Number of records that the synchroniser leaves out, by reason; increased in place.
+        losses: Dict from reasons to numbers of records that the synchroniser leaves out; increased in place.
     """
     override = moving if isinstance(moving, OdometryOverride) else None
     synchroniser = Synchroniser(use_odometry=chosen.steps != "static", losses=losses)

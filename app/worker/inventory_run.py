@@ -73,7 +73,7 @@ class CloudSource(FileSource):
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of points left out, by reason; not a copy."""
+        """Dict from reasons to numbers of points left out; not a copy."""
         return self.cloud.losses
 
     def records(self) -> Iterator[Record]:
@@ -219,7 +219,7 @@ class InventoryRun:
 
     @property
     def remapped(self) -> float | None:
-        """Share of the inventory that replaces the map, from 0 to 1; None without one."""
+        """Share of the inventory that replaces the map, from 0 to 1; None if there is none."""
         return self.share if self.current >= 0 else None
 
     def remap_next(self) -> tuple[Frame, dict[int, float]] | None:
@@ -279,7 +279,8 @@ class InventoryRun:
         """Compute the next step of the inventory.
 
         Returns:
-            Whether this step completed the map, which is then the current one. False without an inventory.
+            Whether this step completed the map, which is then the current one. False if there is no
+            inventory.
 
         Raises:
             StemmapError: The cloud cannot be mapped. As after any other exception, the inventory is abandoned

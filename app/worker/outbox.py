@@ -185,7 +185,7 @@ def picture_of(frame: Frame) -> Frame:
     """Return the frame with at most MOST_POINTS raw and MOST_POINTS filtered points, selected evenly; the
     frame itself if it has no more.
 
-    `counts["not drawn"]` is the number of points that were left out, if any.
+    If points were left out, `counts["not drawn"]` is their number.
     """
     raw = evenly_spaced(len(frame.raw), MOST_POINTS)
     filtered = evenly_spaced(len(frame.filtered), MOST_POINTS)
@@ -203,5 +203,5 @@ def picture_of(frame: Frame) -> Frame:
 
 def for_comparison(frame: Frame) -> Frame:
     """Return the frame for the comparison of parameter sets: as `picture_of`, without raw points, voxel
-    columns and ground, which do not depend on the parameters or are not drawn."""
+    columns and ground, which do not depend on the parameters or are not rendered."""
     return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))

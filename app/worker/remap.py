@@ -45,10 +45,11 @@ class StoredScan(msgspec.Struct, frozen=True):
     """The results of a scan.
 
     Attributes:
-        shown: Its frame without points and path; without columns and ground that are those of the scan
-            before.
-        columns_in, ground_in: Numbers of the scans that have its columns and ground; -1 for none.
-        replaced: Rows of the path that the scan replaced.
+        shown: Frame of the scan without points and path, and without columns and ground if they are those of
+            the scan before.
+        columns_in, ground_in: Numbers of the scans whose stored frames have the columns and the ground of
+            this scan; -1 for none.
+        replaced: Earlier rows of the path that the correction at this scan replaced.
     """
 
     shown: Shown
@@ -60,7 +61,7 @@ class StoredScan(msgspec.Struct, frozen=True):
 class FrameStore:
     """The frames of one map without their points, each with the path and the confirmation times of its time.
 
-    In memory are the newest path and the place of each scan in the file. The rows of the path that a
+    In memory are the newest path and the position of each scan in the file. The rows of the path that a
     correction replaced are in the file.
     """
 
@@ -210,7 +211,7 @@ class ScanCounts:
         Args:
             index: Index of the scan.
             warnings: Warnings about the source, which come first.
-            losses: Number of left-out messages by reason.
+            losses: Dict from reasons to numbers of left-out messages.
         """
         if index + 1 < self._summed:
             self._begin()
@@ -418,8 +419,8 @@ class Snapshots(Generic[S]):
     """States of the mapper by the number of scans they contain (0: before the first scan), in temporary
     files.
 
-    Beyond the largest number of states, every second one is dropped and the spacing doubles. The first state
-    is in memory. A state that the disk refuses is not stored.
+    Beyond the maximum number of states, every second one is dropped and the spacing doubles. The first state
+    is in memory. A state that cannot be written is not stored.
 
     Args:
         start: State before the first scan.
@@ -656,8 +657,8 @@ def _column(columns: Columns, row: int) -> str:
 
 
 def _nearest(places: Float, place: Float) -> int:
-    """Return the row in `places`, shape (K, 2) [m], of the position nearest to `place`, shape (2,) [m], the
-    first of equally near ones; -1 if none is within SAME."""
+    """Return the row of `places`, positions x, y, shape (K, 2) [m], that is nearest to the position `place`,
+    shape (2,) [m]; the first of equally near ones; -1 if none is within SAME."""
     if not len(places):
         return -1
     distance = np.hypot(*(places - place).T)

@@ -44,7 +44,7 @@ MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
 
 class Run:
     """A source, mapped from its first scan to the current one. The constructor makes a mapper and raises
-    StemmapError if the forest of the parameters does not exist.
+    StemmapError if the random forest of the parameters does not exist.
 
     Args:
         source: The source; `close` closes it.
@@ -57,7 +57,8 @@ class Run:
             stored.
         caches: Caches of the segmented scans of this source.
         warnings: Warnings about the source.
-        left_out: Number of records that the cursor left out, by reason; it grows while the source is read.
+        left_out: Dict from reasons to numbers of records that the cursor left out; it grows while the source
+            is read.
 
     Attributes:
         frame: Result of the current scan; None before the first.
@@ -172,7 +173,7 @@ class Run:
 
     def map_again(self) -> Frame | None:
         """Map the current scan again, from the state before it and with the parameters in force for it, and
-        return its result; None without a scan, or after an error or a step back that is not complete.
+        return its result; None if there is no scan, or after an error or a step back that is not complete.
 
         Raises:
             StemmapError: The scan cannot be mapped; the mapper is broken until `approach`.
@@ -288,7 +289,7 @@ class Run:
                 they are unknown or an earlier map is continued.
 
         Raises:
-            StemmapError: The forest that the parameters name does not exist.
+            StemmapError: The random forest of the parameters does not exist.
         """
         self.cancel_remapping()
         if self._map.parameters.are_all(parameters, NOT_OF_THE_MAP):
@@ -345,8 +346,8 @@ class Run:
 
     @property
     def remapped(self) -> float | None:
-        """Share of the scans before the current one that are mapped again, from 0 to 1; None without a rerun,
-        or if the mapper does not have the state after the current scan."""
+        """Share of the scans before the current one that are mapped again, from 0 to 1; None if there is no
+        rerun, or if the mapper does not have the state after the current scan."""
         remapping = self._remapping
         if remapping is None or not self.is_whole:
             return None
@@ -484,7 +485,7 @@ def open_run(
 
     Raises:
         SourceError: The odometry is not available for this source; the source is closed.
-        StemmapError: The forest that the parameters name does not exist; the source is closed.
+        StemmapError: The random forest of the parameters does not exist; the source is closed.
     """
     with ExitStack() as on_error:
         on_error.callback(source.close)

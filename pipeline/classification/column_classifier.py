@@ -170,7 +170,7 @@ def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
     [m]: the larger of those by views and by rays. It is negative if less is visible now.
 
     Args:
-        viewed: Greatest height that a scan observed, shape (K,) [m].
+        viewed: Maximum height that a scan observed, shape (K,) [m].
         met, passed: Rays by slice of height, shape (K, SLICES).
         figures: Features at the classification, shape (K, COUNT).
     """

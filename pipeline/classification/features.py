@@ -79,7 +79,7 @@ def features(
     Args:
         axis: Axes, shape (K, 5), see `find_columns`.
         profiles: Profiles, shape (K, SLICES, PROFILE).
-        viewed: Largest height above the ground that a scan observed at the column, shape (K,) [m].
+        viewed: Maximum height above the ground that a scan observed at the column, shape (K,) [m].
         present, absent: Number of scans with free view in which the column was present or absent, shape (K,).
         met, passed: Number of rays that ended at the column and that passed its axis, shape (K, SLICES).
         figures: Filled with the features.

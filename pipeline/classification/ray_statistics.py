@@ -47,7 +47,7 @@ NEAR = 0.6  # m; a return this near to a column belongs to it
 @compiled
 def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> Float:
     """Return the tangent of the steepest elevation of a return in each direction of the base frame, shape
-    (BINS,); -1 without a return beyond 1 m from the sensor, and at least -1.
+    (BINS,); -1 if there is no return beyond 1 m from the sensor, and at least -1.
 
     Args:
         points: Points in the level sensor frame, shape (N, 3) [m], finite.
@@ -116,8 +116,8 @@ def update_visibility(
 @compiled
 def depth_image(points: Float32) -> UInt16:
     """Return the horizontal distance of the nearest return by direction from the sensor and elevation [cm], 0
-    without a return, at most 65535, uint16, shape (BINS, ELEVATIONS). Returns within 0.3 m of the sensor, or
-    with an elevation outside of the image, are ignored.
+    if there is no return, at most 65535, uint16, shape (BINS, ELEVATIONS). Returns within 0.3 m of the
+    sensor, or with an elevation outside of the image, are ignored.
 
     Args:
         points: Points in the level sensor frame, shape (N, 3) [m], finite.

@@ -166,7 +166,7 @@ class VoxelMap:
         Args:
             points: Points x, y in the map and height above the ground, float32, shape (N, 3) [m].
             scan: Number of the scan, not negative.
-            most: Largest number of voxels, a power of two.
+            most: Maximum number of voxels, a power of two.
         """
         begin = 0
         self.added += 1
@@ -207,7 +207,7 @@ class VoxelMap:
         are full, a second call is needed.
 
         Args:
-            most: Largest number of voxels, a power of two.
+            most: Maximum number of voxels, a power of two.
         """
         rows = np.arange(self.used)
         room, tile_room = len(self.key), len(self.tile_key)

@@ -129,7 +129,7 @@ def markdown_table(presets: dict[str, Parameters]) -> str:
     one row per parameter, with a final line break.
 
     Args:
-        presets: dict from names of presets to their parameters; each gives a column.
+        presets: Dict from names of presets to their parameters; each gives a column.
     """
     values = {name: parameters.flat() for name, parameters in presets.items()}
     head = ["parameter", "unit", "bounds", *(f"`{name}`" for name in presets), "meaning"]

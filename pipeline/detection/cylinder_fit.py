@@ -460,9 +460,9 @@ def _some(rays: Float, n: int, some: Float) -> int:
     iterations use this subset.
 
     Args:
-        rays: Shape (RAY, capacity), of which n columns are valid.
+        rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.
         n: Number of rays.
-        some: Same shape as `rays`, changed in place.
+        some: Selected rays, same shape as `rays`, changed in place.
     """
     stride = 3 if n > ENOUGH else 1
     few = (n + stride - 1) // stride

@@ -24,7 +24,7 @@ def rounded(values: NDArray[Real], step: float) -> NDArray[Real]:
     between two multiples is rounded to the even one, and -0 becomes 0. NaN and infinity remain.
 
     Args:
-        values: float32 or float64, any shape; not changed.
+        values: Values, float32 or float64, any shape; not changed.
         step: A power of two.
     """
     kind = values.dtype.type

@@ -45,8 +45,8 @@ def interpolated(keyframes: Float, motions: Float, scans: Int, keyframe: Int, si
 
     Args:
         keyframes: Corrected poses, shape (K, 3).
-        motions: Motion by odometry from keyframe k - 1 to k, shape (K, 3); NaN without odometry, then nothing
-            is distributed.
+        motions: Motion by odometry from keyframe k - 1 to k, shape (K, 3); NaN if there is no odometry, then
+            nothing is distributed.
         scans: Scan of each keyframe, int64, shape (K,), ascending.
         keyframe: Row of the last keyframe before or at each scan, int64, shape (N,); 0 before the first one.
         since: Motion by odometry from this keyframe to the scan, shape (N, 3).

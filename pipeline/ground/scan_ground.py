@@ -343,10 +343,11 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
         plane: Trend: height at the origin [m] and slopes along x and y, shape (3,).
 
     Returns:
-        Mean height of the lowest layer above the plane, shape (SECTORS, rings) [m], NaN without a candidate;
-        and its weight from 0 (also without a candidate) to 1, same shape. With n returns in the layer and m
-        returns above it between OBJECT_BOTTOM and OBJECT_TOP, the weight is (n / (n + 2 m))^2; the spread of
-        the layer gives a lower limit, which rises to WIDE_WEIGHT for a layer wider than a trunk.
+        Mean height of the lowest layer above the plane, shape (SECTORS, rings) [m], NaN if there is no
+        candidate; and its weight from 0 (also without a candidate) to 1, same shape. With n returns in the
+        layer and m returns above it between OBJECT_BOTTOM and OBJECT_TOP, the weight is (n / (n + 2 m))^2;
+        the spread of the layer gives a lower limit, which rises to WIDE_WEIGHT for a layer wider than a
+        trunk.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     # One row per cell, so that each point accesses one cache line: residual, x and y of the lowest return;
@@ -416,7 +417,7 @@ def trend(lowest: Float, slope: float) -> Float:
         slope: Tangent of the maximum slope; a steeper plane is flattened to it.
 
     Returns:
-        Height at the origin [m] and slopes along x and y, shape (3,); zeros without candidates.
+        Height at the origin [m] and slopes along x and y, shape (3,); zeros if there are no candidates.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     rows = np.empty((sectors * rings, 3))

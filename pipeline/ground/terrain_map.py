@@ -103,7 +103,7 @@ def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -
     left out.
 
     Args:
-        tiles: dict from indices of tiles to their cells, see HeightMapState; may be empty.
+        tiles: Dict from indices of tiles to their cells, see HeightMapState; may be empty.
         correction: Path before and after, with at least one scan.
     """
     from scipy.spatial import cKDTree
@@ -223,7 +223,7 @@ class HeightMapState:
     them.
 
     Attributes:
-        tiles: dict from the index along x and y of a tile to its cells, float32, shape (SIDE, SIDE, COLUMNS),
+        tiles: Dict from the index along x and y of a tile to its cells, float32, shape (SIDE, SIDE, COLUMNS),
             least recently seen first.
         sensor_z: Height of the sensor in the map frame [m]; None before the first scan.
         scans: Number of scans.
@@ -377,7 +377,8 @@ def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedHeightMap:
-    """HeightMapState as plain arrays for saving, with the tiles in their order; an unknown `sensor_z` is NaN.
+    """HeightMapState as arrays and numbers for saving, with the tiles in their order; an unknown `sensor_z`
+    is NaN.
 
     Attributes:
         tile: Tile indices, int64, shape (T, 2).
@@ -392,7 +393,7 @@ class PackedHeightMap:
 
     @classmethod
     def of(cls, state: HeightMapState) -> PackedHeightMap:
-        """Return the state as plain arrays, which are copies except for the published map."""
+        """Return the state in this form; the arrays are copies except for the published map."""
         cells = np.zeros((len(state.tiles), SIDE, SIDE, COLUMNS), np.float32)
         for n, tile in enumerate(state.tiles.values()):
             cells[n] = tile
@@ -406,7 +407,7 @@ class PackedHeightMap:
 
     @classmethod
     def empty(cls) -> PackedHeightMap:
-        """Return the state before the first scan, as plain arrays."""
+        """Return the state before the first scan in this form."""
         return cls.of(HeightMapState({}, None, 0, no_height_map()))
 
     def unpacked(self) -> HeightMapState:

@@ -54,7 +54,7 @@ class PlotMap:
         ground: Height map.
         points: Thinned points between LOWEST and HIGHEST above the ground: x, y, z, height above the ground,
             shape (N, 4) [m].
-        counts: dict from "read", "apart from the plot", "below the ground", "thinned" and "in slices" to
+        counts: Dict from "read", "apart from the plot", "below the ground", "thinned" and "in slices" to
             numbers of points.
         voxel_size: Side of the voxels of the thinning [m].
         whole: Thinned points of all heights (x, y, z, height above the ground), shape (M, 4) [m].
@@ -88,7 +88,7 @@ class PlotPoints:
         slices: The points of `near` by height.
         axes, features: Axes and features of the columns, see `find_columns`, strongest first.
         voxels: Points of all heights.
-        counts: dict from names to numbers of points, as in `PlotMap`.
+        counts: Dict from names to numbers of points, as in `PlotMap`.
     """
 
     ground: TerrainRaster
@@ -249,7 +249,7 @@ def ground_steps(
         cloud: The cloud, which is read three times.
         slope_max: Largest slope of the terrain against the plane of the plot [degrees].
         band: Lowest and highest height above the ground that is kept, both exclusive [m].
-        most: Largest number of points after thinning, a power of two.
+        most: Maximum number of points after thinning, a power of two.
         whole: Table to which the points of all heights are added; None for none.
 
     Returns:

@@ -156,7 +156,7 @@ def _count(part: Float32, squares: dict[int, tuple[int, Float]]) -> None:
 
     Args:
         part: Points, shape (N, 3) [m], N at least 1.
-        squares: dict from the key of a square to its number of points and their bounds x min, y min, x max, y
+        squares: Dict from the key of a square to its number of points and their bounds x min, y min, x max, y
             max, shape (4,) [m].
     """
     cell = np.floor(part[:, :2] / SQUARE).astype(np.int64) + (1 << 30)

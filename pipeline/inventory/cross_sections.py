@@ -210,8 +210,8 @@ def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered
 
 @compiled
 def share_inside(xy: Float, x: float, y: float, r: float) -> float:
-    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r; 0 without
-    points.
+    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r; 0 if there
+    are no points.
 
     Args:
         xy: Points, shape (N, 2) [m].

@@ -132,7 +132,7 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
     """Add points to the tables of `LowestReturns`, in place; points outside are ignored.
 
     Args:
-        points: float32, shape (N, 3) [m].
+        points: Points, float32, shape (N, 3) [m].
         low: Corner of the raster, shape (2,) [m].
         lowest: KEPT lowest returns of each cell in ascending order, infinite where there are fewer, shape
             (columns, rows, KEPT, 3) [m].

@@ -49,7 +49,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
 
     Args:
         folder: The folder.
-        texts: dict from names of files to their texts, which are written as UTF-8.
+        texts: Dict from names of files to their texts, which are written as UTF-8.
 
     Raises:
         OSError: The folder cannot be created.

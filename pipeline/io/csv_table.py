@@ -44,7 +44,7 @@ class CsvTable:
     Attributes:
         lines: List of the line numbers, from 1, of the rows in the file.
         rows: List of the rows that are not empty, each a list of its cells, without the header.
-        column: dict from names of columns in lower case to their indices; of several columns with the same
+        column: Dict from names of columns in lower case to their indices; of several columns with the same
             name, the first one.
 
     Raises:

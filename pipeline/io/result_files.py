@@ -102,7 +102,7 @@ def tree_rows(trees: Trees, start_ns: int, reviews: Mapping[int, str] | None = N
     Args:
         trees: The map.
         start_ns: Time from which the seconds count [ns]; a stamp below 0 is unknown.
-        reviews: dict from numbers of trees to one of REVIEWS; OPEN for other trees.
+        reviews: Dict from numbers of trees to one of REVIEWS; OPEN for other trees.
     """
     review = ((reviews or {}).get(number, OPEN) for number in trees.number.tolist())
     rows = zip(*(column(trees, start_ns) for column in _TREES.values()), review, strict=False)
@@ -291,7 +291,7 @@ class RunFiles:
             start_ns: Time from which the seconds count [ns].
             run: Content of run.json, as JSON values.
             state: Bytes of state.zip for a continuation; None for no state.
-            further: dict from names of additional files, or of files to replace except run.json, to their
+            further: Dict from names of additional files, or of files to replace except run.json, to their
                 texts.
 
         Raises:

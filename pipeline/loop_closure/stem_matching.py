@@ -94,7 +94,7 @@ def _walk_pairs(
 def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
     """Return a grid over stems, shape (N, 2) [m], N > 0: low corner x, y and cell size, shape (3,) [m]; first
     stem of each cell, int32, shape (W, H); and next stem in the same cell of each stem, int32, shape (N,); -1
-    without one. The cell is doubled from `cell` [m] until at most MOST_CELLS are needed."""
+    if there is none. The cell is doubled from `cell` [m] until at most MOST_CELLS are needed."""
     grid = np.empty(3)
     grid[0], grid[1], grid[2] = position[:, 0].min(), position[:, 1].min(), cell
     width = np.floor((position[:, 0].max() - grid[0]) / grid[2]) + 1.0
@@ -586,7 +586,7 @@ class _Search:
     def checked(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
         """Return the pose T_reference_local, its covariance, shape (3, 3), the decimal logarithm of the false
         alarms, and the reason of a refusal (None for none). `second` is the number of pairs of the second
-        best pose, 0 without one.
+        best pose, 0 if there is none.
 
         Raises:
             LinAlgError: The pairs do not determine the pose.

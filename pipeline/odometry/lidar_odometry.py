@@ -49,7 +49,7 @@ class LidarOdometry:
         T_base_lidar: Extrinsics of the LiDAR.
 
     Attributes:
-        losses: dict from reasons to numbers of scans: those without a pose, and those whose pose is only the
+        losses: Dict from reasons to numbers of scans: those without a pose, and those whose pose is only the
             initial guess.
     """
 

@@ -18,7 +18,7 @@ class OdometryEstimator(Protocol):
     """An estimator of odometry from the records of a source.
 
     Attributes:
-        losses: dict from reasons to numbers of scans without a pose.
+        losses: Dict from reasons to numbers of scans without a pose.
     """
 
     losses: dict[str, int]
@@ -77,7 +77,7 @@ class OdometryOverride:
         return self._motion.add(record)
 
     def truth(self) -> Truth | None:
-        """Return the ground truth of the source; None without one."""
+        """Return the ground truth of the source; None if there is none."""
         return self.source.truth()
 
     def close(self) -> None:
@@ -102,7 +102,7 @@ class FileOdometry:
         T_base_lidar: Extrinsics of the LiDAR.
 
     Attributes:
-        losses: dict from reasons to numbers of rows without a scan, or of scans without a row; set by `end`.
+        losses: Dict from reasons to numbers of rows without a scan, or of scans without a row; set by `end`.
 
     Raises:
         SourceError: The file cannot be read, or has another format.

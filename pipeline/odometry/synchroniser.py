@@ -211,7 +211,7 @@ class PoseBuffer:
         Args:
             stamp_ns: Time of the scan [ns].
             T_odom_base: Odometry at the scan, None if unknown.
-            odometry_at: Returns T_odom_base at an earlier time [ns]; None without odometry.
+            odometry_at: Returns T_odom_base at an earlier time [ns]; None if there is no odometry.
         """
         near = min(self._places, key=lambda pose: abs(pose.stamp_ns - stamp_ns), default=None)
         if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS:
@@ -412,7 +412,7 @@ class Synchroniser:
         are removed, which is counted once and reported.
 
         They were ahead if the new reading, at `stamp_ns`, is AHEAD_NS or more before the last one, and is
-        nearer to the newest scan or odometry. False without a scan or odometry.
+        nearer to the newest scan or odometry. False if there is no scan or odometry.
         """
         last = self._turned_ns
         newest = self._odometry.newest
@@ -567,8 +567,8 @@ class Synchroniser:
         self._suspect("there is no odometry", (WALK_SPEED * seconds, WALK_TURN * seconds))
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
-        """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None without one, if it
-        is not a valid quaternion, and, with a warning, if it is more than STALE_NS away."""
+        """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None if there is none,
+        if it is not a valid quaternion, and, with a warning, if it is more than STALE_NS away."""
         if not self._imu:
             return None
         nearest = min(self._imu, key=lambda imu: abs(imu.stamp_ns - stamp_ns))
@@ -589,8 +589,8 @@ class Synchroniser:
 
 
 def _tilt_of(imu: Imu) -> tuple[float, float] | None:
-    """Return roll and pitch [rad] by the orientation of a reading; None without one, or if it is not finite
-    or not a valid quaternion."""
+    """Return roll and pitch [rad] by the orientation of a reading; None if there is none, or if it is not
+    finite or not a valid quaternion."""
     if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
         return None
     try:

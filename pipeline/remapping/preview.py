@@ -194,7 +194,7 @@ class KnownMap:
         parameters: Parameters with which the run was mapped.
         clusters: Clusters of the run.
         path: Path of the run.
-        columns: Voxel columns of the run; None without any.
+        columns: Voxel columns of the run; None if there is none.
     """
 
     parameters: Parameters

@@ -293,8 +293,8 @@ def open_cloud_run(
         request: Requested options; a duration of 0 means one loop, of SHORTEST to LONGEST seconds. A longer
             loop is cut short with a warning.
         cloud: The cloud of the plot.
-        trees: Trees of the plot in the coordinates of the file, i.e. with the offset; None without ground
-            truth.
+        trees: Trees of the plot in the coordinates of the file, i.e. with the offset; None if there is no
+            ground truth.
         T_base_lidar: Extrinsics of the LiDAR; None uses those of simulated robots.
 
     Raises:

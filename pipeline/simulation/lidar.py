@@ -151,9 +151,9 @@ def measure(
     key: int,
     last: bool,
 ) -> tuple[Float, Float, Int32]:
-    """Return what the receiver reports: range [m] (0 without a return, for a lost weak echo and outside of
-    the measured ranges), reflectance 0..255 (0 without a return) and shape (row, GROUND or NOTHING), shape
-    (C, K) each.
+    """Return what the receiver reports: range [m] (0 if there is no return, for a lost weak echo and outside
+    of the measured ranges), reflectance 0..255 (0 if there is no return) and shape (row, GROUND or NOTHING),
+    shape (C, K) each.
 
     Args:
         ranges, hit: Result of `first_returns`, shape (C, K).
@@ -205,7 +205,7 @@ def scan_of_returns(
     Args:
         lidar: The sensor.
         stamp_ns: Time of the start of the sweep [ns].
-        reported: Range of each echo of each beam [m], 0 without a return, shape (C, K, echoes).
+        reported: Range of each echo of each beam [m], 0 if there is no return, shape (C, K, echoes).
         reflectance, source: See `measure`; of the same shape.
     """
     column, ring, echo_number = np.nonzero(reported > 0.0)

@@ -64,12 +64,12 @@ class Solids(NamedTuple):
 
     Attributes:
         kind: Kind of each shape, int32: CONE, ELLIPSOID, BOX or STEM.
-        shape: float64, shape (N, 9). CONE and STEM: start (3), unit axis (3), length, radius at the start,
-            change of radius per metre. ELLIPSOID and BOX: centre (3), half sizes (3), cosine and sine
+        shape: Geometry, float64, shape (N, 9). CONE and STEM: start (3), unit axis (3), length, radius at the
+            start, change of radius per metre. ELLIPSOID and BOX: centre (3), half sizes (3), cosine and sine
             of the yaw, and for the ellipsoid the mean free path of light in it [m], 0 if solid.
-        capsule: float64, shape (N, 7): two ends (3 + 3) and the radius of the enclosing capsule.
-        surface: float64, shape (N, SURFACE): reflectivity 0..1, roughness of the surface [m], and of a STEM
-            the seven parameters of its `Section`.
+        capsule: Two ends (3 + 3) and radius of the enclosing capsule, float64, shape (N, 7) [m].
+        surface: Surface, float64, shape (N, SURFACE): reflectivity 0..1, roughness of the surface [m], and of
+            a STEM the seven parameters of its `Section`.
         owner: Number of the object in the scene, int32.
     """
 

@@ -360,7 +360,7 @@ def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
     Args:
         uri: The URI, for errors.
         query: Part of the URI after "?", percent-encoded.
-        keys: dict from valid keys to descriptions of their values.
+        keys: Dict from valid keys to descriptions of their values.
 
     Raises:
         UsageError: The query is not key=value pairs, or a key is unknown or given twice.

@@ -80,7 +80,7 @@ def associate(
 
     Returns:
         Row of the landmark of each detection, -1 for none, int64, shape (D,), and its squared Mahalanobis
-        distance, shape (D,), 0 without a landmark.
+        distance, shape (D,), 0 if there is no landmark.
     """
     detections = centre.shape[0]
     landmark_of = np.full(detections, -1, np.int64)

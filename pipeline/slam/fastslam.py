@@ -669,7 +669,7 @@ def _at_scans(covariance: Float, graph: KeyframeGraph, scans: Int) -> Float:
 
 
 def _farthest(detections: Detections) -> float:
-    """Return the distance of the farthest detection from the base [m]; 0 without detections."""
+    """Return the distance of the farthest detection from the base [m]; 0 if there are no detections."""
     centre = detections.centre
     return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
 

@@ -101,7 +101,7 @@ class FrameUncertainty:
         self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
     ) -> bool:
         """Return whether a landmark with `hits_min` hits or more, within `reach` [m] of the pose, belongs to
-        a reference pose. The arguments are those of `with_pose`. False without reference poses."""
+        a reference pose. The arguments are those of `with_pose`. False if there are no reference poses."""
         if not len(self.serial):
             return False
         near = np.hypot(*(mean - pose[:2]).T) <= reach
@@ -120,7 +120,7 @@ class FrameUncertainty:
             spread: Covariance of the particles, shape (3, 3).
             n_eff: Effective number of particles.
             least: Lower bound of the covariance by measured poses and odometry, shape (3, 3).
-            by_landmarks: Covariance by the landmarks in reach, shape (3, 3); None without any.
+            by_landmarks: Covariance by the landmarks in reach, shape (3, 3); None if there is none.
 
         Raises:
             LinAlgError: `spread` is not positive semidefinite.
@@ -184,8 +184,8 @@ class FrameUncertainty:
 
     def at_landmarks(self, birth: Int, position: Float) -> Float:
         """Return the covariance of the reference pose of each landmark, transported to its position, shape
-        (L, 2, 2) [m^2]; zeros without reference poses. Landmarks that precede all reference poses belong to
-        the first one.
+        (L, 2, 2) [m^2]; zeros if there are no reference poses. Landmarks that precede all reference poses
+        belong to the first one.
 
         Args:
             birth: Birth numbers of the landmarks, int64, shape (L,).

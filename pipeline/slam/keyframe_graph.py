@@ -199,7 +199,7 @@ class KeyframeGraph:
 
     @property
     def newest_scan(self) -> int:
-        """Scan number of the newest keyframe, -1 without one."""
+        """Scan number of the newest keyframe, -1 if there is none."""
         return self.keyframes[-1].scan if self.keyframes else -1
 
     def with_keyframe(self, keyframe: Keyframe, pose: Float) -> KeyframeGraph:

@@ -150,7 +150,7 @@ class Motion(NamedTuple):
         step: T_base(t-1)_base(t) by the odometry.
         slack: Standard deviations that are added where the odometry is doubtful: position [m], heading [rad].
             Those of successive steps are of one velocity, so they add up linearly; see `advanced`.
-        doubt: Message with the reason of the doubt; empty without one.
+        doubt: Message with the reason of the doubt; empty if there is none.
         measured: Pose that another source measured at this scan, if any.
         turn_sigma: Standard deviation of the yaw of the step [rad] if a gyroscope measured it, else None.
         due: Whether the scan updates the filter even if the robot has moved less than `update_distance`.

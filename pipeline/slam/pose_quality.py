@@ -39,7 +39,8 @@ class ScanStatistics:
         found: Sum of the hits, each at most MOST_HITS, of the well-known landmarks that were detected.
         missed: Sum of the hits, each at most MOST_HITS, of the well-known landmarks in free view that were
             not detected.
-        innovation: Normalised innovation squared per degree of freedom; NaN without a recognised landmark.
+        innovation: Normalised innovation squared per degree of freedom; NaN if there is no recognised
+            landmark.
         odometry: Mahalanobis distance between the motion by SLAM and the odometry [sigma].
     """
 
@@ -364,7 +365,7 @@ def pose_health(
         n_eff: Effective number of particles.
         ancestors: Number of distinct ancestors, see Health.
         covariance: Covariance of x, y [m], yaw [rad] relative to the landmarks, shape (3, 3).
-        doubt: Message why the odometry is doubted; empty without doubt.
+        doubt: Message why the odometry is doubted; empty if there is no doubt.
     """
     sigma_xy = float(np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1])))
     state, reason = _state_and_reason(recent, sigma_xy, doubt)

@@ -52,7 +52,7 @@ class TreeMotion(NamedTuple):
 
 
 def slip_message(motion: Float, corrected: bool, unsure: bool) -> str:
-    """Return the message why the odometry is doubted: STUCK, SLIPPED or UNSURE; empty without doubt.
+    """Return the message why the odometry is doubted: STUCK, SLIPPED or UNSURE; empty if there is no doubt.
 
     Args:
         motion: Motion by the odometry since the last used scan, shape (3,).

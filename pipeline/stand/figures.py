@@ -43,7 +43,8 @@ class PlotTrees:
     Attributes:
         position: Positions x, y in the map, shape (T, 2) [m].
         dbh, dbh_sigma: Diameters at breast height and their standard deviations [m]; NaN where unknown.
-        volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None without a volume formula.
+        volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None if there is no volume
+            formula.
     """
 
     position: Float
@@ -67,9 +68,9 @@ class StandFigures:
         trees: Number of trees of at least the minimum diameter in the observed part.
         without_dbh: Number of these trees without a diameter; they count with the mean basal area of the
             others.
-        with_volume: Number of these trees with a volume; None without a volume formula.
+        with_volume: Number of these trees with a volume; None if there is no volume formula.
         detection: Mean probability that a tree in the observed part is found.
-        values: dict from the names in FIGURES, which has their units, to estimates. Names that end in
+        values: Dict from the names in FIGURES, which has their units, to estimates. Names that end in
             `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
             probability of detection; the others refer to the observed area.
         classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area.
@@ -121,11 +122,11 @@ def stand_figures(
     Standard errors are those of this plot, not of the stand around it: they contain the errors of the
     diameters, the trees of the part that was not observed, and the trees that were not detected. A plot that
     is observed completely, with certain detection and exact diameters of all trees, has standard errors of 0,
-    except for the figures of the spatial pattern.
+    except for the parameters of the spatial pattern.
 
     Args:
         trees: Trees in the observed part, of any diameter.
-        outside: Trees in the rest of the plot, which only the `_plain` figures count.
+        outside: Trees in the rest of the plot, which count only in the `_plain` values.
         area: Area of the plot [m^2].
         seen: Area of the observed part of the plot [m^2].
         perimeter: Length of the border of the observed part [m], for the edge correction of the Clark-Evans
@@ -134,9 +135,9 @@ def stand_figures(
         parameters: Limits of diameters and classes.
 
     Returns:
-        The figures. Unknown ones are NaN: all but the `_plain` ones if no area was observed, the corrected
-        ones if the probability is not above 0, those of diameters and volumes if no tree has one. `_plain`
-        figures have no standard error. In `v_ha`, trees without a volume count as 0.
+        The stand parameters. Unknown ones are NaN: all but the `_plain` ones if no area was observed, the
+        corrected ones if the probability is not above 0, those of diameters and volumes if no tree has one.
+        `_plain` figures have no standard error. In `v_ha`, trees without a volume count as 0.
 
     Raises:
         ValueError: The plot has no area.
@@ -285,10 +286,11 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
 def _with_error(
     figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, found: float
 ) -> Estimate:
-    """Return a figure with its standard error, which is NaN for a single tree of an incomplete plot.
+    """Return a stand parameter with its standard error, which is NaN for a single tree of an incomplete plot.
 
     Args:
-        figure: Returns the figure of diameters, and its derivatives by them, shape (N,).
+        figure: Function of the diameters, shape (N,) [cm], that returns the stand parameter and its
+            derivatives with respect to the diameters, shape (N,).
         d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
         found: Share of all trees that was found and observed.
     """

@@ -87,7 +87,7 @@ def plot_of(name: str, shape: Mapping[str, Any]) -> SamplePlot:
 
     Args:
         name: Name of the plot.
-        shape: dict with the key `kind`: "circle" with x, y, radius [m]; "rectangle" with x, y, length, width
+        shape: Dict with the key `kind`: "circle" with x, y, radius [m]; "rectangle" with x, y, length, width
             [m] and turn_deg; or "polygon" with `polygons`, the coordinates of a GeoJSON MultiPolygon [m].
 
     Raises:
@@ -199,8 +199,8 @@ def figures_of(
     plots: Sequence[SamplePlot], trees: PlotTrees, seen: SeenArea, parameters: Stand
 ) -> dict[str, StandFigures]:
     """Return a dict from the names of the plots to their stand parameters. A plot of which more than 99.5 %
-    was observed counts as observed completely. Detection is certain in a plot with a cell of unknown
-    distance.
+    was observed counts as observed completely. The probability of detection is 1 in a plot with a cell of
+    unknown distance.
 
     Args:
         plots: Plots with unique names.

@@ -49,7 +49,7 @@ class VisitComparison:
     Attributes:
         T_a_b: Pose of the frame of b in that of a.
         b_of: Row of b of each tree of a, -1 for none, int64.
-        reach: Largest distance of a pair [m].
+        reach: Maximum distance of a pair [m].
         stems: Number of stems that agreed in the alignment; 0 if the frames were taken as equal.
         shift: Distance of the two positions of each pair, in the order of a, shape (P,) [m].
         growth, growth_sigma: Diameter in b minus that in a, and its standard deviation, shape (P,) [m]; NaN

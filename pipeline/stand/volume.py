@@ -94,7 +94,7 @@ class VolumeFormula:
 
 def _half_range(volume: Float, above: Float, below: Float) -> Float:
     """Return the change of a volume within one standard deviation of a measurement, shape (T,) [m^3]: the
-    mean of both sides, or that of the side with a volume; 0 without any.
+    mean of both sides, or that of the side with a volume; 0 if there is none.
 
     Args:
         volume: The volume; NaN where it is unknown.

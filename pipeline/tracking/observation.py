@@ -180,7 +180,7 @@ def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) ->
     """Return whether a track is a tree: by the class of its voxel column if it has one, else by its hits.
 
     Args:
-        verdict: Class of the voxel column, see `Verdict`; -1 without a class.
+        verdict: Class of the voxel column, see `Verdict`; -1 if there is no class.
         hits: Number of detections; at least `limits.hits_to_confirm` are required.
         score: Hits minus misses; must be positive.
         limits: See FigureLimits.

@@ -43,14 +43,14 @@ class TrackTable:
 
     Attributes:
         number: Number of the tree, int64, ascending; a number is never reused.
-        landmark: int64, birth number of the landmark of the tree; -1 for a tree that only a voxel column
+        landmark: Birth number of the landmark of the tree, int64; -1 for a tree that only a voxel column
             supports.
         x: State x, y [m], vx, vy [m/s] in the map, shape (T, 4).
         P: Covariance of the state, shape (T, 4, 4).
         shared: Part of P that comes from the poses of the robot, shape (T, 2, 2) [m^2].
         stamp_ns: Time of the last observation [ns], int64.
         first_ns: Time of the first observation [ns], int64.
-        hits: int64, number of observations, see `Trees`.
+        hits: Number of observations, int64, see `Trees`.
         score: Score of the landmark: hits minus misses, see `Landmarks`.
         eccentricity: Sum of the finite eccentricities of the observations.
         eccentricities: Number of finite eccentricities, int64.
@@ -59,8 +59,8 @@ class TrackTable:
         radius_reach: Sum of weights times distances of the sensor [1/m^3].
         radius_above: Sum of weights times distances from breast height [1/m^3].
         radii: Number of summed radii, int64.
-        sides: int64, bit k is set when sector k around the trunk was observed.
-        verdict: int64, class of the voxel column of the tree, see `Verdict`; -1 for unknown.
+        sides: Observed sectors, int64; bit k is set when sector k around the trunk was observed.
+        verdict: Class of the voxel column of the tree, see `Verdict`, int64; -1 for unknown.
     """
 
     number: Int

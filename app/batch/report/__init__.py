@@ -61,7 +61,7 @@ def translated(message: str, texts: dict[str, str]) -> str:
 
     Args:
         message: The warning, in English.
-        texts: Texts of the language by key, see `texts_of`.
+        texts: Dict from keys to texts of the language, see `texts_of`.
     """
     for key, english in texts_of("en").items():
         if not key.startswith("warning_"):
@@ -391,7 +391,7 @@ def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dic
     Coordinates are in mm, y downwards. Keys: `width` and `height` of the drawing; `bars` (stems per hectare),
     each with `x`, `y`, `width`, `height`, `middle` (x), `edge` (x of the lower limit of the class), `high`
     and `low` (y of plus and minus one standard error, at least 0) and `label`, the lower limit of the class
-    [cm] as text; `last`, the upper limit of the last class, "" without one; `marks` of the axis as y and
+    [cm] as text; `last`, the upper limit of the last class, "" if there is none; `marks` of the axis as y and
     text; and `title`.
 
     Args:
@@ -436,12 +436,12 @@ def write_report(page: str, file: FilePath) -> None:
     takes at most two minutes.
 
     Args:
-        page: Its HTML.
+        page: HTML of the report.
         file: File .html or .pdf; its folder must exist.
 
     Raises:
-        StemmapError: The suffix is another one, an HTML file cannot be written, there is no Chromium, or it
-            failed.
+        StemmapError: The suffix is another one, an HTML file cannot be written, there is no Chromium, or
+            Chromium failed.
         OSError: A PDF cannot be written.
     """
     suffix = file.suffix.lower()

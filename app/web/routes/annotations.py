@@ -198,7 +198,7 @@ def _check(content: Content, row: int) -> None:
 
     Args:
         content: The row.
-        row: Its number, from 0 on.
+        row: Index of the row, from 0 on.
     """
     if max(abs(content.x), abs(content.y)) > FARTHEST_M:
         raise BadRequestError(f"row {row + 1} is farther than {FARTHEST_M:.0f} m from the origin")

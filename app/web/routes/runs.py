@@ -225,7 +225,7 @@ async def _run_folder(
 
     Raises:
         UnknownError: There is no such run.
-        StemmapError: It has no result files, they are damaged, or nothing is mapped yet.
+        StemmapError: The run has no result files, they are damaged, or nothing is mapped yet.
     """
     if key in (_OPEN, str(dashboard.run_recorder.record)):
         run = ShownRun.of(dashboard)
@@ -312,7 +312,7 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
 
     Raises:
         UnknownError: There is no such run.
-        StemmapError: It cannot be read.
+        StemmapError: The folder of the run cannot be read.
     """
     if key.startswith(_FOLDER):
         name = key.removeprefix(_FOLDER)

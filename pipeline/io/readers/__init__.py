@@ -241,7 +241,8 @@ def recordings_in(folder: Path) -> list[str]:
 
 
 def named(names: list[str]) -> str:
-    """Return the first five names as text for a message, with the number of the others; "" without names."""
+    """Return the first five names as text for a message, with the number of the others; "" if there are no
+    names."""
     more = len(names) - _MOST_NAMED
     return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 

@@ -47,7 +47,7 @@ class Revision:
     Attributes:
         revision: Number of the revision in the run.
         from_scan: First scan that is mapped with them.
-        values: dict from stages to dicts from names of parameters to values; not checked here.
+        values: Dict from stages to dicts from names of parameters to values; not checked here.
     """
 
     revision: int
@@ -99,7 +99,7 @@ class SourceOptions:
     """Choices of the user for a source.
 
     Attributes:
-        topics: dict from roles ("scan", "odometry", "imu", "gnss", "pose", "camera") to topics; topics of
+        topics: Dict from roles ("scan", "odometry", "imu", "gnss", "pose", "camera") to topics; topics of
             other roles are found by type.
         T_base_lidar: Extrinsics of the LiDAR; None means those of the source, else identity.
         seed: Random seed of simulated runs.

@@ -124,7 +124,7 @@ def picture_of(message: Message, channels: Mapping[int, Channel], stamp_ns: int)
 
     Args:
         message: Image or CompressedImage.
-        channels: dict from numbers to channels.
+        channels: Dict from numbers to channels.
         stamp_ns: Time of the picture [ns].
     """
     if len(message.payload) > BYTES_LIMIT:
@@ -195,7 +195,7 @@ def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
     stamp is missing, 0, or of another clock (_OTHER_CLOCK_NS).
 
     Args:
-        stamp_ns: Stamp in its message, None without one.
+        stamp_ns: Stamp in its message, None if there is none.
         log_ns: Time of arrival [ns].
         offset_ns: Stamp minus arrival of the first scan of the run [ns].
     """
@@ -241,8 +241,8 @@ class MessageSource(FileSource):
         raise NotImplementedError
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a picture [ns] by the stamp in its message (None without one), or None if it is
-        impossible. Subclasses implement it."""
+        """Return the time of a picture [ns] by the stamp in its message (None if there is none), or None if
+        it is impossible. Subclasses implement it."""
         raise NotImplementedError
 
     def picture_stamps(self) -> list[int]:

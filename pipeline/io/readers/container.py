@@ -72,7 +72,7 @@ class Container:
     Attributes:
         kind: Name of the format, e.g. "ROS 2 MCAP".
         channels: All channels.
-        damage: dict from reasons to numbers of parts that could not be read when the file was opened.
+        damage: Dict from reasons to numbers of parts that could not be read when the file was opened.
         clock_steps: Number of times that the clock of the recorder was set back. Later times are shifted, so
             that they continue in the order of the file.
     """
@@ -100,7 +100,7 @@ class Container:
         Args:
             numbers: Numbers of the channels that are read.
             start_ns: Earlier times of recording [ns] are left out; None for none.
-            losses: dict from reasons to numbers of messages that cannot be read; increased in place.
+            losses: Dict from reasons to numbers of messages that cannot be read; increased in place.
         """
         raise NotImplementedError
 
@@ -126,7 +126,7 @@ class IndexedContainer(Container):
 
     def tail_ns(self, numbers: Collection[int]) -> int:
         """Return the time of the last message but two of some channels [ns], of the first one if there are
-        fewer; 0 without any."""
+        fewer; 0 if there is none."""
         rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
         return int(self.index[rows[-TAIL:][0], 1]) if len(rows) else 0
 

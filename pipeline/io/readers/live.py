@@ -92,7 +92,7 @@ class ArrivalReader:
     Attributes:
         description: Description of the source; None until OPENING_NS after the first scan, or until
             OPENING_SCANS scans.
-        losses: dict from reasons to numbers of records left out so far.
+        losses: Dict from reasons to numbers of records left out so far.
     """
 
     def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
@@ -186,7 +186,7 @@ class ArrivalReader:
 
     def _records_of(self, source: RosSource, message: Message) -> list[Record]:
         """Return the records of a message, after notices of the source with the time of the first record (0
-        without one)."""
+        if there is none)."""
         records = list(source.records_of(message, self.losses))
         if source.notices:
             stamp_ns = records[0].stamp_ns if records else 0

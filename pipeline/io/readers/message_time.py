@@ -183,7 +183,7 @@ def in_order_of_stamps(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -
 
     Args:
         arrivals: Contents in the order of arrival.
-        losses: dict from reasons to numbers of contents that are left out; increased in place.
+        losses: Dict from reasons to numbers of contents that are left out; increased in place.
     """
     heap: list[tuple[int, int, int, Stamped[T]]] = []
     newest = last = -(2**63)

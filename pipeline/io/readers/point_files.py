@@ -93,7 +93,7 @@ def read_columns(path: Path, losses: dict[str, int]) -> Columns:
 
     Args:
         path: A PLY, NumPy or PCD file.
-        losses: dict from reasons to numbers; the number of points in the header that the file does not have
+        losses: Dict from reasons to numbers; the number of points in the header that the file does not have
             is added in place.
 
     Raises:

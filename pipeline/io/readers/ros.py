@@ -108,7 +108,7 @@ class RosSource(MessageSource):
 
         Args:
             message: The message.
-            losses: dict from reasons to numbers of contents that cannot be used; increased in place.
+            losses: Dict from reasons to numbers of contents that cannot be used; increased in place.
         """
         if message.channel in self._wanted or message.channel in self._alignments.numbers:
             for stamped in self._times_of(message, losses):

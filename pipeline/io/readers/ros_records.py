@@ -158,12 +158,12 @@ class RecordDecoder:
     """Decodes the messages of one recording into records.
 
     Args:
-        channels: dict from numbers to channels of the recording.
+        channels: Dict from numbers to channels of the recording.
         tree: Fixed transforms.
 
     Attributes:
         base: Name of the base frame; "" if there is none.
-        frames: dict from the roles "gnss" and "pose" to the frames of their measurements, GnssFrame and
+        frames: Dict from the roles "gnss" and "pose" to the frames of their measurements, GnssFrame and
             OtherFrame. Readings of a role that is missing are not used.
         poses: Numbers of the channels with poses of another SLAM.
     """
@@ -182,7 +182,7 @@ class RecordDecoder:
         Args:
             message: The message.
             stamp_ns: Time of the message [ns].
-            losses: dict from reasons to numbers of messages that cannot be used; increased in place. A
+            losses: Dict from reasons to numbers of messages that cannot be used; increased in place. A
                 measured pose whose frame is not known yet is not counted.
         """
         channel = self._channels[message.channel]
@@ -215,7 +215,7 @@ class RecordDecoder:
         Args:
             message: PointCloud2, LaserScan or VelodyneScan.
             stamp_ns: Time of the scan [ns].
-            losses: dict from reasons to numbers; the number of packets that are not data packets is added in
+            losses: Dict from reasons to numbers; the number of packets that are not data packets is added in
                 place.
 
         Raises:

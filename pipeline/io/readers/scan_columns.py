@@ -91,7 +91,7 @@ def first_of(
     """Return the first of some columns that exists, None if none exists.
 
     Args:
-        columns: dict from names to columns.
+        columns: Dict from names to columns.
         names: Names in the order of preference.
     """
     return next((columns[name] for name in names if name in columns), None)
@@ -150,7 +150,7 @@ def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
 
     Args:
         stamp_ns: Time of the scan [ns].
-        columns: dict from names to columns, shape (N,); x, y and z [m] are among them.
+        columns: Dict from names to columns, shape (N,); x, y and z [m] are among them.
     """
     kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
     with np.errstate(invalid="ignore", over="ignore"):

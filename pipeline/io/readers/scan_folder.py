@@ -287,7 +287,7 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
     Args:
         path: The file.
         stamp_ns: Time of the scan [ns].
-        losses: dict from reasons to numbers of what is left out; increased in place.
+        losses: Dict from reasons to numbers of what is left out; increased in place.
 
     Raises:
         ScanFileError: The file is too large, or most of its rows are not positions.

@@ -121,7 +121,7 @@ class Topics:
     """Topics of a recording.
 
     Attributes:
-        chosen: dict from roles to the topics that are read; a role without a topic is missing.
+        chosen: Dict from roles to the topics that are read; a role without a topic is missing.
         every: All topics.
     """
 
@@ -164,7 +164,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
 
     Args:
         channels: Channels of the recording.
-        wanted: dict from roles ("scan", "odometry", "imu", "gnss", "pose", "camera") to topics chosen by the
+        wanted: Dict from roles ("scan", "odometry", "imu", "gnss", "pose", "camera") to topics chosen by the
             user. Other roles get the topic of their type with most messages. Exceptions: "pose" is read only
             if it is chosen; its topic is not used as odometry; LaserScan is used only if there is no other
             topic of scans.
@@ -239,7 +239,7 @@ def _choose(topics: list[Topic], role: str, wanted: Mapping[str, str], where: st
     Args:
         topics: Topics of the recording.
         role: The role.
-        wanted: dict from roles to topics chosen by the user, which may have no messages. If "pose" is
+        wanted: Dict from roles to topics chosen by the user, which may have no messages. If "pose" is
             missing, this role has no topic.
         where: Name of the recording in errors.
 

@@ -219,7 +219,7 @@ class TreeManagerSource(FileSource):
         Args:
             file: The file of the frame.
             stamp_ns: Time of the scan [ns].
-            losses: dict from reasons to numbers of files and rows that cannot be read; increased in place.
+            losses: Dict from reasons to numbers of files and rows that cannot be read; increased in place.
         """
         try:
             table, at, damaged = _read_frame(file, self._uri)
@@ -275,7 +275,7 @@ def _axes(table: Float, at: dict[str, int]) -> Float:
 
     Args:
         table: Rows of the file, shape (N, columns).
-        at: dict from the names of the columns to their indices.
+        at: Dict from the names of the columns to their indices.
     """
     if not all(name in at for name in STEM_AXIS):
         return np.full((len(table), 3), np.nan)

@@ -336,7 +336,7 @@ def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]
         buffer: Bytes of the file.
         at, end: First position of the captured bytes, and one past the last.
         link: Number of bytes before the IP header.
-        losses: dict from reasons to numbers of other packets to the port of the LiDAR, and of data packets
+        losses: Dict from reasons to numbers of other packets to the port of the LiDAR, and of data packets
             that the capture has cut; increased in place.
     """
     ip = at + link

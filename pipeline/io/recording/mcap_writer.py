@@ -284,7 +284,7 @@ class LiveWriter(_RosWriter):
         Args:
             revision: Number of the change.
             from_scan: Index of the first scan with these parameters.
-            values: dict from stages to dicts from names to values, as in `Revision`.
+            values: Dict from stages to dicts from names to values, as in `Revision`.
 
         Raises:
             OSError: The stream cannot be written.
@@ -317,7 +317,7 @@ class RepairResult:
 
     Attributes:
         messages: Number of messages in the new file.
-        losses: dict from reasons to numbers of lost parts.
+        losses: Dict from reasons to numbers of lost parts.
     """
 
     messages: int
