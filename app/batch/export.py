@@ -533,7 +533,7 @@ def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # n
 def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
     """Return the heights of the terrain as a north-up raster in the coordinates of the files, shape (rows
     from north to south, columns from west to east) [m], NaN where unknown, with west and north of its corner
-    [m]; None if there is no terrain. Cells have TERRAIN_CELL metres. A map that is turned or whose cells are
+    [m]; None if there is no terrain. Cells have TERRAIN_CELL metres. A map that is rotated or whose cells are
     not those of the raster is resampled linearly between the centres of its cells, beyond them from the
     nearest one, and only within 0.75 cells of one.
 

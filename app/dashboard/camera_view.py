@@ -170,10 +170,10 @@ MOST = 150
 
 
 def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return boxes around the clusters and trees in a picture as dicts: `kind` ("tree" or "cluster"),
-    `number` of the tree or row of the cluster, `verdict`, `distance_m`, and the box, see `_box`. Only the
-    MOST nearest objects have a box; clusters come before trees, and distant objects before near ones, so that
-    near trees are drawn last.
+    """Return boxes around the clusters and trees in a picture as a list of dicts with `kind` ("tree" or
+    "cluster"), `number` of the tree or row of the cluster, `verdict`, `distance_m`, and the box, see `_box`.
+    Only the MOST nearest objects have a box; clusters come before trees, and distant objects before near
+    ones, so that near trees are rendered last.
 
     The tilt of the robot is not known here, so the boxes of trees are slightly too high or too low on a
     slope.
@@ -190,8 +190,8 @@ def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]
 
 
 def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each confirmed tree in view at more than NEAREST and less than FARTHEST. Arguments and
-    keys as in `marks_of`."""
+    """Return a list of dicts, a box for each confirmed tree in view at more than NEAREST and less than
+    FARTHEST. Arguments and keys as in `marks_of`."""
     trees = frame.trees
     marks = []
     places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)
@@ -208,8 +208,8 @@ def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
 
 
 def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each cluster with points of which none is behind or close to the camera plane, at any
-    distance; arguments and keys as in `marks_of`."""
+    """Return a list of dicts, a box for each cluster with points of which none is behind or close to the
+    camera plane, at any distance; arguments and keys as in `marks_of`."""
     verdicts = clusters_payload(frame)["verdict"]
     points = frame.filtered.astype(np.float64) + frame.sensor_offset
     points[:, :2] = moved.inverse().apply(points[:, :2])

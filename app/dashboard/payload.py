@@ -110,10 +110,10 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 
 def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
-    """Return the confirmed trees of a table as dicts for the page: `number`, `x`, `y` [m], `ellipse` (see
-    `ellipses`), `dbh_cm`, `sigma_dbh_cm`, `eccentricity`, `observations`, `coverage_deg`, `first_seen_s`,
-    `last_seen_s`, `height_m`, `sigma_height_m` and `lean_deg`. Unknown diameters, eccentricities, coverages,
-    heights and leans are None.
+    """Return the confirmed trees of a table as a list of dicts for the dashboard, with `number`, `x`, `y`
+    [m], `ellipse` (see `ellipses`), `dbh_cm`, `sigma_dbh_cm`, `eccentricity`, `observations`, `coverage_deg`,
+    `first_seen_s`, `last_seen_s`, `height_m`, `sigma_height_m` and `lean_deg`. Unknown diameters,
+    eccentricities, coverages, heights and leans are None.
 
     Args:
         trees: The table.

@@ -331,7 +331,7 @@ class LiveSource:
             self._recorder.add_outputs(messages)
 
     def use_parameters(self, revision: int, from_scan: int, parameters: Parameters) -> None:
-        """Record parameters that apply from a mapped scan onwards; nothing without a recording.
+        """Record parameters that apply from a mapped scan onwards; nothing happens if there is no recording.
 
         Args:
             revision: Number of the revision.

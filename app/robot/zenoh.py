@@ -43,12 +43,12 @@ def publisher_of(token: str) -> Publisher | None:
 
 
 def data_key(domain: int, topic: str, msgtype: str, type_hash: str = "*") -> str:
-    """Return the key of the messages of a topic.
+    """Return the key `DOMAIN/TOPIC/PACKAGE::msg::dds_::NAME_/HASH` of the messages of a topic.
 
     Args:
         domain: ROS_DOMAIN_ID.
         topic: Name of the topic; its leading slash is not part of the key.
-        msgtype: In the ROS 2 spelling.
+        msgtype: Message type in the ROS 2 spelling, "PACKAGE/msg/NAME".
         type_hash: Hash of the type; "*" for any.
     """
     package, _, name = msgtype.split("/")

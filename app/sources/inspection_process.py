@@ -332,7 +332,8 @@ def answer(parent: ParentConnection) -> None:
 
 
 def _scores(evaluation: object) -> dict[str, Any] | None:
-    """Return `score_payload` of the scores of run.json; None if there are none or they are damaged."""
+    """Return the dict of `score_payload` for the scores of run.json; None if there are none or they are
+    damaged."""
     from app.dashboard.scores import score_payload
     from pipeline.evaluation import MapScores
 

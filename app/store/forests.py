@@ -84,7 +84,8 @@ class Forests:
             self(parameters.classification.forest, True)
 
     def read(self, name: str) -> dict[str, Any]:
-        """Return the JSON of a learned forest, with its provenance. It is read from the file each time.
+        """Return the JSON of a learned random forest as a dict, with its provenance. It is read from the file
+        each time.
 
         Raises:
             StemmapError: See `__call__`; also for the forest of the package.
@@ -108,8 +109,8 @@ class Forests:
         return self._provenance[name]
 
     def _read(self, name: str) -> tuple[dict[str, Any], list[Forest]]:
-        """Return the JSON of a learned forest from its file, and a list of its two forests, for sensors that
-        see all around and for sensors that look one way.
+        """Return the JSON of a learned forest from its file as a dict, and a list of its two random forests,
+        for sensors that see all around and for sensors that look one way.
 
         Raises:
             StemmapError: The name is invalid, the file does not exist, or it is damaged.

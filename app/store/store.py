@@ -331,8 +331,8 @@ def _with_source() -> Select[Any]:
 
 
 def _figures(figures: RunFigures) -> dict[str, Any]:
-    """Return the columns of `run_records` that change while a run plays: all fields of `figures` except
-    `map`."""
+    """Return a dict from the columns of `run_records` that change while a run plays to values: all fields of
+    `figures` except `map`."""
     return {each.name: getattr(figures, each.name) for each in fields(figures) if each.name != "map"}
 
 

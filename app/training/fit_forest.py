@@ -78,9 +78,9 @@ def of_free_end(figures: Float, label: Int) -> Bool:
 
 def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
     """Return a node of a tree of scikit-learn with all nodes below it as a dict of JSON values. A leaf has
-    `share`, the list of its class shares. A split has `figure`, the name of a feature, `at_most`, the
-    threshold rounded to four decimals, and the nodes `yes` (feature at most the threshold) and `no`. A split
-    with two equal leaves becomes a leaf.
+    `share`, the list of the class shares in the order of CLASSES. A split has `figure`, the name of a
+    feature, `at_most`, the threshold rounded to four decimals, and the nodes `yes` (feature at most the
+    threshold) and `no`. A split with two equal leaves becomes a leaf.
 
     Args:
         tree: The tree.
@@ -120,10 +120,10 @@ def expanded(
     trees: list[dict[str, Any]], settings: ForestSettings, figures: Float, label: Int, thing: Int, seed: int
 ) -> list[dict[str, Any]]:
     """Return the extended trees of a random forest; the given trees are not modified. Leaves that no example
-    reaches stay as they are.
+    reaches are unchanged.
 
     Args:
-        trees: Trees as in the JSON.
+        trees: Root nodes of the trees, see `node_of`.
         settings: Settings with which they were trained.
         figures: Features, shape (N, features).
         label: Index in CLASSES, shape (N,).
@@ -142,14 +142,15 @@ def expanded(
 def _expanded_node(
     node: dict[str, Any], figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
 ) -> dict[str, Any]:
-    """Return a node with its leaves extended by the examples that reach it; the node itself without examples.
+    """Return a node with its leaves extended by the examples that reach it; the argument if there are no
+    examples.
 
     Args:
-        node: Node as in the JSON.
+        node: Node, see `node_of`.
         figures, label: Features and classes of the examples that reach it, shapes (N, features) and (N,).
         weight: Weights of the examples, shape (N,).
-        settings: Settings of the forest.
-        draw: Random seed of this tree.
+        settings: Settings of the random forest.
+        draw: Random seed of the tree.
     """
     if not len(label):
         return node
@@ -166,14 +167,14 @@ def _expanded_node(
 def _leaf(
     share: Float, figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
 ) -> dict[str, Any]:
-    """Return the node that replaces a leaf: a leaf, or at most DEEPER levels of splits that separate trees
-    from all other classes. The class shares of a new leaf are the mean of the previous shares, with weight
-    PRIOR, and of its examples, rounded to two decimals.
+    """Return the node (see `node_of`) that replaces a leaf: a leaf, or at most DEEPER levels of splits that
+    separate trees from all other classes. The class shares of a new leaf are the mean of the previous shares,
+    with weight PRIOR, and of its examples, rounded to two decimals.
 
     Args:
         share: Previous class shares, shape (classes,).
         figures, label, weight: The examples, at least one, see `_expanded_node`.
-        settings: Settings of the forest.
+        settings: Settings of the random forest.
         draw: Random seed.
     """
     from sklearn.tree import DecisionTreeClassifier

@@ -398,7 +398,7 @@ def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str
         progress: Called with progress messages.
 
     Raises:
-        StemmapError: See `learn`, or the forest cannot be stored.
+        StemmapError: See `learn`, or the random forest cannot be stored.
     """
     folder, present = Path(request.folder), Classification.model_validate(request.classification)
     runs = [annotated_run(source) for source in request.sources]

@@ -198,9 +198,9 @@ class Search:
         return _Attempt(values, parameters.model_dump(), list(self._training))
 
     def _suggestion(self) -> dict[str, Value]:
-        """Return the values to try next: as the first of all those of the start, if they are within the
-        bounds; then those that Optuna suggests. The trials on which they depend are first added to its
-        study."""
+        """Return a dict from parameter names to the values to try next. For the first trial these are the
+        values of the start, if they are within the bounds; then those that Optuna suggests. The trials on
+        which they depend are first added to its study."""
         from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 

@@ -293,8 +293,8 @@ def _stem(rows: Float) -> tuple[int, int, int, int, int]:
     number of clean slices in the run, and the highest slice with a return. Slice 0 is not used. If there are
     no returns, lowest is SLICES and highest 0.
 
-    Next to a thick neighbour, which returns more than a thin stem, no slice would be clean; then only the
-    returns nearer than the neighbour count.
+    If no slice is clean with the returns in the ring, the run is that with the share CLEAN_NEAR and without
+    the ring.
     """
     bottom, top = SLICES, 0
     for s in range(1, SLICES):

@@ -107,21 +107,22 @@ def standard_forest(all_around: bool) -> Forest:
 
 
 def read_forest(path: Path, kind: str) -> Forest:
-    """Return a forest of a JSON file for a kind of sensor, ALL_AROUND or ONE_WAY.
+    """Return a random forest of a JSON file for a kind of sensor, ALL_AROUND or ONE_WAY.
 
     Raises:
-        StemmapError: The file is missing, too large (4 MB), not such JSON, without this kind, trained for
-            other classes, or names unknown features.
+        StemmapError: The file is missing, larger than 4 MB, not the JSON of a forest, without this kind,
+            trained for other classes, or names unknown features.
     """
     return read_forests(path, kind)[1][0]
 
 
 def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]:
-    """Return the JSON of a file, and the forests for some kinds of sensors in their order.
+    """Return the JSON of a file as a dict, and a list of the random forests for the kinds of sensors `kinds`,
+    in their order.
 
     Raises:
-        StemmapError: The file is missing, too large (4 MB), not such JSON, without one of the kinds, trained
-            for other classes, or names unknown features.
+        StemmapError: The file is missing, larger than 4 MB, not the JSON of a forest, without one of the
+            kinds, trained for other classes, or names unknown features.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -287,7 +288,7 @@ def _share(figures: Float, unknown: int, root: int | np.int32, trees: DecisionTr
 
     Args:
         figures: Features of a column, shape (F,).
-        unknown: Number of the feature that counts as unknown; negative for none.
+        unknown: Index of the feature that counts as unknown; negative for none.
         root: Row of the root of the tree.
         trees: The trees.
         kind: Index of the class in CLASSES.

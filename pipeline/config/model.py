@@ -150,9 +150,9 @@ def validated(tree: Mapping[str, Any]) -> Parameters:
 
 
 def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings (stage, parameter) with the names of earlier versions replaced by the current
-    names and without removed parameters, each with a RenamedParameterWarning; a stage whose value is not a
-    mapping is returned as it is, to be refused by the validation."""
+    """Return a dict from stages to dicts from parameters to values with the names of earlier versions
+    replaced by the current names and without removed parameters, each with a RenamedParameterWarning; a stage
+    whose value is not a mapping is returned as it is, to be refused by the validation."""
     nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
     result = {stage: values for stage, values in tree.items() if stage not in nested}
     flat = {f"{stage}.{name}": value for stage, values in nested.items() for name, value in values.items()}

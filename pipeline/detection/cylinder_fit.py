@@ -222,8 +222,7 @@ def quantile(ordered: Float, part: float) -> float:
 
 @compiled
 def visible_arc(rays: Float, n: int, p: Float) -> float:
-    """Return the visible arc around the axis [rad], 0 to 2 pi: a full turn minus the largest gap between
-    returns.
+    """Return the visible arc around the axis [rad], 0 to 2 pi: 2 pi minus the largest gap between returns.
 
     Args:
         rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.
@@ -261,8 +260,8 @@ def _from_axis(rays: Float, i: int, p: Float) -> tuple[float, float]:
 
 @compiled
 def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
-    """Return the visible arc [rad] for returns on any side of the axis: a full turn minus the largest gap; 0
-    for one return.
+    """Return the visible arc [rad] for returns on any side of the axis: 2 pi minus the largest gap between
+    returns; 0 for one return.
 
     Args:
         rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.

@@ -359,7 +359,7 @@ def _register(block: Float32, below: Float, weight: Float, before: float | None)
 
 
 def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
-    """Return the map of tiles as a table of the known cells, sorted by tile; without tiles an empty one. The
+    """Return the map of tiles as a table of the known cells, sorted by tile; empty if there are no tiles. The
     arrays are copies."""
     keys = sorted(tiles)
     cells = np.stack([tiles[key] for key in keys]) if keys else np.zeros((0, SIDE, SIDE, COLUMNS), np.float32)

@@ -91,14 +91,15 @@ class Gyro:
 
     @property
     def proven(self) -> bool:
-        """Whether the turns of the gyroscope have agreed with those of the wheels; it stays True."""
+        """Whether the rotations by the gyroscope have agreed with those by the wheels, see `compare`; it
+        stays True."""
         return self._proven
 
     def compare(self, by_wheels: float, turn: Turn) -> None:
         """Add one step to the comparison of wheels and gyroscope, the slope of a line through all steps.
 
-        The gyroscope is `proven` once the wheels have turned by PROOF while the slope is between 1 / ALIKE
-        and ALIKE.
+        The gyroscope is `proven` once the rotations by the wheels sum up to PROOF while the slope is between
+        1 / ALIKE and ALIKE.
 
         Args:
             by_wheels: Rotation of the step by the wheels [rad].

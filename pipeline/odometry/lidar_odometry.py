@@ -153,7 +153,7 @@ def undistorted(points: Float, offset_s: Float | None, delta: Float, span_ns: in
     """Return the points in the sensor frame at the stamp of the scan, shape (N, 3) [m], with constant
     velocity: p' = p + (w x p + v) dt.
 
-    The linearisation is exact to a centimetre for the turns of a robot within one sweep.
+    The linearisation is exact to a centimetre for the rotations of a robot within one sweep.
 
     Args:
         points: Points in the sensor frame at their own times, shape (N, 3) [m].

@@ -42,7 +42,7 @@ class Reading:
 
 
 class Jump(NamedTuple):
-    """A step of the odometry that is impossible for a robot: distance [m] and absolute turn [rad]."""
+    """A step of the odometry that is impossible for a robot: distance [m] and absolute rotation [rad]."""
 
     distance: float
     turn: float

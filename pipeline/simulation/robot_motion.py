@@ -31,7 +31,7 @@ def sharp_cells(s: Float, yaw: Float) -> Bool:
     """Return for each cell between two of N samples of a line whether the robot rotates on the spot in it,
     shape (N - 1,).
 
-    It does so where the turn exceeds YAW_RATE at the speed CREEP, and on cells between two such turns, or
+    It does so where the yaw rate at the speed CREEP exceeds YAW_RATE, and in cells between two such cells, or
     between one and an end of the line, that are at most _APART apart. The difference of the yaw is used,
     because a cusp between two samples has no curvature at them.
 
@@ -55,7 +55,7 @@ def neighbouring_curvature(sharp: Bool, s: Float, yaw: Float, closed: bool) -> F
     open path have one cell; those of a closed path share the first and the last cell.
 
     Args:
-        sharp: Whether the robot turns on the spot in each cell, see `sharp_cells`, shape (N - 1,).
+        sharp: Whether the robot rotates on the spot in each cell, see `sharp_cells`, shape (N - 1,).
         s: Distance of each sample along the path, shape (N,) [m].
         yaw: Yaw of each sample, not wrapped, shape (N,) [rad].
         closed: Whether the last sample is the first one.
@@ -81,7 +81,7 @@ def within_gains(v: Float, s: Float, curvature: Float) -> Float:
         v_i^2 <= v_(i -+ 1)^2 + 2 a ds  with  a = min(ACCELERATION, YAW_GAIN / (2 |k|))
         v_i^2 |dk / ds| <= YAW_GAIN / 2
 
-    so that the turn rate k v changes by no more than a |k| + v^2 |dk / ds| <= YAW_GAIN.
+    so that the yaw rate k v changes by no more than a |k| + v^2 |dk / ds| <= YAW_GAIN.
 
     Args:
         v: Limit at each sample, shape (N,) [m/s].
@@ -139,8 +139,8 @@ class Spin(NamedTuple):
         return cls(0.0, 1.0 / (gain * ramp) + ramp, gain, ramp, first, way, yaw, turn)
 
     def at(self, t: Float) -> tuple[Float, Float]:
-        """Return the share f of the turn and f' [1/s] at times of shape (N,) [s]; 0 and 0 before the turn, 1
-        and 0 after it."""
+        """Return the share f of the turn and f' [1/s] at times of shape (N,) [s]; 0 and 0 before the
+        rotation, 1 and 0 after it."""
         up = np.clip(t - self.begin, 0.0, self.takes)
         left = self.takes - up
         even = self.gain * self.ramp * (up - 0.5 * self.ramp)
@@ -219,7 +219,7 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
     Args:
         course: The course.
         speed: Speed on the straight [m/s]. Turns are driven at 0.5 rad/s at most; where the course reverses,
-            the robot stops and turns on the spot.
+            the robot stops and rotates on the spot.
         duration_s: Duration of the run [s]; the result is half a second longer.
     """
     until = duration_s + 0.5

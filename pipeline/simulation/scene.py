@@ -114,8 +114,8 @@ class SimulatedScene:
 
     def _blown(self, t: float) -> Solids:
         """Return the solids at time t [s] with the leaves (porous ellipsoids) moved along x by the wind: each
-        swings with a phase of its own, in proportion to its height above the ground. `still` is not changed.
-        """
+        oscillates with a phase of its own and the amplitude `wind` times its height above the ground / 10 m.
+        `still` is not changed."""
         solids = self.still
         leaves = np.flatnonzero((solids.kind == ELLIPSOID) & (solids.shape[:, 8] > 0.0))
         x, y, z = solids.shape[leaves, :3].T

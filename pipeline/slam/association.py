@@ -67,8 +67,8 @@ class _Pairs(NamedTuple):
 def associate(
     centre: Float, R: Float, mean: Float, covariance: Float, gate: float, distance_max: float
 ) -> tuple[Int, Float]:
-    """Associate detections with landmarks one to one, most likely pairs first. Without detections or
-    landmarks, no pair exists.
+    """Associate detections with landmarks one to one, pairs with the highest likelihood first. Without
+    detections or landmarks, no pair exists.
 
     Args:
         centre: Detections, shape (D, 2) [m].

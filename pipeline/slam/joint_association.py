@@ -114,9 +114,9 @@ def choose_jointly(
     n: int,
     search: JointSearch,
 ) -> float:
-    """Find the most likely assignment of the detections of n levels, and write it to `search.best` (-1 for a
-    detection without landmark); return its -2 log likelihood. After MOST_STEPS steps the best assignment so
-    far is the result; n = 0 gives 0.
+    """Find the assignment with the highest likelihood of the detections of n levels, and write it to
+    `search.best` (-1 for a detection without landmark); return its -2 log likelihood. After MOST_STEPS steps
+    the best assignment so far is the result; n = 0 gives 0.
 
     Args:
         pose: Pose by the odometry and the pairs that were accepted before.

@@ -751,8 +751,8 @@ def _moved_rigidly(
 
 def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
     """Return pairs of landmarks within TWICE of each other, one begun before a loop and one after it, each
-    landmark in at most one pair (most likely pairs first): the birth numbers of the later ones, ascending,
-    and of the earlier ones, int64, shape (N,) each.
+    landmark in at most one pair (pairs with the highest likelihood first): the birth numbers of the later
+    ones, ascending, and of the earlier ones, int64, shape (N,) each.
 
     Args:
         known: Landmarks of one particle after the correction.

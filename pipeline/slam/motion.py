@@ -26,7 +26,7 @@ class Noise(NamedTuple):
     Attributes:
         distance: Position noise [m/sqrt(m)].
         turn_distance: Heading noise by distance [rad/sqrt(m)].
-        turn: Heading noise by turning [rad/sqrt(rad)].
+        turn: Heading noise by rotation [rad/sqrt(rad)].
     """
 
     distance: float
@@ -45,7 +45,7 @@ def step_variances(x: float, y: float, yaw: float, noise: Noise) -> tuple[float,
 
     With the distance s = hypot(x, y), the position variance is (noise.distance)^2 s for x and for y [m^2],
     and the heading variance is (noise.turn_distance)^2 s + (noise.turn)^2 |yaw| [rad^2]. They are linear in
-    distance and turn, so that many short steps scatter the particles like one long step.
+    distance and rotation.
 
     Args:
         x, y, yaw: Step [m, m, rad].
@@ -83,8 +83,8 @@ def drift_variances(motion: Float, driven: float, trust: OdometryTrust) -> tuple
     faults.
 
     The distance beyond the net motion (a detour, or distance without known trees) counts both as distance and
-    as turn, because its composition is unknown. A heading error that accumulates uniformly over a distance s
-    displaces the end by the variance (heading variance) s^2 / 3, which is added to the position variance.
+    as rotation. A heading error that accumulates uniformly over a distance s displaces the end by the
+    variance (heading variance) s^2 / 3, which is added to the position variance.
 
     Args:
         motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
@@ -369,8 +369,8 @@ def weighted_pose(
     poses.
 
     The mean yaw is the direction of the weighted sum of unit vectors. The covariance is the weighted scatter
-    about the mean plus the covariance of the motion since the poses were drawn, rotated into the frame of the
-    poses.
+    about the mean plus the covariance of the motion since the poses were sampled, rotated into the frame of
+    the poses.
 
     Args:
         pose: x, y [m], yaw [rad] after the motion, shape (P, 3).

@@ -149,9 +149,9 @@ class EstimatedPath:
     """The estimated pose of each scan. The record is immutable; a longer path shares the blocks of a shorter
     one.
 
-    The path of one particle is one sample of the posterior: its map may be turned about the first pose by the
-    whole uncertainty of the heading there. The estimate is the mean of the posterior, and trees, columns and
-    terrain are mapped at it.
+    The path of one particle is one sample of the posterior: its map may be rotated about the first pose by
+    the whole uncertainty of the heading there. The estimate is the mean of the posterior, and trees, columns
+    and terrain are mapped at it.
 
     Attributes:
         blocks: Poses x, y [m], yaw [rad] in the map, oldest first, float64, shape (BLOCK, 3) each.
@@ -205,7 +205,7 @@ class Generation:
     Attributes:
         pose: Pose x, y [m], yaw [rad] of each particle before resampling, float32, shape (P, 3).
         ancestors: Row of the particle from which each particle after the scan descends, int64, shape (Q,);
-            None without resampling.
+            None if the particles were not resampled.
     """
 
     pose: Float32
@@ -321,8 +321,8 @@ def _founders_after(
     scans: int, founders: tuple[Int, Int] | None, particles: int, ancestors: Int | None
 ) -> tuple[Int, Int]:
     """Return the founders after one more scan (see Genealogy); `scans`: number of scans before it. `founders`
-    is None before the first scan, and `ancestors`, shape (P,), None without resampling. `particles` is the
-    number of particles before the scan."""
+    is None before the first scan; `ancestors`, shape (P,), is None if the particles were not resampled.
+    `particles` is the number of particles before the scan."""
     newer, older = founders or (np.arange(particles),) * 2
     if scans % FOUNDED == 0:
         newer, older = np.arange(particles), newer

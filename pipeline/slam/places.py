@@ -78,8 +78,8 @@ class Places:
         return replace(places, seen=seen, contradicted=False)
 
     def with_seen(self, distance: float, birth: Int) -> Places:
-        """Return the places after landmarks were seen for certain: their places and those within
-        REVISIT_DISTANCE of them along the path are active and seen.
+        """Return the places after the landmarks `birth` were seen: the places of these landmarks and those
+        within REVISIT_DISTANCE of them along the path are active and seen.
 
         Args:
             distance: Distance driven [m].
@@ -180,7 +180,7 @@ def agreement(
     pose: Pose, centre: Float, R: Float, mean: Float, covariance: Float
 ) -> tuple[float, Bool, Bool]:
     """Return the log odds that detections show the given landmarks and not others, which landmarks agree with
-    a detection, and which have a detection within WINDOW, shape (L,). The log odds are 0 without a landmark
+    a detection, and which have a detection within WINDOW, shape (L,). The log odds are 0 if no landmark is
     within WINDOW of a detection.
 
     A landmark agrees with one of the detections around it, which have the density rho, by chance with the

@@ -29,8 +29,8 @@ SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])
 
 @dataclass(frozen=True, slots=True)
 class ScanStatistics:
-    """Statistics of one scan, means over the particles. "Well known" is a landmark with `slam.hits_to_weigh`
-    hits.
+    """Statistics of one scan, means over the particles. A landmark is well known if it has at least
+    `slam.hits_to_weigh` hits.
 
     Attributes:
         detections: Number of detections.
@@ -39,8 +39,8 @@ class ScanStatistics:
         found: Sum of the hits, each at most MOST_HITS, of the well-known landmarks that were detected.
         missed: Sum of the hits, each at most MOST_HITS, of the well-known landmarks in free view that were
             not detected.
-        innovation: Normalised innovation squared per degree of freedom; NaN if there is no recognised
-            landmark.
+        innovation: Normalised innovation squared per degree of freedom; NaN if no well-known landmark was
+            detected.
         odometry: Mahalanobis distance between the motion by SLAM and the odometry [sigma].
     """
 
@@ -149,16 +149,16 @@ TREE_MOTION_MAX, TREE_MOTION_STEP = 60, 2
 
 @dataclass(frozen=True, slots=True)
 class RunningStatistics:
-    """Running statistics after a scan. "Well known" is a landmark with `slam.hits_to_weigh` hits.
+    """Running statistics after a scan. A landmark is well known if it has at least `slam.hits_to_weigh` hits.
 
     Attributes:
         innovation: Running mean of the normalised innovation squared per degree of freedom.
-        found: Running mean of the hits of recognised landmarks, as a share of all well-known landmarks in
-            free view.
-        ambiguous: Running mean of the share of detections with two likely landmarks.
+        found: Running mean of `ScanStatistics.found` as a share of `found` plus `missed`, the well-known
+            landmarks in free view.
+        ambiguous: Running mean of the share of detections that `ScanStatistics.ambiguous` counts.
         odometry: Largest deviation from an odometry without doubt [sigma], decaying by FADING per scan.
         alone: Distance driven since the last scan in which FEWEST well-known landmarks were detected [m].
-        mapped: Whether any well-known landmark was ever recognised.
+        mapped: Whether a well-known landmark was ever detected.
         distrust: 1 when the trees contradict the odometry, decaying with the time since (`decayed_distrust`).
         strange: Number of strange scans in a row, see STRANGE_LOST.
         missed: Maximum of `ScanStatistics.missed` over the present strange scans.
@@ -187,8 +187,9 @@ class RunningStatistics:
     @property
     def is_tree_motion_reliable(self) -> bool:
         """Whether the motion that trees determine is trusted without the odometry: `led` is at least its
-        value after TREE_MOTION_SCANS successive scans, from 0, with a doubted odometry and enough recognised
-        trees. A doubted scan with too few trees sets `led` to 0; scans without doubt decrease it slowly."""
+        value after TREE_MOTION_SCANS successive scans, from 0, with a doubted odometry and enough detections
+        of well-known landmarks. A doubted scan with too few trees sets `led` to 0; scans without doubt
+        decrease it slowly."""
         return self.led >= TREE_MOTION_STEP * TREE_MOTION_SCANS
 
     def odometry_trust(self, noise: Noise) -> OdometryTrust:
@@ -223,7 +224,7 @@ def update_statistics(
     Args:
         recent: Statistics before the scan.
         scan: Statistics of the scan.
-        driven: Distance since the last used scan [m], with 1 m per radian of turn.
+        driven: Distance since the last used scan [m], with 1 m per radian of rotation.
         doubted: Doubts about the odometry at this scan.
     """
     expected, is_measured = scan.found + scan.missed, math.isfinite(scan.innovation)
@@ -271,11 +272,11 @@ def decayed_distrust(distrust: float, period: float) -> float:
 
 @compiled
 def updated_familiar(familiar: float, recognised: float, detections: int) -> float:
-    """Return the running mean of the share of detections of known trees after one more scan.
+    """Return the running mean of the share of detections of well-known landmarks after one more scan.
 
     Args:
         familiar: The mean before.
-        recognised: Number of recognised trees in the scan.
+        recognised: Number of detections of well-known landmarks in the scan.
         detections: Number of detections; with fewer than FEWEST the mean is unchanged.
     """
     if detections < FEWEST:
@@ -286,9 +287,10 @@ def updated_familiar(familiar: float, recognised: float, detections: int) -> flo
 def _tree_motion_count(before: int, scan: ScanStatistics, doubted: OdometryDoubt) -> int:
     """Return `RunningStatistics.led` after a scan; `before` is its value before.
 
-    Without doubt it decreases by 1, at least to 0. A doubted scan with TREES_WITHOUT_ODOMETRY recognised
-    trees, or MANY if the doubt is not reported, increases it by TREE_MOTION_STEP, at most to TREE_MOTION_MAX;
-    with fewer trees it becomes 0."""
+    If the odometry is not doubted, it decreases by 1, at least to 0. A doubted scan with
+    TREES_WITHOUT_ODOMETRY detections of well-known landmarks, or MANY if the doubt is not reported, increases
+    it by TREE_MOTION_STEP, at most to TREE_MOTION_MAX; with fewer it becomes 0.
+    """
     if not any(doubted):
         return max(before - 1, 0)
     leading = TREES_WITHOUT_ODOMETRY if doubted.reported else MANY

@@ -255,9 +255,9 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
     to the axis. Several columns may be assigned to one stem.
 
-    Each column in their order takes the track within REACH that is most likely (see `_likeliest`) and not
-    assigned yet. The class of a column depends on its surroundings, up to RING_FAR: at a column without a
-    track or with one without detections, but with a detected track in its surroundings
+    Each column in their order takes the track within REACH with the highest likelihood (see `_likeliest`)
+    that is not assigned yet. The class of a column depends on its surroundings, up to RING_FAR: at a column
+    without a track or with one without detections, but with a detected track in its surroundings
     (`_detected_stem_near`), that track is the stem, and the column is its undergrowth or a branch.
 
     Args:
@@ -342,7 +342,8 @@ def _may_be_stem(verdict: int) -> bool:
 
 @compiled_within
 def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
-    """Return the row of the most likely track within REACH of an axis that is not taken; -1 for none.
+    """Return the row of the track with the highest likelihood within REACH of an axis that is not in `taken`;
+    -1 for none.
 
     The likelihood of a track with the distance d is (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2)); of equal ones
     the lowest row is returned. Hits without the distance would prefer branches near a stem, which are

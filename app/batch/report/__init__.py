@@ -386,13 +386,13 @@ def stand_map(
 
 
 def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dict[str, Any]:
-    """Return what the template draws of the diameter classes, without bars if there are no classes.
+    """Return the content of the histogram of the diameter classes as a dict for the template.
 
     Coordinates are in mm, y downwards. Keys: `width` and `height` of the drawing; `bars` (stems per hectare),
-    each with `x`, `y`, `width`, `height`, `middle` (x), `edge` (x of the lower limit of the class), `high`
-    and `low` (y of plus and minus one standard error, at least 0) and `label`, the lower limit of the class
-    [cm] as text; `last`, the upper limit of the last class, "" if there is none; `marks` of the axis as y and
-    text; and `title`.
+    a list of dicts, empty if there are no classes, with `x`, `y`, `width`, `height`, `middle` (x), `edge` (x
+    of the lower limit of the class), `high` and `low` (y of plus and minus one standard error, at least 0)
+    and `label`, the lower limit of the class [cm] as text; `last`, the upper limit of the last class, "" if
+    there is none; `marks` of the axis, a list of (y, text); and `title`.
 
     Args:
         whole: Stand figures of the whole observed area.

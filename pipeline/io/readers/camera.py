@@ -151,7 +151,7 @@ SHOWN_NS = 1_000_000_000
 
 
 def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:
-    """Return the stamp nearest to each time, and whether it is close enough to be of the same place.
+    """Return the stamp nearest to each time, and whether it is within SAME_TIME_NS of the time.
 
     Args:
         stamps: Stamps of pictures in ascending order, shape (N,), N >= 1 [ns].
@@ -195,7 +195,7 @@ def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
     stamp is missing, 0, or of another clock (_OTHER_CLOCK_NS).
 
     Args:
-        stamp_ns: Stamp in its message, None if there is none.
+        stamp_ns: Stamp in the message of the picture [ns]; None if there is none.
         log_ns: Time of arrival [ns].
         offset_ns: Stamp minus arrival of the first scan of the run [ns].
     """

@@ -218,8 +218,8 @@ class BagFolder(IndexedContainer):
             part.close()
 
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
-        """Return the message at a place of the file to which the channel belongs; None if it cannot be
-        read."""
+        """Return the message at the location `place` in the file to which the channel belongs; None if it
+        cannot be read."""
         part, own = divmod(number, _STRIDE)
         message = self._parts[part]._message(own, log_ns, place)
         return None if message is None else replace(message, channel=number)
