@@ -196,9 +196,9 @@ def card(name: str, dashboard: Dashboard) -> dict[str, Any]:
 
 
 def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
-    """Return `trees` (see `trees_payload`), `path` ([x, y] of each point) and `pose` ([x, y, yaw]) of a
-    dashboard in the frame of its map; None before the first scan. The path is thinned to at most about 400
-    points; the last one is the newest."""
+    """Return a dict of JSON values in the frame of the map of a dashboard: `trees` (see `trees_payload`),
+    `path`, a list of [x, y] [m], and `pose`, [x [m], y [m], yaw [rad]]; None before the first scan. The path
+    is thinned to about MOST_POINTS points; the last one is the newest."""
     shown = dashboard.shown
     if shown is None:
         return None
@@ -213,13 +213,14 @@ def shown_map(dashboard: Dashboard) -> dict[str, Any] | None:
 
 
 def drawn(own: dict[str, Any], pose: Pose2 | None, how: str) -> dict[str, Any]:
-    """Return a map as the page draws it: `trees`, [x, y, DBH in cm or None] of each; `path` and `pose` as in
-    `shown_map`; `common`, the pose [x, y, yaw] of its frame in the common one or None; and `how` that was
-    found.
+    """Return a map for the fleet page as a dict of JSON values. The keys are `trees`, a list of [x [m], y
+    [m], DBH [cm] or None] in the frame of the map; `path` and `pose`, as in `shown_map`; `common`, the pose
+    [x [m], y [m], yaw [rad]] of this frame in the common frame, or None; and `how`.
 
     Args:
         own: Result of `shown_map`.
-        pose, how: Results of `Frames.pose` and `Frames.how`.
+        pose: Result of `Frames.pose`, None if unknown.
+        how: Result of `Frames.how`.
     """
     return {
         "trees": [[round(t["x"], 2), round(t["y"], 2), t["dbh_cm"]] for t in own["trees"]],

@@ -73,7 +73,7 @@ class SavedRun:
         seed: Random seed.
         start_ns: Time of the first scan [ns].
         tally: Counts so far.
-        losses: Number of messages that were left out, by reason.
+        losses: Dict from reasons to numbers of messages that were left out.
         map: State of the mapper.
     """
 
@@ -93,7 +93,7 @@ class SavedRun:
         return validated(json.loads(self.parameters))
 
     def as_bytes(self) -> bytes:
-        """Return the contents of the file state.zip."""
+        """Return the bytes of the file state.zip."""
         return write_archive(*encode(self))
 
 
@@ -183,7 +183,8 @@ class RunStart:
         Args:
             source: Source of the run.
             odometry: Choice of the odometry.
-            left_out: Is increased by the number of scans that are left out, by reason.
+            left_out: Counter from reasons to numbers of records that the synchroniser leaves out; increased
+                in place.
 
         Raises:
             SourceError: The source cannot be read.
@@ -258,9 +259,9 @@ def continue_map(
 
 
 def _resumed(begin: RunStart, source: Source) -> RunStart:
-    """Return `begin`, changed to the start of a run that continues the same drive: with the offset of the
-    last source. If the source is that one, the losses are cleared, because it is read from its start; another
-    source is added to the sources."""
+    """Modify and return `begin` for a run that continues the same drive: the time offset is that of the last
+    source. If the source has the digest of the last source, the losses are cleared, since they are counted
+    again; otherwise it is appended to the sources."""
     known, last = source.description, begin.sources[-1]
     begin.stamp_shift_ns = last.stamp_shift_ns
     if known.digest == last.digest:
@@ -274,16 +275,16 @@ def _resumed(begin: RunStart, source: Source) -> RunStart:
 def _in_another_run(
     begin: RunStart, source: Source, start: Start, pose: Pose2, found: Match | None, warnings: list[str]
 ) -> RunStart:  # fmt: skip
-    """Return `begin`, changed to the start of another drive; the source is added to its sources, and its
-    times follow those of the map by PAUSE_NS where they overlap; its truth is that of the first source. A
-    source that is part of the map already is a warning.
+    """Modify and return `begin` for another drive. The source is appended to the sources. If its first scan
+    is not later than the map, its times are shifted so that this scan follows the map by PAUSE_NS. The truth
+    is that of the first source. If the source is part of the map already, a warning is added.
 
     Args:
         begin: The start so far.
         source: Source of the new run.
         start: Where the user starts it.
         pose: Pose of its first scan in the map.
-        found: The match by stems; None without one.
+        found: The match by stems; None if there is none.
         warnings: Messages for the user that are added to the totals.
     """
     known, after_ns = source.description, begin.after_ns or 0
@@ -341,8 +342,8 @@ def localise(
 
 
 def _truth_of(uri: str) -> Truth:
-    """Return the true trees of the first run, whose frame is that of the map; no trees if it cannot be
-    opened."""
+    """Return the ground truth of the source with this URI, with only its trees; an empty `Truth` if the
+    source cannot be opened."""
     try:
         with closing(open_source(uri, SourceOptions())) as source:
             known = source.truth()

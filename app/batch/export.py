@@ -110,7 +110,8 @@ _FIGURES_SHORT = {
 
 
 def _figure_fields() -> Iterator[Field]:
-    """Yield the fields of the figures of a plot: each figure, and its standard error if it has one."""
+    """Yield a field for each stand parameter in FIGURES and, unless its name ends with "_plain", one for its
+    standard error with "_se" appended to the name."""
     for name, (title, unit) in FIGURES.items():
         short = _FIGURES_SHORT[name]
         yield Field(name, short, unit, title)
@@ -142,13 +143,15 @@ class ExportedRun:
     """A run in the coordinates of its files.
 
     Attributes:
-        uri: Its source.
-        trees: Its confirmed trees.
-        frame: Its reference system.
-        place: East, north of the trees, or x, y of a local map, shape (T, 2) [m].
-        columns: Arrays of the values of TREE_FIELDS by name, shape (T,), rounded; NaN for unknown values.
-        path: The path, shape (N, 2) [m].
-        plots: Plots in these coordinates, with their figures by name.
+        uri: URI of the source.
+        trees: Confirmed trees of the run.
+        frame: Reference system of the run.
+        place: Positions of the trees: east, north, or x, y for a local map, shape (T, 2) [m].
+        columns: Dict from each name of TREE_FIELDS to the rounded values of the trees, shape (T,); NaN for
+            unknown values.
+        path: The path in the coordinates of `place`, shape (N, 2) [m].
+        plots: Tuples, one per plot, of name, shape in the coordinates of `place`, and a dict from the names
+            of PLOT_FIELDS except "plot" to values.
         terrain: x, y, z of the terrain cells in the frame of the map, shape (K, 3) [m].
     """
 
@@ -272,9 +275,9 @@ def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
 
 
 def _layers(run: ExportedRun) -> dict[str, Any]:
-    """Return the layers as GeoDataFrames by name, in the coordinates of the files: `trees`, and where
-    there are any `path`, `plots` and `contours`; their columns are LAYER_FIELDS and the geometry. Raises
-    StemmapError if a package is not installed or the terrain covers too large an area."""
+    """Return a dict from the name of each layer to its GeoDataFrame in the coordinates of the files: `trees`,
+    and, if they are not empty, `path`, `plots` and `contours`. The columns are LAYER_FIELDS and the geometry.
+    Raises StemmapError if a package is not installed or the terrain covers too large an area."""
     geopandas = gis_package("geopandas", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -305,7 +308,8 @@ def _layers(run: ExportedRun) -> dict[str, Any]:
 
 
 def _plot_table(run: ExportedRun) -> dict[str, Any]:
-    """Return the columns PLOT_FIELDS by name, a value per plot, rounded to four decimals; NaN if unknown."""
+    """Return a dict from each name of PLOT_FIELDS to the values of the plots, rounded to four decimals; NaN
+    if unknown."""
     table: dict[str, Any] = {"plot": [name for name, _, _ in run.plots]}
     for field in PLOT_FIELDS[1:]:
         table[field.name] = np.array([round(figures[field.name], 4) for _, _, figures in run.plots])
@@ -508,7 +512,8 @@ def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # n
     Args:
         book: Workbook of xlsxwriter.
         name: Name of the sheet.
-        table: Values by title; columns may differ in length.
+        table: Dict from the title of each column to its values, strings or numbers; columns may differ in
+            length.
         bold: Format of the titles.
     """
     sheet = book.add_worksheet(name)
@@ -528,9 +533,9 @@ def _sheet(book: Any, name: str, table: dict[str, Any], bold: Any) -> None:  # n
 def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
     """Return the heights of the terrain as a north-up raster in the coordinates of the files, shape (rows
     from north to south, columns from west to east) [m], NaN where unknown, with west and north of its corner
-    [m]; None without terrain. Cells have TERRAIN_CELL metres. A map that is turned or whose cells are not
-    those of the raster is resampled linearly between the centres of its cells, beyond them from the nearest
-    one, and only within 0.75 cells of one.
+    [m]; None if there is no terrain. Cells have TERRAIN_CELL metres. A map that is rotated or whose cells are
+    not those of the raster is resampled linearly between the centres of its cells, beyond them from the
+    nearest one, and only within 0.75 cells of one.
 
     Raises:
         SourceError: The raster would have more than 25 million cells.
@@ -568,9 +573,9 @@ def terrain_raster(run: ExportedRun) -> tuple[Float, float, float] | None:
 
 
 def contours(run: ExportedRun) -> list[tuple[float, Float]]:
-    """Return height [m] and line, shape (N, 2) [m], of contours every CONTOUR_STEP metres, in the coordinates
-    of the files; [] without terrain or with a single row or column of cells. Lines of fewer than three points
-    are omitted.
+    """Return (height [m], line, shape (N, 2) [m]) of each contour line, at multiples of CONTOUR_STEP, in the
+    coordinates of the files; [] if there is no terrain or with a single row or column of cells. Lines of
+    fewer than three points are omitted.
 
     Raises:
         StemmapError: contourpy is not installed, or the raster would be too large.

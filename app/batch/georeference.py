@@ -56,11 +56,13 @@ class MapFrame:
 
     Attributes:
         crs: Reference system as text for pyproj, such as EPSG:25832; "" for the local frame of the map.
-        pose: Pose of the map in it: east, north [m], angle of the map's x axis from east to north [rad].
-        z: Height of the map's zero [m].
+        pose: Pose of the map frame in the reference system: east, north [m], angle from east to the x axis of
+            the map, counter-clockwise [rad].
+        z: Height of the origin of the map in the reference system [m].
         method: How it was found: "cloud" (the cloud states it), "file" (the coordinates of the file are
             already in it), "hand", "control" (points) or "gnss" (fixes); "" if unknown.
-        numbers: Numbers of the method by name, see METHOD_NUMBERS; empty for the first three.
+        numbers: Dict from the names in METHOD_NUMBERS to the numbers of the method; empty for "cloud", "file"
+            and "hand".
         note: How it was found as an English text, of a file of an earlier version without method; "" else.
         sigma: Standard deviation of a position by this georeference, at the centre of its points [m]; NaN if
             unknown.
@@ -94,17 +96,19 @@ class MapFrame:
         return self.note or _METHOD_WORDS[self.method].format(**self.numbers)
 
     def to_crs(self, points: Float) -> Float:
-        """Return positions of the map, shape (N, 2), in the reference system: east, north [m]."""
+        """Return positions x, y in the map, shape (N, 2) [m], as east, north in the reference system, shape
+        (N, 2) [m]."""
         return self.pose.apply(np.reshape(points, (-1, 2)))
 
     def to_map(self, points: Float) -> Float:
-        """Return positions in the reference system, shape (N, 2), in the frame of the map [m]."""
+        """Return positions east, north in the reference system, shape (N, 2) [m], as x, y in the map, shape
+        (N, 2) [m]."""
         return self.pose.inverse().apply(np.reshape(points, (-1, 2)))
 
     def record(self) -> dict[str, Any]:
-        """Return the frame as JSON values, the contents of georeference.json: `crs`, `east_m`, `north_m`,
-        `turn_rad`, `z_m`, `sigma_m` (None if unknown), `method`, `numbers`, `residuals_m`, `place` and,
-        if there is one, the note as `how`."""
+        """Return the frame as a dict of JSON values, the content of georeference.json: `crs`, `east_m`,
+        `north_m`, `turn_rad`, `z_m`, `sigma_m` (None if unknown), `method`, `numbers`, `residuals_m`, `place`
+        and, if there is one, the note as `how`."""
         return {
             "crs": self.crs,
             "east_m": self.pose.x,
@@ -125,11 +129,11 @@ class ControlPoint:
     """A point that is known in the map and in a reference system.
 
     Attributes:
-        name: For messages.
-        east, north: Its position in the reference system [m].
-        tree: Number of the tree that it is; None for another mark.
-        x, y: Its position in the map [m]; None for a tree.
-        z: Its height in the reference system [m]; None if unknown.
+        name: Name of the point, for messages.
+        east, north: Position in the reference system [m].
+        tree: Number of the tree at the point; None for another mark.
+        x, y: Position in the map [m]; None for a tree.
+        z: Height in the reference system [m]; None if unknown.
     """
 
     name: str
@@ -145,11 +149,11 @@ def gis_package(module: str, purpose: str) -> Any:  # noqa: ANN401 - a module
     """Import a package of the extra `gis` and return it.
 
     Args:
-        module: Its name.
+        module: Name of the package.
         purpose: What needs it, a plural for the message, such as "GIS files".
 
     Raises:
-        StemmapError: It, or a module that it needs, is not installed.
+        StemmapError: The package, or a module that it needs, is not installed.
     """
     try:
         return importlib.import_module(module)
@@ -160,15 +164,15 @@ def gis_package(module: str, purpose: str) -> Any:  # noqa: ANN401 - a module
 
 
 def projected(crs: str) -> str:
-    """Return a projected reference system with metres in the normal form of its authority (EPSG:25832), or as
-    WKT without one.
+    """Return a projected reference system in metres as "AUTHORITY:CODE", for example EPSG:25832, or as WKT if
+    no authority has a code for it.
 
     Args:
         crs: A code such as "25832" or "EPSG:25832", or any text that pyproj reads.
 
     Raises:
-        StemmapError: It is unknown, not projected (geographic, geocentric, vertical, local) or has another
-            unit than metres. The message states which.
+        StemmapError: The reference system is unknown, not projected (geographic, geocentric, vertical, local)
+            or has another unit than metres. The message states which.
     """
     import pyproj
 
@@ -321,8 +325,9 @@ def read_map_frame(folder: FilePath) -> MapFrame:
 
 
 def _method_of(given: dict[str, Any]) -> tuple[str, dict[str, float], str]:
-    """Return method, numbers and note of a record, see `MapFrame`. A record of an earlier version has only
-    the text `how`, of which the methods without numbers are known.
+    """Return `method`, `numbers` and `note` of `MapFrame` from a record. For a record of an earlier version,
+    which has only the text `how`, the method is "hand" or "file" if the text states it, else "" with the text
+    as note.
 
     Raises:
         ValueError, KeyError, TypeError: The method is unknown, or a number is missing.
@@ -361,8 +366,8 @@ NAME_MAX = 60  # characters of the name of a control point
 
 
 def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
-    """Return the control points of a table, in its order. A point with a tree has no x and y; one without a
-    name is called by its tree or its place in the table.
+    """Return the control points of a table, in its order. A point with a tree has no x and y. A point without
+    a name gets the number of its tree or of its row as name.
 
     Args:
         file: CSV with a header: easting and northing (or lon and lat), tree or x_m and y_m, optionally name
@@ -370,8 +375,8 @@ def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
         crs: Reference system, see `projected`, to which longitudes and latitudes are converted.
 
     Raises:
-        SourceError: It cannot be read, is larger than 1 MB, has an incomplete header or row, a cell that is
-            not a number, a name of more than NAME_MAX characters, no rows or more than POINTS_MAX.
+        SourceError: The file cannot be read, is larger than 1 MB, has an incomplete header or row, a cell
+            that is not a number, a name of more than NAME_MAX characters, no rows or more than POINTS_MAX.
     """
     table = CsvTable.read(file, "table of control points", _LARGEST_FILE)
     if len(table.rows) > POINTS_MAX:
@@ -422,12 +427,12 @@ def by_control_points(
 ) -> MapFrame:
     """Return the frame of a map by control points. It is not written.
 
-    The height of the map's zero is the mean by the points with a height and the terrain of the run; it is 0
-    without heights.
+    The height of the origin of the map is the mean over the points with a height of this height minus the
+    terrain of the run there; 0 if no point has a height.
 
     Args:
         folder: Folder of the run.
-        points: Trees by their numbers, also rejected ones, or positions in the map.
+        points: Trees, also rejected ones, or positions in the map.
         crs: Reference system, see `projected`.
         point_sigma: See `fit_control_points`.
 
@@ -473,15 +478,15 @@ def by_control_points(
 
 
 def by_hand(folder: FilePath, crs: str, east: float, north: float, turn: float, z: float) -> MapFrame:
-    """Return the frame of a map by the position of its origin, without an uncertainty. It is not written.
-    Zeros are the frame of a map whose coordinates are already in the reference system.
+    """Return the frame of a map with a given position of its origin; `sigma` is NaN. Nothing is written. The
+    method is "hand", or "file" if `east`, `north`, `turn` and `z` are all 0.
 
     Args:
         folder: Folder of the run.
         crs: Reference system, see `projected`.
         east, north: Position of the origin [m].
-        turn: Angle of the x axis from east to north [rad].
-        z: Height of the map's zero [m].
+        turn: Angle from east to the x axis of the map, counter-clockwise [rad].
+        z: Height of the origin of the map [m].
 
     Raises:
         StemmapError: The folder is not that of a run, or the centre of the map is not in the area of the
@@ -565,13 +570,13 @@ def by_gnss(folder: FilePath, crs: str, start_ns: int | None = None) -> MapFrame
 
 
 def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
-    """Return the height of the nearest cell of the terrain at positions in the map, shape (N,) [m]; NaN if it
-    is farther than `reach`.
+    """Return the height of the terrain cell nearest to each position, shape (N,) [m]; NaN if that cell is
+    farther than `reach` or there are no cells.
 
     Args:
-        terrain: x, y, z of its cells, shape (K, 3) [m].
-        points: Positions, shape (N, 2) [m].
-        reach: Largest distance of the cell [m].
+        terrain: x, y, z of the terrain cells in the map, shape (K, 3) [m].
+        points: Positions x, y in the map, shape (N, 2) [m].
+        reach: Maximum distance of the cell [m].
     """
     from scipy.spatial import cKDTree
 
@@ -582,8 +587,8 @@ def heights_at(terrain: Float, points: Float, reach: float = 2.0) -> Float:
 
 
 def frame_lines(frame: MapFrame) -> list[str]:
-    """Return a frame as lines for people: where known the place of the map; position and method; where known
-    its standard deviation and the residuals of the control points. A local frame is one line."""
+    """Return a frame as lines for people: the place of the map if it is known; the pose and the method; the
+    standard deviation if it is known; and the residuals of the control points. A local frame is one line."""
     if not frame.crs:
         return ["local coordinates: the map has no reference system"]
     lines = [f"the map is at {frame.place}"] if frame.place else []

@@ -115,7 +115,7 @@ _OWN_FRAME = {**ROBOTS_FRAME, "origin": "that of the cloud"}
 
 
 def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
-    """Return longitude and latitude (WGS84) [deg], shape (N, 2), of positions. None without a reference
+    """Return longitude and latitude (WGS84) [deg], shape (N, 2), of positions. None if there is no reference
     system, and, with a warning, if it is unknown or a position is outside of its area.
 
     Args:
@@ -138,8 +138,8 @@ def _lon_lat(position: Float, crs: str, warnings: list[str]) -> Float | None:
 
 
 def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
-    """Yield a row of DETECTION_COLUMNS for each candidate: scan 0, without time and eccentricity; the width
-    is that of the circle, the height the extent of the stem.
+    """Yield the cells of DETECTION_COLUMNS for each candidate, in the coordinates of the cloud: scan 0,
+    without time and eccentricity. The width is the diameter of the circle, the height the extent of the stem.
 
     Args:
         plot: The map in local coordinates.
@@ -164,8 +164,8 @@ def _detection_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
 
 
 def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
-    """Yield a row of SLICE_COLUMNS for each cross-section of a tree with a known radius; heights are above
-    the ground at the tree. Arguments as in `_detection_rows`."""
+    """Yield the cells of SLICE_COLUMNS for each cross-section of a tree that has a known radius; heights are
+    above the ground at the tree. Arguments as in `_detection_rows`."""
     for number, circles in zip(plot.trees.number, plot.circles[plot.tree_candidate], strict=True):
         for height, s in zip(slice_heights(), circles, strict=True):
             if np.isfinite(s[2]):
@@ -183,9 +183,9 @@ def _slice_rows(plot: PlotMap, offset: Float) -> Iterator[list[str]]:
 
 
 def _terrain_rows(ground: TerrainRaster, offset: Float) -> Iterator[list[str]]:
-    """Yield a row of TERRAIN_COLUMNS for each cell with ground returns, from west to east, without
-    interpolated cells: its centre and height in the coordinates of the cloud; uncertainty and number of views
-    are empty. `offset` as in `_detection_rows`."""
+    """Yield the cells of TERRAIN_COLUMNS for each terrain cell with ground returns, from west to east,
+    without interpolated ones: centre and height in the coordinates of the cloud; uncertainty and number of
+    views are empty. `offset` as in `_detection_rows`."""
     columns, rows = np.nonzero(ground.seen)
     place = ground.low + (np.stack([columns, rows], axis=1) + 0.5) * ground.cell + offset[:2]
     height = ground.height[columns, rows] + offset[2]
@@ -202,17 +202,21 @@ def _run_record(
     warnings: list[str],
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """Return the contents of run.json: `stemmap` (version), `source` with `uri`, `kind`, `sha256`, `offset_m`
-    and `crs` (None without), `seed` and `scans` (both 0), `preset`, `changed`, `parameters`, the counts
-    `trees`, `points` (by stage) and `verdicts`, `voxel_size_m`, `ground_m` (least and greatest height of the
-    terrain in the coordinates of the cloud), `evaluation` (None without), `warnings` and `losses`.
+    """Return the content of run.json as a dict.
+
+    The keys are `stemmap` (version); `source`, a dict with `uri`, `kind`, `sha256`, `offset_m` ([x, y, z])
+    and `crs` (None if unknown); `seed` and `scans`, both 0; `preset`, `changed` and `parameters`; `trees`
+    (number); `points`, a dict from the stage to the number of points; `verdicts`, a dict from the label to
+    the number of candidates; `voxel_size_m`; `ground_m`, [minimum, maximum] of the height of the terrain in
+    the coordinates of the cloud; `evaluation` (a dict, None if there is no ground truth); `warnings` and
+    `losses`.
 
     Args:
         cloud, plot: The cloud and its map.
         preset, parameters: With which it was mapped.
-        evaluation: Scores; None without ground truth.
+        evaluation: Scores; None if there is no ground truth.
         warnings: Messages for people.
-        losses: Number of left-out points by reason.
+        losses: Dict from a reason to the number of points that were left out for it.
     """
     about, heights = cloud.description, plot.ground.height
     verdicts = Counter(Verdict(int(v)).label for v in plot.verdict)
@@ -247,8 +251,8 @@ def _summary(uri: str, plot: PlotMap, trees: Trees, evaluation: MapScores | None
     Args:
         uri: URI of the cloud.
         plot: The map.
-        trees: Its trees.
-        evaluation: Scores; None without ground truth.
+        trees: Trees of the map.
+        evaluation: Scores; None if there is no ground truth.
     """
     dbh = 100.0 * trees.dbh[np.isfinite(trees.dbh)]
     wide = f", DBH {dbh.min():.1f} to {dbh.max():.1f} cm ({len(dbh)} measured)" if len(dbh) else ", no DBH"

@@ -72,7 +72,8 @@ class OfflineRun:
         truth_trees: True trees that replace those of the source; None for these.
         continued: The map that is continued; None begins a map.
         stop_after: Maximum number of scans; None for all.
-        revisions: Parameter changes: first scan and parameters, in order.
+        revisions: Changes of parameters, ascending: index of the first scan, and all parameters from there
+            on.
         on_frame: Called with the results of each scan.
         chosen: Topics and mounting that the user chose, see `SourceRequest.kept_choices`.
     """
@@ -96,9 +97,10 @@ class MappingResult:
 
     Attributes:
         summary: Lines to print.
-        warnings: Each warning once, with its number.
-        losses: Numbers of messages or points that were left out, by reason.
-        scan_ms, stage_ms: Median time of a scan and of each stage [ms], without compilation.
+        warnings: Each warning once, see `warning_texts`.
+        losses: Dict from a reason to the number of messages or points that were left out for it.
+        scan_ms: Median time of a scan without compilation [ms].
+        stage_ms: Dict from each stage to its median time without compilation [ms].
     """
 
     summary: list[str] = field(default_factory=list)
@@ -224,7 +226,7 @@ def _map_scans(
         files: Output files.
         progress: Updated after each scan.
         stopwatch: Measures the stages.
-        seen: Receives what the scans observed.
+        seen: Recorder to which the views of the scans are added.
 
     Raises:
         SourceError: There is no scan that is not in the map yet.
@@ -293,9 +295,9 @@ def _use_revisions(plan: OfflineRun, mapper: Mapper, scan: int) -> None:
 
 
 def _changes(plan: OfflineRun) -> list[dict[str, Any]]:
-    """Return the revisions of the parameters for run.json as dicts with `revision`, `from_scan` and `changes`
-    (new value by dotted name, against the revision before); first an empty one from scan 0 on. Revisions
-    without a change are omitted."""
+    """Return the revisions of the parameters as a list of dicts with `revision` (number), `from_scan` and
+    `changes`, a dict from dotted names to the values that differ from the revision before. The first revision
+    has the number 0, begins with scan 0 and has no changes. Later revisions without a change are omitted."""
     revisions: list[dict[str, Any]] = [{"revision": 0, "from_scan": 0, "changes": {}}]
     before = plan.parameters
     for first, parameters in plan.revisions:
@@ -334,7 +336,7 @@ def _saved(
         begun: Sources and totals.
         mapper: The mapper after the last scan.
         start_ns: Time of the first scan [ns].
-        losses: Number of left-out records by reason.
+        losses: Dict from a reason to the number of records that were left out for it.
     """
     return SavedRun(
         FORMAT,
@@ -350,9 +352,9 @@ def _saved(
 
 
 def _truth(plan: OfflineRun, begun: RunStart) -> Truth:
-    """Return the ground truth in the frame of the map: the trees of the plan, else those of the source; and
-    the path of the source. For another drive in a continued map the source is the first one of the map, whose
-    path is left out. Both are None where unknown."""
+    """Return the ground truth in the frame of the map: the trees of the plan, else those of the source, and
+    the path of the source; None in place of unknown trees or an unknown path. For another drive in a
+    continued map, the source is the first one of the map, and the path is None."""
     known = begun.truth or plan.source.truth() or Truth()
     return Truth(plan.truth_trees or known.trees, known.path)
 
@@ -367,12 +369,14 @@ def _run_record(
     error: PathError | None,
     losses: dict[str, int],
 ) -> dict[str, Any]:
-    """Return the contents of run.json but `odometry_used`: `stemmap` (version), `source` (of the first drive;
-    its `kind` and `sensor` are those of the present one), `recorded` (see `recorded_time`), `continued`
-    (further drives) and `chosen` where there are any, `seed`, `odometry`, `preset`, `changed`, `parameters`,
-    `revisions`, the counts `scans`, `duration_s`, `distance_m`, `trees`, `points` and `verdicts`, the pose
-    quality `health`, the scores `evaluation` and `path_error` (None without), `warnings` and `losses`.
-    Without the time of the mapping and computing times, so that the same run gives the same bytes.
+    """Return the content of run.json except `odometry_used` as a dict. It has no times of computation.
+
+    The keys are `stemmap` (version); `source`, a dict with `uri` and `sha256` of the first drive and `kind`
+    and `sensor` of the present one; `continued`, a list of the further drives, and `chosen`, both only if
+    there are any; `recorded`, see `recorded_time`; `seed`, `odometry`, `preset`, `changed` and `parameters`;
+    `revisions`, see `_changes`; the numbers `scans`, `duration_s`, `distance_m` and `trees`; `points` and
+    `verdicts`, dicts of counts; `health`, see `RunHealth.record`; `evaluation` and `path_error`, dicts, None
+    if there is no ground truth; `warnings` and `losses`.
 
     Args:
         plan: The run with its parameters.
@@ -380,8 +384,8 @@ def _run_record(
         frame: The last frame.
         driven_s_m: Duration [s] and length [m] of the path.
         start_ns: Time of the first scan [ns].
-        evaluation, error: Scores of map and path; None without ground truth.
-        losses: Number of left-out records by reason.
+        evaluation, error: Scores of map and path; None if there is no ground truth.
+        losses: Dict from a reason to the number of records that were left out for it.
     """
     description, tally = plan.source.description, begun.tally
     first, *others = begun.sources

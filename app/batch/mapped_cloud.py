@@ -36,8 +36,9 @@ def write_cloud(folder: FilePath, file: FilePath) -> int:
 
     A whole cloud keeps its points and coordinates. Every EVERY-th scan of a drive is read again from the
     source, placed by the path of the run, and thinned. Points within GROUND of the terrain have class 2.
-    Others within the radius of the nearest trunk and MARGIN, at any height, have class 5 and the number of
-    the tree in the field `tree`, which is 0 for all other points; the rest has class 1.
+    Other points have class 5 and the number of the nearest tree in the field `tree` if their horizontal
+    distance from the tree is at most its radius plus MARGIN (UNKNOWN_RADIUS for a tree without a diameter),
+    at any height. The rest has class 1. `tree` is 0 for all points without class 5.
 
     Args:
         folder: Folder of the run.

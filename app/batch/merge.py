@@ -109,7 +109,7 @@ def _joined(
 
     Args:
         a, b: The runs.
-        merged: Their merged map.
+        merged: Merged map of the two runs.
         match: Pose of the map of b in that of a.
         shift: Offset that is added to the times of run b [ns].
         parameters: Parameters of the merged map.
@@ -152,15 +152,15 @@ def _path(merged: MergedMap) -> Path:
 
 
 def _update(record: dict[str, Any], saved: SavedRun, path: Path, trees: int, match: Match) -> None:
-    """Change the record of run a to that of the merged run, in place. Its scores become None, `continued` has
-    all sources but the first, and `merged` the match: `stems`, `second`, `log10_false_alarms` and
-    `sigma_m_m_rad`.
+    """Change the record of run a to that of the merged run, in place. The scores become None, `continued` a
+    list of all sources but the first, and `merged` a dict of the match with `stems`, `second`,
+    `log10_false_alarms` and `sigma_m_m_rad`, standard deviations of x [m], y [m] and yaw [rad].
 
     Args:
-        record: Contents of run.json of run a.
+        record: Content of run.json of run a.
         saved: The merged run.
-        path: Its path.
-        trees: Number of its confirmed trees.
+        path: Path of the merged run.
+        trees: Number of confirmed trees of the merged run.
         match: How b was matched to a.
     """
     first, *others = saved.sources
@@ -224,8 +224,8 @@ def _correspondence(
 def _moved_rows(
     file: FilePath, T: Pose2, scans: int, shift: int, a: SavedRun, b: SavedRun
 ) -> list[list[str]]:
-    """Return the detections of run b as rows of DETECTION_COLUMNS with frame, scan numbers and times of run
-    a.
+    """Return the detections of run b as cells of DETECTION_COLUMNS, with positions, scan numbers and times
+    moved into run a.
 
     Args:
         file: Table of the detections of run b.

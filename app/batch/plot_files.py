@@ -80,7 +80,7 @@ def placed(contents: Sequence[Content], offset: Sequence[float]) -> list[SampleP
 
     Args:
         contents: Annotations; those that are no plots are left out.
-        offset: Offset x, y of the frame of the map in these coordinates [m].
+        offset: Offset x, y of the frame of the map in these coordinates [m]; further values are ignored.
     """
     plots = [plot_of(**content.plot) for content in contents if content.plot]
     by = np.array(offset[:2], np.float64)
@@ -99,8 +99,8 @@ def stored_plots(store: Store, source: Mapping[str, Any]) -> list[SamplePlot]:
 
 
 def stored_frame(store: Store, source: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Return the reference system that a recording got on the page, in the form of `MapFrame.record`; None
-    without one. Arguments as in `stored_plots`."""
+    """Return the reference system that the store has for a recording, in the form of `MapFrame.record`; None
+    if there is none. Arguments as in `stored_plots`."""
     contents = store.contents(str(source.get("sha256") or source.get("uri")), FRAME)
     return contents[0].plot["frame"] if contents and contents[0].plot else None
 
@@ -137,11 +137,11 @@ def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN4
 
     Args:
         file: The file, for messages and for the members of a GeoJSON.
-        table: Its GeoDataFrame.
+        table: GeoDataFrame of the file.
         given: The system that the user gives, or None.
 
     Raises:
-        StemmapError: It is unknown, or there is none.
+        StemmapError: The reference system is unknown, or there is none.
     """
     import pyproj
 

@@ -33,7 +33,7 @@ _FILES = ("path.csv", "terrain.csv", "seen.csv", "run.json", "georeference.json"
 
 
 def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> dict[int, str]:
-    """Return CONFIRMED or REJECTED for each tree that a person reviewed, by its number.
+    """Return a dict from the number of each tree that a person reviewed to CONFIRMED or REJECTED.
 
     An annotation belongs to the tree that is nearest to it, if it is nearer than SAME_THING. Of several
     annotations of a tree the nearest one counts, of equally near ones the last. The page has the same rule

@@ -53,7 +53,7 @@ class Visit:
 
     Attributes:
         name: For messages.
-        trees: Its trees, without rejected ones.
+        trees: Trees of the visit, without rejected ones.
         rejected: Positions of the trees that a person rejected, shape (R, 2) [m].
         seen: Observed area of a run; None for a table, or a run without a record of it.
         frame: Reference system of its coordinates.
@@ -83,10 +83,10 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
     Args:
         path: The folder or the table.
         dbh_unit: Unit of a diameter column of a table without a unit.
-        may_be_empty: Whether it may have no trees.
+        may_be_empty: Whether the folder or table may have no trees.
 
     Raises:
-        StemmapError: It cannot be read or has no trees.
+        StemmapError: The folder or table cannot be read, or has no trees.
     """
     if path.is_dir():
         trees = read_run(path).trees
@@ -112,8 +112,17 @@ def read_visit(path: FilePath, *, dbh_unit: str | None = None, may_be_empty: boo
 
 
 def _numbers(path: FilePath, keep: Bool) -> np.ndarray:
-    """Return the numbers of the rows of a table that the mask `keep`, shape (N,), selects, int64: its column
-    `tree` if all rows have different whole numbers, else their places in the table, from 1 on."""
+    """Return the tree numbers of the selected rows of a table, int64, in the order of the rows: the cells of
+    the column "tree" if these are different integers in all rows of the table, else the positions of the rows
+    in the table, from 1.
+
+    Args:
+        path: The table, a CSV file.
+        keep: Which of the N rows are selected, shape (N,).
+
+    Raises:
+        StemmapError: The table cannot be read.
+    """
     cells = CsvTable.read(path, "table of trees", LARGEST_FILE).text("tree")
     try:
         numbers = np.array([int(cell) for cell in cells], np.int64)
@@ -134,7 +143,7 @@ def compare(
         a, b: The earlier and the later visit.
         same_frame: Whether their coordinates are taken as equal; then there is no alignment, `T_a_b` is the
             identity, and nothing is raised.
-        reach: Largest distance of the two positions of a tree in the frame of `a` [m].
+        reach: Maximum distance of the two positions of a tree in the frame of `a` [m].
         dbh_sigma: Standard deviation of a known diameter that has none [m].
 
     Raises:
@@ -160,12 +169,13 @@ def _other_unit(a: VisitTrees, b: VisitTrees) -> str:
 
 
 def rows_of(a: Visit, b: Visit, found: VisitComparison) -> list[dict[str, Any]]:
-    """Return one row of COLUMNS per tree, with None for unknown values: first the trees of a in their order,
-    each with its pair in b, then the others of b. Positions are in the frame of a.
+    """Return a dict with the keys COLUMNS for each tree, with None for unknown values: first for the trees of
+    a in their order, each with its pair in b, then for the unpaired trees of b. Positions are in the frame of
+    a.
 
-    The status is `same`, `moved`, `missing` (only in a, at a place that b observed), `new` (only in b, at a
-    place that a observed), `not seen in a` and `not seen in b` where the other visit did not look, or
-    `rejected in a` and `rejected in b` where a tree within the reach of a pair was rejected there.
+    The status is `same` or `moved` for a pair. For a tree of one visit, it is `rejected in a` or `rejected in
+    b` if a rejected tree of the other visit is within `found.reach`; else `missing` (only in a) or `new`
+    (only in b) if the other visit observed the position; else `not seen in a` or `not seen in b`.
     """
     place_b = found.T_a_b.apply(b.trees.position)
     only_a = _status_in(b, "b", "missing", found.T_a_b.inverse().apply(a.trees.position), found.reach)
@@ -224,8 +234,8 @@ def _row(
     sigma: float = math.nan,
     significant: bool | None = None,
 ) -> dict[str, Any]:
-    """Return a row of COLUMNS by name; lengths [m] as in the parameters, diameters and growth in centimetres,
-    None for NaN."""
+    """Return a dict from the names in COLUMNS to rounded values; None for NaN. The arguments are in metres;
+    diameters and growth of the result are in centimetres."""
 
     def number(value: float, digits: int) -> float | None:
         return round(float(value), digits) if math.isfinite(value) else None
@@ -244,13 +254,14 @@ def _row(
 
 
 def comparison_record(a: Visit, b: Visit, found: VisitComparison) -> dict[str, Any]:
-    """Return the figures of a comparison as JSON values, with None where there is none.
+    """Return the results of a comparison as a dict of JSON values; unknown values are None.
 
-    Keys: `stemmap` (version), the names `a` and `b`; `alignment` with the pose of b in a as `x_m`, `y_m` and
-    `turn_deg`, `shift_of_centre_m` (of the mean tree of b, [x, y]) and `stems`; `trees_a`, `trees_b`;
-    `counts`, the number of rows of each status, also 0; `pairs` and `shift_rms_m`; of the pairs `with_dbh`
-    (number) in both visits `growth_mean_cm`, `growth_weighted_cm`, `growth_se_cm` (from two on),
-    `dbh_rms_difference_cm` and the number `significant`; and `warnings` for people.
+    The keys are `stemmap` (version) and the names `a` and `b`; `alignment`, a dict with the pose of b in a
+    (`x_m`, `y_m`, `turn_deg`), `shift_of_centre_m` ([x, y] of the mean position of the trees of b) and
+    `stems`; the numbers of trees `trees_a` and `trees_b`; `counts`, a dict from each status to its number of
+    rows; `pairs`, the number of pairs, and `shift_rms_m`; `with_dbh`, the number of pairs with a DBH in both
+    visits, and of these `growth_mean_cm`, `growth_weighted_cm`, `growth_se_cm` (at least two pairs),
+    `dbh_rms_difference_cm` and the number `significant`; and `warnings`, a list of strings.
     """
     rows = rows_of(a, b, found)
     growth = found.growth[np.isfinite(found.growth)]
@@ -304,7 +315,7 @@ def _unit_warnings(a: Visit, b: Visit, found: VisitComparison) -> list[str]:
 
 
 def comparison_lines(record: dict[str, Any]) -> list[str]:
-    """Return the figures of `comparison_record` as lines for people."""
+    """Return the results of `comparison_record` as lines for people."""
     pose, counts = record["alignment"], record["counts"]
     east, north = pose["shift_of_centre_m"]
     how = f"aligned by {count(pose['stems'], 'stem')}" if pose["stems"] else "coordinates taken as equal"

@@ -61,7 +61,8 @@ class FinishedRun:
         record: run.json; only "source", "seed" and "parameters" are checked.
         uri: URI of the source.
         trees: The trees that no person rejected.
-        reviews: Whether a tree is open or confirmed in the review, see `REVIEWS`, by its number.
+        reviews: Dict from the number of each tree to the state of its review, "open" or "confirmed", see
+            `REVIEWS`.
         rejected: Number of rejected trees.
         of_cloud: Whether a whole cloud was mapped, which has an empty path.
     """
@@ -83,7 +84,7 @@ def read_run(folder: FilePath) -> FinishedRun:
     the first scan, unknown ones of trees are -1; other unknown values are NaN.
 
     Raises:
-        SourceError: A file is missing, damaged or larger than 256 MB.
+        SourceError: A file is missing, damaged or larger than 256 MB, or the parameters are not valid.
     """
     record = read_run_record(folder)
     try:
@@ -108,8 +109,8 @@ def read_run(folder: FilePath) -> FinishedRun:
 
 
 def read_tree_places(folder: FilePath) -> dict[int, tuple[float, float]]:
-    """Return x, y [m] of each tree in trees.csv by its number, also of those that a person rejected. run.json
-    is not read.
+    """Return a dict from the number of each tree in trees.csv to its position (x, y) [m] in the coordinates
+    of the file, also of trees that a person rejected. run.json is not read.
 
     Raises:
         SourceError: The file is missing or damaged.
@@ -151,7 +152,7 @@ _FIRST_DATE_NS = 1_000_000_000_000_000_000  # 2001-09-09
 
 def recorded_time(kind: str, start_ns: int) -> dict[str, str]:
     """Return {"recorded": time of the first scan in UTC (ISO 8601, seconds)} for run.json; {} for a simulated
-    run and for times before 2001-09-09, which count from the start of a sensor.
+    run and for times before 2001-09-09.
 
     Args:
         kind: Name of the format of the source.
@@ -169,10 +170,11 @@ def is_of_cloud(record: dict[str, Any]) -> bool:
 
 
 def read_run_record(folder: FilePath) -> dict[str, Any]:
-    """Return run.json of a folder; "source" and "parameters" are dicts, all else is unchecked.
+    """Return run.json of a folder as a dict; the values of "source" and "parameters" are dicts, other values
+    are not checked.
 
     Raises:
-        SourceError: It is missing or damaged.
+        SourceError: The file is missing, damaged or larger than 256 MB.
     """
     try:
         record = json.loads(_text(folder / "run.json"))
@@ -226,7 +228,7 @@ def _text(file: FilePath) -> str:
     """Return the text of a file.
 
     Raises:
-        SourceError: It cannot be read, is larger than 256 MB, or is not UTF-8.
+        SourceError: The file cannot be read, is larger than 256 MB, or is not UTF-8.
     """
     try:
         if file.stat().st_size > LARGEST_FILE:
@@ -243,16 +245,17 @@ def _text(file: FilePath) -> str:
 
 
 def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
-    """Return the columns of a CSV file by name, shape (rows,) each, in the units of the file; an empty cell
-    is NaN, also in NEW_TREE_COLUMNS that the file does not have, and a review its place in REVIEWS.
+    """Return a dict from the name of each column of a CSV file to its numbers, shape (rows,), in the units of
+    the file. An empty cell is NaN, and so are all cells of NEW_TREE_COLUMNS that the file does not have. A
+    cell of "review" becomes its index in REVIEWS.
 
     Args:
         file: The file.
-        names: Its expected header.
+        names: The expected header; NEW_TREE_COLUMNS may be missing in the file.
 
     Raises:
-        SourceError: The file cannot be read, has another header or a damaged row, or a cell of `_NEVER_EMPTY`
-            is empty.
+        SourceError: The file cannot be read or is larger than 256 MB, has another header or a damaged row, or
+            a cell of `_NEVER_EMPTY` is empty.
     """
     rows = list(csv.reader(_text(file).splitlines()))
     missing = tuple(name for name in NEW_TREE_COLUMNS if name in names and rows and name not in rows[0])
@@ -271,8 +274,8 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
 
 
 def _table(rows: Sequence[Sequence[str]], names: tuple[str, ...]) -> dict[str, Float]:
-    """Return the columns of a CSV table by name, shape (rows,) each; an empty cell is NaN, a review its place
-    in REVIEWS.
+    """Return a dict from the name of each column of a CSV table to its numbers, shape (rows,). An empty cell
+    is NaN, and a cell of "review" becomes its index in REVIEWS.
 
     Args:
         rows: Cells of the rows, without the header.
@@ -288,20 +291,23 @@ def _table(rows: Sequence[Sequence[str]], names: tuple[str, ...]) -> dict[str, F
 
 
 def _number(name: str, cell: str) -> float:
-    """Return a cell of a column as a number, see `_table`; raises ValueError if it is none."""
+    """Return a cell of a column as a number, see `_table`; ValueError if it is neither empty nor a number,
+    nor in REVIEWS for the column "review"."""
     if not cell:
         return math.nan
     return float(REVIEWS.index(cell)) if name == "review" else float(cell)
 
 
 def _path(c: dict[str, Float]) -> Path:
-    """Return the path from the columns of path.csv."""
+    """Return the path from the columns of path.csv, a dict from their names to arrays of shape (N,).
+    `stamp_ns` counts from the first scan of the run."""
     stamp = np.round(c["t_s"] * 1e9).astype(np.int64)
     return Path(stamp, c["x_m"], c["y_m"], c["yaw_rad"], c["sigma_xy_m"])
 
 
 def _trees(c: dict[str, Float]) -> Trees:
-    """Return the trees from the columns of trees.csv, see `read_run`."""
+    """Return the trees from the columns of trees.csv, a dict from their names to arrays of shape (T,). All
+    are confirmed, covariances xy are 0, and an unknown time is -1."""
     n = len(c["tree"])
     covariance = np.zeros((n, 2, 2))
     covariance[:, 0, 0], covariance[:, 1, 1] = c["sigma_x_m"] ** 2, c["sigma_y_m"] ** 2
@@ -324,7 +330,7 @@ def _trees(c: dict[str, Float]) -> Trees:
 
 
 def _stamps(seconds: Float) -> Int:
-    """Return seconds, shape (N,), as nanoseconds, int64; NaN, as in the map of a whole cloud, becomes -1."""
+    """Return times [s], shape (N,), in nanoseconds, int64; NaN or infinity becomes -1."""
     stamps: Int = np.where(np.isfinite(seconds), np.round(np.nan_to_num(seconds) * 1e9), -1.0).astype(
         np.int64
     )
@@ -344,7 +350,7 @@ def check_folder(folder: FilePath, digest: str, *, force: bool) -> bool:
 
     Raises:
         StemmapError: `force` is not set, and the folder contains the run of another source, a run.json that
-            cannot be read, or without run.json files of these names.
+            cannot be read, or no run.json but a file of the names in _FILES.
     """
     if not (folder / "run.json").exists():
         there = [name for name in _FILES if (folder / name).exists()]

@@ -29,21 +29,22 @@ ALL = "all"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandResult:
-    """Stand figures of a run.
+    """Stand parameters of a run.
 
     Attributes:
         run, frame: The run and the frame of its map.
-        trees: Its trees.
-        parameters: Parameters of the figures.
-        plots: The plots; the whole observed area without plots.
+        trees: Trees of the run.
+        parameters: Parameters of the computation.
+        plots: The plots; if there are none, the whole observed area.
         whole: Whether there are no plots, and the only one is the whole observed area.
         seen: Observed area within reach.
-        figures: Figures of each plot by name.
-        total: Mean over the plots, or the figures of the one plot.
-        left_out: Number of trees of the map that no plot counts, by reason: `rejected` (in the review),
-            `outside_of_plots` (only with plots), `outside_of_observed_area` or `below_minimum_dbh`, whichever
-            comes first. A tree without a diameter is not below the minimum.
-        detection_sigma: Scale of the half-normal function [m]; inf for certain detection.
+        figures: Dict from the name of each plot to its stand parameters.
+        total: Dict from each stand parameter to its mean over the plots; with one plot, that of the plot.
+        left_out: Dict from the reason to the number of trees of the map that no plot counts for it:
+            `rejected` (in the review), `outside_of_plots` (only with plots), `outside_of_observed_area` or
+            `below_minimum_dbh`, whichever comes first. A tree without a diameter is not below the minimum.
+        detection_sigma: Scale of the half-normal detection function [m]; inf if detection does not decrease
+            with distance.
         warnings: Messages, those of plots with the name of the plot.
     """
 
@@ -62,12 +63,12 @@ class StandResult:
 
 
 def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = ()) -> StandResult:
-    """Return the stand figures of a finished run; rejected trees do not count. Nothing is written.
+    """Return the stand parameters of a finished run; rejected trees do not count. Nothing is written.
     Diameters that look like those of another unit, and few trees, are warnings.
 
     Args:
-        folder: Its folder.
-        parameters: Parameters of the figures.
+        folder: Folder of the run.
+        parameters: Parameters of the computation.
         plots: Plots in the frame of the map; without any, the whole observed area is one plot.
 
     Raises:
@@ -135,8 +136,8 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
 def _left_out(
     trees: PlotTrees, plots: Sequence[SamplePlot], seen: SeenArea, dbh_min: float
 ) -> dict[str, int]:
-    """Return the number of trees that no plot counts by reason, see `StandResult.left_out`, without
-    `rejected`, which `trees` does not have, and without `outside_of_plots` if there are no plots."""
+    """Return a dict from each reason of `StandResult.left_out` except `rejected` to the number of trees that
+    no plot counts for it; without `outside_of_plots` if there are no plots."""
     reasons = {
         "outside_of_observed_area": seen.rows(trees.position) < 0,
         "below_minimum_dbh": trees.dbh < dbh_min,
@@ -184,9 +185,10 @@ CLASS_COLUMNS = ("plot", "from_cm", "to_cm", "trees", "n_ha", "n_ha_se", "g_ha",
 
 
 def stand_files(result: StandResult) -> dict[str, str]:
-    """Return the texts of three files by name. stand.csv has PLOT_COLUMNS, then each figure of FIGURES and
-    its `_se`, one row per plot, and for several a row `mean` with only figures. classes.csv has
-    CLASS_COLUMNS. stand.json is `stand_record`. Unknown values are empty cells or null."""
+    """Return a dict from the names of three files to their texts. stand.csv has the columns PLOT_COLUMNS,
+    then each stand parameter of FIGURES and its standard error with "_se", one row per plot, and for several
+    plots a row `mean` with only stand parameters. classes.csv has the columns CLASS_COLUMNS, one row per plot
+    and class. stand.json is `stand_record`. Unknown values are empty cells or null."""
     header = (*PLOT_COLUMNS, *(f"{name}{end}" for name in FIGURES for end in ("", "_se")))
     rows = []
     for name, f in result.figures.items():
@@ -208,15 +210,22 @@ def stand_files(result: StandResult) -> dict[str, str]:
 
 
 def stand_record(result: StandResult) -> dict[str, Any]:
-    """Return the contents of stand.json as JSON values.
+    """Return the content of stand.json, a dict of JSON values.
 
-    Each figure is a list [value, standard error]; an unknown number in it is None, so that an unknown figure
-    is [None, None]. `trees_in_map` counts all trees, also rejected ones; `trees_left_out` has the number of
-    those that no plot counts, by reason; `detection_sigma_m` is None for certain detection. `plots` has by
-    the name of the plot `area_m2`, `seen_m2`, `trees`, `trees_without_dbh`, `trees_with_volume` (None if
-    unknown), the figure `detection`, the other figures by name, and `classes`, a list of `from_cm`, `to_cm`,
-    `trees` and the figures `n_ha` and `g_ha`. `mean` has the figures over all plots, and `units` the unit of
-    each figure. Further keys: `stemmap` (version), `source`, `crs`, `parameters` and `warnings`.
+    Each parameter of the stand is a list [value, standard error], in which an unknown number is None. The
+    keys are:
+
+    - `stemmap`: version; `source`: URI of the run; `crs`: name of the frame; `warnings`: list of strings;
+    - `parameters`: dict of the parameters of `Stand`;
+    - `trees_in_map`: number of trees, with rejected ones; `trees_left_out`: dict from a reason to the number
+    of trees that no plot counts;
+    - `detection_sigma_m`: None if all trees are assumed to be detected;
+    - `units`: dict from each stand parameter to its unit;
+    - `plots`: dict from the name of each plot to a dict with `area_m2`, `seen_m2`, `trees`,
+    `trees_without_dbh`, `trees_with_volume` (None if unknown), `detection` (a stand parameter), the other
+    stand parameters by name, and `classes`, a list of dicts with `from_cm`, `to_cm`, `trees`, `n_ha` and
+    `g_ha`;
+    - `mean`: dict from each stand parameter to its mean over all plots.
     """
     return {
         "stemmap": version(),
@@ -255,29 +264,31 @@ def stand_record(result: StandResult) -> dict[str, Any]:
 
 
 def _pair(estimate: Estimate) -> list[float | None]:
-    """Return an estimate (value, standard error) for JSON; None where not finite."""
+    """Return [value, standard error] of an estimate, rounded to six decimals; None in place of a number that
+    is not finite."""
     return [_finite(value) for value in estimate]
 
 
 def _finite(value: float) -> float | None:
-    """Return a number rounded to six decimals for JSON; None where not finite."""
+    """Return a number rounded to six decimals; None if it is not finite."""
     return round(float(value), 6) if math.isfinite(value) else None
 
 
 def _cells(values: dict[str, Estimate]) -> list[str]:
-    """Return value and standard error of each figure of FIGURES as cells."""
+    """Return value and standard error of each stand parameter as cells, in the order of FIGURES, see
+    `_numbers`."""
     return _numbers([value for name in FIGURES for value in values[name]])
 
 
 def _numbers(values: Sequence[float]) -> list[str]:
-    """Return numbers with four decimals; "" where not finite."""
+    """Return each number as text with four decimals; "" if it is not finite."""
     return [number_text(value, 4) for value in values]
 
 
 def stand_summary(result: StandResult) -> list[str]:
-    """Return the figures over all plots as lines for people: the number of trees and the area, trees that are
-    not counted if there are any, the figures that have a value, detection, and the meaning of the standard
-    errors. Warnings are not included."""
+    """Return the stand parameters over all plots as lines for people: the number of trees and the area, trees
+    that are not counted if there are any, the stand parameters that have a value, detection, and the meaning
+    of the standard errors. Warnings are not included."""
     seen = sum(f.seen for f in result.figures.values())
     area = sum(f.area for f in result.figures.values())
     trees = sum(f.trees for f in result.figures.values())
@@ -311,5 +322,6 @@ def stand_summary(result: StandResult) -> list[str]:
 
 
 def _digits(value: float) -> str:
-    """Return a number with two decimals below 10, one below 100, and else none."""
+    """Return a number as text with two decimals if its absolute value is below 10, with one if it is below
+    100, else with none and a comma between thousands."""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.2f}" if abs(value) < 10 else f"{value:.1f}"

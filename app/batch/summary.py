@@ -99,8 +99,8 @@ class RunHealth:
             self._spans_left_out += 1
 
     def _remember_worst(self, health: Health) -> None:
-        """Update the worst values: the least of n_eff and ancestors; of the others the largest, at least 0,
-        where values that are not finite are ignored."""
+        """Update the worst values: the minimum of n_eff and ancestors, and the maximum, at least 0, of the
+        others. Maxima ignore values that are not finite."""
         found = {
             "sigma_xy_m": health.sigma_xy,
             "sigma_yaw_deg": math.degrees(health.sigma_yaw),
@@ -115,11 +115,14 @@ class RunHealth:
             self._worst[name] = min(value, self._worst.get(name, math.inf))
 
     def record(self, start_ns: int) -> dict[str, Any]:
-        """Return the record for run.json: `scans`, the number by state; `worst`, the worst value by name
-        (`sigma_xy_m`, `sigma_yaw_deg`, `innovation`, `odometry_sigmas`, `ambiguous`, `n_eff`, `ancestors`),
-        where there was one; `spans`, at most MOST_SPANS, each with `state`, `reason`, `scans` [first, last]
-        and `time_s` [first, last], seconds after `start_ns`; and `spans_left_out`, the number of further
-        ones."""
+        """Return the record for run.json as a dict.
+
+        The keys are `scans`, a dict from each state to its number of scans; `worst`, a dict with the worst
+        values that are known of `sigma_xy_m`, `sigma_yaw_deg`, `innovation`, `odometry_sigmas`, `ambiguous`,
+        `n_eff` and `ancestors`; `spans`, a list of at most MOST_SPANS dicts with `state`, `reason`, `scans`
+        [first, last] and `time_s` [first, last], seconds after `start_ns`; and `spans_left_out`, the number
+        of further spans.
+        """
         return {
             "scans": {state: self._scans[state] for state in ("good", "weak", "lost")},
             "worst": {name: round(value, 4) for name, value in sorted(self._worst.items())},
@@ -181,9 +184,9 @@ class RunTotals:
     """Counts over a run.
 
     Attributes:
-        warned: Number of times that each warning was given.
-        points: Number of points by the stage that removed them.
-        verdicts: Number of clusters by verdict.
+        warned: Counter from each warning to the number of times that it was given.
+        points: Dict from the names in `Frame.counts` to sums over the scans.
+        verdicts: Number of clusters by label of the verdict.
         health: Quality of the poses.
     """
 
@@ -200,15 +203,15 @@ class RunTotals:
         self.warned.update(frame.warnings)
 
     def warnings(self) -> list[str]:
-        """Return each warning once, with its number."""
+        """Return each warning once, see `warning_texts`."""
         return warning_texts(self.warned)
 
 
 def lost_share(health: Mapping[str, int]) -> float | None:
-    """Return the share of scans in which the pose was lost, from 0 to 1; None without scans.
+    """Return the share of scans in which the pose was lost, from 0 to 1; None if there are no scans.
 
     Args:
-        health: Number of scans by state of the pose, see `Health`.
+        health: Dict from the state of the pose quality, see `Health`, to its number of scans.
     """
     scans = sum(health.values())
     return health.get("lost", 0) / scans if scans else None
@@ -247,12 +250,12 @@ def far_truth(reach: float) -> str:
 
 
 def far_map(scores: MapScores, match_distance: float) -> str:
-    """Return the message for a map that has none of the true trees; empty if it has at least one, or there
-    are no true trees.
+    """Return the message for a map in which no true tree is matched; "" if at least one is matched, or there
+    are no true trees near the path.
 
     Args:
         scores: Scores of the map.
-        match_distance: Largest distance between a tree and its ground truth [m].
+        match_distance: Maximum distance between a tree and its ground truth [m].
     """
     if scores.TA.count or not scores.TA.of:
         return ""
@@ -291,7 +294,7 @@ def summary_lines(
         uri: URI of the source.
         frame: Result of the last scan.
         driven_s_m: Duration [s] and distance [m].
-        evaluation, error: Scores of trees and path; None without ground truth.
+        evaluation, error: Scores of trees and path; None if there is no ground truth.
     """
     seconds, metres = driven_s_m
     trees = int(np.count_nonzero(frame.trees.confirmed))
@@ -332,7 +335,7 @@ def evaluation_lines(e: MapScores, *, whole: bool = False) -> list[str]:
 
 
 def truth_in_doubt(e: MapScores) -> str:
-    """Return a warning where the ground truth may belong to another forest; empty otherwise."""
+    """Return a warning that the ground truth may belong to another forest; "" unless `e.is_doubtful`."""
     if not e.is_doubtful:
         return ""
     few = f"only {e.TA.count}" if e.TA.count else "none"
@@ -354,7 +357,7 @@ def _percent(value: float | None) -> str:
 
 
 def _metres(value: float | None) -> str:
-    """Return a length [m] as text in centimetres; "-" for None."""
+    """Return a length [m] as text with its value in centimetres, "3.2 cm"; "-" for None."""
     return "-" if value is None else f"{100.0 * value:.1f} cm"
 
 

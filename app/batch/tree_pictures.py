@@ -25,9 +25,10 @@ class StemPicture:
     """The best view of a tree.
 
     Attributes:
-        tree: Its number.
-        stamp_ns: Time of the picture.
-        box: left, top, right, bottom [pixels].
+        tree: Number of the tree.
+        stamp_ns: Time of the picture [ns].
+        box: Left, top, right and bottom edge of the stem in the picture [pixels]; it may extend beyond the
+            picture.
     """
 
     tree: int
@@ -37,7 +38,7 @@ class StemPicture:
 
 def best_views(camera: Camera, trees: Trees, path: Path, stamps: Int) -> list[StemPicture]:
     """Return the best view of each tree that the camera saw, of the first MOST confirmed ones, ordered by
-    time and then by number; [] without pictures.
+    time and then by number; [] if there are no pictures.
 
     Args:
         camera: The camera.
@@ -60,8 +61,8 @@ def _best_view(
     camera: Camera, trees: Trees, row: int, path: Path, taken: Int, there: Bool
 ) -> StemPicture | None:
     """Return the view of a tree with the smallest |ln(depth / BEST)| + 2 |offset| / width, where the offset
-    is that from the middle of the picture; of equals the earliest. None if no picture shows its middle
-    between NEAREST and FARTHEST. The box may extend beyond the picture.
+    is the horizontal distance of the stem from the middle of the picture; the earliest of equals. None if no
+    picture shows the middle of the stem at a depth between NEAREST and FARTHEST.
 
     Args:
         camera: The camera.
@@ -97,7 +98,7 @@ def stem_corners(x: float, y: float, dbh: float) -> Float:
 
     Args:
         x, y: Position in the base frame [m], not the origin.
-        dbh: Diameter [m]; NaN where unknown, which is drawn as THIN.
+        dbh: Diameter [m]; NaN if unknown, then THIN is used.
     """
     half = 0.5 * (dbh if np.isfinite(dbh) else THIN)
     across = np.array([-y, x, 0.0]) * half / np.hypot(x, y)

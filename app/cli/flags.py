@@ -58,14 +58,16 @@ def add_parameter_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_set_flag(parser: argparse.ArgumentParser, help_text: str) -> None:
-    """Add --set."""
+    """Add --set to a parser. Each --set appends its text to `assignments`, a list that is empty by
+    default."""
     parser.add_argument(
         "--set", metavar="STAGE.NAME=VALUE", dest="assignments", action="append", default=[], help=help_text
     )
 
 
 def add_truth_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --truth, for several runs, and --dbh-unit; see `files_of`."""
+    """Add --truth and --dbh-unit to a parser. Each --truth appends its text `FILE` or `RUN=FILE` to `truths`,
+    a list that is empty by default; see `files_of`."""
     parser.add_argument(
         "--truth",
         metavar="[RUN=]FILE",
@@ -79,7 +81,8 @@ def add_truth_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def files_of(uris: list[str], truths: list[str]) -> dict[str, str]:
-    """Return the file with the true trees of each run, by its URI; runs without a file are missing.
+    """Return a dict from the URI of each run to its file with the true trees; runs without a file are
+    missing.
 
     Args:
         uris: The runs in their order, held-out runs last.

@@ -64,8 +64,8 @@ def exit_reason(returncode: int) -> str:
 
 
 def starved_s(pid: int) -> float:
-    """Return how long the main thread of a process has waited for a processor since its start [s], because
-    other programs had all of them; 0 where the system does not report it."""
+    """Return the time [s] for which the main thread of a process has waited for a processor since its start;
+    0 if the process does not exist or the system does not report it."""
     try:
         return int(Path(f"/proc/{pid}/schedstat").read_text(encoding="ascii").split()[1]) / 1e9
     except (OSError, ValueError, IndexError):
@@ -78,7 +78,7 @@ class ChildProcess:
 
     Attributes:
         pid: Process number.
-        stdin, stdout: Its standard input and output, for other messages than lines of JSON.
+        stdin, stdout: Standard input and output of the process, for other messages than lines of JSON.
     """
 
     def __init__(self, process: asyncio.subprocess.Process) -> None:
@@ -291,7 +291,7 @@ class ParentConnection:
         """Return the next message, of type `kind`; waits for it without a time limit.
 
         Raises:
-            ProtocolError: It is not of this type.
+            ProtocolError: The message is not of this type.
         """
         message = _decoded(self._lines.get(), kind)
         assert message is not None  # noqa: S101 - only whole lines are queued
@@ -384,7 +384,7 @@ def _encoded(message: object) -> bytes:
 
 
 def _number(value: object) -> object:
-    """Return a NumPy scalar, or another value with `__float__`, as a number for JSON; raises
+    """Return a NumPy scalar, or another value with `__float__`, as a Python number; raises
     NotImplementedError for other values."""
     if isinstance(value, SupportsFloat):
         return value.item() if hasattr(value, "item") else float(value)
@@ -392,7 +392,7 @@ def _number(value: object) -> object:
 
 
 def _decoded(line: bytes, kind: type[T]) -> T | None:
-    """Return the message of a line; None for an incomplete one, with which the sender ended.
+    """Return the message in a line; None for a line without a newline at its end.
 
     Raises:
         ProtocolError: The line is not JSON of this type.

@@ -49,7 +49,7 @@ class Settings:
         port: Port on which it listens; 0 for any free port, None for the default port or one of the next.
         token: Token of the owner's link; empty for a new one.
         hosts: Further host names by which browsers may call the server.
-        recordings: Folder whose recordings the page offers, or None.
+        recordings: Folder whose recordings the dashboard offers, or None.
         folder: Folder of runs, annotations and uploads; None keeps them in memory.
         upload_limit: Maximum size of an uploaded recording [bytes].
         files: Files that an owner may open: "any", "folders" (recordings in the data folders), or "" for any
@@ -100,7 +100,7 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
 
     Args:
         settings: Settings of the deployment.
-        now_s: Time in its name [s since 1970].
+        now_s: Time in the name of the recording [s since 1970].
 
     Raises:
         StemmapError: There is no data folder.
@@ -112,8 +112,8 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
 
 def data_folder(given: Mapping[str, str]) -> Path | None:
     """Return the data folder: STEMMAP_FOLDER, else `stemmap` in XDG_DATA_HOME, LOCALAPPDATA or
-    ~/.local/share, whichever is known first; None without any. Empty variables count as unknown; the folder
-    need not exist.
+    ~/.local/share, whichever is known first; None if there is none. Empty variables count as unknown; the
+    folder need not exist.
 
     Args:
         given: The environment variables, from which the home folder is taken too.

@@ -33,7 +33,8 @@ MOST = 6  # maximum number of values in a line
 
 
 def changed_values(name: str, parameters: Parameters) -> dict[str, Value]:
-    """Return the values that differ from a preset, by dotted name; all values if the preset does not exist.
+    """Return a dict from dotted names to the values that differ from a preset; to all values if the preset
+    does not exist.
 
     Args:
         name: Name of the preset.

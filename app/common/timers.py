@@ -187,11 +187,11 @@ class Stopwatch:
 
     @property
     def scan_ms(self) -> float:
-        """Return the median time of a scan [ms], 0 before the first."""
+        """Median time of a scan [ms]; 0 before the first."""
         return 1e3 * median(self._totals) if self._totals else 0.0
 
     @property
     def stage_ms(self) -> dict[str, float]:
-        """Return the median time of each stage [ms] by name, in the order of their first run; stages without
-        a measurement are left out."""
+        """Dict from the name of each stage to its median time [ms], in the order of their first run; stages
+        without a measurement are left out."""
         return {stage: 1e3 * median(times) for stage, times in self._stages.items() if times}

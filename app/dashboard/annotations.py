@@ -61,9 +61,9 @@ def laid_over(own: TruthTrees | None, contents: Sequence[Content]) -> TruthTrees
     """Return the ground truth of the source with the annotations applied; None if there are neither. The
     objects of the source without an annotation come first, then all annotations.
 
-    An annotation replaces the object within SAME_THING that has another class. One of the same class keeps
-    the position of the source, and its diameter unless one was typed, because a person who confirms a mapped
-    tree has not measured its position. One without such an object is added.
+    Annotations and objects are paired one to one within SAME_THING, see `pipeline.evaluation.match`. An
+    annotation replaces its object. If both have the same class, the position of the object is used, and its
+    diameter if the annotation has none. An annotation without an object is added.
 
     Args:
         own: Ground truth of the source, if any; it is not changed.
@@ -103,8 +103,8 @@ def contradicting(own: TruthTrees | None, rows: Sequence[Annotation]) -> int:
 
 
 def _agreed(own: TruthTrees, k: int, content: Content) -> Content:
-    """Return an annotation; if the object of the source has the same class, at the position of that object,
-    and with its DBH unless the annotation has one.
+    """Return the annotation; if the object of the source has the same class, a copy at the position of that
+    object, with the DBH of the object if the annotation has no DBH and the object has one.
 
     Args:
         own: Ground truth of the source.
@@ -142,7 +142,7 @@ class AnnotationEditor:
 
     Attributes:
         run: Number of the run in the store, None while none is open.
-        rows: The annotations of the run that state something about a tree or another thing.
+        rows: The annotations of trees and other objects.
         skipped: The annotations of trees about which a person did not decide.
         plots: The annotations that are plots.
         frame: The annotation that is the reference system of the map; None for a local map.
@@ -276,10 +276,14 @@ class AnnotationEditor:
         return await self._store.ask(lambda store: function(store, run))
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state for the page: `run`, `serial`, `problem`; the ground truth `used` and the choice
-        `against`, the number of objects of the source (`own`, None without) and of annotations that
-        contradict it (`contradicting`), and `same_thing_m`; `trees` and `skipped`, see `row_payload`; `plots`
-        and `georeference` (None without), see `plot_payload`."""
+        """Return the state for the dashboard as a dict of JSON values.
+
+        The keys are `run`, `serial`, `problem` and `against`, the attributes; `used`, the result of
+        `counted`; `own`, the number of objects in the ground truth of the source, None if there is none;
+        `contradicting`, the result of this function; `same_thing_m`, SAME_THING; `trees` and `skipped`, lists
+        of `row_payload`; `plots`, a list of `plot_payload`; and `georeference`, the `plot_payload` of
+        `frame`, None for a local map.
+        """
         return {
             "run": self.run,
             "serial": self.serial,
@@ -307,8 +311,9 @@ def _edits(before: Sequence[Annotation], after: Sequence[Annotation]) -> tuple[s
 
 
 def row_payload(row: Annotation) -> dict[str, Any]:
-    """Return an annotation of an object as JSON values for the page: `id`, `x` and `y` in the map [m],
-    `kind`, `dbh_cm` (None if unknown), `who`, `at_s` (of the last edit, since 1970) and `version`."""
+    """Return an annotation of an object as a dict of JSON values for the dashboard: `id`, `x` and `y` in the
+    map [m], `kind`, `dbh_cm` (None if unknown), `who`, `at_s` (time of the last edit [s since 1970]) and
+    `version`."""
     content = row.content
     return {
         "id": row.id,
@@ -323,8 +328,8 @@ def row_payload(row: Annotation) -> dict[str, Any]:
 
 
 def plot_payload(row: Annotation) -> dict[str, Any]:
-    """Return a plot or the reference system of the map as JSON values for the page: its values (see
-    `Content.plot`), `id`, `who`, `at_s` (of the last edit, since 1970) and `version`."""
+    """Return the annotation of a plot or of the reference system of the map as a dict of JSON values: the
+    keys of `Content.plot`, and `id`, `who`, `at_s` (time of the last edit [s since 1970]) and `version`."""
     return {
         "id": row.id,
         **(row.content.plot or {}),

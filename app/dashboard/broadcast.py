@@ -86,13 +86,13 @@ class Broadcast:
         return self._map if self._map is not None and self._map[0] > count else None
 
     def path_json(self, count: int, path_xy: NDArray[np.float64], start: int) -> bytes:
-        """Return the rows of a path from `start` on, for a page that has those before, as JSON: `start` and
-        `points`, [x, y] to the millimetre. Listeners that need the same rows share the result.
+        """Return the rows of a path from `start` on as JSON: an object with `start` and `points`, a list of
+        [x, y] [m] rounded to 1 mm. The result of the last call is reused if `count` and `start` are the same.
 
         Args:
             count: Number of the message with the map.
-            path_xy: Its path, shape (N, 2) [m].
-            start: First row.
+            path_xy: Positions x, y of the path of this map, shape (N, 2) [m].
+            start: First row of the result.
         """
         if self._path_json[:2] != (count, start):
             rows = {"start": start, "points": np.round(path_xy[start:], 3).tolist()}

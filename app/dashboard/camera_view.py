@@ -51,11 +51,13 @@ class CameraView:
         return self._kept.get(stamp_ns)
 
     async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
-        """Return the camera picture at the time of a scan as JSON values: `index` of the scan, `of`, a number
-        of the run, `stamp_ns` as text, for `jpeg`, `later_ms`, by how much the picture is later, `marks`, see
-        `marks_of`, `why`, the reason if the camera is unknown and there are no marks, and `received`, see
-        `CameraPicture`. Calls wait for one another, so that there are at most about three pictures per
-        second.
+        """Return the description of the camera picture nearest to a scan as a dict of JSON values; `jpeg`
+        returns the picture itself. Calls wait for one another, so that there are at most about three pictures
+        per second.
+
+        The keys are `index` of the scan; `of`, a number of the run; `stamp_ns`, the time of the picture as a
+        string; `later_ms`, this time minus that of the scan; `marks`, the result of `marks_of`, empty if the
+        camera is unknown; `why`, the reason why it is unknown, else ""; and `received`, see `CameraPicture`.
 
         Args:
             frame: Results of the scan.
@@ -132,8 +134,9 @@ _MARGIN = 0.6
 
 
 def drawn_tree(found: CameraPicture, number: int, trees: Trees, path: Path | None) -> bytes | None:
-    """Return the part of a picture around a tree as JPEG; None if the tree is not in it, camera or path are
-    unknown, or it cannot be decoded. Raises StemmapError if no process can be started.
+    """Return the part of a picture around a tree as JPEG, with a frame around the stem. None if the tree is
+    not in `trees` or not in the picture, the camera is unknown, the path has fewer than two poses, or the
+    picture cannot be decoded. Raises StemmapError if no process can be started.
 
     Args:
         found: The picture with its camera.
@@ -167,10 +170,10 @@ MOST = 150
 
 
 def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return boxes around the clusters and trees in a picture as dicts: `kind` ("tree" or "cluster"),
-    `number` of the tree or row of the cluster, `verdict`, `distance_m`, and the box, see `_box`. Only the
-    MOST nearest objects have a box; clusters come before trees, and distant objects before near ones, so that
-    near trees are drawn last.
+    """Return boxes around the clusters and trees in a picture as a list of dicts with `kind` ("tree" or
+    "cluster"), `number` of the tree or row of the cluster, `verdict`, `distance_m`, and the box, see `_box`.
+    Only the MOST nearest objects have a box; clusters come before trees, and distant objects before near
+    ones, so that near trees are rendered last.
 
     The tilt of the robot is not known here, so the boxes of trees are slightly too high or too low on a
     slope.
@@ -187,8 +190,8 @@ def marks_of(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]
 
 
 def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each confirmed tree in view at more than NEAREST and less than FARTHEST. Arguments and
-    keys as in `marks_of`."""
+    """Return a list of dicts, a box for each confirmed tree in view at more than NEAREST and less than
+    FARTHEST. Arguments and keys as in `marks_of`."""
     trees = frame.trees
     marks = []
     places = (frame.estimate.T_map_base @ moved).inverse().apply(trees.position)
@@ -205,8 +208,8 @@ def _trees(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
 
 
 def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]]:
-    """Return a box for each cluster with points of which none is behind or close to the camera plane, at any
-    distance; arguments and keys as in `marks_of`."""
+    """Return a list of dicts, a box for each cluster with points of which none is behind or close to the
+    camera plane, at any distance; arguments and keys as in `marks_of`."""
     verdicts = clusters_payload(frame)["verdict"]
     points = frame.filtered.astype(np.float64) + frame.sensor_offset
     points[:, :2] = moved.inverse().apply(points[:, :2])
@@ -226,9 +229,9 @@ def _clusters(frame: Frame, camera: Camera, moved: Pose2) -> list[dict[str, Any]
 
 
 def _box(camera: Camera, points: Float) -> dict[str, float] | None:
-    """Return the box around points of the base frame, shape (N, 3), N >= 1 [m], as "left", "top", "width" and
-    "height", shares of the size of the picture, clipped to it; None if it is not in view or a point is at
-    most NEAREST in front of the camera plane."""
+    """Return the box around points of the base frame, shape (N, 3), N >= 1 [m], as a dict with "left", "top",
+    "width" and "height", shares of the size of the picture from 0 to 1, clipped to the picture. None if the
+    box is outside of the picture, or a point is at most NEAREST in front of the camera plane."""
     pixels, depth = camera.project(points)
     if not (depth > NEAREST).all():
         return None

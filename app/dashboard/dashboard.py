@@ -48,7 +48,7 @@ _SCENE_PAUSE_S = 0.09
 
 
 class Dashboard:
-    """State of the open run for the page, and the actions of users.
+    """State of the open run for the browsers, and the actions of users.
 
     `worker` is set before `start`, which sets `scene`.
 
@@ -62,7 +62,7 @@ class Dashboard:
         shown, path, path_xy: Newest results and path; None and shape (0, 2) before the first scan.
         truth: Ground truth with annotations; None where none is known.
         seen: Views of the observed area.
-        results: Folder of stored results of sensitivity curves and searches; None without a data folder.
+        results: Folder of stored results of sensitivity curves and searches; None if there is no data folder.
         source, digest: Requested source, and digest (or URI) of the open run, "" before it is open.
     """
 
@@ -299,7 +299,7 @@ class Dashboard:
 
         Args:
             name: Dotted name of the parameter.
-            values: Its values, in the order in which they are computed.
+            values: Values of the parameter, in the order in which they are computed.
 
         Raises:
             StemmapError: The run cannot be scored, or name or number of values are invalid; the message has
@@ -496,7 +496,7 @@ class Dashboard:
         )
 
     def _broadcast_score(self, score: dict[str, Any] | None) -> None:
-        """Broadcast a score (None without a map) and record it."""
+        """Broadcast a score (None if there is no map) and record it."""
         self.live.publish("evaluation", score)
         self.run_recorder.scored(score)
 
@@ -540,7 +540,7 @@ class LoopPlayback:
         dashboard: State of the run, with its worker.
 
     Attributes:
-        span: First and last time of the part [s since the first scan]; None without repetition.
+        span: First and last time of the part [s since the first scan]; None if there is no repetition.
     """
 
     def __init__(self, dashboard: Dashboard) -> None:

@@ -67,7 +67,8 @@ class Events:
         Args:
             frame: Shown frame; while seeking, not every frame is shown.
             time_s: Time of the frame [s since the first scan].
-            confirmed_s: Confirmation time of each tree [s], NaN if unknown; None if all are unknown.
+            confirmed_s: Confirmation time of each tree of the frame, shape (T,) [s since the first scan], NaN
+                if unknown; None if all are unknown. A tree without a known time gets the event at `time_s`.
         """
         known = set(self._events)
         passed = {key for key, event in self._before.items() if event.time_s <= time_s}
@@ -119,7 +120,7 @@ class Events:
         flagged as from before the change.
 
         Args:
-            before, after: All values by dotted name.
+            before, after: Dicts from the dotted name of each parameter to its value.
             time_s: Time of the current scan [s since the first scan].
         """
         undone = self._set_aside(lambda event: event.time_s > time_s)
@@ -149,9 +150,9 @@ class Events:
         self._note(key, Event(time_s, "annotation", f"{who or 'Somebody'} edited {edits}"[:_LONGEST]))
 
     def as_plain(self) -> dict[str, Any]:
-        """Return {"events": [...]} for the page, ordered by time, each with `t` [s], `kind` and `text`, and
-        `before` (True) if it is from before a change of parameters. Of these only so many are returned that
-        the total is at most _MOST."""
+        """Return {"events": [...]}, a list of a dict for each event, ordered by time, with `t` [s since the
+        first scan], `kind` and `text`. Events from before a change of parameters also have `before`, True;
+        they are included only up to a total of _MOST events."""
         room = _MOST - len(self._events)
         marks = [(event, False) for event in self._events.values()]
         marks += [(event, True) for event in list(self._before.values())[:room]]
@@ -164,14 +165,16 @@ class Events:
         }
 
     def _set_aside(self, which: Callable[[Event], bool]) -> set[str]:
-        """Flag the events of the map that `which` selects as from before a change; return their keys."""
+        """Flag the events of kind "tree" or "health" for which `which` is True as from before a change;
+        return their keys."""
         keys = {k for k, event in self._events.items() if event.kind in _OF_THE_MAP and which(event)}
         self._before |= {key: self._events.pop(key) for key in sorted(keys)}
         return keys
 
     @staticmethod
     def _times(frame: Frame, confirmed_s: Float) -> dict[int, float]:
-        """Return the confirmation time [s] of each confirmed tree by its number, without unknown ones.
+        """Return a dict from the number of each confirmed tree with a known confirmation time to this time
+        [s].
 
         Args:
             frame: The frame.

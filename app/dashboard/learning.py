@@ -52,9 +52,12 @@ class Learning:
         self.learned: dict[str, Any] | None = None
 
     async def known(self, in_force: str = PACKAGE) -> dict[str, Any]:
-        """Return what a training can use, as JSON values: the number of `runs`, of `annotations` by class,
-        and the `needed` numbers of `trees` and `others`; `in_use`, the provenance of the forest in force
-        (None for that of the package and for an unknown one); and the state, see `as_plain`.
+        """Return what a training can use, as a dict of JSON values.
+
+        The keys are `runs`, the number of annotated runs; `annotations`, a dict from each class to its number
+        of annotations; `needed`, a dict with the minimum numbers `trees` and `others`; `in_use`, the
+        provenance of the random forest in force (None for that of the package and for an unknown one); and
+        those of `as_plain`.
 
         Args:
             in_force: Name of the forest in force.
@@ -104,7 +107,7 @@ class Learning:
         await cancel(task)
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state for the browsers: `state`, its text (`words`) and the result (`learned`)."""
+        """Return the attributes `state`, `words` and `learned` as a dict."""
         return {"state": self.state, "words": self.words, "learned": self.learned}
 
     def _become(self, state: str, words: str, learned: dict[str, Any] | None = None) -> None:
@@ -143,8 +146,8 @@ class Learning:
             self._become("failed", str(reply.get("error") or broke))
 
     async def _ask(self, question: dict[str, Any]) -> dict[str, Any]:
-        """Return the last message of the child process, {} without any; the messages before are progress and
-        shown.
+        """Send a question to a new child process and return its last message; {} if it sends none. A message
+        with "progress" sets the state "working".
 
         Raises:
             StemmapError: The process cannot be started, or sends something else.

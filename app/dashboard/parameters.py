@@ -79,7 +79,7 @@ class ParameterState:
         """Change values by dotted name.
 
         Args:
-            changes: New values by dotted name.
+            changes: Dict from dotted names to new values.
             gesture: Identifier of a slider drag, whose values are one undo step however long it takes. Empty
                 if unknown; then changes of the same names within 1.5 s are one step.
 
@@ -150,8 +150,8 @@ class ParameterState:
         """Use the parameters of another run, as one undo step.
 
         Args:
-            preset_name: Its preset; an unknown or empty name means the preset in force.
-            values: Values by dotted name that differ from the preset.
+            preset_name: Preset of the other run; an unknown or empty name means the preset in force.
+            values: Dict from dotted names to the values that differ from the preset.
 
         Raises:
             StemmapError: A name is unknown, a value is not valid, or `check` refuses them; nothing changes.
@@ -176,8 +176,9 @@ class ParameterState:
         return True
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state for the page: `whole`, `preset`, `revision`, `undo` and `redo` (numbers of steps),
-        `values` by dotted name, and `changed`, the names that differ from the preset."""
+        """Return the state as a dict: `whole`, `preset`, `revision`, `undo` and `redo` (numbers of steps),
+        `values`, a dict from dotted names to values, and `changed`, a list of the names whose values differ
+        from the preset."""
         return {
             "whole": self.whole,
             "preset": self.preset,
@@ -189,8 +190,8 @@ class ParameterState:
         }
 
     def as_plain_with_specs(self) -> dict[str, Any]:
-        """Return `as_plain` with `specs`, the declarations of the parameters, and `presets`, each with `name`
-        and `doc`; these do not change."""
+        """Return `as_plain` with two further keys that never change: `specs`, a list of `FieldSpec`, and
+        `presets`, a list of dicts with `name` and `doc`."""
         presets = [{"name": name, "doc": doc} for name, (doc, _) in PRESETS.items()]
         return {**self.as_plain(), "specs": _SPECS, "presets": presets}
 
@@ -246,7 +247,8 @@ _PRESET = re.compile(r"# preset: ([a-z0-9-]{1,40})\s*\n")
 
 
 def file_of(preset_name: str, parameters: Parameters) -> str:
-    """Return all values as the text of a file for `--config`; a comment names their preset.
+    """Return the text of a TOML file for `--config` with all values. Its first line is the comment "# preset:
+    NAME".
 
     Args:
         preset_name: Name of the preset.

@@ -23,10 +23,13 @@ _DIGITS = 4
 
 
 def map_payload(shown: Shown) -> dict[str, Any]:
-    """Return the message "map" without its path: `index` and `time_s` of the scan [s since the first], `pose`
-    and `odom` as [x, y, yaw], `sigma_xy`, the root mean square of the standard deviations of x and y [m],
-    `n_eff`, and `health`, `trees`, `verdicts`, `clusters`, `counts`, `layers` and `clearance` as the
-    functions of this module return them. Points are not included."""
+    """Return the message "map" without its path and without points as a dict of JSON values.
+
+    The keys are `type`, "map"; `index` and `time_s` of the scan [s since the first scan]; `pose` and `odom`,
+    lists [x [m], y [m], yaw [rad]] of `T_map_base` and `T_odom_base`; `sigma_xy`, the root mean square of the
+    standard deviations of x and y [m]; `n_eff`; `counts`, those of the frame; and `health`, `trees`,
+    `verdicts`, `clusters`, `layers` and `clearance`, the results of the functions of this module.
+    """
     frame = shown.frame
     estimate = frame.estimate
     return {
@@ -48,8 +51,8 @@ def map_payload(shown: Shown) -> dict[str, Any]:
 
 
 def layer_counts(frame: Frame) -> dict[str, int]:
-    """Return the number of objects of a frame by layer of the scene: `raw`, `filtered`, `clusters`, `fits`
-    (detected trees with a radius), `particles` and `trees` (confirmed)."""
+    """Return a dict from layers of the scene to the number of their objects in a frame: `raw` and `filtered`
+    (points), `clusters`, `fits` (detected trees with a known radius), `particles` and `trees` (confirmed)."""
     return {
         "raw": len(frame.raw),
         "filtered": len(frame.filtered),
@@ -61,8 +64,8 @@ def layer_counts(frame: Frame) -> dict[str, int]:
 
 
 def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
-    """Return `zone` as text, `ahead_m`, `beside_m` and `within_m`, see `Clearance`; unknown or infinite
-    distances are None, and so is the result without a clearance."""
+    """Return a dict with `zone` (its label), `ahead_m`, `beside_m` and `within_m`, see `Clearance`; None for
+    None. Distances ahead and beside that are NaN or infinite are None."""
     if clearance is None:
         return None
     ahead, beside = _known(clearance.ahead), _known(clearance.beside)
@@ -70,9 +73,9 @@ def clearance_payload(clearance: Clearance | None) -> dict[str, Any] | None:
 
 
 def health_payload(health: Health) -> dict[str, Any]:
-    """Return the pose quality: `state`, `reason`, `n_eff`, `ancestors`, `detections`, `recognised`,
-    `ambiguous`, `innovation`, `sigma_xy_m`, `sigma_yaw_deg` and `odometry_sigmas`, see `Health`; unknown
-    figures are None."""
+    """Return the pose quality as a dict with `state`, `reason`, `n_eff`, `ancestors`, `detections`,
+    `recognised`, `ambiguous`, `innovation`, `sigma_xy_m`, `sigma_yaw_deg` and `odometry_sigmas`, see
+    `Health`. Numbers that are NaN or infinite are None, others are rounded to 3 decimals."""
     return {
         "state": health.state,
         "reason": health.reason,
@@ -89,9 +92,9 @@ def health_payload(health: Health) -> dict[str, Any]:
 
 
 def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
-    """Return the clusters of the scan as columns of equal length: `x`, `y` in the map [m], `distance` from
-    the sensor [m], `verdict` (its label), `size` (number of points), `eccentricity` and `radius_cm`. Unknown
-    or infinite eccentricities and radii are None."""
+    """Return the clusters of the scan as a dict of lists with one value per cluster: `x`, `y` in the map [m],
+    `distance` from the sensor [m], `verdict` (its label), `size` (number of points), `eccentricity` and
+    `radius_cm`. Unknown or infinite eccentricities and radii are None."""
     clusters = frame.clusters
     base = clusters.centre + frame.sensor_offset[:2]
     place = frame.estimate.T_map_base.apply(base)
@@ -107,10 +110,10 @@ def clusters_payload(frame: Frame) -> dict[str, list[Any]]:
 
 
 def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
-    """Return the confirmed trees of a table as dicts for the page: `number`, `x`, `y` [m], `ellipse` (see
-    `ellipses`), `dbh_cm`, `sigma_dbh_cm`, `eccentricity`, `observations`, `coverage_deg`, `first_seen_s`,
-    `last_seen_s`, `height_m`, `sigma_height_m` and `lean_deg`. Unknown diameters, eccentricities, coverages,
-    heights and leans are None.
+    """Return the confirmed trees of a table as a list of dicts for the dashboard, with `number`, `x`, `y`
+    [m], `ellipse` (see `ellipses`), `dbh_cm`, `sigma_dbh_cm`, `eccentricity`, `observations`, `coverage_deg`,
+    `first_seen_s`, `last_seen_s`, `height_m`, `sigma_height_m` and `lean_deg`. Unknown diameters,
+    eccentricities, coverages, heights and leans are None.
 
     Args:
         trees: The table.
@@ -139,23 +142,23 @@ def trees_payload(trees: Trees, start_ns: int) -> list[dict[str, Any]]:
 
 
 def ellipses(covariance: Float) -> list[list[float]]:
-    """Return [major half axis, minor half axis [m], direction of the major axis [rad]] of the 1-sigma ellipse
-    of each covariance, shape (T, 2, 2)."""
+    """Return a list [major half axis [m], minor half axis [m], direction of the major axis [rad]] for the
+    1-sigma ellipse of each covariance, shape (T, 2, 2) [m^2]."""
     rows: list[list[float]] = np.round(half_axes(covariance), _DIGITS).tolist()
     return rows
 
 
 def verdict_counts(verdicts: NDArray[np.int32]) -> dict[str, int]:
-    """Return the number of clusters by label of the verdict, most frequent first, equally frequent ones in
-    the order of `Verdict`."""
+    """Return a dict from the label of each verdict that occurs to its number of clusters, most frequent
+    first, equally frequent ones in the order of `Verdict`."""
     values, counts = np.unique(verdicts, return_counts=True)
     order = np.argsort(-counts, kind="stable")
     return {Verdict(int(values[k])).label: int(counts[k]) for k in order}
 
 
 def truth_payload(truth: TruthTrees | None) -> dict[str, Any] | None:
-    """Return {"trees": [...]}, the objects of the ground truth of all classes with `x`, `y` [m], `dbh_cm`
-    (None if unknown) and `kind`; None for None."""
+    """Return {"trees": [...]}, a list of a dict for each object of the ground truth, of any class, with `x`,
+    `y` [m], `dbh_cm` (None if unknown) and `kind`; None for None."""
     if truth is None:
         return None
     rows = zip(_rounded(truth.x), _rounded(truth.y), _finite(100.0 * truth.dbh), truth.kind, strict=True)
@@ -179,9 +182,10 @@ def _finite(values: Float) -> list[float | None]:
 
 
 def counts_of(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the verdict counts of a scan: `verdicts`, the number of clusters by verdict, and `right` and
-    `wrong`, the numbers of detections that are paired with a true tree (one to one, see `match`), and that
-    are not, also because the paired object is no tree; None without ground truth.
+    """Return a dict with `verdicts`, the result of `verdict_counts` for the scan; `right`, the number of
+    detections that are paired one to one with a true tree (see `match`); and `wrong`, the number of other
+    detections, also of those paired with an object that is no tree. `right` and `wrong` are None if there is
+    no ground truth.
 
     Args:
         frame: Results of the scan.
@@ -207,13 +211,19 @@ class BeforeAfter:
         self._before: tuple[int, dict[str, Any] | None] = self._now
 
     def step(self) -> None:
-        """Keep the present counts as those before a change that is a step of its own."""
+        """Keep the counts of the last call of `shown` as those before the change of parameters that begins
+        now."""
         self._before = self._now
 
     def shown(self, index: int, counts: dict[str, Any]) -> dict[str, Any]:
-        """Set the counts of the displayed scan, by its index, and return `right` and `wrong` of them and
-        `before`, the counts of this scan before the change, for the page; `before` is None without a change,
-        and if another scan was displayed since it."""
+        """Set the counts of the displayed scan. Return a dict with `right` and `wrong` of these counts and
+        `before`, the counts of this scan before the last change; `before` is None if there was no change, or
+        if another scan was displayed since then.
+
+        Args:
+            index: Index of the scan.
+            counts: Result of `counts_of`.
+        """
         self._now = (index, counts)
         if self._before[0] != index:
             self._before = (-1, None)
@@ -224,16 +234,16 @@ REACH = 0.45  # m; maximum distance between a tree and its column
 
 
 def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
-    """Return a dict for each confirmed tree, the most uncertain first (share of votes nearest to
-    `tree_share`), of equal ones the least observed, then the lowest number: its number (`tree`), the share of
-    `votes` for a tree, and the class with most votes besides "tree" (`next`, `next_votes`). [] without
-    confirmed trees.
+    """Return a list of a dict for each confirmed tree: `tree`, the number; `votes`, the share of votes for a
+    tree; `next`, the label of the other class with most votes; and `next_votes`, its share. The trees whose
+    `votes` are nearest to `tree_share` come first; of equal ones, the one with fewer observations, then with
+    the lower number.
 
-    Trees without a voxel column within REACH have no votes (`votes` and `next_votes` are None) and come last.
-    Without any columns, `next` is "" and `next_votes` 0.
+    The votes are those of the nearest voxel column. If it is not within REACH, `votes` and `next_votes` are
+    None and the tree comes last. If the frame has no columns, `votes` is None, `next` "" and `next_votes` 0.
 
     Args:
-        frame: Results of the newest scan, with its voxel columns; None for these gives no votes.
+        frame: Results of the newest scan.
         tree_share: Share of the votes that a tree needs.
     """
     from scipy.spatial import cKDTree
@@ -256,7 +266,7 @@ def doubts_of(frame: Frame, tree_share: float) -> list[dict[str, Any]]:
 
 
 def _margin(votes: float | None, tree_share: float) -> float:
-    """Return how far the votes are from the required share; infinite for None."""
+    """Return the absolute difference between the votes and the required share; infinity for None."""
     return float("inf") if votes is None else abs(votes - tree_share)
 
 
@@ -269,9 +279,9 @@ def binary_payload(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> b
     header and each array are padded to a multiple of four bytes; the length includes the padding.
 
     Args:
-        header: JSON values. A list `arrays` is added, each with `name`, `type` (as `numpy.dtype.str`),
-            `shape` and `at`, its first byte after the header.
-        arrays: Arrays by name.
+        header: A dict of JSON values. The key `arrays` is added, a list of dicts with `name`, `type` (as
+            `numpy.dtype.str`), `shape` and `at`, the offset of the array from the end of the header [bytes].
+        arrays: Dict from names to arrays.
     """
     table, parts, place = [], [], 0
     for name, array in arrays.items():
@@ -286,14 +296,14 @@ def binary_payload(header: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> b
 
 
 def in_centimetres(points: NDArray[np.float32]) -> NDArray[np.int16]:
-    """Return points of shape (N, 3) [m] in whole centimetres, int16, clipped to -327.67 m to 327.67 m."""
+    """Return points, shape (N, 3) [m], rounded to centimetres, int16 [cm], clipped to -32767 to 32767."""
     return np.clip(np.round(100.0 * points), -_FARTHEST_CM, _FARTHEST_CM).astype(np.int16)
 
 
 def described(frame: Frame, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the description of the clusters of a frame for the header of a binary block: `index` of the
-    scan, `clusters` (see `clusters_payload`), the result of `counts_of`, and `counts`, numbers of points by
-    stage. Arguments as in `counts_of`."""
+    """Return the description of the clusters of a frame for the header of a binary block, a dict with `index`
+    of the scan, `clusters` (see `clusters_payload`), the keys of `counts_of`, and `counts` of the frame.
+    Arguments as in `counts_of`."""
     return {
         "index": frame.index,
         "clusters": clusters_payload(frame),
@@ -313,8 +323,8 @@ def comparison_payload(
     frames: list[Frame], header: dict[str, Any], truth: TruthTrees | None, match_distance: float
 ) -> bytes:
     """Return one scan under several parameter sets as a binary block. The arrays are those of `_clustered`
-    for each set; their names end with the number of the set, from 0. The header has `pictures`, see
-    `described`.
+    for each set; the number of the set, from 0, is appended to their names. The header has `pictures`, a list
+    of the result of `described` for each set.
 
     Args:
         frames: Results of the scan with each set.
@@ -329,9 +339,10 @@ def comparison_payload(
 
 
 def _clustered(frame: Frame) -> dict[str, NDArray[Any]]:
-    """Return arrays for `binary_payload`: `points`, filtered points, int16, shape (M, 3) [cm]; `labels`, the
-    cluster of each, int32, shape (M,), -1 for none; and `circles`, x, y, radius (NaN if unknown) and height
-    of the centroid of each cluster, float32, shape (K, 4) [m]. All are in the level frame of the sensor."""
+    """Return a dict of arrays for `binary_payload`: `points`, filtered points, int16, shape (M, 3) [cm];
+    `labels`, the cluster of each point, int32, shape (M,), -1 for none; and `circles`, x, y, radius (NaN if
+    unknown) and height of the centroid of each cluster, float32, shape (K, 4) [m]. All are in the level frame
+    of the sensor."""
     circles = np.column_stack([frame.clusters.centre, frame.clusters.radius, frame.clusters.centroid[:, 2]])
     return {
         "points": in_centimetres(frame.filtered),

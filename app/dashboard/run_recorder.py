@@ -45,7 +45,8 @@ class RunState:
         path_xy: Path, shape (N, 2) [m].
         preset, parameters: Current preset and parameters.
         truth, scores: Ground truth and scores at that moment.
-        files: Returns the texts of its result files by name, see `ShownRun.texts`; takes up to seconds.
+        files: Returns a dict from the names of the result files to their texts, see `ShownRun.texts`; takes
+            up to seconds.
     """
 
     shown: Shown
@@ -155,7 +156,7 @@ class RunRecorder:
         """Record a change of parameters. Ignored before the first scan, or if no value differs.
 
         Args:
-            before, after: All values by dotted name.
+            before, after: Dicts from the dotted name of each parameter to its value.
             preset: Name of the preset.
             revision: Revision after the change.
             who: Name of the person.
@@ -249,7 +250,11 @@ class RunRecorder:
 
 
 def zip_of(texts: Mapping[str, str]) -> bytes:
-    """Return files as a zip archive; the same texts give the same bytes."""
+    """Return a zip archive of files; equal texts give equal bytes.
+
+    Args:
+        texts: Dict from the name of each file to its text.
+    """
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, text in texts.items():
@@ -258,8 +263,8 @@ def zip_of(texts: Mapping[str, str]) -> bytes:
 
 
 def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
-    """Return the figures of a state for the store, with the map as `trees` (see `trees_payload`), thinned
-    `path` and `truth` (see `truth_payload`; None without).
+    """Return the results of a state for the store. `map` is a dict with `trees` (see `trees_payload`), `path`
+    (see `thinned`) and `truth` (the list of `truth_payload`; None if there is no ground truth).
 
     Args:
         state: The state.
@@ -288,8 +293,8 @@ def _figures_of(state: RunState, all_scans: int | None) -> RunFigures:
 
 
 def thinned(path_xy: Float) -> list[list[float]]:
-    """Return a path of shape (N, 2) [m] reduced to at most MOST_PATH_POINTS rows including both ends, rounded
-    to millimetres; [] for an empty path."""
+    """Return at most MOST_PATH_POINTS evenly spaced rows of a path, shape (N, 2) [m], with both ends, as a
+    list of [x, y] rounded to 1 mm; [] for an empty path."""
     n = len(path_xy)
     rows = np.unique(np.linspace(0, n - 1, min(n, MOST_PATH_POINTS)).round().astype(np.int64))
     points: list[list[float]] = np.round(path_xy[rows], 3).tolist()

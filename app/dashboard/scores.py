@@ -29,8 +29,8 @@ class Scores:
     """Computes scores in the background; of several requests only the newest is computed.
 
     Args:
-        tell: Called on the event loop with each score for the page, and with None when there is no map any
-            more.
+        tell: Called on the event loop with each score for the browsers, and with None when there is no map
+            any more.
 
     Attributes:
         latest: The newest score, or None.
@@ -81,9 +81,9 @@ class Scores:
 
 
 def score_payload(score: MapScores) -> dict[str, Any]:
-    """Return scores for the page: the rates `TA`, `TR`, `FA` and `FR`, each as `count`, `of` and `rate`; the
-    other fields of `MapScores` with units in the names (`_m`, `_cm`, `_percent`); and `warning`, see
-    `truth_in_doubt`. An undefined score is None."""
+    """Return scores as a dict of JSON values for the dashboard. `TA`, `TR`, `FA` and `FR` are dicts with
+    `count`, `of` and `rate`. The other keys are fields of `MapScores`, with the unit appended to the name
+    (`_m`, `_cm`, `_percent`), and `warning`, the result of `truth_in_doubt`. An undefined score is None."""
     rates = {"TA": score.TA, "TR": score.TR, "FA": score.FA, "FR": score.FR}
     return {
         **{name: {"count": r.count, "of": r.of, "rate": r.rate} for name, r in rates.items()},
@@ -104,12 +104,12 @@ def score_payload(score: MapScores) -> dict[str, Any]:
 
 
 def pairs_payload(trees: Trees, truth: TruthTrees | None, match_distance: float) -> dict[str, Any]:
-    """Return the distances between the confirmed trees as lists: `numbers` of the T trees, `distance_m`,
-    shape (T, T), and `error_percent`, shape (T, T): the error if both trees are matched with true trees, NaN
-    otherwise; None without ground truth.
+    """Return the distances between the confirmed trees as a dict. The keys are `numbers`, a list of the
+    numbers of T trees; `distance_m`, nested lists of shape (T, T); `error_percent`, nested lists of shape (T,
+    T) with the error of each distance if both trees are matched with true trees, else NaN (None if there is
+    no ground truth); and `left_out`, the number of confirmed trees that are not included.
 
-    Only the first MOST_PAIRED trees are included, because a larger matrix cannot be drawn; `left_out` is the
-    number of the others.
+    Only the first MOST_PAIRED confirmed trees are included.
 
     Args:
         trees: The map.

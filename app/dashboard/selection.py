@@ -116,7 +116,7 @@ class WorkerClient:
 
         Args:
             kind: Type of the question.
-            values, named: Its fields after `ticket` and `run`.
+            values, named: Fields of the question after `ticket` and `run`.
 
         Raises:
             NothingMappedError: No run is shown.
@@ -163,8 +163,8 @@ class Selection:
 
     @property
     def ring(self) -> tuple[float, float, float] | None:
-        """Position and size of the selected cluster in the map: x, y, radius [m], where the radius reaches
-        its farthest point; None if no cluster is selected."""
+        """Position x, y of the selected cluster in the map [m] and the distance of its farthest point from
+        there [m]; None if no cluster is selected."""
         story = self.cluster
         if story is None:
             return None
@@ -172,9 +172,9 @@ class Selection:
         return (*story.position, reach)
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the selection for the page: `tree`, a number or None, and `cluster`, None or `scan`,
-        `cluster` (its row), `verdict`, `x` and `y` in the map [m]. The explanation is requested
-        separately."""
+        """Return the selection as a dict for the dashboard: `tree`, a number or None, and `cluster`, None or
+        a dict with `scan`, `cluster` (its row), `verdict`, `x` and `y` in the map [m]. The explanation is
+        requested separately."""
         story = self.cluster
         if story is None:
             return {"tree": self.tree, "cluster": None}
@@ -194,8 +194,8 @@ class Selector:
         worker_client: Requests the explanations.
         live: Broadcast to the browsers.
         mark: Highlights a tree and a ring in the scene, and returns x, y and height of the ground there [m].
-        run: Returns the number of the present run, None without one.
-        newest: Returns the index of the newest shown scan, None without one.
+        run: Returns the number of the present run, None if there is none.
+        newest: Returns the index of the newest shown scan, None if there is none.
     """
 
     def __init__(

@@ -56,10 +56,11 @@ class ShownRun:
         path: The estimated path.
         start_ns: Time of the first scan [ns].
         preset, parameters: In force.
-        truth: Ground truth in the coordinates of the files; None without one.
+        truth: Ground truth in the coordinates of the files; None if there is none.
         seen: Views of the observed area; those of later scans may be added.
         edits: The annotations of trees and the plots.
-        frame: The reference system that the map got on the page, as annotation; None without one.
+        frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
+            none.
     """
 
     request: SourceRequest
@@ -107,7 +108,7 @@ class ShownRun:
         return placed([row.content for row in self.edits], offset)
 
     def reviews(self) -> dict[int, str]:
-        """Return the reviews of the confirmed trees, see `reviews_of`."""
+        """Return a dict from the number of each confirmed tree to its review, see `reviews_of`."""
         trees = self.shown.frame.trees
         place = trees.position[trees.confirmed]
         return reviews_of(trees.number[trees.confirmed].tolist(), place, [row.content for row in self.edits])
@@ -129,7 +130,8 @@ class ShownRun:
             yield FilePath(name)
 
     def texts(self) -> dict[str, str]:
-        """Return the texts of trees.csv, path.csv, terrain.csv, seen.csv and run.json by name."""
+        """Return a dict from the names trees.csv, path.csv, seen.csv, terrain.csv and run.json to the texts
+        of these files."""
         ground, offset = self.shown.frame.ground, self.cloud.offset if self.cloud else (0.0, 0.0, 0.0)
         cells = [] if ground is None else list(terrain_rows(ground))
         if self.cloud is not None:
@@ -155,9 +157,9 @@ class ShownRun:
         return covered_area(covered + self.cloud.offset[:2])
 
     def _record(self) -> dict[str, Any]:
-        """Return the contents of run.json, without what only `stemmap map` knows, and with `rejected`, the
-        number of rejected trees, which `trees` does not count. Reviews do not change the scores, which are
-        those of the map."""
+        """Return the content of run.json as a dict, without what only `stemmap map` knows, and with
+        `rejected`, the number of rejected trees, which `trees` does not count. Reviews do not change the
+        scores `evaluation`, which are None if there is no ground truth."""
         status, truth = self.status, self.truth
         trees = in_file(self.shown.frame.trees, self.cloud)
         rejected = sum(review == REJECTED for review in self.reviews().values())
@@ -188,11 +190,12 @@ class ShownRun:
         }
 
     def _counts(self, scores: dict[str, Any] | None) -> dict[str, Any]:
-        """Return `health`, `verdicts`, `losses` and `warnings` of run.json, as `stemmap map` writes them;
-        only the warnings of the status if the counts are unknown.
+        """Return a dict with `health` (not for a whole cloud), `verdicts`, `losses` and `warnings` of
+        run.json, as `stemmap map` writes them; only `warnings`, those of the status, if the counts are
+        unknown.
 
         Args:
-            scores: Scores of the map; None without ground truth.
+            scores: Scores of the map as a dict, see `MapScores`; None if there is no ground truth.
         """
         counts = self.shown.counts
         if counts is None:

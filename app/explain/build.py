@@ -181,14 +181,14 @@ def _is_seen_all_around(run: Run) -> bool:
 
 
 def column_story(frame: Frame, place: Float, parameters: Parameters, all_around: bool) -> ColumnStory | None:
-    """Return the classification of the voxel column that is nearest to a place, a tree before all others;
-    None if none is within 0.45 m.
+    """Return the classification of the nearest voxel column within 0.45 m of a position, of the nearest one
+    with the verdict TREE if there is one; None without such a column.
 
     Args:
         frame: Results of the newest scan, with its voxel columns.
-        place: x, y in the map [m].
+        place: Position x, y in the map, shape (2,) [m].
         parameters: Parameters with which the scan was mapped.
-        all_around: Which forest classified them, see `is_seen_all_around`.
+        all_around: Which random forest classified the columns, see `is_seen_all_around`.
 
     Raises:
         StemmapError: The forest of the parameters cannot be read.
@@ -247,7 +247,7 @@ def _nearest_tree(frame: Frame, place: Float, reach: float) -> int | None:
 
     Args:
         frame: Results of the scan.
-        place: x, y in the map [m].
+        place: Position x, y in the map, shape (2,) [m].
         reach: Maximum distance [m].
     """
     trees = frame.trees
@@ -260,12 +260,12 @@ def _nearest_tree(frame: Frame, place: Float, reach: float) -> int | None:
 
 
 def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
-    """Return the row of the cluster nearest to a place; None if none is near. A cluster that is not a
-    detected tree is returned only if no detected one is within `reach`.
+    """Return the row of the detected tree (cluster of a detection) nearest to a position within `reach`;
+    without one, the row of the nearest cluster within `reach`; else None.
 
     Args:
         frame: Results of the scan.
-        place: x, y in the map [m].
+        place: Position x, y in the map, shape (2,) [m].
         reach: Maximum distance [m].
     """
     centre = frame.estimate.T_map_base.apply(frame.clusters.centre + frame.sensor_offset[:2])
@@ -277,11 +277,11 @@ def _cluster_of(frame: Frame, place: Float, reach: float) -> int | None:
 
 
 def _to_picture(centre: Float) -> Float:
-    """Return the rotation of level sensor coordinates after which up points away from the sensor, shape (2,
-    2).
+    """Return the rotation matrix from the level frame of the sensor to the picture, shape (2, 2): the
+    direction from the sensor to the cluster becomes the y axis (up).
 
     Args:
-        centre: x, y of the cluster from the sensor [m].
+        centre: Position x, y of the cluster in the level frame of the sensor, shape (2,) [m].
     """
     reach = max(float(np.hypot(*centre)), 1e-9)
     ux, uy = centre / reach
@@ -289,8 +289,7 @@ def _to_picture(centre: Float) -> Float:
 
 
 def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
-    """Return a fitted stem as it is drawn. `arc_end` is `arc_start` plus the arc; neither is reduced to a
-    full turn.
+    """Return a fitted stem in the picture. `arc_end` is `arc_start` plus the arc; the angles are not wrapped.
 
     Args:
         fit: The fit in level sensor coordinates.
@@ -315,7 +314,7 @@ def _circle(fit: StemFit, covariance: Float, to_picture: Float) -> Circle:
 
 def _axes(points: Float, to_picture: Float) -> list[tuple[float, float]]:
     """Return one standard deviation along the major and the minor principal axis of points, in this order, as
-    (right, up) in the picture [m], with arbitrary sign; [] without points.
+    (right, up) in the picture [m], with arbitrary sign; [] if there are no points.
 
     Args:
         points: x, y in level sensor coordinates, shape (N, 2) [m].
@@ -337,12 +336,13 @@ _MOST_CELLS = 20_000  # 160 kB
 
 
 def points_around(voxels: VoxelMap, place: NDArray[np.float64]) -> list[tuple[float, float, float]]:
-    """Return the voxels within REACH of a place: x, y from it and height above the ground [m], rounded to
-    centimetres. First come those at breast height, at most 600, then the others, at most 900.
+    """Return the voxels within a horizontal distance of REACH of a position as tuples of x, y relative to the
+    position and height above the ground [m], rounded to 1 cm: first at most 600 at breast height (see
+    `_at_breast`), then at most 900 others.
 
     Args:
         voxels: Voxels of all scans.
-        place: x, y in the map [m].
+        place: Position x, y in the map, shape (2,) [m].
     """
     mean, _ = voxels.around(np.floor(place / TILE).astype(np.int64), REACH)
     points = mean.astype(np.float64) - [*place, 0.0]
@@ -425,7 +425,7 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
 
 
 def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
-    """Return the explanation of a candidate of a whole cloud; without checks if no stem was fitted.
+    """Return the explanation of a candidate of a whole cloud; `checks` is empty if no stem was fitted.
 
     Args:
         run: The cloud.
@@ -454,7 +454,7 @@ def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
 
 
 def check_results(checks: Sequence[Check], row: int) -> list[CheckResult]:
-    """Return the checks of one cluster or candidate, by its row, in the order in which they decide."""
+    """Return the checks of the cluster or candidate in `row`, in the order in which they decide."""
     titles = {spec.name: spec.title for spec in field_specs()}
     return [
         CheckResult(
@@ -473,9 +473,9 @@ def check_results(checks: Sequence[Check], row: int) -> list[CheckResult]:
 
 
 def cross_sections(plot: PlotMap, row: int) -> list[CrossSection]:
-    """Return the cross-sections of a candidate, lowest first. Of those with a circle, at most
-    `_SECTION_PICTURES` have points, that at breast height among them. A candidate without a circle has one
-    section at breast height, without a radius.
+    """Return the cross-sections of a candidate that have a circle, lowest first. At most `_SECTION_PICTURES`
+    of them have points, among them the one nearest to breast height. A candidate without any circle has one
+    section at breast height, with points and the radius NaN.
 
     Args:
         plot: The map.
@@ -509,8 +509,8 @@ def cross_sections(plot: PlotMap, row: int) -> list[CrossSection]:
 
 
 def _points_around(plot: PlotMap, height: float, centre: Float, radius: float) -> list[tuple[float, float]]:
-    """Return points of a slice around a circle relative to its centre, at most _MOST_SECTION_POINTS, rounded
-    to millimetres [m].
+    """Return at most _MOST_SECTION_POINTS points of a slice around a circle as (x, y) relative to the centre
+    of the circle [m], rounded to 1 mm.
 
     Args:
         plot: The map.

@@ -49,7 +49,8 @@ class TreeHistory:
         self._append(rows)
 
     def last_places(self) -> dict[int, tuple[float, float]]:
-        """Return the newest stored position of each tree by its number [m], also of trees that ended."""
+        """Return a dict from the number of each tree, also of trees that ended, to its newest stored position
+        (x, y) in the map [m]."""
         known = self._rows[: self._count]
         return {int(number): (float(x), float(y)) for number, x, y in known[:, [_NUMBER, 4, 5]]}
 
@@ -92,11 +93,11 @@ class TreeHistory:
 
 
 def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return major and minor half axis [m] and direction of the major axis [rad] of 1-sigma ellipses, shape
-    (T, 3). Either of the two opposite directions may be returned.
+    """Return major half axis [m], minor half axis [m] and direction of the major axis [rad] of 1-sigma
+    ellipses, shape (T, 3). Either of the two opposite directions may be returned.
 
     Args:
-        covariance: shape (T, 2, 2) [m^2].
+        covariance: Covariances, shape (T, 2, 2) [m^2].
     """
     values, vectors = np.linalg.eigh(covariance)
     minor, major = np.sqrt(np.maximum(values, 0.0)).T
@@ -104,8 +105,9 @@ def half_axes(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _rows_of(frame: Frame, start_ns: int) -> NDArray[np.float64]:
-    """Return a row for each tree that the scan detected, shape (R, _WIDTH): scan, number, observations, time
-    [s], x, y [m], covariance xx, xy, yy [m^2], DBH and its sigma [m]."""
+    """Return a row for each tree that the scan detected, shape (R, _WIDTH): scan, number, observations,
+    time since `start_ns` [s], x, y in the map [m], covariance xx, xy, yy [m^2], DBH [m] and sigma of the
+    DBH [m]."""
     trees = frame.trees
     # A tree that began as a voxel column has a position before any scan detects it.
     rows = np.flatnonzero((trees.last_seen_ns == frame.stamp_ns) & (trees.observations > 0))

@@ -39,8 +39,9 @@ class Circle(msgspec.Struct, frozen=True):
     """The fitted stem seen from above: its axis is at the origin and the sensor is below the picture.
 
     Attributes:
-        radius, radius_sigma: [m].
-        arc_deg: Visible arc; arc_start, arc_end: counter-clockwise from the right of the picture [rad].
+        radius, radius_sigma: Radius and its standard deviation [m].
+        arc_deg: Visible arc [deg].
+        arc_start, arc_end: Ends of the visible arc, counter-clockwise from the right of the picture [rad].
         lean: Shift of the axis per metre of height, to the right and up in the picture.
         lean_deg: Angle of the axis from the vertical.
         ellipse: 1-sigma ellipse of the centre: half axes [m], direction of the major axis [rad].
@@ -65,20 +66,20 @@ class FeatureEffect(msgspec.Struct, frozen=True):
 
 
 class ColumnStory(msgspec.Struct, frozen=True):
-    """Classification of the accumulated scans at a place.
+    """Classification of the accumulated scans at a position.
 
     Attributes:
         verdict: Label of the verdict.
-        distance: Distance from the requested place to the axis of the column [m].
-        votes: Share of the votes by class.
-        tree_share: Share of the votes that a tree needs.
+        distance: Distance from the requested position to the axis of the column [m].
+        votes: Dict from the label of each class to its share of the votes.
+        tree_share: Minimum share of the votes of a tree.
         tree_in_free_air: For an object with a free upper end, the share of votes for a tree of the decision
             trees that separate trees from poles; None otherwise. Where they vote for a pole, `effects`
             explain their votes.
         by_votes: Whether the votes decided the verdict; otherwise a rule did.
-        present, absent: Number of accumulated scans with a clear view of the place that show it occupied, and
-            that show it empty.
-        viewed: Greatest height above ground that any scan observed there [m].
+        present, absent: Number of accumulated scans with a clear view of the position that show it occupied,
+            and that show it empty.
+        viewed: Maximum height above ground that any scan observed there [m].
         effects: The most influential features, the strongest first.
     """
 
@@ -100,7 +101,7 @@ class CrossSection(msgspec.Struct, frozen=True):
     Attributes:
         height: Height of its middle above the ground [m].
         x, y: Centre of the circle relative to the axis at breast height [m].
-        radius, radius_sigma: Of the circle [m]; NaN without one.
+        radius, radius_sigma: Radius of the circle and its standard deviation [m]; NaN if there is no circle.
         coverage_deg: Part of the circumference with points on it.
         scatter: Standard deviation of the points from the circle [m].
         points: Points relative to the centre of the circle [m]; empty where the section has no picture.
@@ -123,18 +124,19 @@ class ClusterStory(msgspec.Struct, frozen=True):
         scan, cluster: Number of the scan, and of the cluster in it.
         time_s: Time of the scan since the first scan of the run [s].
         verdict: Label of the verdict.
-        checks: All of them, in the order in which they decide.
+        checks: All checks, in the order in which they decide.
         size: Number of points of the cluster.
         eccentricity: lambda1 / lambda2.
         position: Position in the frame of the map [m].
         distance: Distance from the sensor [m].
         sensor_sigma: Standard deviation of a range [m].
         points: Points (right, up) in the picture relative to the axis at their height [m]; at most 400.
-        residual: Residuals of the same points, positive outside of the circle [m]; empty without a circle.
-        circle: None if the preset fits no circle or the points are too few.
+        residual: Residuals of the same points, positive outside of the circle [m]; empty if there is no
+            circle.
+        circle: Circle of the cluster; None if the preset fits no circle or the points are too few.
         axes: One standard deviation along the principal axes in the picture: (right, up) of each [m].
         tree: The nearest confirmed tree; None if none is near.
-        column: Classification of the accumulated scans at its place; None without them.
+        column: Classification of the accumulated scans at the position; None if there is none.
         sections: Cross-sections of a candidate of a whole cloud; None for a cluster of a scan.
     """
 
@@ -190,25 +192,27 @@ class TreeStory(msgspec.Struct, frozen=True):
     """A tree of the map.
 
     Attributes:
-        tree: Its number.
-        scan, time_s: The estimates are those after this scan.
-        confirmed: Whether it is shown in the map.
-        position, ellipse: [m]; half axes [m] and direction of the major axis [rad].
-        dbh, dbh_sigma: [m]; NaN if the DBH was not measured.
-        coverage_deg: Observed part of the circumference.
-        dbh_arc_deg: Part of the circumference that a DBH needs.
+        tree: Number of the tree.
+        scan, time_s: Number and time [s since the first scan] of the scan after which the estimates are
+            given.
+        confirmed: Whether the tree is shown in the map.
+        position: Position x, y in the map [m].
+        ellipse: Half axes [m] and direction of the major axis [rad] of the 1-sigma ellipse of the position.
+        dbh, dbh_sigma: DBH and its standard deviation [m]; NaN if the DBH was not measured.
+        coverage_deg: Observed part of the circumference [deg].
+        dbh_arc_deg: Minimum observed part of the circumference for a DBH [deg].
         sides: Observed sectors of 36, counted from x to y; empty if unknown.
         eccentricity: Mean over the observations.
-        observations: Number of scans that detected it.
-        first_seen_s, last_seen_s: [s].
-        cluster: Row of its cluster in the current scan; None without one.
-        column: Classification of the accumulated scans at its place; None without them.
-        points: Accumulated points around it: x, y from its position in the frame of the map and height above
-            the ground [m], see `app.explain.build.points_around`; empty without them.
+        observations: Number of scans that detected the tree.
+        first_seen_s, last_seen_s: Times of the first and the last detection [s since the first scan].
+        cluster: Row of the cluster of the tree in the current scan; None if there is none.
+        column: Classification of the accumulated scans at the position; None if there is none.
+        points: Accumulated points around the tree: x, y relative to the position of the tree along the axes
+            of the map, and height above the ground [m], see `app.explain.build.points_around`; may be empty.
         history: Estimates in order of time.
-        height, height_sigma: Of the tree [m]; NaN where its top is not seen.
-        height_hidden: Reason why the height is not seen; empty where it is.
-        lean_deg: Angle of the stem from the vertical; NaN if it is not measured.
+        height, height_sigma: Height of the tree and its standard deviation [m]; NaN if the top is not seen.
+        height_hidden: Reason why the height is unknown; empty if it is known.
+        lean_deg: Angle of the stem from the vertical [deg]; NaN if it is not measured.
         sections: Cross-sections of a tree of a whole cloud, lowest first; None for a tree of a drive.
     """
 

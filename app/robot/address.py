@@ -44,7 +44,7 @@ class Address:
         domain: ROS_DOMAIN_ID.
         robot: Namespace whose topics are read, ROOT for none; "" for all topics, or for the first robot that
             sends scans.
-        topics: Topic by role where the user names it.
+        topics: Dict from each role for which the user named a topic to this topic.
     """
 
     kind: ClassVar[str]
@@ -189,12 +189,12 @@ def _zenoh(uri: str) -> ZenohAddress:
 
 
 def _known(uri: str, query: str, names: tuple[str, ...]) -> dict[str, str]:
-    """Return the options of an address by name, also those with an empty value; of a repeated option the last
-    value.
+    """Return a dict from the names of the options of an address to their values, also empty ones; of a
+    repeated option the last value counts.
 
     Args:
         uri: The address, for errors.
-        query: Text of the options.
+        query: Text of the options, "NAME=VALUE" separated by "&".
         names: Permitted names.
 
     Raises:
@@ -217,20 +217,21 @@ def _domain(uri: str, options: dict[str, str]) -> int:
 
 
 def _topics(options: dict[str, str]) -> dict[str, str]:
-    """Return the topics that the user named, by role."""
+    """Return a dict from each role for which the user named a topic to this topic."""
     return {role: options[role] for role in _TOPICS if options.get(role)}
 
 
 def _files(uri: str, endpoint: str, named: dict[str, str]) -> dict[str, str]:
-    """Return the absolute paths of the certificates by role.
+    """Return a dict from the roles of the certificates to their absolute paths.
 
     Args:
         uri: The address, for errors.
         endpoint: Endpoint of the router.
-        named: Paths of the certificates by role.
+        named: Dict from the roles "ca", "cert" and "key", as far as they are given, to paths.
 
     Raises:
-        SourceError: A file is missing, a certificate has no key, or the endpoint is not encrypted.
+        SourceError: A file is missing, "cert" or "key" is given without the other, or the endpoint is not
+            encrypted.
     """
     if named and endpoint.startswith("tcp/"):
         raise SourceError(

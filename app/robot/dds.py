@@ -31,7 +31,7 @@ def idl_type(msgtype: str) -> Any:  # noqa: ANN401 - cyclonedds is an extra, and
         A class of cyclonedds, named e.g. "sensor_msgs.msg.dds_.PointCloud2_".
 
     Raises:
-        KeyError: The type is not known to rosbags.
+        KeyError: rosbags does not know the type.
     """
     from cyclonedds.idl import make_idl_struct
 
@@ -99,8 +99,8 @@ def offer_of(topic: str, type_name: str, robot: str, *, reliable: bool, latched:
 
 
 def common_offer(alive: Iterable[Publisher], topic: str, msgtype: str) -> Offer | None:
-    """Return what all writers of a topic offer: reliable if all of them are, latched if all of them are both;
-    None if there is no writer of this topic and type."""
+    """Return the offer that all writers of a topic satisfy: `reliable` if all writers are reliable, `latched`
+    if all are reliable and latched; None if there is no writer of this topic and type."""
     there = [o for o in alive if isinstance(o, Offer) and (o.topic, o.msgtype) == (topic, msgtype)]
     if not there:
         return None
@@ -141,7 +141,7 @@ class DdsLink(Link):
 
     Args:
         address: Address of the domain.
-        inbox: Receives the messages.
+        inbox: Inbox to which the messages are added.
     """
 
     def __init__(self, address: DdsAddress, inbox: Inbox) -> None:
@@ -281,7 +281,7 @@ class _Reader:
     Args:
         participant: Participant of cyclonedds.
         channel: The channel.
-        offer: What all writers of its topic offer.
+        offer: Result of `common_offer` for the topic.
         lost: Called with the channel and a number of lost messages, in a thread of cyclonedds.
     """
 
@@ -323,8 +323,8 @@ class _Reader:
         self.ready = ReadCondition(self._reader, SampleState.Any | ViewState.Any | InstanceState.Any)
 
     def take(self) -> list[bytes]:
-        """Return the messages that arrived since the last call, in CDR; [] without one. Does not wait. At
-        most `depth` messages are kept between two calls: a result of that length means that older ones may
+        """Return the messages that arrived since the last call, in CDR; [] if there is none. Does not wait.
+        At most `depth` messages are kept between two calls: a result of that length means that older ones may
         have been overwritten."""
         found = self._reader.take(self.depth)
         return [sample.payload for sample in found if isinstance(sample, _Sample)]

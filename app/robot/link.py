@@ -63,7 +63,7 @@ class Inbox:
     it may be the robot's own driver. Pictures have a queue of their own.
 
     Attributes:
-        losses: Number of skipped messages, by reason.
+        losses: Dict from reasons to numbers of skipped messages.
         early_scans: Number of scans that were skipped before the first call of `take`.
         pictures_arrived, pictures_accepted: Number of pictures that arrived, and that the rate limit
             accepted.
@@ -101,12 +101,13 @@ class Inbox:
         self._recorder, self._fixed_channels = recorder, frozenset(fixed)
 
     def put(self, message: Message, *, is_scan: bool) -> None:
-        """Record and queue a message; without room, the oldest messages are skipped: first scans, then
-        others, but not fixed transforms, see `begin`. It never waits.
+        """Record and queue a message; never wait. The oldest scans are skipped beyond MAX_SCANS, the oldest
+        other messages beyond MAX_OTHERS. Beyond MAX_BYTES in all, the oldest scans are skipped first, then
+        the oldest other messages. Fixed transforms are not skipped, see `begin`.
 
         Args:
             message: The message.
-            is_scan: Whether it is a scan; other messages are skipped last.
+            is_scan: Whether the message is a scan.
         """
         with self._lock:
             if self._recorder is not None:
@@ -141,8 +142,8 @@ class Inbox:
             return True
 
     def put_picture(self, message: Message) -> None:
-        """Record and queue an accepted picture; where there is no room, the oldest ones are removed and
-        counted in `losses`, but not recorded as skipped."""
+        """Record and queue an accepted picture. Beyond MAX_PICTURES or MAX_PICTURE_BYTES, the oldest pictures
+        are removed and counted in `losses`, but not recorded as skipped."""
         with self._lock:
             if self._recorder is not None:
                 self._recorder.add(message)
@@ -221,7 +222,7 @@ class CountingInbox(Inbox):
         self._heard: dict[int, Heard] = {}
 
     def heard(self, number: int) -> Heard:
-        """Return a copy of the count of a channel so far; no messages for an unknown channel."""
+        """Return a copy of the count of the channel with this number; 0 messages for an unknown channel."""
         with self._guard:
             known = self._heard.get(number, Heard())
             return Heard(known.messages, known.first_ns, known.last_ns)
@@ -264,13 +265,14 @@ class Link(ABC):
     A subclass starts `thread` at the end of its constructor.
 
     Args:
-        inbox: Receives the messages.
+        inbox: Inbox to which the messages are added.
         name: Name of the thread.
 
     Attributes:
         problem: Reason why there is no connection, "" while there is one.
-        alive: What is published now, by the identifier of the writer; `lock` guards it.
-        losses: Number of messages lost before the inbox, by reason.
+        alive: Dict from the identifier of each present writer to the topic that it publishes; guarded by
+            `lock`.
+        losses: Dict from reasons to numbers of messages lost before the inbox.
         scans: Number of scans that arrived.
         version: Number of changes of `alive` so far.
         session: Session on which results can be published, None if there is none.

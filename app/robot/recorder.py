@@ -43,7 +43,7 @@ class Recorder:
     Attributes:
         path: The file that is written.
         problem: Reason why the recording ended before the run; "" otherwise.
-        losses: Number of messages that were not recorded, by reason.
+        losses: Dict from reasons to numbers of messages that were not recorded.
 
     Raises:
         SourceError: The file cannot be created.
@@ -108,8 +108,8 @@ class Recorder:
             self._skipped.setdefault(message.channel, []).append(message.log_ns)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Record results of the mapping by topic, see `pipeline.io.recording.messages`; dropped as by
-        `add`."""
+        """Record results of the mapping, a dict from the topic to the message in CDR, see
+        `pipeline.io.recording.messages`. They are dropped as by `add`."""
         size = sum(map(len, messages_by_topic.values()))
         self._put(size, lambda writer: writer.add_outputs(messages_by_topic))
 
@@ -119,7 +119,7 @@ class Recorder:
         Args:
             revision: Number of the revision.
             from_scan: Index of the first scan that is mapped with them.
-            values: Values by stage and name.
+            values: Dict from the stage to a dict from names to values.
         """
         self._put(0, lambda writer: writer.add_parameters(revision, from_scan, values))
 
@@ -141,7 +141,7 @@ class Recorder:
 
         Args:
             size: Number of bytes that count towards QUEUE_BYTES.
-            work: Writes the entry.
+            work: Function that writes the entry with the given writer.
         """
         with self._lock:
             if self.problem or self._closing.is_set():
@@ -207,8 +207,8 @@ class RawFile:
         path: The file.
 
     Raises:
-        FileExistsError: It exists.
-        OSError: It cannot be created.
+        FileExistsError: The file exists.
+        OSError: The file cannot be created.
     """
 
     def __init__(self, path: FilePath) -> None:
@@ -219,7 +219,7 @@ class RawFile:
         """Write all bytes and return their number.
 
         Raises:
-            OSError: The disk refuses; a part may be written.
+            OSError: The bytes cannot be written; a part of them may be written.
         """
         rest = memoryview(data)
         while rest:

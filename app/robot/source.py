@@ -44,7 +44,7 @@ class PictureStore:
     """Pictures of a run in a temporary file.
 
     Attributes:
-        losses: Number of pictures that were not stored, by reason.
+        losses: Dict from reasons to numbers of pictures that were not stored.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class PictureStore:
 
     def is_due(self, path: Path) -> bool:
         """Return whether the robot has moved STEP_M or turned TURN_RAD since the last picture; True for the
-        first one, False without a pose.
+        first one, False if there is no pose.
 
         Args:
             path: Path up to the present pose.
@@ -70,12 +70,12 @@ class PictureStore:
         return math.hypot(here[0] - x, here[1] - y) >= STEP_M or turned >= TURN_RAD
 
     def add(self, picture: Picture, path: Path) -> None:
-        """Store a picture. A picture that cannot be stored (limit, disk) is counted in `losses`; one with a
-        known time is ignored. In any case `is_due` counts the motion from this pose on.
+        """Store a picture, unless one with the same time is stored. A picture that cannot be stored (limit,
+        disk) is counted in `losses`. In any case `is_due` counts the motion from this pose on.
 
         Args:
             picture: The picture.
-            path: Path up to the pose at which it was taken, at least one.
+            path: Path, of at least one pose, up to the pose at which the picture was taken.
         """
         self._last = float(path.x[-1]), float(path.y[-1]), float(path.yaw[-1])
         if picture.stamp_ns in self._kept:
@@ -111,7 +111,7 @@ MakeLink = Callable[[Any, Inbox], Link]
 
 
 def link_for(address: Address) -> MakeLink:
-    """Return the class of the connection for an address."""
+    """Return the class of the connection for an address: VelodyneLink, DdsLink or ZenohLink."""
     if isinstance(address, VelodyneAddress):
         return VelodyneLink
     return DdsLink if isinstance(address, DdsAddress) else ZenohLink
@@ -199,8 +199,8 @@ class LiveSource:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of messages left out, by reason: lost on the network, skipped by the mapping, not recorded,
-        or not readable."""
+        """New dict from a reason to the number of messages that were left out for it: lost on the network,
+        skipped by the mapping, not recorded, or not readable."""
         read = {} if self._reader is None else self._reader.losses
         kept = {} if self._kept is None else self._kept.losses
         recorder = {} if self._recorder is None else self._recorder.losses
@@ -246,7 +246,8 @@ class LiveSource:
     # --- camera ------------------------------------------------------------------------------
 
     def camera(self) -> tuple[Camera | None, str]:
-        """Return the camera model; None with the reason where it is unknown, or with "" without a camera."""
+        """Return the camera model and "". If the model is unknown, return None and the reason; without a
+        camera, None and ""."""
         return (None, "") if self._camera is None else self._camera.camera(self._base)
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
@@ -264,7 +265,7 @@ class LiveSource:
 
     @property
     def picture_counts(self) -> str:
-        """Numbers of pictures that arrived and were accepted, as text; "" without a camera."""
+        """Numbers of pictures that arrived and were accepted, as text; "" if there is no camera."""
         if self._camera is None:
             return ""
         lost = sum(self._inbox.losses.get(reason, 0) for reason in (PICTURES_SKIPPED, PICTURES_TOO_LARGE))
@@ -301,7 +302,7 @@ class LiveSource:
 
     @property
     def recording(self) -> str:
-        """State of the recording in one line, "" without one."""
+        """State of the recording in one line, "" if there is none."""
         return "" if self._recorder is None else self._recorder.status
 
     def mapped(self, frame: Frame, path: Path) -> None:
@@ -330,7 +331,7 @@ class LiveSource:
             self._recorder.add_outputs(messages)
 
     def use_parameters(self, revision: int, from_scan: int, parameters: Parameters) -> None:
-        """Record parameters that apply from a mapped scan onwards; nothing without a recording.
+        """Record parameters that apply from a mapped scan onwards; nothing happens if there is no recording.
 
         Args:
             revision: Number of the revision.

@@ -80,7 +80,7 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
         publishers: Present publishers.
         robot: Namespace of the robot, ROOT for none, "" for the one with the best scan topic, see
             `_scan_rank`.
-        topics: Topic by role where the user named it.
+        topics: Dict from each role for which the user named a topic to this topic.
         where: The address, for errors.
 
     Raises:
@@ -115,7 +115,7 @@ def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publish
 
     Args:
         there: Publishers of the robot.
-        topics: Topic by role where the user named it.
+        topics: Dict from each role for which the user named a topic to this topic.
         where: The address, for errors.
 
     Raises:
@@ -154,11 +154,11 @@ def _of_role(
     rank: Callable[[Publisher], tuple[object, ...]],
     where: str,
 ) -> Publisher | None:
-    """Return the publisher of a role: that of the named topic, else the first by rank; None without one.
+    """Return the publisher of a role: that of the named topic, else the first by rank; None if there is none.
 
     Args:
         there: Publishers of the robot.
-        topics: Topic by role where the user named it.
+        topics: Dict from each role for which the user named a topic to this topic.
         role: The role.
         types: Message types of the role.
         rank: Sort key of a publisher; the smallest is chosen.
@@ -195,16 +195,17 @@ def _has_word(publisher: Publisher, words: tuple[str, ...]) -> bool:
 
 
 def _scan_rank(publisher: Publisher) -> tuple[object, ...]:
-    """Return the sort key of a scan topic. A planar laser comes last, because with a LiDAR it is a safety
-    sensor; before it, topics whose name suggests that their clouds are not raw sweeps; among equals, packets
-    of a Velodyne sensor come last, then robot and name decide."""
+    """Return the sort key of a scan topic; the smallest is the best topic. A planar laser (LASER_SCAN) comes
+    last. Before it come topics whose name contains a word of `_DERIVED`. Among equals, packets of a Velodyne
+    sensor come last; then robot and name decide."""
     kind, is_derived = publisher.msgtype, _has_word(publisher, _DERIVED)
     return kind == LASER_SCAN, is_derived, kind == VELODYNE_SCAN, publisher.robot, publisher.topic
 
 
 def _odometry_rank(publisher: Publisher) -> tuple[object, ...]:
-    """Return the sort key of an odometry topic: names with gps, map or slam last, names that end in odom
-    first, then by name."""
+    """Return the sort key of an odometry topic; the smallest is the best topic. Names that contain gps, map
+    or slam come last; of the others, names that end in odom come first; among equals, the name decides. Case
+    is ignored."""
     name = publisher.topic.lower()
     return any(word in name for word in ("gps", "map", "slam")), not name.endswith("odom"), publisher.topic
 

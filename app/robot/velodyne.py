@@ -22,7 +22,7 @@ _SECOND = 1_000_000_000
 
 
 class Sweeps:
-    """Joins the packets of one sensor to sweeps of one turn. A sweep has the time of its last packet."""
+    """Joins the packets of one sensor to sweeps of one rotation. A sweep has the time of its last packet."""
 
     def __init__(self) -> None:
         self._packets: list[tuple[int, bytes]] = []
@@ -34,7 +34,7 @@ class Sweeps:
 
         Args:
             stamp_ns: Time of arrival, not before that of the packet before [ns].
-            packet: 1206 bytes that pass `is_data_packet`.
+            packet: Data packet of 1206 bytes, see `is_data_packet`.
         """
         begins = self._rotation.begins(packet[2] + 256 * packet[3], stamp_ns)
         ended = self.end() if begins or len(self._packets) >= MOST_PACKETS else None
@@ -93,7 +93,7 @@ class VelodyneLink(Link):
 
     Args:
         address: Address on which it listens, and address of the sender.
-        inbox: Receives the sweeps.
+        inbox: Inbox to which the sweeps are added.
     """
 
     def __init__(self, address: VelodyneAddress, inbox: Inbox) -> None:
@@ -152,7 +152,8 @@ class VelodyneLink(Link):
         return listening
 
     def _pause(self) -> None:
-        """Handle a pause: a short one completes the sweep, after a long one the sensor counts as absent."""
+        """Complete the sweep if its last packet is older than GAP_NS, and withdraw the topic if no packet
+        arrived for _LOST_S."""
         if self._sweeps.is_stale(self.times.now_ns()):
             self._hand_over(self._sweeps.end())
         silence_s = self.silence_s

@@ -24,9 +24,9 @@ _LONGEST_TOKEN = 1000
 
 
 def publisher_of(token: str) -> Publisher | None:
-    """Return robot (the namespace), topic and message type of the liveliness token of a publisher. None for
-    tokens of other entities, for invalid names, without a type `<package>::msg::dds_::<name>_`, and for
-    tokens that are too long.
+    """Return the publisher that a liveliness token describes: robot (the namespace), topic and message type.
+    None for tokens of other entities, for invalid names, without a type `<package>::msg::dds_::<name>_`, and
+    for tokens that are too long.
 
     A token is `@ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>`, followed for
     an endpoint by `/<topic>/<type>/<hash>/<qos>`. A slash inside of a part is written `%`.
@@ -43,12 +43,12 @@ def publisher_of(token: str) -> Publisher | None:
 
 
 def data_key(domain: int, topic: str, msgtype: str, type_hash: str = "*") -> str:
-    """Return the key of the messages of a topic.
+    """Return the key `DOMAIN/TOPIC/PACKAGE::msg::dds_::NAME_/HASH` of the messages of a topic.
 
     Args:
         domain: ROS_DOMAIN_ID.
         topic: Name of the topic; its leading slash is not part of the key.
-        msgtype: In the ROS 2 spelling.
+        msgtype: Message type in the ROS 2 spelling, "PACKAGE/msg/NAME".
         type_hash: Hash of the type; "*" for any.
     """
     package, _, name = msgtype.split("/")
@@ -69,7 +69,7 @@ def configuration(endpoint: str, files: Mapping[str, str] | None = None) -> str:
 
     Args:
         endpoint: Endpoint of the router.
-        files: Paths of certificates by role, see `ZenohAddress`.
+        files: Dict from roles to paths of certificates, see `ZenohAddress`.
     """
     tls: dict[str, Any] = {_TLS[name]: path for name, path in (files or {}).items()}
     if "connect_certificate" in tls:
@@ -94,7 +94,7 @@ class ZenohLink(Link):
 
     Args:
         address: Address of the router.
-        inbox: Receives the messages.
+        inbox: Inbox to which the messages are added.
     """
 
     def __init__(self, address: ZenohAddress, inbox: Inbox) -> None:
@@ -262,8 +262,9 @@ class RosPublisher:
         return f"{self._prefix}/{topic}"
 
     def publish(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Publish messages in CDR by topic, see `pipeline.io.recording.messages`. It does not wait for slow
-        subscribers; KeyError for an unknown topic."""
+        """Publish messages, a dict from the topic to the message in CDR, see
+        `pipeline.io.recording.messages`. It does not wait for slow subscribers; KeyError for an unknown
+        topic."""
         for topic, payload in messages_by_topic.items():
             self._publishers[topic].put(payload)
 

@@ -82,19 +82,19 @@ def by_verdict(verdicts: NDArray[np.integer]) -> Colours:
 
 
 def by_category(numbers: NDArray[np.integer]) -> Colours:
-    """Return a colour for each number, uint8, shape (K, 3); equal numbers have equal colours, and the 12
-    colours repeat."""
+    """Return a colour for each integer, shape (K,), as uint8, shape (K, 3): one of 12 colours by the number
+    modulo 12."""
     chosen: Colours = _CATEGORIES[np.asarray(numbers) % len(_CATEGORIES)]
     return chosen
 
 
 def ramp(values: NDArray[np.floating], low: float, high: float) -> Colours:
-    """Return colours from violet to yellow, uint8, shape (K, 3). Values outside are clipped; NaN counts as
-    `high`.
+    """Return colours from violet to yellow, uint8, shape (K, 3). Values outside of `low` to `high` are
+    clipped; NaN counts as `high`.
 
     Args:
-        values: shape (K,).
-        low, high: Values of violet and yellow.
+        values: Values, shape (K,).
+        low, high: Values that are violet and yellow.
     """
     t = (np.nan_to_num(values, nan=high, posinf=high, neginf=low) - low) / max(high - low, 1e-9)
     place = np.clip(t, 0.0, 1.0) * (len(_RAMP) - 1)
@@ -126,7 +126,8 @@ def choose(first: NDArray[np.bool_], one: Rgb, other: Rgb) -> Colours:
 
 
 def of_lines(each: NDArray[np.uint8]) -> Colours:
-    """Return the colours with which viser draws lines in the colours `each`, uint8, of the same shape.
+    """Return the colours that viser must get so that its client renders lines in the colours `each`, uint8,
+    of the same shape.
 
     Its client treats the colours of lines as linear light and converts them to sRGB again.
     """
@@ -143,7 +144,7 @@ class Layer(NamedTuple):
     """A layer of the scene.
 
     Attributes:
-        title: Name on the page.
+        title: Name on the dashboard.
         colour: Colour while the scene is coloured by verdict; None for several colours.
         on: Whether it is visible at the start. Layers that are slow or cover others are not.
     """
@@ -213,8 +214,9 @@ class ViewSettings:
             self.layers[name] = value
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the state for the page: `layers` in order, each with `name`, `title`, `on` and `colour`
-        ("#rrggbb" or None), `follow`, and each of CHOICES with its `value` and the possible values (`of`)."""
+        """Return the state as a dict for the dashboard: `layers`, a list of dicts in the order of LAYERS with
+        `name`, `title`, `on` and `colour` ("#rrggbb" or None); `follow`; and for each name in CHOICES a dict
+        with `value` and `of`, the list of possible values."""
         layers = [
             {"name": name, "title": layer.title, "on": self.layers[name], "colour": _hex(layer.colour)}
             for name, layer in LAYERS.items()

@@ -83,15 +83,16 @@ Place = tuple[float, float, float]
 def cluster_labels(
     frame: Frame, numbers: np.ndarray, label_by: str, taken: Sequence[Place] = ()
 ) -> list[Label]:
-    """Return labels for the clusters of a scan above their tops in the frame of the map: trees first, then
-    the nearest, at most MOST_LABELS. Clusters without a text, such as those without a circle by "DBH", have
-    none; [] by "none". The page hides the labels that overlap in its view.
+    """Return at most MOST_LABELS labels for the clusters of a scan, 0.1 m above their tops in the frame of
+    the map: first clusters with the verdict TREE, then others, each from near to far. Clusters without a text
+    (see `_cluster_text`) have no label; [] if `label_by` is "none".
 
     Args:
         frame: Results of the scan.
         numbers: Persistent number of each cluster, shape (K,), the keys of the labels.
         label_by: One of colours.LABEL_BY.
-        taken: Places of the labels of trees; a cluster less than OWN_TREE from one of them has no label.
+        taken: Positions x, y, z of the labels of trees in the map [m]; a cluster at a horizontal distance of
+            less than OWN_TREE from one of them has no label.
     """
     if label_by == "none":
         return []
@@ -111,8 +112,8 @@ def cluster_labels(
 
 
 def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
-    """Return the text of a cluster; "" if its DBH is unknown. An external stem, which has no eccentricity,
-    has its verdict.
+    """Return the text of a cluster: the label of its verdict for "verdict"; the diameter in cm for "DBH", ""
+    if it is unknown; the eccentricity for "eccentricity", or the label of the verdict if that is NaN.
 
     Args:
         frame: Results of the scan.
@@ -130,14 +131,14 @@ def _cluster_text(frame: Frame, k: int, label_by: str) -> str:
 
 
 def shown_height(height: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the drawn height of clusters, shape (K,) [m]: at least 0.2, and STEM_HEIGHT for NaN, because an
-    external stem has no measured height."""
+    """Return the height with which clusters are rendered, shape (K,) [m]: the height, at least 0.2, and
+    STEM_HEIGHT for NaN."""
     return np.where(np.isnan(height), STEM_HEIGHT, np.maximum(height, 0.2))
 
 
 def short(value: float) -> str:
-    """Return a number as text that rarely changes: one decimal below 10, a whole number below 100, above that
-    one significant digit; "∞" if it is not finite."""
+    """Return a number as text: with one decimal below 10, as an integer below 100, and from 100 on with one
+    significant digit; "∞" if it is not finite."""
     if not np.isfinite(value):
         return "∞"
     if value >= 100.0:

@@ -32,7 +32,7 @@ class MapNodes:
         on_tree: Called in the thread of viser with the number of a clicked tree.
 
     Attributes:
-        labelled: Places of the labels [m].
+        labelled: Positions x, y, z of the labels in the map [m].
     """
 
     def __init__(self, scene: viser.SceneApi, on_tree: Callable[[int], None]) -> None:
@@ -75,8 +75,9 @@ class MapNodes:
         self.labelled = [label.place for label in labels]
 
     def place_of(self, frame: Frame, tree: int | None, ring: Ring) -> tuple[float, float, float] | None:
-        """Return x, y and height of the ground of the selected cluster, else of the selected tree [m]; None
-        without them, also if the tree is not confirmed. Arguments as in `show`."""
+        """Return x, y and height of the ground [m] in the map of the selected cluster (`ring`), else of the
+        selected tree. None if there is no `ring` and `tree` is no confirmed tree of the frame. Arguments as
+        in `show`."""
         places = frame.trees.position[frame.trees.confirmed & (frame.trees.number == tree)]
         if ring is not None:
             places = np.array([ring[:2]])
@@ -154,12 +155,12 @@ class MapNodes:
 def tree_labels(
     trees: Trees, robot: NDArray[np.float64], selected: int | None, foot: NDArray[np.float64]
 ) -> list[Label]:
-    """Return labels for the selected tree, first, and the trees nearest to the robot, at most MOST_LABELS.
-    The page hides the labels that overlap in its view.
+    """Return at most MOST_LABELS labels in the frame of the map: for the selected tree, then for other trees
+    from near to far from the robot.
 
     Args:
-        trees: Trees of the map, which may all get labels.
-        robot: Position of the robot, shape (2,) [m].
+        trees: Trees of the map; they need not be confirmed.
+        robot: Position x, y of the robot in the map, shape (2,) [m].
         selected: Number of the selected tree, or None.
         foot: Height of the ground at each tree, shape (T,) [m].
     """
@@ -248,8 +249,9 @@ class ErrorNode(Segments):
 
 
 def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> tuple[Float, Float, Float]:
-    """Return the errors of a map: pairs of true and mapped position of matched trees, shape (M, 2, 2), missed
-    trees, shape (K, 2), and false trees, shape (F, 2), all in metres.
+    """Return the errors of a map as positions x, y in the map [m]: pairs of true and mapped position of
+    matched trees, shape (M, 2, 2); true positions of missed trees, shape (K, 2); and mapped positions of
+    false trees, shape (F, 2).
 
     Args:
         trees: The map; confirmed trees count. One that is matched with another object is false, and one that
@@ -279,12 +281,12 @@ def errors(trees: Trees, truth: TruthTrees, path: Float, wanted: Evaluation) -> 
 
 
 def _near(way: object, places: Float, reach: float) -> NDArray[np.bool_]:
-    """Return which places are within reach of the path, shape (N,).
+    """Return which positions are within `reach` of the path, shape (N,).
 
     Args:
         way: KD-tree of the path.
-        places: shape (N, 2) [m].
-        reach: Largest distance [m].
+        places: Positions, shape (N, 2) [m].
+        reach: Maximum distance [m].
     """
     if not len(places):
         return np.zeros(0, np.bool_)
@@ -293,7 +295,8 @@ def _near(way: object, places: Float, reach: float) -> NDArray[np.bool_]:
 
 
 def _crosses(places: Float) -> Float:
-    """Return two diagonal segments at each place (N, 2) [m], shape (2 N, 2, 2)."""
+    """Return two diagonal segments, each from corner to corner of a square with side 2 CROSS, around each of
+    N positions, shape (N, 2) [m], as shape (2 N, 2, 2) [m]."""
     arms = CROSS * np.array([[[-1.0, -1.0], [1.0, 1.0]], [[-1.0, 1.0], [1.0, -1.0]]])
     return (places[:, None, None, :] + arms).reshape(-1, 2, 2)
 
@@ -363,11 +366,12 @@ class Accumulated:
         return went_back or len(new) > 0
 
     def points_of(self, window: str) -> NDArray[np.float32]:
-        """Return the points that the layer shows, float32, shape (N, 3) [m], one per cell: those of the whole
-        run, which are not copied, or, by the poses of the time, of the scans shortly before the last one.
+        """Return the points that the layer shows in the frame of the map, float32, shape (N, 3) [m], one per
+        cell: `points` itself for the whole run, else the points of the kept scans within the time window
+        before the last one, placed by the pose that each scan had when it was added.
 
         Args:
-            window: One of colours.WINDOWS.
+            window: A key of colours.WINDOWS.
         """
         seconds = colours.WINDOWS[window]
         if seconds is None or not self._recent:

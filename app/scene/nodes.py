@@ -48,9 +48,9 @@ def placed(points: Points, pose: Pose2, z: float) -> NDArray[np.float32]:
     """Return points of the level base frame in the frame of the map, float32, of the same shape (..., 3) [m].
 
     Args:
-        points: shape (..., 3) [m].
+        points: Points in the level base frame, shape (..., 3) [m].
         pose: Pose of the robot in the map.
-        z: Height of the base [m].
+        z: Height of the base in the map [m].
     """
     moved = np.empty(points.shape, np.float32)
     moved[..., :2] = pose.apply(np.asarray(points[..., :2], np.float64))
@@ -59,7 +59,8 @@ def placed(points: Points, pose: Pose2, z: float) -> NDArray[np.float32]:
 
 
 def scan_in_map(frame: Frame, points: Points) -> NDArray[np.float32]:
-    """Return points of the sensor frame of a scan in the frame of the map, float32, shape (N, 3) [m]."""
+    """Return points of the level frame of the sensor, shape (N, 3) [m], in the frame of the map by the pose
+    of a scan, float32, shape (N, 3) [m]."""
     return placed(points + frame.sensor_offset, frame.estimate.T_map_base, frame.base_z)
 
 
@@ -69,12 +70,12 @@ def circles(
     """Return circles as line segments, `SIDES` for each circle.
 
     Args:
-        centres: shape (N, 2) [m].
-        radii: shape (N,) [m].
+        centres: Positions x, y, shape (N, 2) [m].
+        radii: Radii, shape (N,) [m].
         z: Heights, shape (N,) [m].
 
     Returns:
-        float32, shape (N * SIDES, 2, 3) [m].
+        Ends of the segments, circle by circle, float32, shape (N * SIDES, 2, 3) [m].
     """
     angle = np.linspace(0.0, 2.0 * np.pi, SIDES + 1)
     rim = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -104,8 +105,8 @@ class Node(Generic[N]):
 
         Args:
             on: Whether it is visible.
-            content: The same properties in each call, by name; those that are unchanged are not sent. Arrays
-                are kept and must not be modified.
+            content: Dict from names of properties, the same in each call, to values; unchanged ones are not
+                sent. Arrays are kept and must not be modified.
         """
         changed = [
             name
@@ -158,8 +159,8 @@ class Batch(Node[viser.BatchedMeshHandle]):
         Args:
             on: Whether they are visible.
             positions: Positions of the copies, shape (N, 3) [m].
-            scales: Their sizes along x, y, z in units of the mesh, shape (N, 3).
-            colours: Their colours, uint8, shape (N, 3).
+            scales: Sizes of the copies along x, y, z in units of the mesh, shape (N, 3).
+            colours: Colours of the copies, uint8, shape (N, 3).
             yaw: Rotation of each copy about the vertical [rad].
 
         Raises:
@@ -213,9 +214,9 @@ class CloudNode(Node[viser.PointCloudHandle]):
 
         Args:
             on: Whether they are visible.
-            points: shape (N, 3) [m] in the frame of the map.
-            colours: One colour, or one for each point.
-            look: `point_size`, their diameter if it changes [m].
+            points: Points in the frame of the map, shape (N, 3) [m].
+            colours: One colour, shape (3,), or one for each point, shape (N, 3).
+            look: `point_size`, the diameter of the points [m]; without it the size does not change.
 
         Raises:
             ValueError: The number of colours differs from that of the points.
@@ -252,7 +253,7 @@ class Segments(Node[viser.LineSegmentsHandle]):
 
         Args:
             on: Whether they are visible.
-            segments: Ends of the segments, shape (S, 2, 3) [m].
+            segments: Ends of the segments in the map, shape (S, 2, 3) [m].
             each: One colour, or one for each segment, uint8, shape (S, 3).
         """
         drawn = colours.of_lines(np.asarray(each, np.uint8))
@@ -276,14 +277,15 @@ class Circles(Segments):
         self._height = height
 
     def show_at(self, on: bool, centres: Float, radii: Float, each: Colours, ground: Float) -> None:
-        """Replace the circles.
+        """Replace the circles. If there are none, nothing is shown.
 
         Args:
             on: Whether they are visible.
-            centres: x, y, shape (N, 2) [m].
-            radii: shape (N,) [m].
-            each: Colours, uint8, shape (N, 3).
-            ground: Heights of the ground, shape (N,) [m].
+            centres: Positions x, y in the map, shape (N, 2) [m].
+            radii: Radii, shape (N,) [m].
+            each: Colour of each circle, uint8, shape (N, 3).
+            ground: Heights z of the ground in the map at the centres, shape (N,) [m]. The circles are the
+                height of the constructor above it.
         """
         self.show(on, circles(centres, radii, self._height + ground), np.repeat(each, SIDES, axis=0))
 
@@ -306,12 +308,13 @@ class LineNode:
         self._chunks: list[Segments] = []
 
     def show(self, on: bool, places: Float, ground: Float | float = 0.0) -> None:
-        """Show the line through places; only chunks that changed are sent.
+        """Show the line through the points, `height` of the constructor above the ground; only chunks that
+        changed are sent.
 
         Args:
             on: Whether it is visible.
-            places: Points of the line, shape (N, 2) [m].
-            ground: Heights of the ground there, scalar or shape (N,) [m].
+            places: Points x, y of the line in the map, shape (N, 2) [m].
+            ground: Heights of the ground at the points, scalar or shape (N,) [m].
         """
         segments = polyline(np.column_stack([places, np.broadcast_to(self._height + ground, len(places))]))
         while len(self._chunks) * CHUNK < len(segments):
@@ -367,7 +370,7 @@ class GroundNode(Node[viser.MeshHandle]):
         interpolation.
 
         Args:
-            places: Positions, shape (N, 2) [m].
+            places: Positions x, y in the map, shape (N, 2) [m].
             otherwise: Height where the ground is unknown, also outside of the map [m].
         """
         cell = np.floor((np.asarray(places, np.float64).reshape(-1, 2) - self._low) / self._cell)
@@ -378,8 +381,8 @@ class GroundNode(Node[viser.MeshHandle]):
 
 
 def raster(ground: HeightMap) -> tuple[Float, Float, float]:
-    """Return the heights of a grid around all known cells of a height map, its lower corner, and the side of
-    a cell.
+    """Return the heights of a grid around all known cells of a height map, the lower corner of the grid, and
+    the side of a cell [m].
 
     Heights have shape (I, J) [m] and are NaN where unknown; one NaN, shape (1, 1), for a map without cells.
     The corner, shape (2,) [m], is the outer corner of cell (0, 0). Two by two cells are averaged, and the

@@ -126,20 +126,22 @@ def _kind(spec: FieldSpec) -> type[int] | type[float]:
 
 
 def _range(spec: FieldSpec, value: Value) -> tuple[float, float]:
-    """Return the ends of a slider: those declared (0 and 1 without), or the value if it is beyond them."""
+    """Return the lower and upper end of a slider: `spec.shown`, or 0 and 1 if there are none, widened to the
+    value if it is beyond them."""
     low, high = spec.shown or (0.0, 1.0)
     kind = _kind(spec)
     return kind(min(low, float(value))), kind(max(high, float(value)))
 
 
 def _label(spec: FieldSpec, changed: bool) -> str:
-    """Return title and unit of a parameter, with a mark if its value differs from the preset."""
+    """Return title and unit of a parameter, "TITLE [UNIT]", with CHANGED in front if `changed`."""
     unit = f" [{spec.unit}]" if spec.unit else ""
     return f"{CHANGED if changed else ''}{spec.title}{unit}"
 
 
 def _meant(spec: FieldSpec, value: Value) -> Value:
-    """Return the value of a widget as a parameter: floats are rounded to 9 decimals."""
+    """Return the value of a widget as the value of a parameter: rounded to 9 decimals for the kind "float",
+    else unchanged."""
     # A slider of step 0.01 gives 0.15000000000000002 for 0.15.
     return round(float(value), 9) if spec.kind == "float" else value
 

@@ -77,8 +77,8 @@ class RobotNodes:
 
 
 def _thinned(path: Float) -> Float:
-    """Return a path with at most MOST_POINTS + 1 points: those at multiples of a power of two, and the last
-    one, shape (N, 2) [m]."""
+    """Return at most MOST_POINTS + 1 rows of a path, shape (N, 2) [m]: the rows at multiples of the smallest
+    sufficient power of two, and the last row."""
     spacing = 1
     while len(path) > spacing * MOST_POINTS:
         spacing *= 2
@@ -86,13 +86,13 @@ def _thinned(path: Float) -> Float:
 
 
 def _stepped(ground: GroundNode, places: Float) -> Float:
-    """Return heights of the ground at places (N, 2) [m], shape (N,) [m], rounded to STEP, so that small
-    changes do not send a line again. 0 where the ground is unknown."""
+    """Return the heights of the ground at positions, shape (N, 2) [m], rounded to multiples of STEP, shape
+    (N,) [m]; 0 where the ground is unknown."""
     return np.round(ground.heights(places, 0.0) / STEP) * STEP
 
 
 def _part(mesh: Mesh, size: tuple[float, float, float], place: tuple[float, float, float]) -> Mesh:
-    """Return a mesh that is scaled along x, y, z and then moved [m]."""
+    """Return a mesh that is scaled along x, y, z by `size` and then moved by `place` [m]."""
     vertices, faces = mesh
     return (vertices * np.array(size) + np.array(place)).astype(np.float32), faces
 
@@ -187,13 +187,13 @@ class WayNode(Segments):
 
 
 def way_lines(curvature: float, backward: bool, begins: float, parameters: Obstacles) -> NDArray[np.float32]:
-    """Return both sides of the path ahead, and lines across it at its beginning and at the end of each zone,
-    in the level base frame, as segments of shape (S, 2, 3) [m].
+    """Return line segments in the level base frame, shape (S, 2, 3) [m]: both sides of the path ahead, and
+    lines across the path at its beginning and at the ends of the stop and slow zones.
 
     Args:
         curvature: Curvature of the path [1/m], positive to the left.
         backward: Whether the robot drives backward.
-        begins: Distance of the beginning of the path from the base [m].
+        begins: Distance along the path from the base to its beginning [m].
         parameters: Widths and lengths of the zones.
     """
     half = 0.5 * parameters.width

@@ -51,13 +51,13 @@ class ScanNodes:
             _report(batch, self._markers, on_cluster)
 
     def show(self, frame: Frame, view: ViewSettings, labelled: Sequence[Place]) -> None:
-        """Show a scan. For a whole cloud, points of clusters are drawn as such only, and clusters have
-        neither labels nor fitted circles.
+        """Show a scan. For a whole cloud, points of clusters are not shown as filtered points, and clusters
+        have neither labels nor fitted circles.
 
         Args:
             frame: Results of the scan.
             view: Visible layers, colours and labels.
-            labelled: Places of the labels of trees, which those of clusters do not cover.
+            labelled: Positions of the labels of trees, see `cluster_labels`.
         """
         layers, ends = view.layers, height_range(frame)
         centroid = frame.clusters.centroid[:, :2] + frame.sensor_offset[:2]
@@ -91,7 +91,8 @@ class ScanNodes:
 
         Args:
             instance: Number of the hit marker in the scan that the browser showed; None if unknown.
-            origin, direction: Ray of the click in the frame of the map, shape (3,) each.
+            origin, direction: Origin [m] and direction of the ray of the click in the frame of the map, shape
+                (3,) each.
         """
         return meant(origin, direction, *self._axes, instance)
 
@@ -102,9 +103,9 @@ class ScanNodes:
         """Return colours by height, one per point, if the view is coloured so; otherwise the plain colour.
 
         Args:
-            points: shape (N, 3) [m] in the level frame of the sensor.
+            points: Points in the level frame of the sensor, shape (N, 3) [m].
             view: The choices.
-            plain: The other colour.
+            plain: Colour of all points if the view is not coloured by height.
             ends: Heights at the ends of the ramp [m].
         """
         if view.colour_by == "height":
@@ -150,9 +151,9 @@ def _report(batch: Batch, markers: Batch, on_cluster: OnCluster) -> None:
     """Let clicks on the copies of a batch call `on_cluster`.
 
     Args:
-        batch: Receives the clicks.
-        markers: Batch whose copies are the clusters in order; only for it the number of the copy is passed
-            on.
+        batch: Batch whose clicks are reported.
+        markers: Batch whose copies are the clusters in order; only for this batch the number of the copy is
+            passed to `on_cluster`.
         on_cluster: Called in the thread of viser, see `ScanNodes`.
     """
 
@@ -170,13 +171,15 @@ def cloud_point_size(frame: Frame) -> float:
 
 
 def extent(frame: Frame) -> float:
-    """Return the greater side of the area of the points of a frame [m]; 0 without points."""
+    """Return the longer side of the bounding box of the filtered points in x and y [m]; 0 if there are no
+    points."""
     return float(np.ptp(frame.filtered[:, :2], axis=0).max()) if len(frame.filtered) else 0.0
 
 
 def height_range(frame: Frame) -> tuple[float, float]:
-    """Return the heights at the ends of the colour ramp [m]: of a scan, and of a cloud without points, always
-    the same; of a whole cloud the percentiles 1 and 99 of its points."""
+    """Return the lower and upper end of the colour ramp, heights in the level frame of the sensor [m]:
+    HEIGHT_LOW and HEIGHT_HIGH for a scan and for a cloud without points; the percentiles 1 and 99 of the
+    filtered points for a whole cloud."""
     if not frame.of_cloud or not len(frame.filtered):
         return HEIGHT_LOW, HEIGHT_HIGH
     low, high = np.percentile(frame.filtered[:, 2], (1.0, 99.0))
@@ -221,8 +224,8 @@ class VoxelNode:
         self.count = 0
 
     def show(self, on: bool, frame: Frame, size: float) -> None:
-        """Show the voxels, in the level frame of the sensor, that contain filtered points. `count` becomes
-        their number, also of those beyond MOST_VOXELS, which are not drawn; 0 while nothing is shown.
+        """Show the voxels, in the level frame of the sensor, that contain filtered points. At most
+        MOST_VOXELS are rendered. `count` becomes the number of all of them; 0 while nothing is shown.
 
         Args:
             on: Whether the layer is on; otherwise nothing is computed.
@@ -248,7 +251,7 @@ REACH = 0.5  # largest distance between the places of one cluster in consecutive
 
 
 class ClusterNumbers:
-    """Gives clusters the numbers of the clusters at the same places in the previous scan.
+    """Gives clusters the numbers of the clusters at the same positions in the previous scan.
 
     Colours and labels follow these numbers, so that they do not flicker.
     """
@@ -259,11 +262,11 @@ class ClusterNumbers:
         self._next = 0
 
     def follow(self, places: Float) -> Int:
-        """Return a number for each cluster at these places: that of the cluster of the previous call with
+        """Return a number for each cluster at these positions: that of the cluster of the previous call with
         which it is paired within REACH (one to one, see `match`), else the next unused one, from 0 on.
 
         Args:
-            places: shape (K, 2) [m] in the frame of the map.
+            places: Positions of the clusters in the frame of the map, shape (K, 2) [m].
 
         Returns:
             Different numbers, int64, shape (K,).

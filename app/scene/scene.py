@@ -88,11 +88,11 @@ class Scene:
 
     def show_parameters(self, parameters: Parameters, preset_name: str) -> None:
         """Set the widgets to parameters, without a callback; sliders that a person is moving are not set. The
-        parameters also apply to voxels, errors and path ahead of the next drawing.
+        parameters also apply to voxels, errors and the path ahead when a scan is rendered next.
 
         Args:
             parameters: The values.
-            preset_name: Their preset.
+            preset_name: Name of the preset of the parameters.
         """
         self._parameters, self._preset = parameters, preset_name
         with self._server.atomic():
@@ -105,16 +105,16 @@ class Scene:
             self._map.show_truth(trees, self._view)
 
     def select(self, tree: int | None, ring: Ring = None) -> Vector | None:
-        """Highlight the selection in place of the one before. It is drawn with the next scan if none is
-        shown.
+        """Highlight the selection in place of the one before; if no scan is shown, with the next scan.
 
         Args:
             tree: Number of the selected tree, or None; an unknown number highlights nothing.
             ring: x, y and radius of the selected cluster [m] in the frame of the map, or None.
 
         Returns:
-            x, y and height of the ground of the selected cluster, else of the tree, in the frame of the map
-            [m]; None if it is not in the shown map.
+            x, y and height of the ground [m] in the map of the selected cluster, else of the selected tree;
+            None before the first scan, without a selection, and if the tree is no confirmed tree of the shown
+            scan.
         """
         self._selected, self._ring = tree, ring
         self._draw()
@@ -131,13 +131,14 @@ class Scene:
 
     @property
     def view(self) -> dict[str, Any]:
-        """State of the view for the page: `layers` and choices, see `ViewSettings.as_plain`, and `counts`."""
+        """State of the view for the dashboard, a dict with the keys of `ViewSettings.as_plain` and
+        `counts`."""
         return {**self._view.as_plain(), "counts": self.counts}
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of elements of the layers that only the scene counts: `ground` (triangles), `voxels`,
-        `gathered` (points) and `errors` (missed and false trees)."""
+        """Dict from layers to the number of their elements: `ground` (triangles), `voxels`, `gathered`
+        (points) and `errors` (missed and false trees)."""
         return {
             "ground": self._map.ground.faces,
             "voxels": self._voxels.count,

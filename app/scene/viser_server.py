@@ -112,7 +112,7 @@ def send_properties(node: viser.SceneNodeHandle, content: dict[str, Any]) -> Non
 
     Args:
         node: The node.
-        content: Properties by name; an array is sent with the type of the present one.
+        content: Dict from names of properties to values; an array is sent with the type of the present one.
     """
     properties = node._impl.props
     for name, value in content.items():

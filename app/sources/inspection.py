@@ -36,7 +36,7 @@ class TookTooLongError(StemmapError):
 
 
 class InspectionResult(msgspec.Struct, frozen=True):
-    """Answer of the child process, or the error: what, where, remedy."""
+    """Answer of the child process, or the error (what, where, remedy); None if there is no error."""
 
     content: dict[str, Any] = {}
     error: tuple[str, str, str] | None = None
@@ -91,7 +91,7 @@ async def check_source(request: SourceRequest) -> None:
     checked.
 
     Raises:
-        StemmapError: It cannot be opened; the error gives the reason.
+        StemmapError: The source cannot be opened; the error gives the reason.
     """
     if not check_address(request.uri):
         return

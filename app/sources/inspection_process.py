@@ -40,7 +40,7 @@ def recording(question: dict[str, Any]) -> dict[str, Any]:
         question: The key "path" has the path.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The recording cannot be read.
     """
     if is_cloud(question["path"]):
         return {"kind": f"whole cloud, {open_cloud(question['path']).description.kind}"}
@@ -74,16 +74,18 @@ def inside(question: dict[str, Any]) -> dict[str, Any]:
         question: The key "path" has the path of the recording or the address of the robot.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The recording or the robot cannot be read.
     """
     return (heard if is_live(question["path"]) else recorded)(question["path"])
 
 
 def finished(question: dict[str, Any]) -> dict[str, Any]:
-    """Return a folder that `stemmap map` wrote as the page shows a run: `uri`, `kind`, `source` (digest),
-    `odometry`, `seed`, `chosen`, `scans`, `time_s`, `distance_m`, `lost` (see `lost_share`), `trees` (their
-    number), `preset`, `parameters` by dotted name, `scores` (see `score_payload`; None without), and `map`
-    with `trees` (see `trees_payload`), thinned `path` and `truth` (None). Long texts are cut.
+    """Return the run in a folder that `stemmap map` wrote as a dict of JSON values. Long strings are cut.
+
+    The keys are `uri`, `kind`, `source` (digest), `odometry`, `seed`, `chosen`, `scans` (number), `time_s`,
+    `distance_m`, `lost` (see `lost_share`), `trees` (number of trees that are not rejected) and `preset`;
+    `parameters`, a dict from dotted names to values; `scores` (see `score_payload`; None if unknown); and
+    `map`, a dict with `trees` (see `trees_payload`), `path` (see `thinned`) and `truth` (None).
 
     Args:
         question: The key "path" has the folder.
@@ -122,9 +124,9 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def plots(question: dict[str, Any]) -> dict[str, Any]:
-    """Return {"plots": [{"name", "polygons"}]} of a GIS file in the frame of the map of a run; `polygons` are
-    the coordinates of a GeoJSON MultiPolygon [m], rounded to millimetres, but without the last corner of each
-    ring, which repeats the first.
+    """Return {"plots": [...]}, a list of a dict for each plot of a GIS file, with `name` and `polygons`.
+    `polygons` are the coordinates of a GeoJSON MultiPolygon in the frame of the map of a run [m], rounded to
+    1 mm, without the last corner of each ring, which repeats the first.
 
     Args:
         question: The key "path" has the file, "run" the folder of the run, and "crs" the reference system of
@@ -148,8 +150,9 @@ def plots(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def georeference(question: dict[str, Any]) -> dict[str, Any]:
-    """Return the reference system of a map: `frame`, see `app.batch.georeference.MapFrame.record`, and
-    `points`, the control points as dicts, see `ControlPoint`; [] for another method. Nothing is written.
+    """Return the reference system of a map as a dict: `frame`, see `app.batch.georeference.MapFrame.record`,
+    and `points`, a list of the fields of each `ControlPoint` ([] for methods without control points). Nothing
+    is written.
 
     Args:
         question: The key "path" has the folder of the run, "crs" the reference system, and "how" is
@@ -196,9 +199,9 @@ def report(question: dict[str, Any]) -> dict[str, Any]:
     """Write the report of a run to a file; return {}.
 
     Args:
-        question: The key "path" has the folder of the run, "file" the .html or .pdf file, "language" its
-            language, "plots" the plots as [name, GeoJSON geometry] in the coordinates of its files, and
-            "parameters" those of the stand figures.
+        question: The key "path" has the folder of the run, "file" the .html or .pdf file, "language" the
+            language of the report, "plots" a list of [name, GeoJSON geometry] in the coordinates of the files
+            of the run, and "parameters" the values of `Stand`.
 
     Raises:
         StemmapError, OSError: See `app.batch.report`.
@@ -228,10 +231,11 @@ def visits(question: dict[str, Any]) -> dict[str, Any]:
             names for errors; `same_frame` states whether their frames are equal.
 
     Returns:
-        `how` they were aligned, or why they were not; whether they are `aligned`; `pose` [x, y, yaw] of the
-        later in the earlier; `rows` (see `app.batch.revisit.rows_of`) and the same as `csv`; `places_b`, the
-        places [x, y] of the trees of the later in the frame of the earlier by their number as text; and
-        `record`, see `comparison_record`.
+        A dict with `how`, how the visits were aligned, or why they were not; `aligned`, whether they are
+        aligned or share their frame; `pose`, [x [m], y [m], yaw [rad]] of the later visit in the frame of the
+        earlier one; `rows`, see `app.batch.revisit.rows_of`; `csv`, the rows as CSV text; `places_b`, a dict
+        from the number (as text) of each tree of the later visit to its position [x, y] [m] in the frame of
+        the earlier one; and `record`, see `comparison_record`.
 
     Raises:
         StemmapError: The files of a visit cannot be read.
@@ -268,12 +272,13 @@ def visits(question: dict[str, Any]) -> dict[str, Any]:
 
 
 def alignment(question: dict[str, Any]) -> dict[str, Any]:
-    """Return `pose`, [x, y, yaw] of the map `local` in `reference` found by stem matching, or None; `reason`
-    if there is none, else ""; and `stems`, the number of matched stems.
+    """Match two maps by their stems. Return a dict with `pose`, [x [m], y [m], yaw [rad]] of the map `local`
+    in the frame of `reference`, or None if there is no match; `reason`, why there is none, else ""; and
+    `stems`, the number of matched stems.
 
     Args:
-        question: `local` and `reference` are the maps, with a row per stem: x, y, sigma, DBH and its sigma
-            [m]; None for an unknown DBH.
+        question: The keys "local" and "reference" have the maps: for each stem a list of x, y, sigma of the
+            position, DBH and sigma of the DBH [m]; None for an unknown DBH.
     """
     import numpy as np
 
@@ -327,7 +332,7 @@ def answer(parent: ParentConnection) -> None:
 
 
 def _scores(evaluation: object) -> dict[str, Any] | None:
-    """Return the scores of run.json for the page, see `score_payload`; None if there are none or they are
+    """Return the dict of `score_payload` for the scores of run.json; None if there are none or they are
     damaged."""
     from app.dashboard.scores import score_payload
     from pipeline.evaluation import MapScores
@@ -349,9 +354,10 @@ _ROLES = {kind: role for role, kinds in reversed(TYPES_BY_ROLE.items()) for kind
 
 
 def recorded(uri: str) -> dict[str, Any]:
-    """Return the contents of a file, folder or simulated run: `kind`, the format; `topics`, the fields of at
-    most MOST_TOPICS `RecordedTopic` with `rate_hz`; `mount` (x, y, z [m], roll, pitch, yaw [deg]; None
-    without topics); and at most 20 `warnings`.
+    """Return the description of a file, folder or simulated run as a dict: `kind`, the format; `topics`, a
+    list of at most MOST_TOPICS dicts with the fields of `RecordedTopic` and `rate_hz`; `mount`, [x, y, z [m],
+    roll, pitch, yaw [deg]] of the LiDAR on the robot (None if there are no topics); and `warnings`, at most
+    20 strings.
 
     Raises:
         SourceError: The source cannot be read, or is a whole cloud.
@@ -402,12 +408,13 @@ def heard(uri: str) -> dict[str, Any]:
 
 
 def _counted(publisher: Publisher, heard: Heard, listened: bool) -> dict[str, Any]:
-    """Return the description of a topic for the page: the fields of a `RecordedTopic`, with the counted
-    `messages` (None if not counted), the time of counting `seconds` and `rate_hz`.
+    """Return the description of a topic as a dict: the fields of a `RecordedTopic`, of which `messages` is
+    the number of counted messages (None if they were not counted); `seconds`, the time of counting [s]; and
+    `rate_hz`.
 
     Args:
         publisher: The topic.
-        heard: Number and times of its messages.
+        heard: Number and times of the messages of the topic.
         listened: Whether its messages were counted.
     """
     why = ""

@@ -145,7 +145,7 @@ def _be_child(work: Callable[[], object], limits: ProcessLimits, where: str, sen
 
 
 def _data_bytes() -> int:
-    """Return the private memory of this process that RLIMIT_DATA counts [bytes]."""
+    """Return the memory of this process that RLIMIT_DATA counts (VmData) [bytes]; Linux only."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(int(line.split()[1]) << 10 for line in lines if line.startswith("VmData:"))
 
@@ -155,10 +155,10 @@ def check_address(uri: str) -> bool:
     Nothing is opened.
 
     Returns:
-        Whether it is a file or folder, or has an unknown scheme.
+        True for a file or folder; False for the address of a live robot or a simulated run.
 
     Raises:
-        StemmapError: It does not exist, or the address is wrong.
+        StemmapError: The source does not exist, or the address is wrong.
     """
     if is_live(uri):
         parse_address(uri)
@@ -175,7 +175,7 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
     ground truth, in a child process with limits, so that it is read twice.
 
     Raises:
-        SourceError: It cannot be read, or takes more time or memory than a file of its size should.
+        SourceError: The source cannot be read, or takes more time or memory than a file of its size should.
     """
     if is_cloud(uri):
         open_cloud(uri)
@@ -217,8 +217,8 @@ def _check(opening: Callable[[], object], uri: str) -> None:
 
 
 def _size(uri: str) -> int | None:
-    """Return the size of a file, or of all files in a folder [bytes]; None if there is no such path, as for a
-    simulated run."""
+    """Return the size of a file, or of all files in a folder, also in subfolders [bytes]; None if there is no
+    such path or it cannot be read."""
     with contextlib.suppress(OSError, ValueError, RuntimeError):
         path = Path(uri.removeprefix("file:").removeprefix("//")).expanduser()
         if path.is_dir():

@@ -39,11 +39,12 @@ class SourceRequest(msgspec.Struct, frozen=True):
         uri: Path or address of the source, as the user wrote it.
         odometry: "auto", "wheels", "kiss-icp", "static", or "file:" and a path, see `choose_odometry`.
         seed: Random seed of the mapping and of a simulated source.
-        topics: Topic name by role, where the user chose one; other topics are found by type.
+        topics: Dict from each role for which the user chose a topic to its name; other topics are chosen by
+            type.
         mount: Pose of the LiDAR on the robot: x, y, z [m], roll, pitch, yaw [rad]. None uses the pose that
             the source declares.
         preset: Name of the parameter preset; empty for the preset that suits the source.
-        parameters: Parameter values by dotted name that differ from the preset.
+        parameters: Dict from dotted names to the parameter values that differ from the preset.
     """
 
     uri: Uri
@@ -65,15 +66,15 @@ class SourceRequest(msgspec.Struct, frozen=True):
         return SourceOptions(dict(self.topics), mounted, self.seed)
 
     def kept_choices(self) -> dict[str, Any] | None:
-        """Return `topics` (name by role) and `mount` (x, y, z [m], roll, pitch, yaw [rad], or None) for the
-        store and run.json; None where neither was chosen."""
+        """Return a dict for the store and run.json with `topics`, a dict from roles to names, and `mount`,
+        [x, y, z [m], roll, pitch, yaw [rad]] or None; None if neither was chosen."""
         if not self.topics and self.mount is None:
             return None
         return {"topics": dict(self.topics), "mount": None if self.mount is None else list(self.mount)}
 
     def for_page(self) -> dict[str, Any]:
-        """Return `uri`, `odometry`, `seed`, `topics` and `mount` (None if not chosen) as `POST /api/open`
-        takes them: the mounting angles are degrees. Preset and parameters are left out."""
+        """Return a dict as `POST /api/open` takes it: `uri`, `odometry`, `seed`, `topics` and `mount`, [x, y,
+        z [m], roll, pitch, yaw [deg]] or None. Preset and parameters are left out."""
         mount = None if self.mount is None else [*self.mount[:3], *map(degrees, self.mount[3:])]
         return {
             "uri": self.uri,
@@ -118,8 +119,8 @@ def request_of_kept(
 
 
 def mount_of_degrees(mount: tuple[float, float, float, float, float, float] | None) -> Mount | None:
-    """Convert the angles roll, pitch, yaw of a mounting x, y, z [m], roll, pitch, yaw from degrees to
-    radians; None stays None."""
+    """Return a mounting (x, y, z [m], roll, pitch, yaw [rad]) from one whose angles are in degrees; None for
+    None."""
     if mount is None:
         return None
     x, y, z, roll, pitch, yaw = mount

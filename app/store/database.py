@@ -24,11 +24,11 @@ _version = sa.Table(
 
 
 def _prepare_tables(connection: sa.Connection) -> None:
-    """Create the tables of a new database, or check the version of an existing one and bring those of
-    `_ADDED` up to date.
+    """Create the tables of an empty database and store VERSION. To a database of a version in `_ADDED`, add
+    the columns of that version and of all later ones, and store VERSION. A database of VERSION is unchanged.
 
     Raises:
-        StemmapError: The tables are of another version or of another program.
+        StemmapError: The tables are of any other version, or of another program.
     """
     names = sa.inspect(connection).get_table_names()
     if not names:

@@ -35,8 +35,8 @@ _NAME = re.compile(r"[0-9a-f]{16}")
 
 
 def name_of(data: dict[str, Any]) -> str:
-    """Return the name of a forest from its JSON: 16 hex digits of the SHA-256 of its classes and trees,
-    without provenance."""
+    """Return the name of a random forest from its JSON: the first 16 hex digits of the SHA-256 of its classes
+    and trees, without provenance."""
     from pipeline.classification.forest import ALL_AROUND, FREE_END, ONE_WAY
 
     decides = [data.get(key) for key in ("classes", ALL_AROUND, ONE_WAY)]
@@ -46,7 +46,7 @@ def name_of(data: dict[str, Any]) -> str:
 
 
 class Forests:
-    """The forests of a data folder, and the forest of the package.
+    """The random forests of a data folder, and the random forest of the package.
 
     Args:
         folder: The data folder; None where there is none.
@@ -74,7 +74,8 @@ class Forests:
         return self._known[name, all_around]
 
     def check(self, parameters: Parameters) -> None:
-        """Check that the forest of the parameters exists and can be read. That of the package is not read.
+        """Check that the random forest of the parameters exists and can be read. The forest of the package is
+        not read.
 
         Raises:
             StemmapError: See `__call__`.
@@ -83,7 +84,8 @@ class Forests:
             self(parameters.classification.forest, True)
 
     def read(self, name: str) -> dict[str, Any]:
-        """Return the JSON of a learned forest, with its provenance. It is read from the file each time.
+        """Return the JSON of a learned random forest as a dict, with its provenance. It is read from the file
+        each time.
 
         Raises:
             StemmapError: See `__call__`; also for the forest of the package.
@@ -91,9 +93,9 @@ class Forests:
         return self._read(name)[0]
 
     def provenance(self, name: str) -> dict[str, Any] | None:
-        """Return `name`, `date`, `things` (number of objects by class) and `runs` (their number) of a learned
-        forest; None for the forest of the package and for files that are missing, damaged or without
-        provenance. Found values are stored and shared."""
+        """Return a dict with `name`, `date` (text), `things`, a dict from classes to numbers of objects, and
+        `runs`, the number of runs, of a learned forest; None for the forest of the package and for files that
+        are missing, damaged or without provenance. The dict is cached and must not be modified."""
         if name == PACKAGE:
             return None
         if name not in self._provenance:
@@ -107,11 +109,11 @@ class Forests:
         return self._provenance[name]
 
     def _read(self, name: str) -> tuple[dict[str, Any], list[Forest]]:
-        """Return the JSON of a learned forest and its two forests, for sensors that see all around and for
-        sensors that look one way, from its file.
+        """Return the JSON of a learned forest from its file as a dict, and a list of its two random forests,
+        for sensors that see all around and for sensors that look one way.
 
         Raises:
-            StemmapError: The name or file does not exist, or the file is damaged.
+            StemmapError: The name is invalid, the file does not exist, or it is damaged.
         """
         file = self._file(name)
         if file is None or not file.is_file():

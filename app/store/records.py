@@ -46,7 +46,7 @@ class Content:
     """Content of an annotation.
 
     Attributes:
-        x, y: Position [m].
+        x, y: Position in the map [m].
         kind: Class, one of KINDS, SKIPPED, PLOT or FRAME.
         dbh: Diameter at breast height [m], None if not measured.
         plot: Name and shape of a plot, see `pipeline.stand.plots.plot_of`; of a FRAME the values of the route
@@ -145,9 +145,9 @@ class RunFigures:
         lost: Share of the scans in which the pose was lost, from 0 to 1; None for a whole cloud.
         trees: Number of confirmed trees.
         preset: Name of the preset.
-        parameters: All values by dotted name.
-        scores: Scores as shown on the page, or None.
-        map: Trees, path and ground truth as plain lists.
+        parameters: Dict from the dotted name of each parameter to its value.
+        scores: Result of `score_payload`, or None.
+        map: Dict with `trees`, `path` and `truth`, lists of JSON values.
     """
 
     scans: int
@@ -171,7 +171,7 @@ class Change:
         time_s: Time of the current scan [s since the first scan].
         who: Name of the person.
         preset: Name of the preset.
-        changes: [before, after] by parameter name.
+        changes: Dict from dotted names to [value before, value after].
     """
 
     revision: int

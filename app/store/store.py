@@ -173,7 +173,7 @@ class RunRecords:
             return record
 
     def update(self, record: int, figures: RunFigures) -> None:
-        """Update figures and map of a record; nothing happens if it does not exist.
+        """Update results and map of a record; nothing happens if it does not exist.
 
         Args:
             record: Number of the record.
@@ -194,8 +194,8 @@ class RunRecords:
                 _revise(connection, record, change, now)
 
     def listed(self) -> list[dict[str, Any]]:
-        """Return the runs without their maps as dicts of the columns of `run_records` and `source`, the key
-        of the recording; those that changed last first, at most MOST_LISTED. Deleted runs are left out."""
+        """Return at most MOST_LISTED runs that are not deleted, the last changed first. Each is a dict of the
+        columns of `run_records` and `source`, the key of the recording."""
         query = (
             _with_source()
             .where(_records.c.deleted_ns.is_(None))
@@ -206,8 +206,8 @@ class RunRecords:
             return [_plain(row) for row in connection.execute(query).all()]
 
     def whole(self, record: int) -> dict[str, Any]:
-        """Return a run as in `listed`, with its `map` and `revisions`, dicts of the columns of
-        `parameter_revisions`, oldest first.
+        """Return a run as in `listed` with two further keys: `map`, see `RunFigures`, and `revisions`, a list
+        of dicts of the columns of `parameter_revisions`, the oldest first.
 
         Raises:
             UnknownError: The run does not exist or was deleted.
@@ -229,7 +229,7 @@ class RunRecords:
 
         Raises:
             UnknownError: The run does not exist or was deleted.
-            NoFilesError: It has none.
+            NoFilesError: The record has no files.
         """
         with self._engine.begin() as connection:
             _found(connection, record)
@@ -293,8 +293,8 @@ class RunRecords:
             connection.execute(insert(_uploads).values(file=file, **values))
 
     def uploads(self) -> dict[str, dict[str, Any]]:
-        """Return the records of uploaded files by their names in the folder: dicts with `file`, original
-        `name`, `kind`, `bytes` and `at_ns`."""
+        """Return a dict from the name of each uploaded file in the folder to a dict with `file` (this name),
+        `name` (the original name), `kind`, `bytes` (size) and `at_ns`."""
         with self._engine.begin() as connection:
             return {row.file: _plain(row) for row in connection.execute(select(_uploads)).all()}
 
@@ -331,8 +331,8 @@ def _with_source() -> Select[Any]:
 
 
 def _figures(figures: RunFigures) -> dict[str, Any]:
-    """Return the columns of `run_records` that change while a run plays: all fields of `figures` except
-    `map`."""
+    """Return a dict from the columns of `run_records` that change while a run plays to values: all fields of
+    `figures` except `map`."""
     return {each.name: getattr(figures, each.name) for each in fields(figures) if each.name != "map"}
 
 
@@ -369,7 +369,7 @@ def _forget_deleted(connection: Connection, before_ns: int) -> None:
 
 
 def _plain(row: Row[Any]) -> dict[str, Any]:
-    """Return a row as a dict by column name."""
+    """Return a row as a dict from column names to values."""
     return dict(row._mapping)
 
 
@@ -429,8 +429,13 @@ class Store:
         return [Annotation(row.id, _content(row), row.who, row.at_ns, row.version) for row in rows]
 
     def contents(self, source: str, kind: str = "") -> list[Content]:
-        """Return the annotations of a class ("" for all) of a source by its digest or URI, in the order of
-        their creation; [] for an unknown source."""
+        """Return the contents of the annotations of a source that are not deleted, in the order of their
+        creation; [] for an unknown source.
+
+        Args:
+            source: Digest of the recording, or its URI if it has no digest.
+            kind: Class of the annotations; "" for all.
+        """
         query = (
             select(_annotations)
             .join(_runs, _runs.c.id == _annotations.c.run)
@@ -441,8 +446,7 @@ class Store:
             return [_content(row) for row in connection.execute(query.order_by(_annotations.c.id))]
 
     def annotation_counts(self) -> dict[int, int]:
-        """Return the number of annotations of KINDS by the number of the source, without sources that have
-        none."""
+        """Return a dict from the number of each source with annotations of KINDS to their number."""
         a = _annotations.c
         query = select(a.run, func.count()).where(a.deleted.is_(False), a.kind.in_(KINDS)).group_by(a.run)
         with self._engine.begin() as connection:
@@ -570,7 +574,7 @@ class Store:
             run: Number of the source.
             step: Number of the step.
             author: Author of the edit.
-            content: Its content.
+            content: Content of the annotation.
         """
         edit = {"who": author.who, "at_ns": self._clock(), "version": 1, "deleted": False, "made_by": 0}
         id_ = _inserted(connection, insert(_annotations).values(run=run, **asdict(content), **edit))
@@ -623,9 +627,9 @@ class Store:
     # --- back and forth --------------------------------------------------------------------------
 
     def _turn(self, run: int, author: Author, to: Literal["done", "undone"]) -> None:
-        """Undo or redo the next step of a browser. If another person has changed one of its annotations, or
-        the run would get a second reference system, none changes, and the step can never be undone or redone
-        again.
+        """Undo or redo the next step of a browser. If an annotation of the step was changed since, or the run
+        would get a second reference system, nothing is undone or redone, and the step can never be undone or
+        redone again.
 
         Args:
             run: Number of the source.
@@ -634,7 +638,7 @@ class Store:
 
         Raises:
             StemmapError: There is no such step.
-            StaleError: Another person has changed an annotation or added a reference system since.
+            StaleError: An annotation of the step was changed, or a reference system was added, since.
         """
         with self._engine.begin() as connection:
             step = _next_step(connection, run, author, to)
@@ -705,7 +709,7 @@ def _row(connection: Connection, id_: int) -> Row[Any]:
 
 
 def _frame(connection: Connection, run: int) -> Row[Any] | None:
-    """Return the row of the reference system of a run that is not deleted; None without one."""
+    """Return the row of the reference system of a run that is not deleted; None if there is none."""
     a = _annotations.c
     return connection.execute(
         select(_annotations).where(a.run == run, a.kind == FRAME, a.deleted.is_(False)).limit(1)
@@ -731,7 +735,8 @@ def _inserted(connection: Connection, statement: Insert) -> int:
 
 
 def _stale(row: Row[Any]) -> StaleError:
-    """Return the error of an edit of an annotation that was changed or deleted meanwhile."""
+    """Return the error of an edit of an annotation that was changed or deleted meanwhile; `row` is its
+    present row."""
     done = "deleted" if row.deleted else "changed"
     return StaleError(
         f"annotation {row.id} was {done} by {row.who} at {moment(row.at_ns)}",

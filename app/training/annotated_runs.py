@@ -58,9 +58,9 @@ class ExampleCollector:
         """Add the columns after a scan. None, no columns, and the same object as in the last call are
         ignored.
 
-        The features of the nearest column within REACH of an annotation are copied as its newest ones, and
-        once more at the first calls at which the column has been observed at least 3, 10 and 30 times, at
-        most one of these numbers per call.
+        For each annotation, the features of its column (see `_pairs`) are copied as the newest ones. A
+        further copy is stored once for each number of SEEN, in the first call in which the column was
+        observed at least this number of times; at most one further copy is stored per call.
         """
         if columns is None or columns is self._before or self._nearest is None or not len(columns.axis):
             return
@@ -76,12 +76,12 @@ class ExampleCollector:
         those after 3, 10 and 30 observations and the newest, which is the last. Annotations without a column
         give none.
 
-        Their axis has the position of the annotation (and zeros), by which the examples of one object can be
-        recognised.
+        `axis` of an example is x, y of the annotation and three zeros, so that all examples of one object
+        have the same.
 
         Args:
             scene: Name of the scene.
-            all_around: Which forest classifies the columns, see `is_seen_all_around`.
+            all_around: Which random forest classifies the columns, see `is_seen_all_around`.
         """
         axis, rows, label = [], [], []
         for a, marked, last in zip(self._annotations, self._marked, self._last, strict=True):
@@ -99,11 +99,12 @@ class ExampleCollector:
         )
 
     def _pairs(self, place: Float) -> list[tuple[int, int]]:
-        """Return pairs of an annotation (index) and its nearest column (row), each annotation at most once.
-        Columns farther than REACH of the kind of their nearest annotation are ignored.
+        """Return pairs (index of an annotation, row of its column), each annotation at most once. The column
+        is the nearest one to the annotation, of the columns to which no other annotation is nearer and that
+        are within REACH for the kind of the annotation.
 
         Args:
-            place: x, y of the columns, shape (K, 2) [m].
+            place: Positions x, y of the columns in the map, shape (K, 2) [m].
         """
         assert self._nearest is not None  # noqa: S101 - `add` has checked
         distance, annotation = self._nearest.query(place)
@@ -123,7 +124,7 @@ class AnnotatedRun:
     """An annotated run.
 
     Attributes:
-        name, digest: Name and digest of its source.
+        name, digest: Name and digest of the source.
         request: Source, odometry, seed, topics and mounting with which it was mapped.
         parameters: Parameters with which it was mapped.
         annotations: Annotations in the frame of its map.
@@ -156,7 +157,7 @@ def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Exa
     Args:
         run: The run.
         kept: Folder of the examples; None stores nothing.
-        progress: Called with a text while the run is mapped, every 50 scans.
+        progress: Called with a progress message every 50 scans while the run is mapped.
 
     Raises:
         SourceError: The run cannot be read, is live, or is another recording.
@@ -189,7 +190,7 @@ def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
 
     Args:
         run: The run.
-        progress: Called with a text every 50 scans.
+        progress: Called with a progress message every 50 scans.
 
     Raises:
         SourceError: The run cannot be read, is live, or is another recording.

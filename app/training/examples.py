@@ -29,7 +29,7 @@ class Examples:
     Attributes:
         scene: Name of the scene. All examples of a scene are used for training, or all for validation.
         simulated: Whether the scene is simulated.
-        all_around: Which forest classifies its columns, see `is_seen_all_around`.
+        all_around: Which random forest classifies the columns, see `is_seen_all_around`.
         axis: Axes of the columns, shape (N, 5), see `find_columns`.
         figures: Features, shape (N, features).
         label: Index in CLASSES, UNKNOWN where the class cannot be decided, int64, shape (N,).
@@ -44,8 +44,9 @@ class Examples:
 
 
 def object_numbers(examples: Sequence[Examples]) -> Int:
-    """Return a number from 0 on for each example of all sets in their order, int64, shape (N,), equal for all
-    examples of one object, that is of one position in one set."""
+    """Return the number of the object of each example of all sets, in their order, int64, shape (N,).
+    Examples of one set with the same x, y of `axis` belong to one object; objects are numbered from 0 in the
+    order of their first example."""
     key = [
         (scene, float(x), float(y))
         for scene, each in enumerate(examples)
@@ -57,7 +58,7 @@ def object_numbers(examples: Sequence[Examples]) -> Int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _StoredExamples:
-    """Contents of a file of examples."""
+    """Content of a file of examples."""
 
     sets: tuple[Examples, ...]
 

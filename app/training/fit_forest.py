@@ -25,7 +25,7 @@ DEEPER = 4  # largest number of additional splits on a path
 
 @dataclass(frozen=True, slots=True)
 class ForestSettings:
-    """Settings of the forest for a kind of sensor.
+    """Settings of the random forest for a kind of sensor.
 
     Attributes:
         figures: Share of the features that is tried at each split.
@@ -52,13 +52,13 @@ FREE_END_SETTINGS = ForestSettings(0.3, tree=1.0, upright=1.5, rays=False)
 
 
 def class_weight(weight: Float, label: Int, settings: ForestSettings) -> Float:
-    """Return weights multiplied by those of the classes, shape (N,).
+    """Return the weights multiplied by the factor of their class, shape (N,).
 
     Args:
         weight: Weights, shape (N,).
         label: Index in CLASSES, shape (N,).
-        settings: Settings with the factors `tree` of trees and `upright` of poles and persons; it is 1 for
-            all others.
+        settings: Settings with the factors `tree` for trees and `upright` for poles and persons; the factor
+            of other classes is 1.
     """
     factor = np.where(label == TREE, settings.tree, 1.0)
     factor[np.isin(label, UPRIGHT)] = settings.upright
@@ -66,16 +66,21 @@ def class_weight(weight: Float, label: Int, settings: ForestSettings) -> Float:
 
 
 def of_free_end(figures: Float, label: Int) -> Bool:
-    """Return which examples are poles or trees with a free upper end (`ends_in_free_air`), shape (N,), from
-    their features and labels."""
+    """Return which of N examples are poles or trees with a free upper end (`ends_in_free_air`), shape (N,).
+
+    Args:
+        figures: Features, shape (N, features).
+        label: Index in CLASSES, shape (N,).
+    """
     of: Bool = np.isin(label, (TREE, POLE)) & ends_in_free_air(figures)
     return of
 
 
 def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN401
-    """Return the JSON of a node of a tree of scikit-learn with all nodes below it. A leaf has `share`, the
-    list of its class shares. A split has `figure`, the name of a feature, `at_most`, rounded to four
-    decimals, and the nodes `yes` and `no`. A split whose two leaves are equal becomes a leaf.
+    """Return a node of a tree of scikit-learn with all nodes below it as a dict of JSON values. A leaf has
+    `share`, the list of the class shares in the order of CLASSES. A split has `figure`, the name of a
+    feature, `at_most`, the threshold rounded to four decimals, and the nodes `yes` (feature at most the
+    threshold) and `no`. A split with two equal leaves becomes a leaf.
 
     Args:
         tree: The tree.
@@ -95,11 +100,12 @@ def node_of(tree: Any, share: Float, row: int) -> dict[str, Any]:  # noqa: ANN40
 def all_expanded(
     base: dict[str, Any], kind: str, figures: Float, label: Int, thing: Int, seed: int
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return the extended trees for a kind of sensor, by their key in the JSON. For sensors that look one way
-    these include the trees for columns with a free upper end, which would overrule the others.
+    """Return a dict from keys of the JSON of the random forest to lists of extended trees: `kind` and, for
+    ONE_WAY, FREE_END if the forest has it; the trees of FREE_END are extended only with examples of
+    `of_free_end`.
 
     Args:
-        base: JSON of the forest.
+        base: JSON of the random forest.
         kind: Kind of the sensor, a key of SETTINGS.
         figures, label, thing, seed: See `expanded`.
     """
@@ -113,11 +119,11 @@ def all_expanded(
 def expanded(
     trees: list[dict[str, Any]], settings: ForestSettings, figures: Float, label: Int, thing: Int, seed: int
 ) -> list[dict[str, Any]]:
-    """Return the extended trees of a forest; the given ones remain unchanged. Leaves that no example reaches
-    stay as they are.
+    """Return the extended trees of a random forest; the given trees are not modified. Leaves that no example
+    reaches are unchanged.
 
     Args:
-        trees: Trees as in the JSON.
+        trees: Root nodes of the trees, see `node_of`.
         settings: Settings with which they were trained.
         figures: Features, shape (N, features).
         label: Index in CLASSES, shape (N,).
@@ -136,14 +142,15 @@ def expanded(
 def _expanded_node(
     node: dict[str, Any], figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
 ) -> dict[str, Any]:
-    """Return a node with its leaves extended by the examples that reach it; the node itself without examples.
+    """Return a node with its leaves extended by the examples that reach it; the argument if there are no
+    examples.
 
     Args:
-        node: Node as in the JSON.
+        node: Node, see `node_of`.
         figures, label: Features and classes of the examples that reach it, shapes (N, features) and (N,).
-        weight: Their weights, shape (N,).
-        settings: Settings of the forest.
-        draw: Random seed of this tree.
+        weight: Weights of the examples, shape (N,).
+        settings: Settings of the random forest.
+        draw: Random seed of the tree.
     """
     if not len(label):
         return node
@@ -160,14 +167,14 @@ def _expanded_node(
 def _leaf(
     share: Float, figures: Float, label: Int, weight: Float, settings: ForestSettings, draw: int
 ) -> dict[str, Any]:
-    """Return a leaf, or the splits in its place, at most DEEPER levels, which separate trees from all other
-    classes. Each new leaf mixes the previous shares, with weight PRIOR, and those of its examples, rounded to
-    two decimals.
+    """Return the node (see `node_of`) that replaces a leaf: a leaf, or at most DEEPER levels of splits that
+    separate trees from all other classes. The class shares of a new leaf are the mean of the previous shares,
+    with weight PRIOR, and of its examples, rounded to two decimals.
 
     Args:
         share: Previous class shares, shape (classes,).
         figures, label, weight: The examples, at least one, see `_expanded_node`.
-        settings: Settings of the forest.
+        settings: Settings of the random forest.
         draw: Random seed.
     """
     from sklearn.tree import DecisionTreeClassifier

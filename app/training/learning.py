@@ -73,11 +73,11 @@ class Rates:
 
 @dataclass(frozen=True, slots=True)
 class Validation:
-    """Scores of the present and the new forest on the same objects. The new forest of each fold is trained
-    without its objects.
+    """Scores of the present and the new random forest on the same objects. The new random forest of each fold
+    is trained without the objects of the fold.
 
     Attributes:
-        by: "run" or "place": the groups that are left out as a whole.
+        by: Groups that are left out as a whole: "run" or "place", see `groups_of`.
         folds: Number of folds.
     """
 
@@ -90,16 +90,16 @@ class Validation:
 def validate(
     examples: Sequence[Examples], base: dict[str, Any], kind: str, old: Forest, share: float, seed: int
 ) -> Validation:
-    """Cross-validate the training. The new forest decides on each object in the fold that left it out; only
-    the last example of each object counts.
+    """Cross-validate the training. The new random forest decides on each object in the fold that left it out;
+    only the last example of each object counts.
 
     Args:
         examples: Examples of one kind of sensor, from at least two groups of `groups_of`; those of an object
             follow one another, the newest last.
-        base: JSON of the forest that is extended.
-        kind: Kind of the sensor.
-        old: The present forest.
-        share: Share of votes that makes a tree.
+        base: JSON of the random forest that is extended.
+        kind: Kind of the sensor, ALL_AROUND or ONE_WAY.
+        old: The present random forest.
+        share: Minimum share of votes for a tree.
         seed: Random seed of the folds and the training.
     """
     figures = np.concatenate([e.figures for e in examples])
@@ -125,11 +125,12 @@ def validate(
 
 
 def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
-    """Return the kind of group that is left out, "run" or "place", and the group number of each example,
-    shape (N,). Runs are left out if there are at least LEAST_RUNS groups of them, otherwise places.
+    """Return the kind of the groups, "run" or "place", and the group number of each of N examples, int64,
+    shape (N,). The groups are runs if there are at least LEAST_RUNS groups of runs, otherwise places
+    (clusters of objects).
 
-    Runs that share a place form one group, and so do places with the same coordinates in two runs, because
-    drives that begin at the same point see the same stems.
+    A place is a cluster of objects, of any run, each within SAME_PLACE of another one. Runs that share a
+    place form one group.
 
     Args:
         examples: Examples of each run; together at least one.
@@ -155,8 +156,9 @@ def fold_of(group: Int, tree: Bool, thing: Int, seed: int) -> Int:
 
     Args:
         group: Number of the group of each example, shape (N,); at least two groups.
-        tree: Whether it is of a tree, shape (N,).
-        thing: Number of its object, shape (N,); an object counts once, however many examples it has.
+        tree: Whether each example is of a tree, shape (N,).
+        thing: Number of the object of each example, shape (N,); an object counts once for any number of
+            examples.
         seed: Random seed.
     """
     from sklearn.model_selection import StratifiedGroupKFold
@@ -177,7 +179,7 @@ def _accepted(figures: Float, forest: Forest, share: float) -> Bool:
     Args:
         figures: Features, shape (N, features).
         forest: The forest.
-        share: Share of votes that makes a tree.
+        share: Minimum share of votes for a tree.
     """
     accepted: Bool = (vote(figures, forest)[:, 0] >= share) & ~too_few_voxels(figures)
     return accepted
@@ -188,14 +190,14 @@ _ABOUT = "Random forest of the package, extended with annotations."
 
 @dataclass(frozen=True, slots=True)
 class LearningResult:
-    """A trained forest with its scores.
+    """A trained random forest with its scores.
 
     Attributes:
         data: JSON of the new forest, with its provenance.
-        validated: Scores of the present and the new forest, by kind of sensor.
-        things: Number of annotated objects by class.
+        validated: Dict from each kind of sensor to the scores of the present and the new forest.
+        things: Dict from the label of each class to the number of annotated objects.
         old_saw: Whether the present forest was trained with the same runs, so that its scores are optimistic.
-        warnings: Runs and annotations that could not be used.
+        warnings: Messages about runs and annotations that could not be used.
     """
 
     data: dict[str, Any]
@@ -213,8 +215,8 @@ def learn(
     seed: int = 0,
     progress: Progress = lambda _: None,
 ) -> LearningResult:
-    """Extend the forest of the package with the annotations of runs. Nothing is stored except the examples of
-    the runs.
+    """Extend the random forest of the package with the annotations of runs. Nothing is stored except the
+    examples of the runs.
 
     Args:
         runs: The annotated runs. One that cannot be read is left out with a warning.
@@ -281,8 +283,7 @@ def seen_by(data: dict[str, Any]) -> tuple[str, ...]:
 
 
 def things_by_class(examples: Sequence[Examples]) -> Counter[str]:
-    """Return the number of objects of each class, by the label of the class; classes without any are
-    missing."""
+    """Return a Counter from the label of each class that occurs to its number of objects."""
     label = [int(k) for e in examples for k in e.label]
     of_thing = dict(zip(object_numbers(examples).tolist(), label, strict=True))
     return Counter(CLASSES[k].label for k in of_thing.values())
@@ -316,8 +317,9 @@ def what_lacks(examples: Sequence[Examples]) -> str:
 def _examples(
     runs: Sequence[AnnotatedRun], kept: Path | None, progress: Progress, warnings: list[str]
 ) -> list[tuple[AnnotatedRun, Examples]]:
-    """Return the examples of each run that can be mapped; the others are left out with a warning, and there
-    is one for annotations without a column. Damaged stored examples raise StemmapError.
+    """Return the runs that can be mapped, each with its examples. A run that raises SourceError is left out
+    with a warning. A run with annotations that have no column is kept with a warning. Damaged stored examples
+    raise StemmapError.
 
     Args:
         runs: The runs.
@@ -341,9 +343,9 @@ def _examples(
 
 
 def table_lines(learned: LearningResult) -> list[str]:
-    """Return a table of TA, FR, TR and FA of the present ("old") and the new forest for each kind of sensor,
-    as lines of text. The first line gives the number of objects by class; there is a last one if the scores
-    of the present forest are optimistic."""
+    """Return lines of text: the number of objects by class; for each kind of sensor a heading and a table of
+    TA, FR, TR and FA of the present ("old") and the new forest; and, if `old_saw`, a line that the scores of
+    the present forest are optimistic."""
     classes = ", ".join(
         f"{n} {name}" for name, n in sorted(learned.things.items(), key=lambda item: -item[1])
     )
@@ -361,12 +363,13 @@ def table_lines(learned: LearningResult) -> list[str]:
 
 
 def _cells(rates: Rates) -> list[str]:
-    """Return TA, FR, TR and FA as text."""
+    """Return TA, FR, TR and FA as text, in this order, see `rate_text`."""
     return [rate_text(rate) for rate in (rates.TA, rates.FR, rates.TR, rates.FA)]
 
 
 def _row(*cells: str) -> str:
-    """Return a row of the table as text; the first cell is aligned left, the others right."""
+    """Return a row of the table as text: the first cell, left-aligned with a width of 5, and the others,
+    right-aligned with a width of 18."""
     return "  " + cells[0].ljust(5) + "".join(cell.rjust(18) for cell in cells[1:])
 
 
@@ -387,15 +390,15 @@ class LearningRequest(msgspec.Struct, frozen=True):
 
 
 def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str, Any]:
-    """Train a forest, store it under its name, and return the result for the page, see `as_plain`. It is not
-    in force yet.
+    """Train a random forest, store it in `request.folder`, and return the result of `as_plain`. The
+    parameters still name the present forest.
 
     Args:
         request: What is trained.
         progress: Called with progress messages.
 
     Raises:
-        StemmapError: See `learn`, or the forest cannot be stored.
+        StemmapError: See `learn`, or the random forest cannot be stored.
     """
     folder, present = Path(request.folder), Classification.model_validate(request.classification)
     runs = [annotated_run(source) for source in request.sources]
@@ -404,13 +407,17 @@ def train(request: LearningRequest, progress: Callable[[str], None]) -> dict[str
 
 
 def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
-    """Return the result for the page: `name`, `against` (the present forest), `things` (number of objects by
-    class), `old_saw`, at most 20 `warnings`, and `tables`, the `Validation` of each `kind` of sensor.
+    """Return the result for the dashboard as a dict of JSON values.
+
+    The keys are `name`; `against`, the name `old`; `things`, a dict from each class to its number of objects;
+    `old_saw`, whether the present forest was trained with the same runs, so that its scores are optimistic;
+    `warnings`, the first 20; and `tables`, a list of a dict for each kind of sensor with `kind` and the
+    fields of `Validation`.
 
     Args:
-        learned: The result.
-        name: Name under which the new forest is stored.
-        old: Name of the present forest.
+        learned: The result of `learn`.
+        name: Name under which the new random forest is stored.
+        old: Name of the present random forest.
     """
     return {
         "name": name,
@@ -423,8 +430,9 @@ def as_plain(learned: LearningResult, name: str, old: str) -> dict[str, Any]:
 
 
 def serve(parent: ParentConnection) -> None:
-    """Receive one `LearningRequest`, send progress and then the result or the error, see the module; the
-    program of the child process. Other exceptions than StemmapError and MemoryError are raised."""
+    """Run the program of the child process: receive one `LearningRequest`, send {"progress": text} messages
+    and then {"learned": result of `train`} or, after StemmapError or MemoryError, {"error": text}. Other
+    exceptions are raised."""
     try:
         request = parent.receive(LearningRequest)
         parent.send({"learned": train(request, lambda text: parent.send({"progress": text}))})

@@ -78,8 +78,8 @@ def spec_of(name: str) -> FieldSpec:
 
 
 def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
-    """Return every combination of the values as dicts by parameter name; the last axis changes fastest.
-    Without axes there is one empty combination."""
+    """Return every combination of the values, each a dict from parameter name to value. The last axis changes
+    fastest. If there are no axes, the result is [{}]."""
     return [
         dict(zip((axis.name for axis in axes), values, strict=True))
         for values in itertools.product(*(axis.values for axis in axes))
@@ -87,8 +87,7 @@ def combinations(axes: Sequence[GridAxis]) -> list[dict[str, Value]]:
 
 
 def words_of(changes: Mapping[str, Value]) -> str:
-    """Return a combination as text in the syntax of `--set`, separated by spaces; "unchanged" for an empty
-    one."""
+    """Return a combination as text, "NAME=VALUE" separated by spaces; "unchanged" for an empty one."""
     return " ".join(f"{name}={value_text(value)}" for name, value in changes.items()) or "unchanged"
 
 
@@ -128,11 +127,11 @@ def grid_axis(name: str, entries: Sequence[Any]) -> GridAxis:
 
     Args:
         name: Dotted name, or PRESET.
-        entries: Values, or texts in the syntax of the command line.
+        entries: Values, or strings in the syntax of the command line.
 
     Raises:
-        ParameterError: The name is unknown, a value is invalid or out of bounds, or there are none or more
-            than `MOST_VALUES`.
+        ParameterError: The name is unknown, a value is invalid or out of bounds, or a parameter has no values
+            or more than `MOST_VALUES`. PRESET may have any number of values.
     """
     if name == PRESET:
         values: list[Value] = [word for entry in entries for word in _parts(str(entry))]
@@ -204,18 +203,17 @@ def spread(low: float, high: float, count: int, *, ratio: bool) -> list[float]:
 
 
 def _rounded(spec: FieldSpec, value: float) -> Value:
-    """Return a value of a range: rounded to a whole number for kind "int", otherwise to 12 significant
-    digits."""
+    """Return a value of a range, rounded to an integer for kind "int", otherwise to 12 significant digits."""
     # Twelve digits, so that 0.1..0.3/3 contains exactly 0.2.
     return round(value) if spec.kind == "int" else float(f"{value:.12g}")
 
 
 def checked_value(spec: FieldSpec, text: str) -> Value:
-    """Parse a value, with or without its unit. Contradictions between two values depend on the other
-    parameters and are not checked.
+    """Return the value of a text, with or without its unit. Contradictions between two values depend on the
+    other parameters and are not checked.
 
     Raises:
-        ParameterError: It is invalid, or outside of the bounds or choices of the parameter.
+        ParameterError: The value is invalid, or outside of the bounds or choices of the parameter.
     """
     bare = text.strip()
     if spec.kind in ("int", "float") and spec.unit:

@@ -37,14 +37,14 @@ _GRACE_S = 3.0
 
 
 class TuneSearch:
-    """The newest search of the page.
+    """The newest search that the dashboard started.
 
     Args:
         tell: Called with the state for the browsers whenever it changes, see `as_plain`.
         command: Program and arguments of the child process.
 
     Attributes:
-        plan, request: The search, and the request of the browser from which it was made; None without a
+        plan, request: The search, and the request of the browser from which it was made; None if there is no
             search.
         result: The result, once the search has ended.
     """
@@ -115,7 +115,7 @@ class TuneSearch:
         """Return the name of the preset, the parameters and the parameter file of the best set.
 
         Raises:
-            StemmapError: No better set was found.
+            StemmapError: There is no result, or no set was better than the start.
         """
         if self.plan is None or self.result is None or not self.result.better:
             raise StemmapError("no better set was found", remedy="Search, or search over other parameters")
@@ -127,8 +127,8 @@ class TuneSearch:
         self._tell(self.as_plain())
 
     def as_plain(self) -> dict[str, Any]:
-        """Return `state`, `error`, `go_on` (see `can_go_on`) and the values of `for_page` for the browsers;
-        only the state "none" without a search."""
+        """Return a dict for the browsers with `state`, `error`, `go_on` (see `can_go_on`) and the keys of
+        `for_page`; {"state": "none"} if there is no search."""
         if self.plan is None:
             return {"state": "none"}
         return {
@@ -214,11 +214,11 @@ class OtherRun(msgspec.Struct, frozen=True):
     """A run in the list of runs that is not open.
 
     Attributes:
-        records: Numbers of its records, the newest first.
+        records: Numbers of the records of the run, the newest first.
         name: Name in the list.
-        digest: Digest of its source.
+        digest: Digest of the source.
         opened: Request with which it was opened last.
-        annotations: Its annotations.
+        annotations: Annotations of the run.
         why_not: Reason why it cannot be scored; empty if it can.
     """
 
@@ -230,8 +230,9 @@ class OtherRun(msgspec.Struct, frozen=True):
     why_not: str
 
     def as_plain(self) -> dict[str, Any]:
-        """Return the run for the browsers: the number of its newest `record`, `name`, `truth`, a description
-        of its true trees, and `why_not`."""
+        """Return the run as a dict of JSON values for the browsers. The keys are `record`, the number of the
+        newest record; `name`; `truth`, the number of annotations in words, or "its own true trees" if there
+        are none; and `why_not`."""
         truth = count(len(self.annotations), "annotation") if self.annotations else "its own true trees"
         return {"record": self.records[0], "name": self.name, "truth": truth, "why_not": self.why_not}
 
@@ -246,7 +247,7 @@ def other_runs(
     Runs that cannot be scored are included, with the reason in `why_not`. Checks whether their files exist.
 
     Args:
-        rows: Records of the store, the newest first, see `RunRecords.listed`.
+        rows: Records of the store as dicts, the newest first, see `RunRecords.listed`.
         annotated: Sources with annotations.
         open_digest: Digest of the open run; empty if none is open.
         may_be_opened: Returns the URI that is opened for a URI, or None if that is not allowed.
@@ -292,7 +293,7 @@ def plan_of(
 
     Args:
         request: The request.
-        source, digest, truth: The open run; the digest is empty where none is open, truth is None where no
+        source, digest, truth: The open run. The digest is empty if no run is open; the truth is None if no
             true trees are known.
         parameters, preset: Those in force.
         others: The other runs of the list.
@@ -355,8 +356,8 @@ def _planned(request: SearchRequest, others: Sequence[OtherRun]) -> list[Planned
 
 
 def _why_gone(uri: str) -> str:
-    """Return the reason why a recording cannot be opened again: it is live, or its file does not exist; empty
-    if it can. A simulated run can always be opened."""
+    """Return the reason why a source cannot be opened again: it is live, or its file does not exist; "" if it
+    can be opened. A simulated run can always be opened."""
     if is_live(uri):
         return "it is a live run, which cannot be mapped again"
     try:

@@ -38,7 +38,7 @@ class RunWithTruth(msgspec.Struct, frozen=True):
 
     Attributes:
         source: Source, and how it is mapped.
-        digest: SHA-256 of the source, by which another recording at the same path is recognised.
+        digest: SHA-256 of the source; another digest means that another recording is at the path.
         truth: True trees in the frame of the map.
     """
 
@@ -52,7 +52,7 @@ class Job(msgspec.Struct, frozen=True):
 
     Attributes:
         run: The run.
-        parameters: All values, by stage and name.
+        parameters: Dict from stages to dicts from names to values, with all parameters.
     """
 
     run: RunWithTruth
@@ -111,9 +111,9 @@ def check_run(digest: str, uri: str, truth: TruthTrees | None) -> list[Content]:
     scored.
 
     Args:
-        digest: Digest of the run; empty where none is open.
-        uri: URI of its source.
-        truth: Its true trees, with the annotations; None where none are known.
+        digest: Digest of the run; empty if none is open.
+        uri: URI of the source.
+        truth: True trees of the run, with the annotations; None if none are known.
 
     Raises:
         StemmapError: No run is open, it is live, or its truth has no tree.
@@ -136,7 +136,8 @@ T = TypeVar("T")
 
 
 class LostError(StemmapError):
-    """Every process that computed a job ended before it sent a result."""
+    """A job has no result: MOST_LOSSES processes ended or sent damaged messages during it, or the processes
+    were closed."""
 
 
 class ResultStore:
@@ -246,7 +247,7 @@ class ScoringProcesses(Generic[T]):
     Attributes:
         count: Number of processes.
         kept: The stored results.
-        lost: Number of processes that ended during a job, by reason.
+        lost: Counter from the reason to the number of processes that were lost during a job.
     """
 
     def __init__(self, count: int, command: Sequence[str] = (), kept: ResultStore | None = None) -> None:
@@ -262,12 +263,12 @@ class ScoringProcesses(Generic[T]):
     def advance(
         self, next_job: Callable[[int], tuple[T, Job] | None], wait_s: float | None = None
     ) -> list[tuple[T, JobResult]]:
-        """Give a job to each free process, wait for the first result, and return the results since the last
-        call, in any order. A job whose processes were lost has an error as result.
+        """Give a job to each free process, wait for the first result, and return the jobs that are done as
+        tuples of identifier and result, in any order. A job with LostError has a result with `error`.
 
         Args:
-            next_job: Returns the next job for the process with this number, and what identifies it in the
-                result; None if there is none now.
+            next_job: Returns an identifier and the next job for the process with this number; None if there
+                is no job now.
             wait_s: Longest wait [s]; None for no limit. Without jobs in progress there is no wait.
 
         Raises:

@@ -75,7 +75,7 @@ class Goal:
 
     Attributes:
         name: See `GOALS`.
-        false_max: Largest share of false trees that the goal "ta" allows.
+        false_max: Maximum share of false trees that the goal "ta" allows.
     """
 
     name: GoalName = "f1"
@@ -163,7 +163,7 @@ def pool(scores: Sequence[MapScores]) -> Pooled:
 
 
 def _mean(weighed: list[tuple[int, float]]) -> float | None:
-    """Return the weighted mean of (weight, value) pairs; None if the weights sum to 0."""
+    """Return the weighted mean of (weight, value) pairs; None if the sum of the weights is 0."""
     whole = sum(weight for weight, _ in weighed)
     return sum(weight * value for weight, value in weighed) / whole if whole else None
 
@@ -247,10 +247,11 @@ class SearchAxis(msgspec.Struct, frozen=True):
 
 
 def axes_of(texts: Sequence[str]) -> tuple[SearchAxis, ...]:
-    """Return the axes of a search, in the order of the texts.
+    """Return the axes of a search, in the order of `texts`.
 
     Args:
-        texts: `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`; without bounds those of the declaration are used.
+        texts: Strings `NAME`, `NAME=LOW..HIGH` or `NAME=A,B`; for `NAME` alone, the bounds of the declaration
+            are used.
 
     Raises:
         ParameterError: A name is unknown or given twice, belongs to a stage that does not change the map, or
@@ -297,18 +298,18 @@ def check(axes: Iterable[SearchAxis], start: Parameters) -> None:
 
 
 def values_of(axes: Iterable[SearchAxis], suggested: Mapping[str, Any]) -> dict[str, Value]:
-    """Return the parameter values of a trial by name, rounded and clipped by `SearchAxis.value_of`.
+    """Return a dict from the name of each axis to its value in a trial, see `SearchAxis.value_of`.
 
     Args:
         axes: The search space.
-        suggested: Values of Optuna by name, one for each axis.
+        suggested: Dict from the name of each axis to the value of Optuna.
     """
     return {axis.name: axis.value_of(suggested[axis.name]) for axis in axes}
 
 
 def _axis(text: str) -> SearchAxis:
-    """Parse one text of `axes_of`; raises its errors. A switch without values has both values as choices, a
-    name needs at least two."""
+    """Parse one text of `axes_of`; raises its errors. A bool without values has both as choices. Choices and
+    names need at least two values, and a parameter of kind "name" has no default values."""
     name, given, bounds = (part.strip() for part in text.partition("="))
     spec = spec_of(name)
     why = _NO_PART_OF_THE_MAP.get(name.partition(".")[0])
@@ -330,8 +331,8 @@ def _range(spec: FieldSpec, bounds: str) -> tuple[float, float]:
     """Parse "LOW..HIGH" for a numeric parameter.
 
     Raises:
-        ParameterError: The text is not two numbers (whole numbers for kind "int"), the lower one is not below
-            the upper one, or one is outside of the bounds of the declaration.
+        ParameterError: The text is not two numbers (integers for kind "int"), the first one is not below the
+            second one, or one is outside of the bounds of the declaration.
     """
     first, dots, last = bounds.partition("..")
     if not dots:
@@ -381,7 +382,8 @@ class Plan(msgspec.Struct, frozen=True):
     Attributes:
         runs: At least one that is not held out.
         axes: The parameters that are searched, with their bounds.
-        start: All parameters with which the search begins, by stage. They are the first trial.
+        start: Dict from stages to dicts from names to values, with all parameters with which the search
+            begins. They are the first trial.
         kept: Folder of stored results; empty keeps them in memory.
         preset: Name of the preset from which the parameters come.
         goal, false_max: See `app.tuning.plan.Goal`.
@@ -420,7 +422,7 @@ class Trial(msgspec.Struct, frozen=True):
 
     Attributes:
         number: Trials are numbered in the order in which they are suggested; -1 is the start of the search.
-        values: The values that were tried, by parameter name.
+        values: Dict from the names of the searched parameters to the values of the set.
         loss: See `Goal.loss`; None where the values contradict one another.
         training, held_out: Scores by run. Held-out runs are scored only for a set that is the best so far.
     """

@@ -38,8 +38,9 @@ class SweepPlan:
     Attributes:
         runs: The runs, in the order in which they were named.
         sets: The combinations of parameter values.
-        jobs: Jobs by number of the set and of the run.
-        left_out: Sets whose values contradict one another for a run, by the same numbers, with the reason.
+        jobs: Dict from (number of the set, number of the run), from 0, to the job.
+        left_out: Dict from the same numbers to the reason, for sets whose values contradict one another for a
+            run.
     """
 
     runs: tuple[PreparedRun, ...]
@@ -157,9 +158,9 @@ class Row:
     Attributes:
         set_number: Number of the set, from 1 on.
         run: Number of the run, from 1 on; 0 for the mean.
-        figures: Scores by name, see COLUMNS; empty for a failure.
+        figures: Dict from the names of COLUMNS to scores; empty for a failure.
         seconds: Computing time [s]; for a mean the sum.
-        looked: Whether the front end ran in this time.
+        looked: Whether the front end (segmentation of scans) ran in this time.
         error: Reason of the failure.
     """
 
@@ -178,7 +179,8 @@ class Comparison:
     Attributes:
         rows: By set and run.
         means: A row per set.
-        best: Number of the best set by name of the goal; 0 where all sets are equal or unknown.
+        best: Dict from each name in CRITERIA to the number of the best set, from 1; 0 if all sets are equal
+            or unknown.
     """
 
     plan: SweepPlan
@@ -188,19 +190,19 @@ class Comparison:
 
     @property
     def failed(self) -> list[Row]:
-        """Rows without figures."""
+        """Rows of single runs with an error."""
         return [row for row in self.rows if row.error]
 
 
 def _most(name: str) -> Criterion:
-    """Return a criterion function whose value is a figure, where larger is better; None where the figure is
-    unknown."""
+    """Return a criterion that prefers a large value of the score `name`. It returns (value,) for the scores
+    of a row, and None if the score is unknown."""
     return lambda f: None if f[name] is None else (float(f[name] or 0.0),)
 
 
 def _least(name: str) -> Criterion:
-    """Return a criterion function that prefers a small figure, then a large F1; None where the figure is
-    unknown."""
+    """Return a criterion that prefers a small value of the score `name`, then a large F1. It returns (-value,
+    F1) for the scores of a row, and None if the score is unknown."""
     return lambda f: None if f[name] is None else (-float(f[name] or 0.0), float(f["f1"] or 0.0))
 
 
@@ -226,7 +228,8 @@ def compare_results(plan: SweepPlan, answers: dict[tuple[int, int], JobResult]) 
 
     Args:
         plan: The comparison.
-        answers: Results by number of the set and of the run, from 0 on; one for each job of the plan.
+        answers: Dict from (number of the set, number of the run), from 0, to the result; one for each job of
+            the plan.
     """
     rows, means = [], []
     for s in range(len(plan.sets)):
@@ -244,7 +247,7 @@ def _row(plan: SweepPlan, answers: dict[tuple[int, int], JobResult], s: int, r: 
 
     Args:
         plan: The comparison.
-        answers: Results by number of the set and of the run.
+        answers: Dict from (number of the set, number of the run), from 0, to the result.
         s, r: Numbers of set and run, from 0 on.
     """
     if (s, r) in plan.left_out:
@@ -256,7 +259,7 @@ def _row(plan: SweepPlan, answers: dict[tuple[int, int], JobResult], s: int, r: 
 
 
 def _figures(answer: JobResult, scores: MapScores) -> Figures:
-    """Return the scores of a job by the names in COLUMNS."""
+    """Return a dict from the names in COLUMNS to the scores of a job; lengths are in metres."""
     figures: Figures = {name: getattr(scores, name).count for name in ("TA", "FR", "TR", "FA")}
     figures |= {"TA_of": scores.TA.of, "TR_of": scores.TR.of, "scans": answer.scans, "trees": answer.trees}
     return {
@@ -266,13 +269,13 @@ def _figures(answer: JobResult, scores: MapScores) -> Figures:
 
 
 def _mean(set_number: int, rows: Sequence[Row]) -> Row:
-    """Return the row of a set over all runs. Counts are summed over the runs; all other figures are means of
-    the runs that have them, with equal weights, and None without any. A set that failed on a run has the
-    error of the first failure and no figures, because it could not be compared with the others.
+    """Return the row of a set over all runs. Counts are summed over the runs; all other scores are means over
+    the runs that have them, with equal weights, or None if no run has one. A set that failed on a run has the
+    error of the first failure and no scores.
 
     Args:
         set_number: Number of the set, from 1 on.
-        rows: Its rows, one per run.
+        rows: Rows of the set, one per run.
     """
     failed = [row for row in rows if row.error]
     seconds = sum(row.seconds for row in rows)
@@ -304,8 +307,8 @@ def best_of(means: Sequence[Row], criterion: Criterion) -> int:
 
 
 def figure_words(figures: Figures, name: str, scale: float) -> str:
-    """Return a score as text: TA and TR as "count/total", other counts as whole numbers, all else with two
-    decimals; "-" if it is unknown.
+    """Return a score as text: TA and TR as "count/total", other integers with `scale` 1 as they are, and all
+    other scores times `scale` with two decimals; "-" if it is unknown.
 
     Args:
         figures: Scores of a row; must have the name.
@@ -383,10 +386,11 @@ def files(comparison: Comparison, folder: Path) -> list[str]:
 
 
 def json_text(comparison: Comparison) -> str:
-    """Return everything but the times as JSON text that ends with a newline: `stemmap` (version), `runs`
-    (`run`, its number, `name`, `sha256`, `seed`, `odometry` and number of `true_trees`), `sets` (`set`, its
-    number, and `parameters`), `results` (a row per set and run, see `_record`), `means` (a row per set) and
-    `best` (number of the set by criterion)."""
+    """Return the comparison without the times as the text of a JSON object that ends with a newline. The keys
+    are `stemmap` (version); `runs`, a list of objects with `run` (number from 1), `name`, `sha256`, `seed`,
+    `odometry` and `true_trees` (number); `sets`, a list of objects with `set` (number from 1) and
+    `parameters`; `results` and `means`, lists of `_record` for each set and run, and for each set; and
+    `best`, the numbers of the best sets by criterion."""
     plan = comparison.plan
     record: dict[str, Any] = {
         "stemmap": version(),
@@ -410,7 +414,8 @@ def json_text(comparison: Comparison) -> str:
 
 
 def _record(row: Row) -> dict[str, Any]:
-    """Return a row for JSON: `set`, `run` (not for a mean), and either the scores of COLUMNS or `error`."""
+    """Return a row as a dict of JSON values: `set`, `run` (not for a mean), and either the scores of COLUMNS
+    or `error`."""
     numbers = {"set": row.set_number, **({"run": row.run} if row.run else {})}
     if row.error:
         return {**numbers, "error": row.error}
@@ -438,8 +443,9 @@ def _table(comparison: Comparison, rows: Sequence[Row]) -> str:
 
 
 def _times(comparison: Comparison) -> str:
-    """Return the computing times as CSV text: set, run, seconds and scans_looked_at (whether the front end
-    ran); rows that failed are left out."""
+    """Return the computing times as CSV text with a header and a row for each set and run that did not fail:
+    "set" and "run", their numbers from 1; "seconds", with 3 decimals; and "scans_looked_at", "true" if the
+    front end ran, else "false"."""
     rows = [
         [str(r.set_number), str(r.run), f"{r.seconds:.3f}", str(r.looked).lower()]
         for r in comparison.rows
@@ -482,8 +488,8 @@ def _cells(comparison: Comparison, row: Row, *, one: bool) -> list[str]:
 
 
 def _aligned(rows: list[list[str]]) -> list[str]:
-    """Return the table as lines with aligned columns. Rows that are shorter than the first one (failures) do
-    not count for the widths."""
+    """Return the table as lines with aligned columns. Rows with fewer cells than the first one (failures) do
+    not count for the widths, and their cells are padded only in the columns of text."""
     whole = [row for row in rows if len(row) == len(rows[0])]
     width = [max(len(row[k]) for row in whole) for k in range(len(rows[0]))]
     words = len(rows[0]) - len(SHOWN) - 1  # columns of text, aligned left; figures are aligned right
@@ -545,8 +551,9 @@ def page(comparison: Comparison) -> str:
 
 
 def _best(rows: list[Row]) -> dict[str, float | None]:
-    """Return the best value of each score of SHOWN by name: the smallest of those in `_LEAST`, else the
-    largest; None with fewer than two rows, or if no row has it."""
+    """Return a dict from each score of SHOWN to its best value in the rows: the smallest for scores in
+    `_LEAST`, else the largest; None if there are fewer than two rows or the score is unknown in all of
+    them."""
     best: dict[str, float | None] = {}
     for name, _, _, _ in SHOWN:
         known = [value for row in rows if not row.error and (value := row.figures[name]) is not None]
@@ -555,8 +562,9 @@ def _best(rows: list[Row]) -> dict[str, float | None]:
 
 
 def _f1_by_value(comparison: Comparison) -> dict[str, dict[float, list[float]]]:
-    """Return F1 [%] of all sets by parameter name and value. Parameters that are not numeric or have fewer
-    than two values with a known F1 are omitted."""
+    """Return a dict from parameter names to dicts from each value to the list of the mean F1 [%] of all sets
+    with this value. Parameters that are not numeric or have fewer than two values with a known F1 are
+    omitted."""
     plan, found = comparison.plan, {}
     for axis in plan.sets[0] if plan.sets else ():
         points: dict[float, list[float]] = {}
@@ -570,13 +578,14 @@ def _f1_by_value(comparison: Comparison) -> dict[str, dict[float, list[float]]]:
 
 
 def _chart(axis: str, points: dict[float, list[float]]) -> dict[str, Any]:
-    """Return a chart of F1 over a parameter for the template: `axis`, the name of the parameter; `best` and
-    `mean`, "x,y" coordinates [px] of the lines through the best and the mean F1 at each value; and the labels
-    of the ends of the axes, `low`, `high` (F1) and `first`, `last` (value).
+    """Return a chart of F1 over a parameter as a dict for the template: `axis`, the name of the parameter;
+    `best` and `mean`, lists of coordinates "x,y" [px] of the lines through the best and the mean F1 at each
+    value; and the labels of the ends of the axes as strings, `low`, `high` (F1 [%]) and `first`, `last`
+    (value).
 
     Args:
         axis: Name of the parameter.
-        points: F1 [%] of the sets by value; at least two values.
+        points: Dict from each value, at least two, to the F1 [%] of its sets.
     """
     xs = sorted(points)
     best, mean = [max(points[x]) for x in xs], [sum(points[x]) / len(points[x]) for x in xs]

@@ -90,7 +90,7 @@ def toml_of(plan: Plan, result: Result, date: str) -> str:
 
     Args:
         plan: The search.
-        result: Its result.
+        result: Result of the search.
         date: Date of the search, as it is written.
     """
     parameters = best_parameters(plan, result)
@@ -106,16 +106,17 @@ def best_parameters(plan: Plan, result: Result) -> Parameters:
 
 
 def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
-    """Return the provenance of the best set. Unknown values are left out, because TOML has no null.
+    """Return the provenance of the best set as a dict for TOML; unknown values are omitted.
 
-    `tuned` has `stemmap` (version), `date`, `goal` (and `false_max` of "ta"), the numbers `trials` and
-    `refused`, `seed`, `odometry`, `better_than_start`, the axes `over` as text, and `importance` by name.
-    `run` is a list with `uri`, `sha256`, `held_out`, `truth` (name of a file) and the scores `start` and
-    `best` of each run, see `_file_scores`.
+    `tuned` is a dict with `stemmap` (version), `date`, `goal` (and `false_max` for "ta"), the numbers
+    `trials` and `refused`, `seed`, `odometry`, `better_than_start`, `over`, a list of the axes as text, and
+    `importance`, a dict from parameter names to shares. `run` is a list of a dict for each run with `uri`,
+    `sha256`, `held_out`, `truth` (name of a file, only if known) and the scores `start` and `best`, see
+    `_file_scores`.
 
     Args:
         plan: The search.
-        result: Its result.
+        result: Result of the search.
         date: Date of the search, as it is written.
     """
     return {
@@ -207,7 +208,7 @@ _LABELS = {
 
 
 def _file_scores(scores: Sequence[MapScores]) -> dict[str, float]:
-    """Return the pooled scores for a file, rounded to 6 decimals: `f1`, `ta`, `false_share`,
+    """Return the pooled scores for a file as a dict, rounded to 6 decimals: `f1`, `ta`, `false_share`,
     `position_rmse_m` and `mean_pair_error_percent`. Unknown ones are omitted, because TOML has no null."""
     values = asdict(pool(scores)).items()
     return {name: round(value, 6) for name, value in values if value is not None}
@@ -225,7 +226,7 @@ def _by_run(trial: Trial, sources: Sequence[tuple[str, str, bool]]) -> list[MapS
 
     Args:
         trial: The trial.
-        sources: URI, digest and whether it is held out, by run.
+        sources: URI, digest and whether it is held out, for each run.
     """
     training, held_out = iter(trial.training), iter(trial.held_out)
     return [next(held_out if held else training) for _, _, held in sources]
@@ -240,8 +241,8 @@ def _decimal(value: float | None) -> str:
 
 
 def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
-    """Return the trial with the smallest loss, the one with the smallest number among equals; None without a
-    scored trial.
+    """Return the trial with the smallest loss, the one with the smallest number among equals; None if there
+    is no scored trial.
 
     Args:
         trials: Trials of the search.
@@ -254,13 +255,16 @@ def best_of(trials: Sequence[Trial], start: Trial | None) -> Trial | None:
 def for_page(
     plan: Plan, trials: Sequence[Trial], start: Trial | None, result: Result | None
 ) -> dict[str, Any]:
-    """Return the progress of a search for the page, without its state: the goal (`goal`, `label`, `unit`),
-    the axes (`over`), numbers of trials (`wanted`, `made`), `start` and `best` (see `_trial_figures`), the
-    chart (`points`, `held_out`), the table of `scores` (see `_rows`), and of the result `warning`,
-    `importance`, `better` and `changes` (see `_changes`), which are empty or False before.
+    """Return the progress of a search as a dict for the dashboard. The keys are:
 
-    The points of the chart are (number, score); the score is None for contradicting values. Trials outside
-    the bound of the goal are omitted, and of more than 400 points only every n-th is sent.
+    - `goal`, `label` and `unit`: texts of the goal; `over`: list of the axes as text;
+    - `wanted` and `made`: numbers of trials;
+    - `start` and `best`: see `_trial_figures`; `scores`: see `_rows`;
+    - `points` and `held_out`: lists of (number of the trial, score), see below and `_held_points`;
+    - `warning`, `importance`, `better` and `changes` (see `_changes`) of the result; empty or False before.
+
+    The score of a point is None for contradicting values. Trials outside the bound of the goal are omitted,
+    and of more than 400 points only every n-th is returned.
 
     Args:
         plan: The search.
@@ -295,15 +299,15 @@ def for_page(
 
 
 def _trial_figures(plan: Plan, trial: Trial | None) -> dict[str, Any] | None:
-    """Return `number` of a trial, its loss as text (`shown`) and the pooled scores of the search runs (see
-    `_figures`); None for None."""
+    """Return a dict with `number` of a trial, `shown`, its loss as text, and the pooled scores of the search
+    runs (see `_figures`); None for None."""
     if trial is None:
         return None
     return {"number": trial.number, "shown": plan.aim.shown(trial.loss or 0.0), **_figures(trial.training)}
 
 
 def _figures(scores: Sequence[MapScores]) -> dict[str, Any]:
-    """Return pooled scores for the page: `f1`, `TA`, `false_share`, `rmse_cm` and `pair_error_percent`;
+    """Return pooled scores as a dict with `f1`, `TA`, `false_share`, `rmse_cm` and `pair_error_percent`;
     unknown errors are None."""
     pooled = pool(scores)
     return {
@@ -319,7 +323,8 @@ def _rows(plan: Plan, start: Trial | None, best: Trial | None) -> list[dict[str,
     """Return the scores of the start and the best parameter set: one row for the search runs, and one for the
     held-out runs if there are any; [] before both trials are scored.
 
-    A row has `held_out`, the number of `runs`, and `start` and `best`, see `_figures`.
+    A row is a dict with `held_out` (bool), `runs`, the number of runs, and `start` and `best`, see
+    `_figures`.
 
     Args:
         plan: The search.

@@ -64,12 +64,12 @@ class OpenDrive:
         source: What is mapped, and how.
 
     Attributes:
-        digest: Digest of the source with its odometry; recording_digest: without.
+        digest, recording_digest: Digest of the source with and without the odometry.
         own_truth: True trees of the source; None if it has none.
         preset: Name of the preset that suits the source.
 
     Raises:
-        StemmapError: It cannot be read; nothing remains open.
+        StemmapError: The source cannot be read; nothing remains open.
     """
 
     def __init__(self, source: SourceRequest) -> None:
@@ -207,7 +207,7 @@ def open_run(source: SourceRequest) -> OpenRun:
     """Open a source. The caller closes it.
 
     Raises:
-        StemmapError: It cannot be read.
+        StemmapError: The source cannot be read.
     """
     return OpenCloud(source) if is_cloud(source.uri) else OpenDrive(source)
 
@@ -219,8 +219,8 @@ def prepare_run(planned: PlannedRun) -> PreparedRun:
         planned: The run; its URI may be a folder that `stemmap map` wrote, which names its source.
 
     Raises:
-        StemmapError: It cannot be read, is another recording than the annotated one, or has no true trees; or
-            the folder's map was made of several sources.
+        StemmapError: The run cannot be read, is another recording than the annotated one, or has no true
+            trees; or the map of the folder was made of several sources.
     """
     name, source = planned.source.uri, _source_of(planned.source)
     with closing(open_run(source)) as run:
@@ -245,9 +245,9 @@ def prepare_run(planned: PlannedRun) -> PreparedRun:
 
 
 def _source_of(source: SourceRequest) -> SourceRequest:
-    """Return the request of a run; for a folder that `stemmap map` wrote, that of its source with the seed,
-    topics and mounting of the folder, the requested odometry, and topics and mounting of the request where
-    given, without preset and parameters.
+    """Return the request of a run: `source` itself, unless its URI is a folder that `stemmap map` wrote. For
+    a folder, the request has the URI and the seed of the run in it, the odometry of `source`, and topics and
+    mounting of `source` if given, else of the folder; preset and parameters are empty.
 
     Raises:
         SourceError: The map of the folder was made of several sources, or its files are damaged.
@@ -306,7 +306,7 @@ class Scorer:
         are too many.
 
         Raises:
-            StemmapError: It cannot be opened, or is another recording than that of the job.
+            StemmapError: The run cannot be opened, or is another recording than that of the job.
         """
         key = msgspec.json.encode([requested.source, requested.digest])
         if key not in self._open:
@@ -321,8 +321,8 @@ class Scorer:
 
 
 def main(words: list[str]) -> None:
-    """Receive jobs and send their results until the parent ends, which ends this process; the program of a
-    child process. It never returns.
+    """Run the program of a scoring process: receive jobs and send their results until the parent ends, which
+    ends this process. It never returns.
 
     Args:
         words: Arguments of the command line: --low-priority, --runs N.

@@ -39,7 +39,7 @@ def check_start(uri: str, scores: MapScores, match_distance: float) -> None:
     Args:
         uri: URI of the run.
         scores: Scores of its first map.
-        match_distance: Largest distance between a tree and its ground truth [m].
+        match_distance: Maximum distance between a tree and its ground truth [m].
 
     Raises:
         StemmapError: No true tree is near the path, or no tree of the map is near a true tree.
@@ -62,11 +62,12 @@ class _Attempt:
     """A set of parameters that is being scored.
 
     Attributes:
-        values: Its values by parameter name.
-        parameters: All parameters, by stage; None where the values contradict one another.
+        values: Dict from parameter names to the values of the set.
+        parameters: Dict from stages to dicts from names to values, with all parameters; None if the values
+            contradict one another.
         runs: Numbers of the runs on which it is scored.
-        begun: How many of these were given to a process.
-        scores: Scores by number of the run.
+        begun: Number of runs that were given to a process, the first ones of `runs`.
+        scores: Dict from the number of a run to its scores.
     """
 
     values: dict[str, Value]
@@ -197,9 +198,9 @@ class Search:
         return _Attempt(values, parameters.model_dump(), list(self._training))
 
     def _suggestion(self) -> dict[str, Value]:
-        """Return the values to try next: as the first of all those of the start, if they are within the
-        bounds; then those that Optuna suggests. The trials on which they depend are first added to its
-        study."""
+        """Return a dict from parameter names to the values to try next. For the first trial these are the
+        values of the start, if they are within the bounds; then those that Optuna suggests. The trials on
+        which they depend are first added to its study."""
         from optuna.samplers import TPESampler
         from optuna.trial import TrialState
 
@@ -230,9 +231,9 @@ class Search:
         self._complete_in_order()
 
     def _complete_in_order(self) -> None:
-        """Make trials of the sets whose runs are all scored, up to the first one that is not; the first set
-        of all becomes `start`. If a set is the best so far and has held-out runs without scores, these are
-        queued first."""
+        """Make trials of the sets whose runs are all scored, in the order of suggestion, up to the first set
+        with a run that is not scored. The first set becomes `start`. If a set is the best so far and its
+        held-out runs are not scored, they are queued and the set is not a trial yet."""
         while self._attempts and len(self._attempts[0].scores) == len(self._attempts[0].runs):
             attempt, loss = self._attempts[0], None
             training, held_out = attempt.scores_of(self._training), attempt.scores_of(self._held_out)
@@ -253,8 +254,8 @@ class Search:
             self._attempts.pop(0)
 
     def _learn(self, until: int) -> None:
-        """Add the trials with numbers below `until` to Optuna's study that it does not have yet.
-        Contradicting sets count as the worst, so that the sampler avoids them."""
+        """Add the trials with numbers below `until` to the study of Optuna, unless it has them. A trial
+        without a loss is added as pruned."""
         from optuna.trial import TrialState, create_trial
 
         distributions = {axis.name: axis.distribution() for axis in self.plan.axes}
@@ -266,14 +267,15 @@ class Search:
         self._learned = max(self._learned, until)
 
     def _start_values(self) -> dict[str, Value]:
-        """Return the values of the searched parameters at the start, by name."""
+        """Return a dict from the name of each searched parameter to its value at the start."""
         flat = self._parameters.flat()
         return {axis.name: flat[axis.name] for axis in self.plan.axes}
 
     def importances(self) -> dict[str, float]:
-        """Return the share of the variance of the loss that each parameter explains (fANOVA, Hutter et al.
-        2014), by name, the largest first. Shares that are not finite are omitted. Empty if there are too few
-        trials or all have the same loss. Suggestions after this call depend on all trials so far."""
+        """Return a dict from the name of each searched parameter to the share of the variance of the loss
+        that it explains (fANOVA, Hutter et al. 2014), the largest first. Shares that are not finite are
+        omitted. The dict is empty if there are too few trials or all have the same loss. Suggestions after
+        this call depend on all trials so far."""
         from optuna.importance import FanovaImportanceEvaluator, get_param_importances
 
         self._learn(len(self._trials))
@@ -299,9 +301,9 @@ _MESSAGE_INTERVAL_S = 0.25
 
 
 def search_for_page(parent: ParentConnection) -> None:
-    """Receive a `Plan`, search until a further message arrives, all trials are made or the time is
-    over, and send `SearchMessage`s; the program of the child process of the page. Errors are sent as the last
-    message, not raised."""
+    """Run the program of the child process of a search: receive a `Plan`, search until a further message
+    arrives, all trials are made or the time is over, and send `SearchMessage`s. StemmapError and MemoryError
+    are sent as the last message, not raised."""
     plan = parent.receive(Plan)
     try:
         with closing(search_processes(plan)) as processes:

@@ -57,10 +57,10 @@ def question_of(
 
     Args:
         source, digest: The open run; the digest is empty if none is open.
-        truth: True trees, with the annotations; None where none are known.
+        truth: True trees, with the annotations; None if none are known.
         parameters: The parameters in force.
         name: Dotted name of the parameter.
-        values: Its values, in the order in which they are computed.
+        values: Values of the parameter, in the order in which they are computed.
 
     Raises:
         StemmapError: No run is open, it is live, or it has no true trees.
@@ -150,8 +150,8 @@ class Sensitivity:
     async def _point(
         self, question: Question, value: Value, process: ScoringProcesses[None]
     ) -> dict[str, Any]:
-        """Return a point for the page: `value` with its scores (see `_figures`), or with `error` if the value
-        contradicts other parameters or the job failed.
+        """Return a point of the curve as a dict: `value` with its scores (see `_figures`), or with `error` if
+        the value contradicts other parameters or the job failed.
 
         Args:
             question: The curve.
@@ -170,12 +170,12 @@ class Sensitivity:
 
 
 def _state_of(question: Question, points: list[dict[str, Any]], error: str = "") -> dict[str, Any]:
-    """Return a curve for the page: `name`, all parameters in force by dotted name (`asked_with`), number of
-    values (`of`), `points` and `error`.
+    """Return a curve as a dict: `name`; `asked_with`, a dict from the dotted names of all parameters in force
+    to their values; `of`, the number of values; `points`; and `error`.
 
     Args:
         question: Parameter, its values, and the other parameters.
-        points: Points so far, at most one per value.
+        points: Points so far, see `Sensitivity._point`.
         error: Why the computation ended early; empty if it did not.
     """
     return {
@@ -188,7 +188,7 @@ def _state_of(question: Question, points: list[dict[str, Any]], error: str = "")
 
 
 def _figures(answer: JobResult) -> dict[str, Any]:
-    """Return the scores of a point for the page: `f1`, `TA` and `TA_of`, `false` (number of false trees),
+    """Return the scores of a point as a dict: `f1`, `TA` and `TA_of`, `false` (number of false trees),
     `position_rmse_m`, `mean_pair_error_percent` and `trees`; only `error` if the job failed or no ground
     truth is near the path."""
     s = answer.scores

@@ -344,8 +344,8 @@ class Guard:
 
         Args:
             scope: The request.
-            headers: Its headers.
-            send: Sends the response.
+            headers: Headers of the request.
+            send: Function that sends the response.
         """
         if scope["path"] != "/" or not self._is_half_over(headers):
             return send
@@ -402,8 +402,8 @@ class Guard:
         )
 
     def _limit_of(self, scope: Scope) -> int:
-        """Return the maximum size of the body of a request [bytes]; uploads of recordings have a larger
-        one."""
+        """Return the maximum size of the body of a request [bytes]: `body_limit`, or for an upload of a
+        recording the maximum of `body_limit` and `upload_limit`."""
         is_upload = scope.get("path") == UPLOADS and scope.get("method") == "POST"
         return max(self._body_limit, self._upload_limit) if is_upload else self._body_limit
 
@@ -482,12 +482,12 @@ class Guard:
         return len(origins) == 1 and origins[0].lower() in (f"http://{host}", f"https://{host}")
 
     def _role(self, headers: Headers) -> Role | None:
-        """Return the role of a request by its session cookie, else by its header Authorization; None without
-        a valid one."""
+        """Return the role of a request by its session cookie, else by its header Authorization; None if there
+        is no valid one."""
         return self._role_by_cookie(headers) or self._role_by_bearer(headers)
 
     def _role_by_cookie(self, headers: Headers) -> Role | None:
-        """Return the highest role of all valid session cookies; None without one."""
+        """Return the highest role of all valid session cookies; None if there is none."""
         roles = {self._role_by_session(value) for value in self._cookies(headers)}
         return "owner" if "owner" in roles else "viewer" if "viewer" in roles else None
 
@@ -528,7 +528,7 @@ class Guard:
         return role
 
     def _role_by_bearer(self, headers: Headers) -> Role | None:
-        """Return the role of the header `Authorization: Bearer TOKEN`; None without a valid one."""
+        """Return the role of the header `Authorization: Bearer TOKEN`; None if there is no valid one."""
         scheme, _, given = headers.get("authorization", "").partition(" ")
         return self._role_by_token(given.strip()) if scheme.lower() == "bearer" else None
 
@@ -553,13 +553,13 @@ def _cookie_value(part: str, name: str) -> str | None:
 
 
 def _seconds(text: str) -> int | None:
-    """Return a time as int; None unless the text consists of at most 12 digits."""
+    """Return the integer in a text; None unless the text consists of 1 to 12 digits."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= 12 else None
 
 
 def _limited(receive: Receive, limit: int) -> Receive:
-    """Return a `receive` that limits the body, also where the request does not announce its length; it raises
-    HTTPException 413 beyond `limit` [bytes]."""
+    """Return a `receive` that passes on messages and raises HTTPException 413 once the body exceeds `limit`
+    [bytes], whether or not the request announces its length."""
     seen = 0
 
     async def counted() -> dict[str, object]:

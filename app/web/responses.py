@@ -50,7 +50,8 @@ class BadRequestError(StemmapError):
 
 @contextmanager
 def as_bad_request(where: str | None = None) -> Iterator[None]:
-    """Raise a StemmapError inside the context as BadRequestError, at another place unless `where` is None."""
+    """Convert a StemmapError inside the context to a BadRequestError with the same text. Its `where` is
+    replaced by the argument unless that is None."""
     try:
         yield
     except StemmapError as error:
@@ -73,7 +74,7 @@ def json_reply(content: object, status: int = 200) -> Response:
 def error_reply(
     status: int, what: str, *, where: str = "", remedy: str = "", retry_after_s: int | None = None
 ) -> Response:
-    """Return an error as JSON for the page: {"error": {"what", "where", "remedy"}}.
+    """Return an error as JSON: {"error": {"what": ..., "where": ..., "remedy": ...}}.
 
     Args:
         status: HTTP status.
@@ -138,10 +139,10 @@ def bytes_reply(content: bytes, media_type: str = "application/octet-stream", fi
     """Return bytes that are not cached.
 
     Args:
-        content: Contents.
-        media_type: Their type.
-        filename: Name under which the browser saves them, without quotes or characters beyond ASCII; empty
-            to show them.
+        content: The body.
+        media_type: Media type of the body.
+        filename: Name under which the browser saves the body, without quotes or characters beyond ASCII;
+            empty to show it.
     """
     reply = Response(content, 200, {"Cache-Control": "no-store"}, media_type=media_type)
     if filename:

@@ -71,9 +71,9 @@ class Uploads:
     async def take(
         self, name: str, size: int, stream: AsyncIterator[bytes], *, many: bool = False
     ) -> dict[str, Any]:
-        """Receive a file, or the files of one recording as a folder, check it in a child process, and return
-        its path (`uri`), original `name`, format (`kind`) and size (`bytes`). It gets a generated name; what
-        is refused is removed.
+        """Receive a file, or the files of one recording as a folder, and check it in a child process. It gets
+        a generated name; a refused upload is removed. Return a dict with the path (`uri`), the original name
+        (`name`), the format (`kind`) and the size in bytes (`bytes`).
 
         Args:
             name: Original name of the file or folder.
@@ -208,14 +208,14 @@ async def _write_folder(
 
 
 def _file_list(line: bytes) -> list[tuple[PurePosixPath, int]]:
-    """Return the paths in the folder and the sizes [bytes] of the files of an upload.
+    """Return (path in the folder, size [bytes]) of each file of an upload, in the order of the list.
 
     Args:
         line: JSON, a list of [path, size].
 
     Raises:
-        UploadError: It is no such list, has no or too many files, two of one path, or a path that leaves the
-            folder, is hidden, too deep or too long.
+        UploadError: The value is not such a list, has no or too many files, two of one path, or a path that
+            leaves the folder, is hidden, too deep or too long.
     """
     try:
         listed = msgspec.json.decode(line, type=list[tuple[str, Annotated[int, msgspec.Meta(ge=0)]]])
@@ -252,7 +252,7 @@ async def _write(part: Path, size: int, stream: AsyncIterator[bytes], wrote: Cal
     Args:
         part: File to write; it must not exist.
         size: Announced length [bytes].
-        stream: The contents.
+        stream: Yields the bytes.
         wrote: Called with the length of each block but the last.
 
     Raises:
@@ -294,12 +294,12 @@ async def _in_time(stream: AsyncIterator[bytes]) -> AsyncIterator[bytes]:
 
 
 async def _look_at(part: Path, name: str) -> str:
-    """Return the format of the file, detected in a child process; "not looked through yet" if that takes too
-    long.
+    """Return the name of the format of the file, detected in a child process; "not looked through yet" if
+    that takes too long.
 
     Args:
         part: The incomplete file.
-        name: Its original name, for errors.
+        name: Original name of the file, for errors.
 
     Raises:
         UploadError: The file cannot be read.

@@ -50,7 +50,7 @@ class StepStore:
 
 
 class Cursor:
-    """Position before a step of a run.
+    """Position in the steps of a run, before the step that `take` returns next.
 
     Args:
         read: Returns the steps of the source from its start, numbered from 0. A live source yields None while
@@ -171,8 +171,8 @@ class Cursor:
 
 
 def _fingerprint(step: Step) -> int:
-    """Return a hash of a step, by which a step that is read again is recognised: of its time, number of
-    points, odometry, tilt and turn, not of its points."""
+    """Return a hash of the time, number of points, odometry, roll, pitch and `turn` of a step. The points
+    themselves are not included."""
     scan = step.scan
     return hash((scan.stamp_ns, scan.points.shape[0], step.T_odom_base, step.roll, step.pitch, step.turn))
 
@@ -180,14 +180,14 @@ def _fingerprint(step: Step) -> int:
 def live_steps(
     source: LiveSource, chosen: ChosenOdometry, moving: Source, losses: Counter[str]
 ) -> Iterator[Step | None]:
-    """Yield the steps of a live robot as they arrive, and None whenever no message waits, without end. An
+    """Yield the steps of a live robot as they arrive, and None whenever no message is queued; never end. An
     unreadable message raises SourceError.
 
     Args:
         source: The robot.
         chosen: Selected source of the motion.
-        moving: The source with that motion, see `with_odometry`.
-        losses: Increased in place by what the synchroniser leaves out, by reason.
+        moving: The source with the odometry that was selected, see `with_odometry`.
+        losses: Dict from reasons to numbers of records that the synchroniser leaves out; increased in place.
     """
     override = moving if isinstance(moving, OdometryOverride) else None
     synchroniser = Synchroniser(use_odometry=chosen.steps != "static", losses=losses)

@@ -73,7 +73,7 @@ class CloudSource(FileSource):
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of points left out, by reason; not a copy."""
+        """Dict from reasons to numbers of points left out; not a copy."""
         return self.cloud.losses
 
     def records(self) -> Iterator[Record]:
@@ -184,7 +184,7 @@ class InventoryRun:
 
     def map_next(self, *, hurried: bool = False) -> Frame | None:
         """Compute the next step of the first inventory. Return the frame of the map if this step completed
-        it; None before, and if the map was complete already.
+        the map; None if it is not complete yet, or was complete before the call.
 
         Args:
             hurried: Ignored; it is there because `Run.map_next` has it.
@@ -219,14 +219,15 @@ class InventoryRun:
 
     @property
     def remapped(self) -> float | None:
-        """Share of the inventory that replaces the map, from 0 to 1; None without one."""
+        """Share of the inventory that replaces the map, from 0 to 1; None if there is none."""
         return self.share if self.current >= 0 else None
 
     def remap_next(self) -> tuple[Frame, dict[int, float]] | None:
         """Compute the next step of the inventory that replaces the map.
 
         Returns:
-            The frame of the new map, and 0 for each tree, by its number [s]; None while it is not complete.
+            The frame of the new map and a dict from each tree number to the confirmation time 0 [s]; None
+            while the new map is not complete, and if no inventory is computed.
 
         Raises:
             StemmapError: The cloud cannot be mapped with these parameters. The map does not change.
@@ -278,7 +279,8 @@ class InventoryRun:
         """Compute the next step of the inventory.
 
         Returns:
-            Whether this step completed the map, which is then the current one. False without an inventory.
+            Whether this step completed the map, which is then the current one. False if there is no
+            inventory.
 
         Raises:
             StemmapError: The cloud cannot be mapped. As after any other exception, the inventory is abandoned
@@ -310,8 +312,9 @@ class InventoryRun:
 
 
 def _frame_of(plot: PlotMap) -> Frame:
-    """Return a map of a cloud as a frame. The points are relative to the middle of the plot; the pose is that
-    position. Labels are the rows of the candidates to whose crowns and stems the points belong."""
+    """Return a map of a cloud as a frame. The pose is the middle of the plot with yaw 0 and `base_z` the
+    ground there; points and clusters are relative to it. `filtered` has the thinned points, `raw` none. The
+    label of a point is the row of the candidate to whose crown or stem it belongs, -1 if there is none."""
     middle = plot.ground.low + 0.5 * plot.ground.cell * np.array(plot.ground.height.shape)
     base_z = float(plot.ground.at(middle[:1], middle[1:])[0])
     points = (plot.whole[:, :3] - np.append(middle, base_z)).astype(np.float32)
@@ -345,13 +348,13 @@ def _frame_of(plot: PlotMap) -> Frame:
 
 
 def _clusters_of(plot: PlotMap, middle: Float, base_z: float, labels: Int32) -> Clusters:
-    """Return the candidates as clusters; what a cloud does not give is NaN. A candidate without a circle has
-    the extent of a thin box at breast height.
+    """Return the candidates as clusters; eccentricity, covariance and `radius_sigma` are NaN. A candidate
+    without a circle has the extent of a thin box at breast height.
 
     Args:
         plot: The map.
-        middle, base_z: Origin of the frame of the clusters in that of the map [m].
-        labels: Candidate of each thinned point, -1 for none.
+        middle, base_z: Origin of the frame of the clusters: x, y, shape (2,), and z in the map [m].
+        labels: Row of the candidate of each thinned point, shape (N,), -1 for none.
     """
     stems, n = plot.stems, len(plot.stems)
     nan = np.full(n, np.nan)
@@ -394,8 +397,8 @@ def _detections_of(clusters: Clusters) -> Detections:
 
 
 def _height_map(ground: TerrainRaster) -> HeightMap:
-    """Return the visible ground as a height map, whose cells are multiples of their size; standard deviations
-    are unknown."""
+    """Return the visible ground as a height map whose cells begin at multiples of the cell size. Standard
+    deviations are NaN, and each cell has one view."""
     cell = ground.cell
     first = np.floor(ground.low / cell).astype(np.int64)
     place = np.argwhere(np.ones(np.array(ground.height.shape) + 1, np.bool_)) + first

@@ -205,7 +205,7 @@ class WorkerLoop:
         return quiet_s if due_s is None else min(due_s, quiet_s)
 
     def _quiet_s(self) -> float:
-        """Return the time left of `_QUIET_S` after the last command [s]."""
+        """Return the time [s] until `_QUIET_S` has passed since the last command; 0 if it has."""
         return max(0.0, self._quiet_until - self._clock())
 
     def _due_in(self) -> float | None:
@@ -247,7 +247,8 @@ class WorkerLoop:
         self._report()
 
     def _report_when_due(self, now: float) -> None:
-        """Send the status if the last one is older than `_REPORT_S`."""
+        """Send the status if the last one was sent `_REPORT_S` or longer before `now` [s], or none was
+        sent."""
         if self._reported is None or now >= self._reported[1] + _REPORT_S:
             self._report()
 
@@ -325,9 +326,10 @@ class WorkerLoop:
         self._put(msgspec.structs.replace(opened, run=self._run, requested=self._requested))
 
     def _begin(self, command: protocol.Begin) -> None:
-        """Set the parameters of the open run and show its scan, if it has one; then play, or seek the first
-        scan. Nothing for another run. If a person has paused or an error occurred since the opening, only the
-        parameters are set. Raises ParameterError for invalid values."""
+        """Set the parameters of the open run and show the current scan if there is one; then play, or seek
+        the first scan if `command.play` is False. If `command.run` is not the open run, do nothing. If a
+        person has paused or an error occurred since the opening, only set the parameters. Raises
+        ParameterError for invalid values."""
         if command.run != self._run:  # another run was opened since
             return
         self._show(self._session.set_parameters(validated(command.values), command.revision))
@@ -339,9 +341,8 @@ class WorkerLoop:
             self._session.advance(1)
 
     def _prepare(self) -> None:
-        """Compile kernels before the first scan, once for each run, also after an error; the status is sent
-        before and after. This is not done at opening, when the parameters are not known. Raises SourceError
-        if there is no scan or it cannot be read."""
+        """Compile the kernels for the first scan with `Session.prepare`, and send the status before and
+        after. The run counts as prepared also after an error. Errors of the session pass through."""
         self._send_status(self._preparing(), self._clock())
         self._prepared = True
         self._session.prepare()
@@ -447,7 +448,7 @@ class WorkerLoop:
         return None
 
     def _fail(self, detail: str) -> None:
-        """Set the state "failed" with its reason; the run does not continue by itself."""
+        """Set the state "failed" with the reason `detail`; the run does not continue by itself."""
         self._held = True
         self._session.fail(detail)
 
@@ -458,7 +459,7 @@ def answer(session: Session, recent: RecentScans, question: protocol.Question, r
 
     Args:
         session: Session of the run.
-        recent: Recently sent frames, to which questions refer.
+        recent: Recently sent frames; a question about a cluster refers to one of them.
         question: Question of any kind.
         run: Number of the open run.
     """

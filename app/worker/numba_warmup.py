@@ -168,8 +168,8 @@ def warm_tree_map() -> None:
 
 
 def _stems() -> Iterator[Step]:
-    """Yield the twelve steps of a robot that drives 0.5 m per scan between trees in a grid of 3 m by 1.5 to 3
-    m."""
+    """Yield twelve steps, 0.1 s apart, of a robot that drives 0.5 m per scan along x, between trees in a grid
+    with spacings of 3 m in x and 2.5 to 3 m in y."""
     from pipeline.geometry.poses import Pose2
     from pipeline.types.records import Scan, Stems, Step
 

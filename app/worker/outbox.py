@@ -94,9 +94,9 @@ class Outbox:
             return  # the web process is gone; the reader of commands ends the worker
 
     def _packed(self, message: FromWorker) -> list[bytes]:
-        """Return the encoded message; if it is too large or has a value that cannot be sent, the last status
-        with a warning, encoded, or nothing before the first status. After a frame that was not sent, the next
-        one has the whole path and the ground."""
+        """Return a list of the encoded message. If the message is too large or has a value that cannot be
+        sent, return a list of the last status with a warning, encoded, or an empty list if no status was
+        sent. After a frame that was not sent, the next frame has the whole path and the ground."""
         try:
             return [self._codec.encode(self._made_ready(message))]
         except (WireError, NotImplementedError, ValueError, OverflowError) as error:
@@ -122,15 +122,16 @@ class Outbox:
         return message
 
     def _with_refusal(self, report: Report) -> Report:
-        """Return a status with the warning about dropped messages, if there is one."""
+        """Return a status with the last warning about dropped messages appended; the status itself if there
+        is no warning."""
         if not self._refused:
             return report
         return Report(replace(report.status, warnings=[*report.status.warnings, self._refused]))
 
     def _next(self) -> FromWorker | None:
-        """Wait for the next message to send; None after `close`, when nothing waits. A frame waits for
-        _SHORTEST_PAUSE_S after the one before and for other messages, but not for the status of a run that
-        does not play."""
+        """Wait for the next message, remove it from the queue and return it; None after `close` if nothing is
+        queued. Other messages come before a frame, except the status "paused" or "finished". A frame is
+        returned at the earliest _SHORTEST_PAUSE_S after the previous frame, or at once after `close`."""
         with self._changed:
             while True:
                 if self._messages and (self._picture is None or not _is_standing(self._messages[0])):
@@ -184,7 +185,7 @@ def picture_of(frame: Frame) -> Frame:
     """Return the frame with at most MOST_POINTS raw and MOST_POINTS filtered points, selected evenly; the
     frame itself if it has no more.
 
-    `counts["not drawn"]` is the number of points that were left out, if any.
+    If points were left out, `counts["not drawn"]` is their number.
     """
     raw = evenly_spaced(len(frame.raw), MOST_POINTS)
     filtered = evenly_spaced(len(frame.filtered), MOST_POINTS)
@@ -202,5 +203,5 @@ def picture_of(frame: Frame) -> Frame:
 
 def for_comparison(frame: Frame) -> Frame:
     """Return the frame for the comparison of parameter sets: as `picture_of`, without raw points, voxel
-    columns and ground, which do not depend on the parameters or are not drawn."""
+    columns and ground, which do not depend on the parameters or are not rendered."""
     return picture_of(replace(frame, raw=np.zeros((0, 3), np.float32), columns=None, ground=None))

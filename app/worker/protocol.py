@@ -52,7 +52,7 @@ class Status:
 
     Attributes:
         state: "waiting" means that a live source sends nothing; the reason of "failed" is in `detail`.
-        detail: What happened, what it means, and what to do; empty without a problem.
+        detail: What happened, what it means, and what to do; empty if there is no problem.
         source: URI of the source.
         kind: Name of the format of the source.
         odometry: Description of the source of motion.
@@ -60,26 +60,26 @@ class Status:
         scan_index: Index of the current scan, -1 before the first.
         scans: Number of scans in the run, None if unknown.
         speed: Playback speed as a factor of real time.
-        scan_rate_hz, mapping_ms: Rate and mapping time, measured over the last scans.
-        stage_ms: Median time of each stage over the last scans.
+        scan_rate_hz, mapping_ms: Rate [Hz] and mapping time [ms], measured over the last scans.
+        stage_ms: Dict from stages to median times over the last scans [ms].
         scans_behind: Number of scans that wait to be mapped.
         trees: Number of confirmed trees.
-        distance_m: Driven distance.
+        distance_m: Driven distance [m].
         health: Pose quality "good", "weak" or "lost", or why it is too early to know (see `health_word`).
         warnings: Warnings, each once, the newest last.
         revision: Revision of the parameters in force.
         going_to: Description of the sought time or scan until it is reached; empty otherwise.
         going_to_s: Sought time if it is known, else None.
-        going_far: Whether the seek takes so long that the page shows it.
+        going_far: Whether the seek takes so long that the dashboard shows it.
         live: Whether the source is live.
         robot: Namespace of the robot, empty for none.
         robots: Namespaces of all robots on the network that publish scans.
-        compiling_since_s: Start of the present compilation of kernels [s since 1970], None without one.
-        compiled: Share of the kernels that are compiled, from 0 to 1; None without a compilation.
-        remapped: Share of the run that is mapped again (see `SetParameters`), from 0 to 1; None without a
-            rerun.
+        compiling_since_s: Start of the present compilation of kernels [s since 1970], None if there is none.
+        compiled: Share of the kernels that are compiled, from 0 to 1; None if there is no compilation.
+        remapped: Share of the run that is mapped again (see `SetParameters`), from 0 to 1; None if there is
+            no rerun.
         camera: Whether the source has camera pictures.
-        recording: State of the recording of a live run; empty without one.
+        recording: State of the recording of a live run; empty if there is none.
         cloud: Frame of a whole cloud whose stems are mapped; None for a run of scans.
     """
 
@@ -149,7 +149,7 @@ class SetParameters(msgspec.Struct, frozen=True, tag="set_parameters"):
     `whole`, the run is mapped again from its first scan.
 
     Attributes:
-        values: All values by stage and name.
+        values: Dict from stages to dicts from names to values, with all parameters.
         revision: Number of the revision, which results repeat.
         whole: Whether to map the run again.
         step: Changes with the same step (a slider drag) are compared with the map before the first of them;
@@ -211,11 +211,12 @@ class RunCounts(msgspec.Struct, frozen=True):
     """Counts of a run up to a scan, as in run.json, or of a whole cloud, with the cells that it covers.
 
     Attributes:
-        health: Number of scans by the state of the pose quality; empty for a whole cloud.
-        sigma_xy_m: Largest standard deviation of the position [m]; None if unknown.
-        verdicts: Number of clusters by verdict.
-        losses: Number of messages or points that were left out, by reason.
-        warnings: Each warning once, with its number.
+        health: Dict from the states of the pose quality ("good", "weak", "lost") to numbers of scans; empty
+            for a whole cloud.
+        sigma_xy_m: Maximum standard deviation of the position [m]; None if unknown.
+        verdicts: Dict from verdicts to numbers of clusters.
+        losses: Dict from reasons to numbers of messages or points that were left out.
+        warnings: Warnings as strings, each once, with the number of its occurrences if it is more than 1.
         covered: Centres of the cells that a whole cloud covers, shape (K, 2) [m]; None for a run of scans.
     """
 
@@ -447,8 +448,8 @@ class View(msgspec.Struct, frozen=True, tag="view"):
 
     Attributes:
         run: As in `Shown`.
-        stamp_ns: Its time [ns].
-        free: Free range by direction in the base frame [m].
+        stamp_ns: Time of the scan [ns].
+        free: Free range by azimuth in the base frame, shape (bins,) [m].
     """
 
     run: int
@@ -500,9 +501,9 @@ class MessageCodec(Generic[M]):
         """Return the encoded message with its length as prefix.
 
         Raises:
-            WireError: It is larger than LARGEST_MESSAGE, or has an array of a dtype or number of dimensions
-                that cannot be sent.
-            NotImplementedError: It has a value of a type that cannot be sent.
+            WireError: The message is longer than LARGEST_MESSAGE, or has an array of a dtype or number of
+                dimensions that cannot be sent.
+            NotImplementedError: The message has a value of a type that cannot be sent.
         """
         packed = bytearray(LENGTH_BYTES)
         self._encoder.encode_into(message, packed, LENGTH_BYTES)
@@ -545,7 +546,7 @@ def check_size(size: int) -> None:
     """Check the length of a message [bytes] before memory is allocated for it.
 
     Raises:
-        WireError: It is larger than LARGEST_MESSAGE.
+        WireError: The message is longer than LARGEST_MESSAGE.
     """
     if size > LARGEST_MESSAGE:
         raise WireError(f"a message of {size} bytes is larger than {LARGEST_MESSAGE}")
@@ -562,7 +563,7 @@ def from_worker() -> MessageCodec[FromWorker]:
 
 
 def _read_exactly(stream: BinaryIO, size: int) -> bytes:
-    """Read `size` bytes; fewer where the stream ends before."""
+    """Return the next `size` bytes of a blocking stream; fewer if the stream ends before."""
     parts: list[bytes] = []
     while size > 0 and (part := stream.read(size)):
         parts.append(part)
@@ -571,7 +572,8 @@ def _read_exactly(stream: BinaryIO, size: int) -> bytes:
 
 
 def _to_plain(value: object) -> object:
-    """Return an array as dtype, shape and bytes (see `_EncodedArray`), a NumPy scalar as a Python number.
+    """Return an array as a tuple of dtype, shape and bytes (see `_EncodedArray`), and a NumPy scalar as a
+    Python number.
 
     Raises:
         WireError: The array has a dtype or number of dimensions that cannot be sent.

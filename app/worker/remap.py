@@ -46,10 +46,11 @@ class StoredScan(msgspec.Struct, frozen=True):
     """The results of a scan.
 
     Attributes:
-        shown: Its frame without points and path; without columns and ground that are those of the scan
-            before.
-        columns_in, ground_in: Numbers of the scans that have its columns and ground; -1 for none.
-        replaced: Rows of the path that the scan replaced.
+        shown: Frame of the scan without points and path, and without columns and ground if they are those of
+            the scan before.
+        columns_in, ground_in: Numbers of the scans whose stored frames have the columns and the ground of
+            this scan; -1 for none.
+        replaced: Earlier rows of the path that the correction at this scan replaced.
     """
 
     shown: Shown
@@ -61,7 +62,7 @@ class StoredScan(msgspec.Struct, frozen=True):
 class FrameStore:
     """The frames of one map without their points, each with the path and the confirmation times of its time.
 
-    In memory are the newest path and the place of each scan in the file. The rows of the path that a
+    In memory are the newest path and the position of each scan in the file. The rows of the path that a
     correction replaced are in the file.
     """
 
@@ -117,8 +118,8 @@ class FrameStore:
         self._path, self._objects, self._objects_in = path, objects, (columns_in, ground_in)
 
     def read(self, index: int) -> Shown | None:
-        """Return the results of a scan without points, with the path up to it and the run number 0; None if
-        they are not stored or damaged."""
+        """Return the results of a scan without points, with the path up to this scan and the run number 0;
+        None if the results are not stored or are damaged."""
         scan = self._read(index)
         path = None if scan is None else self._path_at(index)
         if scan is None or path is None:
@@ -145,7 +146,8 @@ class FrameStore:
         self._blocks.close()
 
     def _path_at(self, index: int) -> Path | None:
-        """Return the path up to a stored scan; None if it cannot be read or has no scan."""
+        """Return the path as it was after a stored scan; None if a stored part cannot be read, or no scan is
+        stored."""
         end = index + 1
         parts: list[Path] = []
         for scan, start in self._corrections:
@@ -204,13 +206,13 @@ class ScanCounts:
             self._warnings[index] = tuple(frame.warnings)
 
     def totals(self, index: int, warnings: Sequence[str], losses: Mapping[str, int]) -> RunCounts:
-        """Return the totals up to a scan that was recorded. `health` has all states, `verdicts` and `losses`
-        only what was counted; `covered` is None. At most 200 different warnings are returned.
+        """Return the totals up to a scan that was recorded. `health` has all states; `verdicts` and `losses`
+        have only entries above 0; `covered` is None. At most 200 different warnings are returned.
 
         Args:
             index: Index of the scan.
             warnings: Warnings about the source, which come first.
-            losses: Number of left-out messages by reason.
+            losses: Dict from reasons to numbers of left-out messages.
         """
         if index + 1 < self._summed:
             self._begin()
@@ -246,7 +248,8 @@ class RunMap:
         before: State of the mapper before the current scan.
         snapshots: Earlier states of the mapper.
         history: Estimate of each tree over time.
-        confirmed_s: Time at which each tree was first confirmed, by its number [s since the first scan].
+        confirmed_s: Dict from the number of each tree to the time of its first confirmation [s since the
+            first scan].
         clusters: Clusters of all scans.
         counts: Counts of all scans.
         views: Time [ns] and free range by direction [m], see `SegmentedScan.free`, of the scans that
@@ -305,14 +308,15 @@ class RunMap:
         return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
 
     def ended(self, trees: Trees) -> dict[int, tuple[float, float]]:
-        """Return the last position of each tree that was confirmed once and is not among `trees`, by its
-        number [m]."""
+        """Return a dict from the number of each tree that was ever confirmed and is not among `trees` to its
+        last position (x, y) in the map [m]."""
         last = self.history.last_places()
         return {n: last[n] for n in self.confirmed_s.keys() - set(trees.number.tolist()) if n in last}
 
     def use(self, parameters: Parameters, index: int) -> bool:
         """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
-        value changes; then what is stored of later scans is dropped."""
+        value changes. If so, the states after that scan are dropped, and the frames of this scan and of later
+        ones."""
         changes = self.parameters.set_from(index, parameters)
         if changes:
             self.snapshots.forget_after(index)
@@ -321,8 +325,9 @@ class RunMap:
         return changes
 
     def rewind_if_same(self, parameters: Parameters) -> bool:
-        """Return to the state before the current scan, and use these parameters from there on. Return whether
-        all earlier scans have them too, so that the map is that of a rerun; False leaves the map unusable."""
+        """Restore the state before the current scan and use these parameters from the current scan on. Return
+        whether all earlier scans were mapped with the same values, except those of NOT_OF_THE_MAP. If the
+        result is False, the mapper is not restored and the map must be discarded."""
         self.use(parameters, self.before.path_length)
         if not self.parameters.are_all(parameters, NOT_OF_THE_MAP):
             return False
@@ -350,8 +355,9 @@ class Remapping:
         self.rerun, self.map, self._preview = rerun, new_map, preview
 
     def map_next(self, until: int) -> bool:
-        """Take the next step of the preview; map the next scan if there is none. Return whether `until` scans
-        are mapped. If the run went back meanwhile, the rerun goes back as well.
+        """Take the next step of the preview and return False; if the preview is complete, map the next scan
+        and return whether exactly `until` scans are mapped. If more than `until` scans are mapped, because
+        the run went back, the rerun first returns to the newest state with at most `until` scans.
 
         Raises:
             StemmapError: The scan cannot be read again.
@@ -400,15 +406,17 @@ class MapComparison:
     def changes(
         self, shown: Frame, new: Frame, revision: int, time_s: float, confirmed_s: dict[int, float]
     ) -> MapChanges:
-        """Return the differences between the map before the step and the new map. The map before is the
-        present one if the step has none of this scan yet.
+        """Return the differences between the map before the step and the new map. The map before the step is
+        the `shown` frame of the first call of the step; a call with another scan replaces it by its own
+        `shown`.
 
         Args:
             shown: The current scan with the present map.
             new: The same scan with the new map.
             revision: Revision of the parameters of the new map.
             time_s: Time of the scan [s since the first scan].
-            confirmed_s: Time at which each tree of the new map was confirmed, by its number [s].
+            confirmed_s: Dict from the number of each tree of the new map to its confirmation time [s since
+                the first scan].
         """
         if self._before is None or self._before.index != new.index:  # the run went on, or elsewhere
             self._before = shown
@@ -425,12 +433,12 @@ class Snapshots(Generic[S]):
     """States of the mapper by the number of scans they contain (0: before the first scan), in temporary
     files.
 
-    Beyond the largest number of states, every second one is dropped and the spacing doubles. The first state
-    is in memory. A state that the disk refuses is not stored.
+    Beyond the maximum number of states, every second one is dropped and the spacing doubles. The first state
+    is in memory. A state that cannot be written is not stored.
 
     Args:
         start: State before the first scan.
-        most: Largest number of states after it; 0 for a run that cannot go back.
+        most: Maximum number of further states; 0 for a run that cannot go back.
     """
 
     def __init__(self, start: S, most: int = _MOST_STATES) -> None:
@@ -440,8 +448,9 @@ class Snapshots(Generic[S]):
         self._spacing = _SPACING
 
     def offer(self, scans: int, state: S) -> None:
-        """Store a state if `is_due`; nothing if it is too large or the disk is full. Above the greatest
-        number of states, those at every second place are dropped and the distance doubles.
+        """Store a state if `is_due`, unless it is too large or the disk is full. If more than `most` states
+        are stored, the spacing doubles and the states at other numbers of scans than its multiples are
+        dropped.
 
         Args:
             scans: Number of scans that the state contains.
@@ -500,7 +509,7 @@ class ParameterHistory:
         return self._sets[bisect_right(self._starts, index) - 1]
 
     def are_all(self, parameters: Parameters, aside: set[str]) -> bool:
-        """Return whether every scan was mapped with these values.
+        """Return whether the parameters of every scan, also of later ones, have these values.
 
         Args:
             parameters: The values.
@@ -572,11 +581,12 @@ def changes_between(
     confirmed trees of the old map. Positions and diameters are rounded to 1 mm.
 
     Args:
-        before: Last scan in the old map.
-        after: The same scan in the new map.
+        before: Frame of the scan in the old map.
+        after: Frame of the same scan in the new map.
         revision: Revision of the parameters of the new map.
         time_s: Time of the scan [s since the first scan].
-        confirmed_s: Time at which each tree of the new map was confirmed, by its number [s].
+        confirmed_s: Dict from the number of each tree of the new map to its confirmation time [s since the
+            first scan].
     """
     old, new = np.flatnonzero(before.trees.confirmed), np.flatnonzero(after.trees.confirmed)
     old_at, new_at = before.trees.position[old], after.trees.position[new]
@@ -622,12 +632,13 @@ def _change(kind: Literal["appeared", "vanished", "moved"], trees: Trees, row: i
 
 
 def _why_not(frame: Frame, place: Float) -> str:
-    """Return the reason why a map has no tree at a place, as text: the class of the nearest column unless it
-    is a tree; for a whole cloud the verdict of the nearest candidate; else the number of observations of the
-    nearest tree, or that nothing was detected. Only what is within SAME counts.
+    """Return the reason why a map has no confirmed tree at a position, as text: the class of the nearest
+    column unless it is a tree; for a whole cloud, the verdict of the nearest candidate; else the number of
+    observations of the nearest tree, or that nothing was detected. Only columns, candidates and trees within
+    SAME count.
 
     Args:
-        frame: Last scan in that map.
+        frame: Frame of the last scan in the map.
         place: x, y in the map, shape (2,) [m].
     """
     if frame.columns is not None:
@@ -648,8 +659,8 @@ def _why_not(frame: Frame, place: Float) -> str:
 
 
 def _column(columns: Columns, row: int) -> str:
-    """Return the verdict of a column as text, with its share of votes for a tree unless it has too few points
-    or moves; "" for a tree."""
+    """Return the verdict of a column as text, with the share of votes for a tree [%] unless the verdict is
+    TOO_FEW_POINTS or MOVING; "" for a tree."""
     verdict = Verdict(int(columns.verdict[row]))
     if verdict is Verdict.TREE:
         return ""
@@ -660,8 +671,8 @@ def _column(columns: Columns, row: int) -> str:
 
 
 def _nearest(places: Float, place: Float) -> int:
-    """Return the row of the nearest of some positions, shape (K, 2), to a position, shape (2,), the first of
-    equals; -1 if none is within SAME."""
+    """Return the row of `places`, positions x, y, shape (K, 2) [m], that is nearest to the position `place`,
+    shape (2,) [m]; the first of equally near ones; -1 if none is within SAME."""
     if not len(places):
         return -1
     distance = np.hypot(*(places - place).T)

@@ -43,7 +43,7 @@ MakeMapper = Callable[[SourceDescription, Parameters, int, StageTimer], Mapper]
 
 class Run:
     """A source, mapped from its first scan to the current one. The constructor makes a mapper and raises
-    StemmapError if the forest of the parameters does not exist.
+    StemmapError if the random forest of the parameters does not exist.
 
     Args:
         source: The source; `close` closes it.
@@ -56,12 +56,13 @@ class Run:
             stored.
         caches: Caches of the segmented scans of this source.
         warnings: Warnings about the source.
-        left_out: Number of records that the cursor left out, by reason; it grows while the source is read.
+        left_out: Dict from reasons to numbers of records that the cursor left out; it grows while the source
+            is read.
 
     Attributes:
         frame: Result of the current scan; None before the first.
-        confirmed_s: Time at which each of its trees was first confirmed [s since the first scan], NaN for
-            trees that never were; None before the first scan.
+        confirmed_s: Time of the first confirmation of each tree of `frame`, shape (T,) [s since the first
+            scan], NaN for trees that were never confirmed; None before the first scan.
         current: Index of the current scan; -1 before the first.
         is_bare: Whether the frame has no points, see `map_next`.
         warnings: Warnings about the source, to which those of a robot are added.
@@ -107,7 +108,8 @@ class Run:
         return RunMap(mapper, mapper.parameters, lambda: self.start_ns, is_live=self._is_live)
 
     def history(self, number: int, scan: int) -> History:
-        """Return the estimates of a tree up to a scan, see `TreeHistory.of`; empty for an unknown number."""
+        """Return the estimates of the tree `number` up to the scan `scan`, see `TreeHistory.of`; empty for an
+        unknown number."""
         in_map = self._numbers.in_map(number)
         return self._map.history.of(-1 if in_map is None else in_map, scan)
 
@@ -168,7 +170,7 @@ class Run:
 
     def map_again(self) -> Frame | None:
         """Map the current scan again, from the state before it and with the parameters in force for it, and
-        return its result; None without a scan, or after an error or a step back that is not complete.
+        return its result; None if there is no scan, or after an error or a step back that is not complete.
 
         Raises:
             StemmapError: The scan cannot be mapped; the mapper is broken until `approach`.
@@ -277,7 +279,7 @@ class Run:
                 they are unknown or an earlier map is continued.
 
         Raises:
-            StemmapError: The forest that the parameters name does not exist.
+            StemmapError: The random forest of the parameters does not exist.
         """
         self.cancel_remapping()
         if self._map.parameters.are_all(parameters, NOT_OF_THE_MAP):
@@ -334,7 +336,7 @@ class Run:
 
     @property
     def remapped(self) -> float | None:
-        """Share of the scans up to the current one that are mapped again, from 0 to 1; None without a
+        """Share of the scans before the current one that are mapped again, from 0 to 1; None if there is no
         rerun, or if the mapper does not have the state after the current scan."""
         remapping = self._remapping
         if remapping is None or not self.is_whole:
@@ -353,9 +355,9 @@ class Run:
         the run continues with the new map, as if its parameters had been in force from the start.
 
         Returns:
-            The current scan in the new map, and the time at which each tree was confirmed, by its number [s];
-            None while scans are left, without a rerun, and if the mapper does not have the state after the
-                current scan.
+            The frame of the current scan in the new map, and a dict from the number of each tree to the time
+            of its first confirmation [s since the first scan]; None while scans are left, without a rerun,
+            and if the mapper does not have the state after the current scan.
 
         Raises:
             StemmapError: A scan cannot be read again. The map does not change.
@@ -473,7 +475,7 @@ def open_run(
 
     Raises:
         SourceError: The odometry is not available for this source; the source is closed.
-        StemmapError: The forest that the parameters name does not exist; the source is closed.
+        StemmapError: The random forest of the parameters does not exist; the source is closed.
     """
     with ExitStack() as on_error:
         on_error.callback(source.close)

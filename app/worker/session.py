@@ -109,27 +109,27 @@ class Session:
 
     @property
     def frame(self) -> Frame | None:
-        """Frame of the current scan, or of the sought scan if it was mapped; None without a run, or before
-        its first scan."""
+        """Frame of the current scan, or of the sought scan if it was mapped; None if there is no run, or
+        before its first scan."""
         shown = self._kept or self._run
         return shown.frame if shown else None
 
     @property
     def path(self) -> Path | None:
-        """Path up to the scan of `frame`, without rows before its first scan; None without a run."""
+        """Path up to the scan of `frame`, without rows before its first scan; None if there is no run."""
         shown = self._kept or self._run
         return shown.path if shown else None
 
     @property
     def confirmed_s(self) -> Float | None:
         """Confirmation time of each tree of `frame`, shape (T,) [s since the first scan], NaN for trees that
-        never were confirmed; None without a frame."""
+        never were confirmed; None if there is no frame."""
         shown = self._kept or self._run
         return shown.confirmed_s if shown else None
 
     @property
     def counts(self) -> RunCounts | None:
-        """Counts of the run up to the scan of `frame`; None without a frame."""
+        """Counts of the run up to the scan of `frame`; None if there is no frame."""
         frame = self.frame
         return None if self._run is None or frame is None else self._run.counts(frame.index)
 
@@ -150,8 +150,8 @@ class Session:
         return self._run
 
     def next_ns(self) -> int | None:
-        """Return the time of the next scan [ns]; None without a run, at the end of the run, or before a live
-        scan arrived. Raises SourceError if nothing more can be read."""
+        """Return the time of the next scan [ns]; None if there is no run, at the end of the run, or before a
+        live scan arrived. Raises SourceError if nothing more can be read."""
         return self._run.peek_ns() if self._run else None
 
     def open(
@@ -176,8 +176,8 @@ class Session:
             The opened run; None for a robot that has not sent scans yet, see `listen`.
 
         Raises:
-            SourceError: It cannot be read.
-            StemmapError: The forest that the parameters name does not exist.
+            SourceError: The source cannot be read.
+            StemmapError: The random forest of the parameters does not exist.
         """
         self.close()
         self._requested = uri, odometry, seed
@@ -201,7 +201,7 @@ class Session:
 
         Raises:
             SourceError: What it sends cannot be read, or the odometry is not available for it.
-            StemmapError: The forest that the parameters name does not exist. After this error, and for an
+            StemmapError: The random forest of the parameters does not exist. After this error, and for an
                 odometry that is not available, the source is closed.
         """
         if self._robot is None or self._requested is None:
@@ -223,7 +223,7 @@ class Session:
 
         Raises:
             SourceError: The odometry is not available for this source; the source is closed.
-            StemmapError: The forest that the parameters name does not exist; the source is closed.
+            StemmapError: The random forest of the parameters does not exist; the source is closed.
         """
         warnings: tuple[str, ...]
         if isinstance(source, CloudSource):
@@ -292,7 +292,7 @@ class Session:
             The run that was opened again, or None.
 
         Raises:
-            SourceError: It cannot be read.
+            SourceError: The source cannot be read.
             StemmapError: As in `open`.
         """
         opened = None
@@ -431,8 +431,8 @@ class Session:
         return self._run.map_with(sets)
 
     def fail(self, detail: str) -> None:
-        """Set the state of the run to failed, with the reason; a seek and a rerun are cancelled. The run
-        stays open until `play` or `open`."""
+        """Set the state "failed" with the reason `detail`; a seek and a rerun are cancelled. The run stays
+        open until `play` or `open`."""
         self._state, self._detail = "failed", detail
         self._target.forget()
         self._kept = None
@@ -644,8 +644,8 @@ class SeekTarget:
             run.approach(self._index)
 
     def is_at_end(self, run: AnyRun) -> bool:
-        """Return whether the run has reached the sought scan; False without one. For a time, the following
-        scan must be known; SourceError if it cannot be read."""
+        """Return whether the run has reached the sought scan; False if there is none. For a time, the
+        following scan must be known; SourceError if it cannot be read."""
         if self._index is not None:
             return run.current >= self._index
         if self._stamp_ns is None or run.current < 0:
@@ -662,7 +662,7 @@ class SeekTarget:
         return f"scan {self._index}" if time_s is None else clock(time_s)
 
     def time_s(self, run: AnyRun | None) -> float | None:
-        """Return the time of the sought scan [s since the first scan]; None without one, or if it is
+        """Return the time of the sought scan [s since the first scan]; None if there is none, or if it is
         unknown."""
         if run is None:
             return None
@@ -685,8 +685,8 @@ def has_camera(description: SourceDescription) -> bool:
 
 
 def pictures_of(source: Source | None) -> PictureSource:
-    """Return an open source as the reader of its camera pictures, without a wrapper for its odometry; raises
-    StemmapError without a source or a camera."""
+    """Return the source that reads the camera pictures: `source`, or the source inside of an
+    OdometryOverride. Raises StemmapError if it is None or has no camera."""
     origin: object = source.source if isinstance(source, OdometryOverride) else source
     if source is None or not has_camera(source.description) or not isinstance(origin, PictureSource):
         raise StemmapError("this run has no camera", remedy="Record the topic of a camera as well")
@@ -698,7 +698,7 @@ def camera_picture(source: Source | None, stamp_ns: int) -> CameraPicture:
     known.
 
     Args:
-        source: The open source; None where no run is open.
+        source: The open source; None if no run is open.
         stamp_ns: The time [ns].
 
     Raises:
@@ -722,7 +722,7 @@ def tree_picture(run: Run | InventoryRun | None, number: int) -> CameraPicture:
     would need the whole recording.
 
     Args:
-        run: The run; None where none is open.
+        run: The run; None if none is open.
         number: Number of the tree.
 
     Raises:

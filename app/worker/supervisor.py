@@ -206,7 +206,8 @@ class WorkerProcess:
         self._opening, self._opening_since = "requested", self._clock()
 
     def _note_opening(self, message: protocol.FromWorker) -> None:
-        """Update from a message of the worker whether the source is still being opened."""
+        """Update `_opening` from a message of the worker. Opening ends with `Opened` for the requested
+        source, or with a status of it that is not "starting" after one that is."""
         if not self._opening or self._open is None:
             return
         if isinstance(message, protocol.Opened) and message.requested in ("", self._open.uri):

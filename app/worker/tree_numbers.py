@@ -23,8 +23,8 @@ SAME = 0.5  # largest distance of the same tree in two maps [m]
 class TreeNumbers:
     """The numbers of the trees of a run as people see them.
 
-    Those of the first map are its own. In another map, a tree that is paired with a known tree within SAME
-    (one to one, see `match`) has the number of that tree, also if the map in between had no tree there; other
+    In the first map, the trees have the numbers of the map. In another map, a tree that is paired one to one
+    within SAME (see `match`) with a confirmed tree of any earlier map has the number of that tree; other
     trees have new numbers.
     """
 
@@ -35,8 +35,8 @@ class TreeNumbers:
         self._next = 1
 
     def renumber(self, trees: Trees) -> Trees:
-        """Return a copy of the trees of a frame of the present map with their numbers. Trees without a number
-        get one, and the positions of confirmed trees are remembered."""
+        """Return a copy of the trees of a frame of the present map with the numbers that people see. Trees
+        without such a number get one, and the positions of confirmed trees are remembered."""
         numbers = trees.number
         if self._number_of is not None:
             known = self._number_of
@@ -49,12 +49,13 @@ class TreeNumbers:
         return replace(trees, number=numbers)
 
     def begin_map(self, trees: Trees, ended: Mapping[int, Place]) -> None:
-        """Begin another map of the run. Its confirmed trees get numbers first, then the others, then those
-        that ended.
+        """Begin another map of the run, and give numbers to its trees: first to confirmed trees, then to
+        other trees, then to trees that ended.
 
         Args:
-            trees: Its trees at the scan that was numbered last in the map before.
-            ended: Last positions of its trees that ended before this scan, by their numbers in the new map.
+            trees: Trees of the new map at the scan whose trees `renumber` numbered last.
+            ended: Dict from the number in the new map of each tree that ended before this scan to its last
+                position (x, y) [m].
         """
         self._number_of = {}
         self._name(_places(trees, np.flatnonzero(trees.confirmed)))
@@ -62,20 +63,20 @@ class TreeNumbers:
         self._name(ended)
 
     def known(self, number: int) -> int | None:
-        """Return the number of a tree by its number in the present map, which is the same in the first map;
-        None for a tree of another map that was never numbered."""
+        """Return the number that people see of the tree with this number in the present map; None if the tree
+        was never numbered. In the first map it is `number` itself, which is not checked."""
         return number if self._number_of is None else self._number_of.get(number)
 
     def in_map(self, number: int) -> int | None:
-        """Return the number of a tree in the present map; None if the map has no such tree. In the first map
-        it is `number` itself, which is not checked."""
+        """Return the number in the present map of the tree whose number people see; None if the map has no
+        such tree. In the first map it is `number` itself, which is not checked."""
         if self._number_of is None:
             return number
         return next((in_map for in_map, known in self._number_of.items() if known == number), None)
 
     def stored(self, trees: Trees) -> tuple[Trees, NDArray[np.int64]]:
-        """Return a copy of the trees of an earlier frame of the present map with their numbers, and the rows
-        of `trees` that they come from. Trees that were never numbered are left out: they ended in a rerun,
+        """Return a copy of the trees of an earlier frame of the present map with the numbers that people see,
+        and their rows in `trees`, int64. Trees that were never numbered are left out: they ended in a rerun
         and were not confirmed."""
         known = [self.known(number) for number in trees.number.tolist()]
         rows = np.array([row for row, number in enumerate(known) if number is not None], np.int64)
@@ -83,11 +84,12 @@ class TreeNumbers:
         return replace(rows_of(trees, rows), number=numbers), rows
 
     def _name(self, places: Mapping[int, Place]) -> None:
-        """Give numbers to trees of the present map: those of the trees of the last frame that they are paired
-        with, then those of earlier trees, then new ones in the order of `places`.
+        """Give numbers to trees of the present map. A tree that is paired within SAME with a confirmed tree
+        of the last numbered frame gets its number; of the rest, a tree that is paired with an earlier
+        confirmed tree gets its number; the others get new numbers in the order of `places`.
 
         Args:
-            places: Positions of trees that have no number yet, by their numbers in the map.
+            places: Dict from the number in the map of each tree without a number to its position (x, y) [m].
         """
         number_of = {} if self._number_of is None else self._number_of
         left = list(places)
@@ -105,7 +107,7 @@ class TreeNumbers:
 
 
 def _places(trees: Trees, rows: NDArray[np.int64]) -> dict[int, Place]:
-    """Return the position [m] of each tree in some rows, by its number."""
+    """Return a dict from the number of each tree in these rows to its position (x, y) in the map [m]."""
     places = [(x, y) for x, y in trees.position[rows].tolist()]
     return dict(zip(trees.number[rows].tolist(), places, strict=True))
 

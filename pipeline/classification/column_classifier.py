@@ -40,10 +40,10 @@ class ColumnVotes:
     """Columns of length C.
 
     Attributes:
-        place: x, y in the frame of the map, shape (C, 2) [m].
-        votes: Shares of the votes, shape (C, classes); trees first.
-        otherwise: Verdict with too few votes for a tree, int32. Columns that might be a tree by a round
-            cluster are TOO_LOW where rays pass above the height of a head.
+        place: Positions x, y in the map, shape (C, 2) [m].
+        votes: Shares of the votes in the order of CLASSES (tree first), shape (C, 6).
+        otherwise: Verdict if the share of votes for tree is below `tree_share`, int32: the class with most
+            votes, OTHER in place of TREE, or TOO_LOW (see `column_votes`).
         forced: Verdict that does not depend on the votes, int32, UNFORCED for none: too few voxels, gone, or
             TOO_LOW where rays pass at breast height.
     """
@@ -59,11 +59,11 @@ class ColumnVotes:
         return self.place.nbytes + self.votes.nbytes + self.otherwise.nbytes + self.forced.nbytes
 
     def verdict(self, tree_share: float) -> Int32:
-        """Return the verdict of each column, int32, shape (C,): `forced` if there is one, else TREE with
-        enough votes, else `otherwise`.
+        """Return the verdict of each column, int32, shape (C,): `forced` unless that is UNFORCED, else TREE
+        if the share of votes for tree is at least `tree_share`, else `otherwise`.
 
         Args:
-            tree_share: Least share of the votes of a tree, inclusive.
+            tree_share: Minimum share of the votes of a tree, inclusive.
         """
         voted = np.where(self.votes[:, 0] >= tree_share, np.int32(Verdict.TREE), self.otherwise)
         verdict: Int32 = np.where(self.forced == UNFORCED, voted, self.forced).astype(np.int32)
@@ -71,9 +71,11 @@ class ColumnVotes:
 
 
 def column_votes(columns: Columns) -> ColumnVotes:
-    """Return everything that decides the verdicts of columns, as copies; without columns, empty arrays. Of
-    several forced verdicts, gone (MOVING) comes before too few voxels (TOO_FEW_POINTS), and this before
-    TOO_LOW."""
+    """Return the data that decide the verdicts of columns, as copies; empty arrays if there are no columns.
+    The forced verdict is MOVING if the column was absent in at least GONE_SCANS scans and more than the share
+    GONE, else TOO_FEW_POINTS (`too_few`), else TOO_LOW if rays pass at breast height (`is_transparent`).
+    `otherwise` is TOO_LOW where rays pass above a head and the votes for tree, weighted by AT_ROUND, reach
+    MIGHT."""
     c = columns
     if not len(c.share):
         nothing = np.zeros(0, np.int32)
@@ -91,15 +93,13 @@ def column_votes(columns: Columns) -> ColumnVotes:
 
 
 def is_transparent(columns: Columns, slices: slice) -> Bool:
-    """Return which columns let most rays pass in a band of heights, shape (C,).
+    """Return which columns stop less than the share STOPPED of the rays in a band of heights, shape (C,).
 
-    A trunk is opaque: of 5,106 views of simulated and labelled trunks with at least `RAYS` rays between 1.2
-    and 2.2 m, only one stopped less than `STOPPED` of the rays. Above parked motorcycles rays pass. Columns
-    with fewer than `RAYS` rays in the band are not transparent.
+    Columns with fewer than RAYS rays in the band are not transparent.
 
     Args:
         columns: Columns with the numbers of rays that ended at them and that passed them, by slice.
-        slices: The band.
+        slices: The band, as a slice of the axis of heights.
     """
     met, passed = (rays[:, slices].sum(axis=1) for rays in (columns.met, columns.passed))
     transparent: Bool = (met + passed >= RAYS) & (met < STOPPED * (met + passed))
@@ -107,8 +107,8 @@ def is_transparent(columns: Columns, slices: slice) -> Bool:
 
 
 def too_few(figures: Float) -> Bool:
-    """Return which columns have so few voxels up to 3 m, less than LEAST_VOXELS, that they may have been
-    found by chance, shape (C,). `figures` are their features, shape (C, COUNT)."""
+    """Return which columns have fewer than LEAST_VOXELS voxels up to 3 m, shape (C,). `figures` are their
+    features, shape (C, COUNT)."""
     few: Bool = figures[:, VOXELS] < LEAST_VOXELS
     return few
 
@@ -119,7 +119,7 @@ LOW, HIGH = 0.6, 1.6  # m above the ground; voxels in this band decide when a co
 def corrected_columns(columns: Columns, memory: VoxelMap, correction: PathCorrection) -> Columns:
     """Return the columns after a correction of the path: position and lean move with the scan that last saw
     the horizontally nearest voxel between LOW and HIGH, and tiles are updated. All other attributes are
-    shared. Without columns or such voxels, the columns are returned as they are.
+    shared. If there are no columns or no such voxels, the argument is returned.
 
     Args:
         columns: The columns; not changed.
@@ -149,7 +149,8 @@ _LOOKED, _RAYS = NAMES.index("looked at up to"), NAMES.index("rays up to")
 
 def seen_higher(columns: Columns) -> Int:
     """Return at most MOST_STALE tiles, int64, shape (T, 2), with columns whose visible height has increased
-    by more than HIGHER since they were classified, largest increase first; none without columns.
+    by more than HIGHER since they were classified, largest increase first; shape (0, 2) if there are no
+    columns.
 
     A person next to the robot at the start is seen from two metres, where no ring reaches above the head.
     Later views from a distance add few returns, so that the tile does not count as grown.
@@ -169,7 +170,7 @@ def _gains(viewed: Float, met: Int32, passed: Int32, figures: Float) -> Float:
     [m]: the larger of those by views and by rays. It is negative if less is visible now.
 
     Args:
-        viewed: Greatest height that a scan observed, shape (K,) [m].
+        viewed: Maximum height that a scan observed, shape (K,) [m].
         met, passed: Rays by slice of height, shape (K, SLICES).
         figures: Features at the classification, shape (K, COUNT).
     """
@@ -190,7 +191,8 @@ FOLD = 25  # scans that a state stores one by one, before they are folded into i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnClassifierState:
-    """State between two scans: packed voxels, the scans since, and the columns.
+    """State between two scans: packed voxels, the scans since as tuples (points, scan number, maximum number
+    of voxels), and the columns.
 
     It shares its arrays with the classifier, so that a snapshot copies nothing.
     """
@@ -214,8 +216,8 @@ class ColumnClassifier:
 
     Args:
         parameters: Parameters of this stage.
-        all_around: Initial value of the attribute.
-        forests: Finds the random forest by its name.
+        all_around: Initial value of the attribute `all_around`.
+        forests: Function of the name of a random forest and `all_around` that returns the forest.
 
     Raises:
         StemmapError: There is no such forest.
@@ -234,8 +236,8 @@ class ColumnClassifier:
 
     @property
     def all_around(self) -> bool:
-        """Whether the forest for sensors that see all around votes, see `is_seen_all_around`. After a change,
-        the next scan classifies all columns again."""
+        """Whether the random forest for sensors that see all around is used, see `is_seen_all_around`. After
+        a change, the next scan classifies all columns again."""
         return self._all_around
 
     @all_around.setter
@@ -271,8 +273,9 @@ class ColumnClassifier:
 
         Args:
             points: Points in the level sensor frame, float32, shape (N, 3) [m].
-            height: Their heights above the ground, shape (N,) [m]; points of unknown height (NaN), not above
-                0, from SLICES * SLICE on, or `range_max` or farther from the base are ignored.
+            height: Heights of the points above the ground, shape (N,) [m]. Points are ignored if the height
+                is NaN, at most 0 or at least SLICES * SLICE, or if they are `range_max` or farther from the
+                base.
             scan: Number of the scan, not negative, ascending.
             view: Pose and visibility of the scan.
         """
@@ -305,8 +308,8 @@ class ColumnClassifier:
         self._vote_again = True  # another forest may have voted at that time
 
     def correct(self, correction: PathCorrection) -> None:
-        """Move voxels and columns with a corrected path, and settle. All tiles become due; verdicts change at
-        the next scan."""
+        """Move voxels and columns with a corrected path, and call `settle`. All tiles become due; verdicts
+        change at the next scan."""
         self.columns = corrected_columns(self.columns, self.memory, correction)
         self._memory = corrected_voxels(self.memory, correction)
         self.settle()
@@ -386,7 +389,7 @@ def _rows(axis: Float, tile: Int) -> Columns:
 
     Args:
         axis: Axes, shape (K, 5): x, y at 1.3 m [m], shift per metre of height, strength; not copied.
-        tile: Tile of each, int64, shape (K, 2); not copied.
+        tile: Tile of each column, int64, shape (K, 2); not copied.
     """
     n = len(axis)
     zero = np.zeros(n)
@@ -422,9 +425,9 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
     NaN are left out.
 
     Args:
-        points: Level sensor frame, shape (N, 3) [m].
-        height: Their heights above the ground, shape (N,) [m].
-        pose: x, y [m], yaw [rad] of the base.
+        points: Points in the level sensor frame, shape (N, 3) [m].
+        height: Heights of the points above the ground, shape (N,) [m].
+        pose: Pose x, y [m], yaw [rad] of the base in the map, shape (3,).
         offset: Position of the sensor in the base frame, shape (3,) [m].
         range_max: Maximum horizontal distance from the base, exclusive [m].
     """
@@ -443,7 +446,7 @@ def _to_map(points: Float32, height: Float32, pose: Float, offset: Float, range_
 @compiled
 def _nearest_before(old: Float, axis: Float, first: int) -> Int:
     """Return for each column from row `first` of `axis` onwards the row of the nearest column of `old` within
-    SAME (exclusive, at 1.3 m), -1 without; int64, shape (K - first,).
+    SAME (exclusive, at 1.3 m), -1 for none; int64, shape (K - first,).
 
     Args:
         old: Axes of earlier columns, shape (M, 5).

@@ -30,13 +30,13 @@ def find_columns(mean: Float32, returns: Int32, low: Float, side: float) -> Floa
     """Return the candidates for columns with their foot in or near a square tile.
 
     The search uses all heights up to 3 m, and then the low ones only, where a trunk is visible below a crown
-    that dominates the count over all heights. A column that both find appears twice.
+    that dominates the count over all heights. A column that both searches find appears twice.
 
     Args:
-        mean: Voxels in and around the tile, x, y, height [m], shape (N, 3).
+        mean: Voxels in and around the tile: x, y in the map and height above the ground, shape (N, 3) [m].
         returns: Number of returns of each voxel, shape (N,).
-        low: Corner of the tile, shape (2,) [m].
-        side: Its side [m].
+        low: Corner of the tile with the minimum x and y, shape (2,) [m].
+        side: Side of the tile [m].
 
     Returns:
         Axis (x, y at 1.3 m above the ground at the middle of a cell of SIDE, and shift per metre of height,
@@ -82,7 +82,7 @@ def _is_peak(strength: Float, i: int, j: int, reach: int) -> bool:
 @compiled
 def _strength(mean: Float32, returns: Int32, low: Float, cells: int, high: int) -> Float:
     """Return for each cell the sum over the slices of log(1 + n), where n is the number of returns in the
-    cell and its eight neighbours; 0 with returns in fewer than `LEAST` slices. Shape (cells, cells).
+    cell and its eight neighbours; 0 if fewer than LEAST slices have returns. Shape (cells, cells).
 
     Args:
         mean, returns, low: See `find_columns`.
@@ -123,7 +123,7 @@ def in_buckets(mean: Float32, low: Float, side: float) -> tuple[Int, Int]:
     Args:
         mean: Voxels, x, y first, shape (N, 3) [m].
         low: Corner of the tile, shape (2,) [m].
-        side: Its side [m].
+        side: Side of the tile [m].
 
     Returns:
         Order of the voxels by bucket, shape (N,), and the first row of each bucket in this order, shape
@@ -203,9 +203,9 @@ def _is_known(axis: Float, found: Float, kept: int) -> bool:
 
 @compiled
 def _fit_line(axis: Float, mean: Float32, returns: Int32, runs: Int, reach: float) -> None:
-    """Refine an axis, in place; without returns at the axis it remains. The weight of a slice depends mainly
-    on the share of its returns that is at the axis, less on their number, so that foliage does not shift the
-    axis. A weak prior keeps it upright, and the shift per metre is limited to 0.5.
+    """Refine an axis, in place; it is unchanged if there are no returns at the axis. The weight of a slice
+    depends mainly on the share of its returns that is at the axis, less on their number, so that foliage does
+    not shift the axis. A weak prior keeps it upright, and the shift per metre is limited to 0.5.
 
     Args:
         axis: See `find_columns`; position and shift per metre are changed.
@@ -294,8 +294,8 @@ def _count(dx: float, dy: float, n: float, row: Float, octant: Bool) -> None:
     """Add one voxel to the sums of a slice, see `profile`; a voxel beyond RING_FAR changes nothing.
 
     Args:
-        dx, dy: Its position from the axis [m].
-        n: Number of its returns.
+        dx, dy: Position of the voxel relative to the axis [m].
+        n: Number of returns in the voxel.
         row: Profile of the slice, shape (PROFILE,), changed in place.
         octant: Filled octants of the ring, shape (OCTANTS,), changed in place.
     """

@@ -79,9 +79,9 @@ def features(
     Args:
         axis: Axes, shape (K, 5), see `find_columns`.
         profiles: Profiles, shape (K, SLICES, PROFILE).
-        viewed: Largest height above the ground that a scan saw there, shape (K,) [m].
+        viewed: Maximum height above the ground that a scan observed at the column, shape (K,) [m].
         present, absent: Number of scans with free view in which the column was present or absent, shape (K,).
-        met, passed: Number of rays that ended at it or passed its axis, shape (K, SLICES).
+        met, passed: Number of rays that ended at the column and that passed its axis, shape (K, SLICES).
         figures: Filled with the features.
     """
     for c in range(axis.shape[0]):
@@ -94,10 +94,10 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
     """Write the features of one column that do not come from rays into `out`; see NAMES.
 
     Args:
-        axis: Its axis, shape (5,).
-        rows: Its profile, shape (SLICES, PROFILE).
-        viewed: Greatest height that a scan observed there [m].
-        present, absent: Number of scans in which it was there or not.
+        axis: Axis of the column, shape (5,).
+        rows: Profile of the column, shape (SLICES, PROFILE).
+        viewed: Maximum height that a scan observed at the column [m].
+        present, absent: Number of scans in which the column was present and absent.
         out: Features in the order of NAMES, changed in place; those from RAYS onwards are not written.
     """
     for b in range(BANDS.shape[0]):
@@ -145,9 +145,9 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
 @compiled
 def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
     """Write into `out` the features of rays: for each band the share of rays that ended at the column, UNSEEN
-    without rays; the free height above the clean slices up to the next return, and above the highest return;
-    the height up to which there are rays; and the gap between the clean slices and the next return, as far as
-    there are rays [m].
+    if there are no rays; the free height above the clean slices up to the next return, and above the highest
+    return; the height up to which there are rays; and the gap between the clean slices and the next return,
+    as far as there are rays [m].
 
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE); a slice has a return if its first value, the
@@ -190,7 +190,7 @@ def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE).
         first, end: First slice, and one past the last slice.
-        out: Receives both shares.
+        out: Filled with both shares.
     """
     inside, near, ring = 0.0, 0.0, 0.0
     for s in range(first, end):
@@ -204,8 +204,7 @@ def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
 @compiled
 def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
     """Return the mean standard deviations of the inside of slices across and along its long side [m], and the
-    relative variation of the width; the former are UNSEEN where no slice has two voxels. Above the clean
-    slices the plate of a sign is flat, foliage is not.
+    relative variation of the width; the standard deviations are UNSEEN if no slice has two voxels.
 
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE).
@@ -231,14 +230,14 @@ def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
 
 @compiled
 def _circle(rows: Float, last: int, out: Float) -> None:
-    """Write into `out` the radius of the circle through the returns of all clean slices, at most 1 [m], their
-    rms distance from it [m], and the ratio of distance and radius; UNSEEN with fewer than six returns or
-    where the fit fails (Kasa 1976: z + B x + C y + D = 0 by least squares).
+    """Write into `out` the radius of the circle through the returns of all clean slices, at most 1 [m], the
+    rms distance of the returns from the circle [m], and this distance divided by the radius; all UNSEEN if
+    there are fewer than six returns or the fit fails (Kasa 1976: z + B x + C y + D = 0 by least squares).
 
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE); slices 1 to `last` that are clean are used.
         last: Last slice.
-        out: Shape (3,).
+        out: Filled with the three values, shape (3,).
     """
     m = np.zeros(9)
     for s in range(1, min(last + 1, SLICES)):
@@ -275,7 +274,7 @@ def _band(rows: Float, first: int, end: int, out: Float) -> None:
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE).
         first, end: First slice, and one past the last slice.
-        out: Receives the shares.
+        out: Filled with the shares.
     """
     inside, around, filled, octants = 0.0, 0.0, 0.0, 0.0
     for s in range(first, end):
@@ -290,11 +289,12 @@ def _band(rows: Float, first: int, end: int, out: Float) -> None:
 
 @compiled
 def _stem(rows: Float) -> tuple[int, int, int, int, int]:
-    """Return slices: lowest with a return, first and last clean slice of the run (see `_run`), their number,
-    highest with a return. Slice 0 is not used; without returns lowest is SLICES and highest 0.
+    """Return the lowest slice with a return, the first and the last clean slice of the run (see `_run`), the
+    number of clean slices in the run, and the highest slice with a return. Slice 0 is not used. If there are
+    no returns, lowest is SLICES and highest 0.
 
-    Next to a thick neighbour, which returns more than a thin stem, no slice would be clean; then only the
-    returns nearer than the neighbour count.
+    If no slice is clean with the returns in the ring, the run is that with the share CLEAN_NEAR and without
+    the ring.
     """
     bottom, top = SLICES, 0
     for s in range(1, SLICES):
@@ -309,13 +309,14 @@ def _stem(rows: Float) -> tuple[int, int, int, int, int]:
 
 @compiled
 def _run(rows: Float, part: float, ring: float) -> tuple[int, int, int]:
-    """Return first and last clean slice of the lowest run, and their number; SLICES, 0 and 0 without one.
+    """Return the first and the last clean slice of the lowest run, and the number of clean slices in it;
+    SLICES, 0 and 0 if there is none.
 
     A slice is clean if enough of its returns are at the axis. The run ends at a gap of more than GAP slices.
 
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE); slice 0 is not used.
-        part: Least share of the returns that is at the axis.
+        part: Minimum share of the returns that is at the axis.
         ring: Weight of the returns in the ring.
     """
     first, last, clean = SLICES, 0, 0

@@ -43,7 +43,8 @@ class DecisionTrees(NamedTuple):
     Attributes:
         root: First node of each tree, int32, shape (T,).
         feature: Index of the feature, -1 at a leaf, int32.
-        threshold: Values up to it continue at `left`, others at `right` (int32, nodes).
+        threshold: Threshold of the feature. Values up to it continue at the node `left`, others and NaN at
+            the node `right` (both int32).
         share: Class shares of the training examples of a leaf, shape (N, classes).
     """
 
@@ -60,8 +61,8 @@ class Forest:
     """A random forest.
 
     Attributes:
-        trees: Its trees.
-        free_end: Forest that decides whether a tree with a free upper end is a pole; None without.
+        trees: Decision trees of the forest.
+        free_end: Forest that decides whether a tree with a free upper end is a pole; None if there is none.
     """
 
     trees: DecisionTrees
@@ -73,19 +74,18 @@ ForestOf = Callable[[str, bool], Forest]
 
 
 def is_seen_all_around(rings: int, xy: Float) -> bool:
-    """Return whether the forest for sensors that see all around classifies the columns of a run: the sensor
-    does, or it has moved, so that it has seen the columns from several positions. The other forest is for a
-    sensor that stands still and looks one way: it sees one side of each trunk and nothing behind it.
+    """Return whether the random forest for sensors that see all around classifies the columns of a run: the
+    sensor has rings, or the extent of the positions along x or y exceeds MOVED.
 
     Args:
         rings: Rings of the sensor; 0 for a sensor that looks one way.
-        xy: Positions of the robot so far, shape (N, 2) [m].
+        xy: Positions of the robot in the map so far, shape (N, 2) [m].
     """
     return rings > 0 or (len(xy) > 0 and bool((np.ptp(xy, axis=0) > MOVED).any()))
 
 
 def package_alone(name: str, all_around: bool) -> Forest:
-    """Return the forest of the package for runs with `is_seen_all_around`, or for the others.
+    """Return the random forest of the package for runs with `is_seen_all_around`, or for the others.
 
     Raises:
         StemmapError: The name is not PACKAGE, or the file cannot be read.
@@ -97,8 +97,8 @@ def package_alone(name: str, all_around: bool) -> Forest:
 
 @cache
 def standard_forest(all_around: bool) -> Forest:
-    """Return the forest of the package for runs with `is_seen_all_around`, or for the others: their views of
-    a trunk differ too much for a common forest. The file is read once per process.
+    """Return the random forest of the package for runs with `is_seen_all_around`, or for the others. The file
+    is read once per process.
 
     Raises:
         StemmapError: The file is missing or damaged.
@@ -107,21 +107,22 @@ def standard_forest(all_around: bool) -> Forest:
 
 
 def read_forest(path: Path, kind: str) -> Forest:
-    """Return a forest of a JSON file for a kind of sensor, ALL_AROUND or ONE_WAY.
+    """Return a random forest of a JSON file for a kind of sensor, ALL_AROUND or ONE_WAY.
 
     Raises:
-        StemmapError: The file is missing, too large (4 MB), not such JSON, without this kind, trained for
-            other classes, or names unknown features.
+        StemmapError: The file is missing, larger than 4 MB, not the JSON of a forest, without this kind,
+            trained for other classes, or names unknown features.
     """
     return read_forests(path, kind)[1][0]
 
 
 def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]:
-    """Return the JSON of a file, and the forests for some kinds of sensors in their order.
+    """Return the JSON of a file as a dict, and a list of the random forests for the kinds of sensors `kinds`,
+    in their order.
 
     Raises:
-        StemmapError: The file is missing, too large (4 MB), not such JSON, without one of the kinds, trained
-            for other classes, or names unknown features.
+        StemmapError: The file is missing, larger than 4 MB, not the JSON of a forest, without one of the
+            kinds, trained for other classes, or names unknown features.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -135,7 +136,7 @@ def read_forests(path: Path, *kinds: str) -> tuple[dict[str, Any], list[Forest]]
 
 
 def _damaged(path: Path, why: str) -> StemmapError:
-    """Return the error for a file of decision trees that cannot be read; `why` is the reason in short."""
+    """Return the error for a file of decision trees that cannot be read; `why` is the reason."""
     return StemmapError(
         f"the decision trees cannot be read: {why}",
         where=str(path),
@@ -148,11 +149,13 @@ def forest_of(data: dict[str, Any], kind: str) -> Forest:
     earlier files do not have.
 
     Args:
-        data: JSON with the names of the classes and, by kind, a list of trees of nested nodes.
+        data: JSON object: "classes" is the list of the labels of CLASSES, and each kind is a list of trees of
+            nested nodes (see `_lay_out`).
         kind: ALL_AROUND, ONE_WAY or FREE_END.
 
     Raises:
-        ValueError, TypeError, KeyError, RecursionError: The JSON is not that of a forest.
+        ValueError, TypeError, KeyError, RecursionError: The JSON is not that of a forest, or has other
+            classes, no tree, or more than 100,000 nodes.
     """
     if data["classes"] != [verdict.label for verdict in CLASSES]:
         raise ValueError("it was trained for other classes")
@@ -200,11 +203,11 @@ def _lay_out(node: dict[str, Any], rows: list[_Row]) -> int:
 
 
 def vote(figures: Float, forest: Forest) -> Float:
-    """Return the class shares in the order of CLASSES, mean over the trees, shape (K, classes); `figures` are
-    the features in the order of NAMES, shape (K, COUNT).
+    """Return the shares of the votes in the order of CLASSES, mean over the decision trees, shape (K, 6).
+    `figures` are the features of the columns in the order of NAMES, shape (K, COUNT).
 
-    For columns with a free upper end, votes for a tree count for a pole where `free_end` decides so, because
-    the training examples of the main forest contain too few poles (docs/trunks.md).
+    For columns with a free upper end whose share `tree_in_free_air` is below TREE_IN_FREE_AIR, the votes for
+    tree are added to those for pole.
     """
     votes = _vote(figures, forest.trees)
     poles = np.flatnonzero(tree_in_free_air(figures, forest) < TREE_IN_FREE_AIR)
@@ -256,7 +259,7 @@ def feature_effects(figures: Float, forest: Forest, kind: Verdict) -> Float:
     branches of each split on it count by half. The forest `free_end` is not considered.
 
     Args:
-        figures: Features of one column, shape (F,).
+        figures: Features of one column in the order of NAMES, shape (F,).
         forest: The forest.
         kind: One of CLASSES (ValueError for another verdict).
 
@@ -285,7 +288,7 @@ def _share(figures: Float, unknown: int, root: int | np.int32, trees: DecisionTr
 
     Args:
         figures: Features of a column, shape (F,).
-        unknown: Number of the feature that counts as unknown; negative for none.
+        unknown: Index of the feature that counts as unknown; negative for none.
         root: Row of the root of the tree.
         trees: The trees.
         kind: Index of the class in CLASSES.

@@ -22,7 +22,7 @@ class ScanView:
     """Pose and visibility of a scan.
 
     Attributes:
-        T_map_base: Pose of the base.
+        T_map_base: Pose of the base in the map.
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
         clear_range: Free range by direction in the base frame, shape (BINS,) [m].
         steepest: Tangent of the steepest elevation of a return by direction, shape (BINS,).
@@ -47,7 +47,7 @@ NEAR = 0.6  # m; a return this near to a column belongs to it
 @compiled
 def steepest_by_direction(points: Float32, offset: Float, all_around: bool) -> Float:
     """Return the tangent of the steepest elevation of a return in each direction of the base frame, shape
-    (BINS,); -1 without a return beyond 1 m from the sensor, and at least -1.
+    (BINS,); -1 if there is no return beyond 1 m from the sensor, and at least -1.
 
     Args:
         points: Points in the level sensor frame, shape (N, 3) [m], finite.
@@ -89,8 +89,9 @@ def update_visibility(
     Args:
         axis: Axes of the columns, shape (K, 5).
         viewed, present, absent: Statistics of the columns, shape (K,), changed in place.
-        pose: x, y [m], yaw [rad] of the base.
-        clear_range, steepest: By direction in the base frame, shape (BINS,).
+        pose: Pose x, y [m], yaw [rad] of the base in the map, shape (3,).
+        clear_range, steepest: Free range [m] and tangent of the steepest elevation by direction in the base
+            frame, shape (BINS,); see `ScanView`.
         offset: Position of the sensor in the base frame, shape (3,) [m].
         terrain: Terrain of this scan, as `Terrain.height`.
         range_max: Columns farther from the base are skipped [m].
@@ -115,8 +116,8 @@ def update_visibility(
 @compiled
 def depth_image(points: Float32) -> UInt16:
     """Return the horizontal distance of the nearest return by direction from the sensor and elevation [cm], 0
-    without a return, at most 65535, uint16, shape (BINS, ELEVATIONS). Returns within 0.3 m of the sensor, or
-    with an elevation outside of the image, are ignored.
+    if there is no return, at most 65535, uint16, shape (BINS, ELEVATIONS). Returns within 0.3 m of the
+    sensor, or with an elevation outside of the image, are ignored.
 
     Args:
         points: Points in the level sensor frame, shape (N, 3) [m], finite.

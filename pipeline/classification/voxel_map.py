@@ -84,21 +84,24 @@ class _Tables(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class VoxelMap:
-    """Voxels as columns, of which the first `used` rows count, and likewise tiles.
+    """Voxels as columns, of which the first `used` rows are valid, and tiles as columns, of which the first
+    `tiles` rows are valid.
 
     Attributes:
-        key: Cell, int64.
-        slot: Hash table of row + 1, 0 where free, int32.
-        mean: x, y in the frame of the map and height above the ground [m], float32, shape (rows, 3).
-        returns, scans, latest: Number of returns, number of scans with returns, and the last of these, int32.
+        key: Key of the cell, int64, see `keys_of`.
+        slot: Hash table of row + 1, 0 for a free position, int32.
+        mean: Mean x, y in the map and mean height above the ground of the returns, float32, shape (rows, 3)
+            [m].
+        returns, scans, latest: Number of returns, number of scans with returns, and number of the last scan
+            with returns, int32.
         following: Next voxel of the same tile, -1 for none, int32.
         home: Row of the tile, int32.
-        tile_key, tile_slot: As for voxels.
+        tile_key, tile_slot: Keys (`tiles_of`) and hash table of the tiles, as for voxels.
         tile_first: First voxel of each tile, int32.
         tile_returns, tile_judged: Number of returns, and that number when the tile was last classified,
             int64.
-        used, tiles: Voxels and tiles in use.
-        added: Number of scans.
+        used, tiles: Number of voxels and tiles in use.
+        added: Number of scans that were added.
     """
 
     key: Int
@@ -161,9 +164,9 @@ class VoxelMap:
         map.
 
         Args:
-            points: x, y in the frame of the map, height above the ground [m], float32, shape (N, 3).
+            points: Points x, y in the map and height above the ground, float32, shape (N, 3) [m].
             scan: Number of the scan, not negative.
-            most: Largest number of voxels, a power of two.
+            most: Maximum number of voxels, a power of two.
         """
         begin = 0
         self.added += 1
@@ -174,10 +177,10 @@ class VoxelMap:
             self._make_room(most)
 
     def due_tiles(self, grown: float) -> Int:
-        """Return the tiles, int64, shape (T, 2), whose returns have grown by more than the factor `grown`
-        since they were last classified, and mark them as classified. Tiles that were never classified are
-        due. After FIRST_SCANS scans at most the `MOST_TILES` with the largest growth, the older ones of equal
-        tiles, are returned, which bounds the time of a scan; the others remain due."""
+        """Return the indices along x and y of the tiles, int64, shape (T, 2), whose returns have grown by
+        more than the factor `grown` since they were last classified, and mark them as classified. Tiles that
+        were never classified are due. After FIRST_SCANS scans, at most the MOST_TILES tiles with the largest
+        growth (of equal ones the older) are returned; the others remain due."""
         most = MOST_TILES if self.added > FIRST_SCANS else self.tiles
         return _select_due(self._tables(), self.tiles, grown, most)
 
@@ -204,7 +207,7 @@ class VoxelMap:
         are full, a second call is needed.
 
         Args:
-            most: Largest number of voxels, a power of two.
+            most: Maximum number of voxels, a power of two.
         """
         rows = np.arange(self.used)
         room, tile_room = len(self.key), len(self.tile_key)
@@ -260,7 +263,7 @@ def tiles_of(keys: Int) -> Int:
 
 @compiled
 def _first_place(key: int | np.int64, mask: int) -> int:
-    """Return the position in a hash table at which the search for a key begins; `mask` is the length of the
+    """Return the index in a hash table at which the search for a key begins; `mask` is the length of the
     table, a power of two, minus 1."""
     # The upper bits of the product are well mixed; 26 bits are enough for the largest table.
     return int(np.int64((np.uint64(key) * SPREAD) >> np.uint64(38)) & mask)
@@ -268,13 +271,13 @@ def _first_place(key: int | np.int64, mask: int) -> int:
 
 @compiled
 def _find(key: int | np.int64, keys: Int, slot: Int32) -> int:
-    """Return the position of a key in a hash table, or the free position for it.
+    """Return the index of a key in a hash table, or the free index for it.
 
     Args:
         key: The key.
         keys: Keys by row.
-        slot: Row + 1 in `keys` at each position, 0 for free; its length is a power of two, with at least one
-            free position.
+        slot: Hash table of row + 1 in `keys`, 0 for free; its length is a power of two, with at least one
+            free entry.
     """
     mask = slot.shape[0] - 1
     at = _first_place(key, mask)
@@ -306,7 +309,7 @@ def _tile_of(key: int | np.int64) -> int:
 @compiled
 def _link(row: int | np.int64, tables: _Tables, tiles: int) -> int:
     """Add the voxel `row` to the chain of its tile, in place, and the tile to the tables if it is new. Return
-    the number of tiles; `tiles` is the number before."""
+    the number of tiles; `tiles` is the number of tiles before."""
     tile = _tile_of(tables.key[row])
     at = _find(tile, tables.tile_key, tables.tile_slot)
     if tables.tile_slot[at] == 0:

@@ -60,10 +60,11 @@ class Parameters(BaseModel):
     evaluation: stages.Evaluation = Field(default_factory=stages.Evaluation)
 
     def replace(self, changes: Mapping[str, Any]) -> Parameters:
-        """Return a copy with values changed by their dotted names, validated as a whole.
+        """Return a copy in which the values with the dotted names in `changes` are replaced, validated as a
+        whole.
 
         Names and choices of earlier versions are accepted with a RenamedParameterWarning; removed parameters
-        are ignored with one.
+        are ignored with such a warning.
 
         Raises:
             ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
@@ -81,7 +82,8 @@ class Parameters(BaseModel):
         return validated(tree)
 
     def flat(self) -> dict[str, Value]:
-        """Return every value by its dotted name, in the order of the stages."""
+        """Return a dict from the dotted names of all parameters, in the order of the stages, to their
+        values."""
         return {
             f"{stage}.{name}": value
             for stage, values in self.model_dump().items()
@@ -89,15 +91,15 @@ class Parameters(BaseModel):
         }
 
     def changes_from(self, other: Parameters) -> dict[str, Value]:
-        """Return the values of this set, by dotted name, that differ from those of another set; empty for
-        equal sets."""
+        """Return a dict from dotted names to the values of this set that differ from those of `other`; empty
+        for equal sets."""
         others = other.flat()
         return {name: value for name, value in self.flat().items() if others[name] != value}
 
 
 def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values by dotted name, with names and choices of earlier versions replaced by the current ones.
-    Removed parameters are left out; unknown names are kept.
+    """Return a dict from dotted names to values, with names and choices of earlier versions replaced by the
+    current ones. Removed parameters are left out; unknown names are kept.
 
     A RenamedParameterWarning is issued for each renamed parameter, each removed parameter and each replaced
     choice. A value under the current name takes precedence over one under an earlier name.
@@ -135,7 +137,7 @@ def _warn(message: str) -> None:
 def validated(tree: Mapping[str, Any]) -> Parameters:
     """Return parameters from nested mappings (stage, parameter). Stages and parameters that are missing have
     their defaults, those of the preset `forest`. Names and choices of earlier versions are accepted with a
-    RenamedParameterWarning; removed parameters are ignored with one.
+    RenamedParameterWarning; removed parameters are ignored with such a warning.
 
     Raises:
         ParameterError: A name is unknown, a value has the wrong type or is out of bounds, or two values
@@ -148,9 +150,9 @@ def validated(tree: Mapping[str, Any]) -> Parameters:
 
 
 def _current_tree(tree: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings (stage, parameter) with the names of earlier versions replaced by the current
-    names and without removed parameters, each with a RenamedParameterWarning; a stage whose value is not a
-    mapping is returned as it is, to be refused by the validation."""
+    """Return a dict from stages to dicts from parameters to values with the names of earlier versions
+    replaced by the current names and without removed parameters, each with a RenamedParameterWarning; a stage
+    whose value is not a mapping is returned as it is, to be refused by the validation."""
     nested = {stage: values for stage, values in tree.items() if isinstance(values, Mapping)}
     result = {stage: values for stage, values in tree.items() if stage not in nested}
     flat = {f"{stage}.{name}": value for stage, values in nested.items() for name, value in values.items()}
@@ -175,8 +177,8 @@ def _first_message(error: ValidationError) -> str:
 
 
 def _nearest(name: str) -> str:
-    """Return the text "; the nearest is ..." with the most similar parameter name; empty without a similar
-    one."""
+    """Return the text "; the nearest is ..." with the most similar parameter name; "" if no name is
+    similar."""
     close = difflib.get_close_matches(name, [spec.name for spec in field_specs()], n=1)
     return f"; the nearest is {close[0]!r}" if close else ""
 
@@ -189,14 +191,14 @@ class FieldSpec:
         name: Dotted name, for example "clustering.eps".
         stage: Title of the stage.
         title: Short label.
-        unit: Unit symbol, empty if dimensionless.
+        unit: Unit symbol; "" if dimensionless.
         doc: One sentence of explanation.
         kind: Type of the value.
-        minimum, maximum, step: Bounds and slider increment of a number, else None.
-        shown: Range of the slider of a number, else None.
+        minimum, maximum, step: Bounds and slider increment of a number; None for other kinds.
+        shown: Range of the slider of a number; None for other kinds.
         log: Whether the slider is logarithmic: its range is positive and spans a factor of 8 or more.
         main: Whether the parameter has a slider next to the 3D scene.
-        choices: Valid words of a choice, else empty.
+        choices: Valid values of a choice; empty for other kinds.
         default: Value in the preset `forest`.
     """
 

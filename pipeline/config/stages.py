@@ -56,8 +56,8 @@ def number(
         unit: Unit symbol; empty if dimensionless.
         low, high: Bounds, inclusive.
         step: Increment of the slider by a key.
-        shown: Range of the slider; not compared with the bounds. By default, from a tenth to ten times of the
-            default within the bounds if the default is positive and `low` not negative, else the bounds.
+        shown: Range of the slider; not compared with the bounds. None: from a tenth to ten times the default,
+            clipped to the bounds, if the default is positive and `low` is not negative, else the bounds.
         main: Whether the parameter has a slider next to the 3D scene.
     """
     if shown is None:
@@ -68,7 +68,7 @@ def number(
 
 def count(default: int, title: str, unit: str, low: int, high: int, *, main: bool = False) -> Any:  # noqa: ANN401
     """Return the declaration of an integer parameter, as `number` with the step 1 and the default range of
-    the slider, whose ends need not be whole numbers.
+    the slider, whose ends need not be integers.
 
     Args:
         default: Value in the preset `forest`.
@@ -85,19 +85,19 @@ def name(default: str, title: str, pattern: str) -> Any:  # noqa: ANN401
 
     Args:
         default: Value in the preset `forest`.
-        title: Label on the page.
+        title: Label on the dashboard.
         pattern: Regular expression of the valid names.
     """
     return Field(default=default, title=title, pattern=pattern)
 
 
 def choice(default: str | bool, title: str) -> Any:  # noqa: ANN401
-    """Return the declaration of a parameter of type bool or Literal, which lists the valid words; the type is
-    that of the annotation.
+    """Return the declaration of a parameter of type bool or Literal. The type and the valid values are those
+    of the annotation.
 
     Args:
         default: Value in the preset `forest`.
-        title: Label on the page.
+        title: Label on the dashboard.
     """
     return Field(default=default, title=title)
 

@@ -39,15 +39,15 @@ def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
 
 def value_text(value: Value) -> str:
     """Return the value of a parameter in the syntax of `--set`, for example "0.2", "true" or "dbscan". Floats
-    have six significant digits."""
+    have up to six significant digits."""
     if isinstance(value, bool):
         return str(value).lower()
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def parsed(spec: FieldSpec, text: str) -> Value:
-    """Return the value of a parameter from its text; bounds and choices are checked later, with the whole
-    set. The text of a bool other than "true" and "false" is returned as it is, so that this check refuses it.
+    """Return the value of a parameter from its text; bounds and choices are not checked. The text of a bool
+    other than "true" and "false" is returned unchanged.
 
     Raises:
         ParameterError: The text of a numeric parameter is not a number.
@@ -105,7 +105,7 @@ def from_toml(text: str, base: Parameters, where: str) -> Parameters:
 
 
 def toml_table(text: str, where: str) -> dict[str, Any]:
-    """Return the contents of a TOML text from outside, without a check of names and values.
+    """Return the top-level table of a TOML text as a dict, without a check of names and values.
 
     Args:
         text: Content of the file.
@@ -129,7 +129,7 @@ def markdown_table(presets: dict[str, Parameters]) -> str:
     one row per parameter, with a final line break.
 
     Args:
-        presets: Parameters by the name of the preset; each gives a column.
+        presets: Dict from names of presets to their parameters; each gives a column.
     """
     values = {name: parameters.flat() for name, parameters in presets.items()}
     head = ["parameter", "unit", "bounds", *(f"`{name}`" for name in presets), "meaning"]

@@ -70,7 +70,7 @@ def spread_about(points: Float, bounds: Int, centre: Float) -> Float:
     Args:
         points: Points in the order of the clusters, shape (N, 2 or 3) [m].
         bounds: First row of each cluster, and N, shape (K + 1,); no cluster is empty.
-        centre: x, y first, shape (K, 2 or 3) [m].
+        centre: Centres of the clusters, x, y first, shape (K, 2 or 3) [m].
     """
     clusters = bounds.shape[0] - 1
     spread = np.zeros(clusters)
@@ -94,7 +94,7 @@ LiftOf = Callable[[Float], Float]
 
 
 def no_lift(centroid: Float) -> Float:
-    """Return 0 for each centroid, shape (K,): the centre at the mean height of the points."""
+    """Return the height 0 above each centroid, shape (K,) [m]."""
     return np.zeros(len(centroid))
 
 
@@ -109,8 +109,8 @@ def describe_stems(
     """Describe each cluster, after trunks are separated from vegetation that is clustered with them.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame.
-        labels: Cluster of each point; no cluster is empty.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
+        labels: Cluster of each point, -1 for none; no cluster is empty.
         sensor: Range sigma and azimuth step of the LiDAR.
         parameters: Choice of centre, and number of slices of `split_trunks`.
         radius_bounds: Smallest and largest radius of a trunk [m].
@@ -156,16 +156,16 @@ def describe(
     """Return the shape of each cluster; all verdicts are OTHER, `cut` is False, and `hidden` is the array of
     the labels.
 
-    With the centre "centroid", radius and its sigma are NaN and the arc is 0; so are those of clusters with
-    fewer than five points, whose radial deviation by the circle fit is 0.
+    With the centre "centroid", radius and its sigma are NaN and the arc is 0; the same holds for clusters
+    with fewer than five points, whose radial deviation by the circle fit is 0.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
         labels: Cluster of each point, -1 for none; no cluster is empty.
         sensor: Range sigma and azimuth step of the LiDAR scale the fit.
         parameters: `centre`: circle fit or centroid.
-        lift_of: Returns the height above each centroid at which the centre of the circle is wanted, such as
-            breast height; the axis leans.
+        lift_of: Function of the centroids, shape (K, 3) [m], that returns the height above each centroid at
+            which the centre of the circle is computed, shape (K,) [m]; not used with the centre "centroid".
     """
     order, bounds = group_rows(labels.label, labels.clusters)
     members = points[order].astype(np.float64)
@@ -202,7 +202,7 @@ def eccentricity(eigenvalues: Float) -> Float:
     paper calls this ratio eccentricity; the geometric eccentricity is sqrt(1 - lambda2 / lambda1).
 
     Args:
-        eigenvalues: Descending, shape (K, 2 or 3) [m^2].
+        eigenvalues: Descending eigenvalues, shape (K, 2 or 3) [m^2].
     """
     ratio = np.ones(eigenvalues.shape[0])
     for k in range(eigenvalues.shape[0]):
@@ -224,10 +224,10 @@ def _centroids_as_stems(members: Float, bounds: Int, centroid: Float, range_sigm
         range_sigma: Standard deviation of a range [m]; it enters the covariance across the ray only.
 
     Returns:
-        Shape (K, COLUMNS), columns as in `fit_stems`. The standard deviation of the centre along the ray is
-        CENTROID_BIAS, since the centroid lies in front of the axis. Radius, its sigma and the lean are NaN,
-        and the arc is 0. The radial deviation is the standard deviation of the horizontal distances of the
-        points to the centroid [m].
+        Stems, shape (K, COLUMNS), with the columns of `fit_stems`. The standard deviation of the centre along
+        the ray is CENTROID_BIAS, since the centroid lies in front of the axis. Radius, its sigma and the lean
+        are NaN, and the arc is 0. The radial deviation is the standard deviation of the horizontal distances
+        of the points to the centroid [m].
     """
     stem = np.full((len(centroid), COLUMNS), np.nan)
     stem[:, 0:2] = centroid[:, :2]

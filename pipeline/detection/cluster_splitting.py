@@ -39,9 +39,9 @@ class Runs(NamedTuple):
 
     Attributes:
         level: Index of the height slice.
-        x, y, radius: Circle of the run [m].
-        height: Mean height of its returns [m].
-        returns: Number of its returns.
+        x, y, radius: Centre in the sensor frame and radius of the circle of the run [m].
+        height: Mean z of the returns of the run [m].
+        returns: Number of returns of the run.
         agrees: Whether the run belongs to the current trunk hypothesis.
         best: Whether the run belongs to the best trunk hypothesis.
     """
@@ -72,7 +72,7 @@ def split_trunks(
     not hidden at an edge.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
         labels: Cluster of each point; not changed.
         clusters: Shape of each cluster.
         sensor: Range sigma and azimuth step of the LiDAR.
@@ -82,7 +82,8 @@ def split_trunks(
     Returns:
         Labels in which a trunk keeps the number of its cluster and the remaining points form a new cluster
         with a number above all others, which counts as not hidden; and the ascending numbers of the reduced
-        and of the new clusters, int64. Without a separated trunk, equal labels and no numbers.
+        and of the new clusters, int64. If no trunk is separated, the labels are equal to the argument and
+        there are no numbers.
     """
     width = np.maximum(clusters.extent[:, 0], clusters.extent[:, 1])
     thickest = radius_bounds[1]
@@ -120,9 +121,9 @@ def _split_trunks(
         points: Points, shape (N, 3) [m], sensor frame.
         rows: Rows of the points in the order of the clusters; those of clusters that are not examined are
             missing.
-        bounds: First position of each cluster in `rows`, and their number, shape (K + 1,).
+        bounds: First index of each cluster in `rows`, and the length of `rows`, shape (K + 1,).
         step: Azimuth step of the sensor [rad].
-        sigma: Standard deviation of its ranges [m].
+        sigma: Standard deviation of a range [m].
         slices: Number of slices that must agree.
         radius_bounds: Smallest and largest radius of a trunk [m].
         label: Cluster of each point, shape (N,); changed.
@@ -173,11 +174,11 @@ def _find_runs(
         points: Points, shape (N, 3) [m], sensor frame.
         own: Rows of the points of the cluster, shape (n,).
         step: Azimuth step of the sensor [rad].
-        sigma: Standard deviation of its ranges [m].
+        sigma: Standard deviation of a range [m].
         radius_bounds: Smallest and largest radius of a trunk [m].
         runs: The table; the columns `agrees` and `best` are not written.
         run: Run of each return, shape (n,); must be -1; changed.
-        level: Receives the slice of each return, counted from the lowest return, shape (n,).
+        level: Filled with the slice of each return, counted from the lowest return, shape (n,).
     """
     n = own.shape[0]
     x, y, lowest = 0.0, 0.0, np.inf
@@ -241,11 +242,11 @@ def _follows_circle(
     mean square residual up to BENT sigma), and if so write x, y and radius of the circle into the table.
 
     Args:
-        part: Returns of the run, from right to left: indexes of `across` and `reach`.
+        part: Indices in `across` and `reach` of the returns of the run, from right to left.
         across: Tangent of the azimuth of each return of the cluster, from its middle, shape (n,).
         reach: Horizontal range of each return [m], shape (n,).
         step: Azimuth step of the sensor [rad].
-        sigma: Standard deviation of its ranges [m].
+        sigma: Standard deviation of a range [m].
         radius_bounds: Smallest and largest radius of a trunk [m].
         c, s: Cosine and sine of the azimuth of the middle of the cluster.
         runs: The table.

@@ -34,9 +34,9 @@ class Cores(NamedTuple):
     """Core points sorted by cell.
 
     Attributes:
-        place: Coordinates [m], shape (_AXES, cores).
+        place: Coordinates of the core points, shape (_AXES, cores) [m].
         bounds: Index of the first core point of each cell, shape (cells + 1,).
-        box: Minimum and maximum coordinates of the core points of each cell [m], shape (cells, 2 * _AXES).
+        box: Minimum, then maximum coordinates of the core points of each cell, shape (cells, 2 * _AXES) [m].
     """
 
     place: Float
@@ -50,9 +50,9 @@ def dbscan_grid(
     """Cluster points with DBSCAN on the compiled grid.
 
     Args:
-        points: Shape (N, 2) or (N, 3) [m], finite; may be empty.
+        points: Points, shape (N, 2) or (N, 3) [m], finite; may be empty.
         eps: Maximum distance between neighbours, inclusive [m].
-        min_points: Neighbours, including the point itself, that make a core point.
+        min_points: Minimum number of neighbours of a core point, including the point itself.
         weight: Number of neighbours that each point counts for, at least 1, int32, shape (N,); None means 1.
             The result equals that of a cloud in which each point is repeated this many times.
 
@@ -101,7 +101,7 @@ def _cluster(
         order: Rows of the points by ascending key, shape (N,).
         rows: Result of `_row_offsets`.
         eps2: Square of the radius [m^2].
-        min_points: Least weight within the radius of a core point, including its own.
+        min_points: Minimum weight within the radius of a core point, including its own.
         weight: Weight of each point, shape (N,).
 
     Returns:
@@ -272,12 +272,11 @@ def _lay_cores(laid: Float, bounds: Int, core: Bool) -> Cores:
 
 @compiled
 def _join(cores: Cores, rows: Int, reach: Int32, eps2: float) -> Int:
-    """Return the parent of each cell in a union-find forest with one tree per cluster of cells, shape
-    (cells,).
+    """Return the parent of each cell in a disjoint-set structure with one set per cluster of cells, int64,
+    shape (cells,).
 
     The cell with the smallest index of a cluster is its root; a cell without core points is its own root.
-    Near rows are joined first, since most cells of one cluster are then already joined and need no distance
-    computation.
+    Near rows are joined first.
 
     Args:
         cores: Core points by cell.
@@ -304,8 +303,8 @@ def _join(cores: Cores, rows: Int, reach: Int32, eps2: float) -> Int:
 
 @compiled
 def root_of(parent: Int, c: int) -> int:
-    """Return the root of cell c in a forest of disjoint sets, and halve the paths to it in `parent`, shape
-    (C,)."""
+    """Return the root of cell c in a disjoint-set structure, and halve the path to the root in `parent`,
+    int64, shape (C,)."""
     while parent[c] != c:
         parent[c] = parent[parent[c]]
         c = parent[c]
@@ -369,10 +368,10 @@ def weigh(points: Float32, sensor: Sensor, parameters: Clustering) -> Int32:
 
     A visible stem area A gives n(r) = A / (r^2 da de) returns at the horizontal range r, where da and de are
     the angles between successive shots and between rings. Where n(r) is below `min_points`, a return has the
-    weight min_points / n(r), rounded down. DBSCAN then finds stems over the whole range.
+    weight min_points / n(r), rounded down. Elsewhere the weight is 1.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame, finite.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m], finite.
         sensor: Angles between shots and between rings; UNKNOWN_RING_STEP for a sensor without rings.
         parameters: `stem_area` is A [m^2], above 0.
     """
@@ -398,9 +397,9 @@ def range_jump(points: Float32, jump: float, min_points: int, azimuth_step: floa
     behind the sensor.
 
     Args:
-        points: float32, shape (N, 3) [m], sensor frame; z is ignored.
+        points: Points in the sensor frame, float32, shape (N, 3) [m]; z is ignored.
         jump: Maximum difference in range between neighbouring beams of one cluster [m].
-        min_points: Smaller clusters are noise.
+        min_points: Minimum number of points of a cluster; smaller ones are noise.
         azimuth_step: Angle between neighbouring beams [rad]; beams up to 2.5 steps apart are neighbours.
 
     Returns:
@@ -424,10 +423,10 @@ def _cut(
 
     Args:
         azimuth: Ascending azimuth of each beam, shape (N,), N at least 1 [rad].
-        distance: Horizontal range of each beam [m], same order.
+        distance: Horizontal range of each beam in the same order, shape (N,) [m].
         order: Row of each beam in the scan, in which the labels are returned.
         jump: Maximum difference in range between neighbours of one cluster [m].
-        min_points: Smaller clusters are noise.
+        min_points: Minimum number of points of a cluster; smaller ones are noise.
         gap: Maximum angle between neighbours [rad].
     """
     n = azimuth.shape[0]
@@ -474,7 +473,7 @@ def _grid(points: Float32, eps: float, min_points: int, weight: Int32 | None = N
     """Return the labels of `dbscan_grid`, see `Engine`.
 
     Raises:
-        ValueError: The cloud is too wide for its cells.
+        ValueError: The cloud is too wide for the cells, see `dbscan_grid`.
     """
     return dbscan_grid(points.astype(np.float64), eps, min_points, weight)[0]
 
@@ -519,7 +518,7 @@ def cluster(points: Float32, sensor: Sensor, parameters: Clustering) -> Labels:
     """Cluster the points of a scan.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame, finite; may be empty.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m], finite; may be empty.
         sensor: The LiDAR, whose angular resolution sets weights and beam gaps.
         parameters: Method and thresholds. The method "range_jump" uses `eps` as the maximum jump; otherwise
             `engine` runs DBSCAN on the first two or three coordinates, with weights if `stem_area` is above

@@ -49,15 +49,15 @@ def normal_equations(
     phi).
 
     Args:
-        rays: shape (RAY, capacity), of which n columns are valid.
+        rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.
         n: Number of returns.
         p: Parameters of the cylinder, shape (5,); the radius p[4] is positive.
         sigma: Standard deviation of a range, above 0 [m].
         within: Returns with a larger residual have no weight [m].
         back: Returns farther behind the axis have no weight [m], since no beam reaches the back of a trunk;
             may be infinite.
-        g: Receives the gradient.
-        H: Receives the lower triangle; the upper one is not written.
+        g: Filled with the gradient.
+        H: The lower triangle is filled; the upper one is not written.
 
     Returns:
         Sum of all squared residuals, and the sum of squared residuals clipped to `within` [m^2].
@@ -163,9 +163,8 @@ class MiddleHalf(NamedTuple):
     Attributes:
         c, s: Cosine and sine of the bearing of the cluster.
         across: Lateral offset of the median return from that bearing, positive to the left [m].
-        x, y: Front of the trunk at the median return [m].
-        radius: Interquartile range of the lateral offsets [m]; beams that are evenly spaced over a trunk
-            cover its radius with their middle half.
+        x, y: Position of the front of the trunk at the median return, sensor frame [m].
+        radius: Interquartile range of the lateral offsets [m].
     """
 
     c: float
@@ -181,7 +180,7 @@ def middle_half(rays: Float, n: int, lean_x: float, lean_y: float) -> MiddleHalf
     """Return the initial estimate of a trunk; quartiles are robust against branches beside the trunk.
 
     Args:
-        rays: shape (RAY, capacity), of which n columns are valid.
+        rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.
         n: Number of returns, at least 1.
         lean_x, lean_y: Shift of the axis per metre of height, which is removed before the width is measured.
     """
@@ -223,11 +222,10 @@ def quantile(ordered: Float, part: float) -> float:
 
 @compiled
 def visible_arc(rays: Float, n: int, p: Float) -> float:
-    """Return the visible arc around the axis [rad], 0 to 2 pi: a full turn minus the largest gap between
-    returns.
+    """Return the visible arc around the axis [rad], 0 to 2 pi: 2 pi minus the largest gap between returns.
 
     Args:
-        rays: shape (RAY, capacity), of which n columns are valid.
+        rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.
         n: Number of returns, at least 1.
         p: x, y of the axis at z0 [m] and its shift in x and y per metre of height; further values are not
             used.
@@ -248,19 +246,25 @@ def visible_arc(rays: Float, n: int, p: Float) -> float:
 
 @compiled
 def _from_axis(rays: Float, i: int, p: Float) -> tuple[float, float]:
-    """Return the horizontal vector x, y [m] from the axis p (x, y, lean x, lean y first), at the height of
-    the return, to return i of `rays`."""
+    """Return the horizontal vector x, y [m] from the axis to a return, at the height of the return.
+
+    Args:
+        rays: Returns, shape (RAY, capacity).
+        i: Column of the return.
+        p: x, y of the axis at z0 [m] and its shift in x and y per metre of height; further values are not
+            used.
+    """
     reach, h = rays[2, i], rays[3, i]
     return rays[0, i] * reach - p[0] - p[2] * h, rays[1, i] * reach - p[1] - p[3] * h
 
 
 @compiled
 def _full_turn_less_largest_gap(rays: Float, n: int, p: Float) -> float:
-    """Return the visible arc [rad] for returns on any side of the axis: a full turn minus the largest gap; 0
-    for one return.
+    """Return the visible arc [rad] for returns on any side of the axis: 2 pi minus the largest gap between
+    returns; 0 for one return.
 
     Args:
-        rays: shape (RAY, capacity), of which n columns are valid.
+        rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.
         n: Number of returns, at least 1.
         p: x, y of the axis at z0 [m] and its shift in x and y per metre of height.
     """
@@ -296,8 +300,8 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
     """Fit a leaning cylinder to each cluster.
 
     Args:
-        points: shape (N, 3) [m], level sensor frame, sorted by cluster; of each cluster at most MOST_POINTS
-            evenly drawn points are used.
+        points: Points in the level sensor frame, sorted by cluster, shape (N, 3) [m]; of each cluster at most
+            MOST_POINTS evenly sampled points are used.
         bounds: Index of the first point of each cluster, and N, shape (K + 1,); no cluster is empty.
         range_sigma: Standard deviation of a range [m]; at least SIGMA_MIN is used.
         azimuth_step: Angle between successive shots [rad].
@@ -305,11 +309,12 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
             (K,) [m]. The uncertain lean widens the covariance there.
 
     Returns:
-        Shape (K, 11): centre x, y of the axis at that height [m]; its covariance xx, xy, yy [m^2];
-        radius and its sigma [m]; root mean square of the residuals, outliers included [m]; visible arc [rad];
-        shift of the axis in x and y per metre of height. For clusters with fewer than five points, radius and
-        its sigma are NaN, the last four columns are 0, and the centre is estimated from the angular width,
-        without lift. A poor fit is not reported as such: it shows in the residuals and the sigmas.
+        Stems, shape (K, 11): centre x, y of the axis at that height [m]; covariance xx, xy, yy of the centre
+        [m^2]; radius and sigma of the radius [m]; root mean square of the residuals, outliers included [m];
+        visible arc [rad]; shift of the axis in x and y per metre of height. For clusters with fewer than five
+        points, the radius and its sigma are NaN, the last four columns are 0, and the centre is estimated
+        from the angular width, without lift. A poor fit is not reported as such: it shows in the residuals
+        and the sigmas.
     """
     clusters = bounds.shape[0] - 1
     stems = np.empty((clusters, COLUMNS))
@@ -325,14 +330,14 @@ def fit_stems(points: Float, bounds: Int, range_sigma: float, azimuth_step: floa
 
 @compiled
 def _to_rays(points: Float, begin: int, end: int, rays: Float) -> int:
-    """Fill `rays` from points begin..end-1, at most MOST_POINTS evenly drawn ones: rows are x and y of the
-    horizontal direction, horizontal range [m], and height above the mean of the drawn points [m]. Return the
-    number of rays.
+    """Fill `rays` from points begin..end-1, at most MOST_POINTS evenly sampled ones: rows are x and y of the
+    horizontal direction, horizontal range [m], and height above the mean of the sampled points [m]. Return
+    the number of rays.
 
     Args:
-        points: Shape (N, 3) [m], sensor frame.
+        points: Points in the sensor frame, shape (N, 3) [m].
         begin, end: Range of the points, not empty.
-        rays: Shape (RAY, MOST_POINTS), changed in place; columns beyond the result are not written.
+        rays: Rays, shape (RAY, MOST_POINTS), changed in place; columns beyond the result are not written.
     """
     n = min(end - begin, MOST_POINTS)
     z0 = 0.0
@@ -358,8 +363,8 @@ def _place_by_width(rays: Float, n: int, azimuth_step: float, stem: Float) -> No
         rays: Rays, see `_to_rays`.
         n: Number of rays, at least 1.
         azimuth_step: Azimuth step of the sensor [rad].
-        stem: Receives centre and covariance, see `fit_stems`; radius and its sigma become NaN, the columns
-            after them 0.
+        stem: Row of the result of `fit_stems`, changed in place: centre and covariance; radius and sigma of
+            the radius become NaN, the columns after them 0.
     """
     distance = 0.0
     for i in range(n):
@@ -393,7 +398,7 @@ def _fit(
         sigma: Standard deviation of the ranges, at least SIGMA_MIN [m].
         azimuth_step: Azimuth step of the sensor [rad].
         lift: Height above the mean height of the rays at which the centre is wanted [m].
-        stem: Receives the result, shape (COLUMNS,).
+        stem: Filled with the result, shape (COLUMNS,).
     """
     half = middle_half(rays, n, 0.0, 0.0)
     away = np.hypot(half.x, half.y)
@@ -454,9 +459,9 @@ def _some(rays: Float, n: int, some: Float) -> int:
     iterations use this subset.
 
     Args:
-        rays: Shape (RAY, capacity), of which n columns are valid.
+        rays: Rays, see `_to_rays`, shape (RAY, capacity), of which n columns are valid.
         n: Number of rays.
-        some: Same shape as `rays`, changed in place.
+        some: Selected rays, same shape as `rays`, changed in place.
     """
     stride = 3 if n > ENOUGH else 1
     few = (n + stride - 1) // stride
@@ -469,7 +474,8 @@ def _some(rays: Float, n: int, some: Float) -> int:
 @compiled
 def _write(p: Float, L: Float, inflate: float, lift: float, stem: Float) -> None:
     """Write centre, radius and their covariance to the first seven values of `stem`, a row of the result of
-    `fit_stems`. The covariance of the parameters is (L L^T)^-1 times `inflate`; that of the model is added.
+    `fit_stems`. The covariance of the parameters is (L L^T)^-1 times `inflate`; the variance MODEL^2 is added
+    to those of centre and radius.
 
     Args:
         p: x, y [m], lean x, lean y, radius [m], shape (5,).
@@ -500,7 +506,7 @@ class StemFit:
     """Leaning cylinder through the points of one cluster, in the level sensor frame.
 
     Attributes:
-        centre: Axis at the mean height of the points, shape (2,) [m].
+        centre: Position x, y of the axis at the mean height of the points, shape (2,) [m].
         lean: Shift of the axis in x and y per metre of height, shape (2,).
         radius, radius_sigma: Radius and its standard deviation [m].
         arc: Visible part of the circle [rad].
@@ -524,7 +530,8 @@ def fit_one(points: Float, sensor: Sensor) -> StemFit | None:
     not finite.
 
     Args:
-        points: Shape (N, 3) [m], level sensor frame; `offset` and `residual` of the result have their rows.
+        points: Points in the level sensor frame, shape (N, 3) [m]; `offset` and `residual` of the result have
+            the same rows.
         sensor: Range sigma and azimuth step of the LiDAR.
     """
     if not len(points):

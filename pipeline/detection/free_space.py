@@ -29,8 +29,8 @@ def clear_range(raw: Float32, filtered: Float32, sensor_offset: Float) -> Float:
     one way does not observe. It is 0 everywhere for an empty scan.
 
     Args:
-        raw: The scan before the filters, float32, shape (N, 3) [m], level sensor frame.
-        filtered: The scan after the filters, float32, shape (M, 3) [m], same frame.
+        raw: Points before the filters in the level sensor frame, float32, shape (N, 3) [m].
+        filtered: Points after the filters in the same frame, float32, shape (M, 3) [m].
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
     """
     bins = directions(raw, sensor_offset)
@@ -78,10 +78,10 @@ def widest_gap(bins: NDArray[np.uint16]) -> tuple[int, int]:
 def directions(points: Float32, sensor_offset: Float) -> NDArray[np.uint16]:
     """Return the `direction_bin` (of BINS) of each point as seen from the base, uint16, shape (N,).
 
-    The loop has no branches and reads contiguous rows, so that the compiler vectorises it.
+    A point at the base itself has the direction (1, 0).
 
     Args:
-        points: Float32, shape (N, 2 or 3) [m], level sensor frame, finite.
+        points: Points in the level sensor frame, float32, shape (N, 2 or 3) [m], finite.
         sensor_offset: Position of the sensor in the level base frame, x, y first [m]; zeros for directions
             from the sensor.
     """

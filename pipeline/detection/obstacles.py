@@ -39,16 +39,16 @@ def find_clearance(
     parameters: Obstacles,
 ) -> Clearance | None:
     """Return the clearance of the path of the robot, or None if obstacle detection is off (`method` is
-    "none"). Of a robot that drives backwards it is the path behind.
+    "none"). If the robot drives backwards, it is the path behind the robot.
 
-    An obstacle beside the robot, within the path width, has distance 0. Without terrain and with a sensor
-    below the minimum obstacle height (for example with an unknown mounting), lower obstacles would be missed;
-    then each zone except STOP becomes UNKNOWN, SLOW included.
+    An obstacle within the path width beside the robot has the distance 0. If `terrain` is None and the sensor
+    is below the minimum obstacle height, each zone except STOP becomes UNKNOWN.
 
     Args:
         points: The whole scan beyond `acquisition.range_min`, float32, shape (N, 3) [m], level sensor frame;
             rows with NaN are ignored.
-        near: Closer returns, float32, shape (M, 3) [m], same frame; returns inside the robot are removed.
+        near: Returns within `acquisition.range_min`, float32, shape (M, 3) [m], same frame; those inside the
+            robot are removed.
         terrain: Terrain of the scan; without it, heights are relative to the base.
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
         twist: Velocity of the base: forward, left [m/s], yaw rate [rad/s]; the velocity to the left is not
@@ -109,9 +109,9 @@ def _beyond_the_robot(near: Float32, sensor_offset: Float, parameters: Obstacles
 
 
 def path_curvature(twist: tuple[float, float, float]) -> float:
-    """Return the curvature [1/m] of the path that results from the velocities forward, left [m/s] and turn
-    [rad/s], positive to the left, at most 1 / TIGHTEST in size. It is 0 below the forward speed STANDING and
-    for NaN. When driving backwards it is turn / forward too."""
+    """Return the curvature [1/m] of the path that results from the velocities forward, left [m/s] and the yaw
+    rate [rad/s], positive to the left, at most 1 / TIGHTEST in size. It is yaw rate / forward velocity, also
+    when driving backwards. It is 0 if the forward speed is below STANDING or the ratio is not finite."""
     forward, _, turn = twist
     if abs(forward) < STANDING or not math.isfinite(turn / forward):
         return 0.0
@@ -133,7 +133,7 @@ def _find_obstacles(
     """Find the obstacles along the path of the robot.
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame; rows with NaN are ignored.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m]; rows with NaN are ignored.
         ground: `Terrain.height`; shape (0, 0) if unknown: then heights are relative to the base.
         sensor: Position of the sensor in the level base frame, shape (3,) [m].
         curvature: Curvature of the path [1/m].
@@ -142,13 +142,13 @@ def _find_obstacles(
         robot: Extent of the robot in and against the direction of driving and half of its width, shape (3,)
             [m].
         zones: Lengths of the zones STOP and SLOW from the end of the robot, shape (2,) [m].
-        least: Number of returns within DEPTH that form an obstacle.
+        least: Minimum number of returns within DEPTH that form an obstacle.
 
     Returns:
         Zone as an integer (CLEAR becomes UNKNOWN with fewer than `least` returns within 30 degrees of the
-        direction of driving); distance along the path from the end of the robot, and least lateral distance
-        from its sides up to BESIDE [m], infinite without an obstacle; x, y of a return of the nearest
-        obstacle on the path in the level base frame [m], NaN without.
+        direction of driving); distance along the path from the end of the robot, and minimum lateral distance
+        [m] from its sides up to BESIDE, infinite if there is no obstacle; x, y [m] of a return of the nearest
+        obstacle on the path in the level base frame, NaN if there is none.
     """
     reach, behind, half = robot[0], robot[1], robot[2]
     stop, slow = zones[0], zones[1]
@@ -192,7 +192,7 @@ def _find_obstacles(
 
 @compiled
 def _lateral_distance(x: float, y: float, curvature: float) -> float:
-    """Return the lateral distance [m] of a place x, y [m] from the arc through the origin that begins along
+    """Return the lateral distance [m] of a point x, y [m] from the arc through the origin that begins along
     +x with a curvature [1/m], positive to the left."""
     if abs(curvature) < STRAIGHT:
         return abs(y)
@@ -203,9 +203,9 @@ def _lateral_distance(x: float, y: float, curvature: float) -> float:
 
 @compiled
 def _arc_length(x: float, y: float, curvature: float) -> float:
-    """Return the arc length [m] from the origin to the foot of a place x, y [m] on the arc through the origin
-    that begins along +x with a curvature [1/m], positive to the left; up to half a turn is in front of the
-    robot, the rest is negative."""
+    """Return the arc length [m] from the origin to the foot point of a point x, y [m] on the arc through the
+    origin that begins along +x with a curvature [1/m], positive to the left; up to half a turn is in front of
+    the robot, the rest is negative."""
     if abs(curvature) < STRAIGHT:
         return x
     radius = 1.0 / abs(curvature)
@@ -215,7 +215,7 @@ def _arc_length(x: float, y: float, curvature: float) -> float:
 @compiled
 def _nearest(values: Float, least: int) -> float:
     """Return the smallest of the values, shape (N,) [m], that starts a group of `least` values within DEPTH,
-    or infinity without such a group.
+    or infinity if there is no such group.
 
     Fewer returns, such as rain or an insect, are not an obstacle.
     """

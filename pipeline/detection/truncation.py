@@ -56,8 +56,8 @@ def is_truncated(
     or more returns at other ranges end too; shape (K,).
 
     Args:
-        points: float32, shape (N, 3) [m], level sensor frame.
-        labels: Cluster of each point.
+        points: Points in the level sensor frame, float32, shape (N, 3) [m].
+        labels: Cluster of each point, -1 for none.
         raw: The whole scan, from which the field of view is estimated, float32, shape (M, 3) [m], same frame.
         sensor: Angle between shots, range sigma and maximum range of the LiDAR.
         filters: The pass-through box, whose vertical faces are borders.
@@ -92,8 +92,8 @@ def _within(bins: UInt16, first: int) -> Bool:
 
 
 def _end(beside: Float32, c: float, s: float, side: float) -> tuple[float, Float]:
-    """Return the largest bearing of returns to a side [rad], and the horizontal ranges of all of them, shape
-    (N,) [m].
+    """Return the largest bearing [rad] of returns to a side, and the horizontal ranges of all these returns,
+    shape (N,) [m].
 
     Args:
         beside: Returns at one edge of the field of view, shape (N, 3) [m], N at least 1.
@@ -119,13 +119,13 @@ def _touches(
     """Return whether each cluster has a point at a border, see `is_truncated`, shape (K,).
 
     Args:
-        points: float32, shape (N, 3) [m], sensor frame.
+        points: Points in the sensor frame, float32, shape (N, 3) [m].
         label: Cluster of each point, -1 for none, shape (N,).
         clusters: Number of clusters K.
-        box: x_min, x_max, y_min, y_max [m].
+        box: Faces x_min, x_max, y_min, y_max of the box, shape (4,) [m].
         ranges: Minimum and maximum range, shape (2,) [m].
         azimuth_step: Angle between shots [rad].
-        least: Distance from a border that counts at least [m].
+        least: Lower bound of the distance from a border within which a point is at the border [m].
         view: Field of view; its edges count only if it is less than 360 degrees.
     """
     cut = np.zeros(clusters, np.bool_)

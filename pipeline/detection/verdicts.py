@@ -30,7 +30,8 @@ def detections(clusters: Clusters, sensor_offset: Float, parameters: Detection) 
     Args:
         clusters: Clusters with verdicts, level sensor frame.
         sensor_offset: Position of the sensor in the level base frame, x, y first [m].
-        parameters: `sigma_range` and `sigma_bearing`, whose covariance is added to that of the fit.
+        parameters: `sigma_range` [m] and `sigma_bearing` [degrees], whose covariance is added to that of the
+            fit.
     """
     rows = np.flatnonzero(clusters.verdict == Verdict.TREE)
     place, covariance = clusters.centre[rows], clusters.covariance[rows]
@@ -64,13 +65,13 @@ class Check:
 
     Attributes:
         verdict: Verdict of a cluster that fails this check and no earlier one.
-        figure: Name of the checked quantity.
+        figure: Name of the checked quantity for people.
         unit: Unit of `value` and `limit`.
-        value: shape (K,), NaN if unknown.
+        value: Value of each cluster, shape (K,); NaN if unknown.
         relation: AT_LEAST or AT_MOST the limit, which passes; NO_LIMIT for a yes/no check, which fails for
             yes (1).
-        limit: NaN without a limit.
-        parameter: Dotted name of the parameter that sets the limit, empty without one.
+        limit: Limit of the value; NaN if there is none.
+        parameter: Dotted name of the parameter that sets the limit; "" if there is none.
     """
 
     verdict: Verdict

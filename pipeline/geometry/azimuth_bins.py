@@ -9,8 +9,8 @@ from pipeline.jit import compiled
 
 @compiled
 def direction_turn(x: float, y: float) -> float:
-    """Return the direction of a finite vector (x, y) as a share of a whole turn, 0 to 1, from -x over -y
-    (0.25), +x (0.5) and +y (0.75).
+    """Return the direction of a finite vector (x, y) as a share of a revolution, 0 to 1, counter-clockwise
+    from -x (0) over -y (0.25), +x (0.5) and +y (0.75).
 
     It is uniform along the diamond |x| + |y| = 1 instead of the circle, which needs no arctangent. The origin
     counts as the direction +x.
@@ -26,8 +26,8 @@ def direction_turn(x: float, y: float) -> float:
 
 @compiled
 def direction_bin(x: float, y: float, bins: int) -> int:
-    """Return in which of `bins` sectors around the origin the direction of a finite vector (x, y) is, 0 to
-    bins - 1, counted from -x over -y, +x and +y.
+    """Return the index, 0 to bins - 1, of the sector around the origin that contains the direction of a
+    finite vector (x, y). Sectors are counted counter-clockwise from -x over -y, +x and +y.
 
     The sectors divide the diamond of `direction_turn`; the widest is twice as wide as the narrowest. The
     origin counts as the direction +x.

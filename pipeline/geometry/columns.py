@@ -24,7 +24,7 @@ def rounded(values: NDArray[Real], step: float) -> NDArray[Real]:
     between two multiples is rounded to the even one, and -0 becomes 0. NaN and infinity remain.
 
     Args:
-        values: float32 or float64, any shape; not changed.
+        values: Values, float32 or float64, any shape; not changed.
         step: A power of two.
     """
     kind = values.dtype.type
@@ -96,7 +96,7 @@ def rows_of(table: Table, rows: Any) -> Table:  # noqa: ANN401 - what indexes an
 
     Args:
         table: A dataclass whose fields are arrays of equal length, or None.
-        rows: Indexes, a mask or a slice.
+        rows: Row numbers, a mask or a slice.
     """
     columns = {f.name: getattr(table, f.name) for f in fields(table)}  # type: ignore[arg-type]
     return type(table)(**{name: None if c is None else c[rows] for name, c in columns.items()})
@@ -118,8 +118,8 @@ def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:
     shorter one. NaN differs from NaN, except in arrays that share their memory, see `GrowingColumns`.
 
     Args:
-        old: Shape (M, ...); None has no rows.
-        new: Shape (N, ...), with the same number of columns.
+        old: Rows, shape (M, ...); None has no rows.
+        new: Rows, shape (N, ...), with the same number of columns.
     """
     if old is None:
         return 0

@@ -82,9 +82,9 @@ def expected_spread(
 
     Args:
         pose: Pose with its covariance P.
-        c, s: Cosine and sine of its yaw.
-        ax, ay: Vector from the robot to the detection in the frame of the map: J = [I, (-ay, ax)^T].
-        R: xx, xy, yy in the base frame, shape (D, 3) [m^2].
+        c, s: Cosine and sine of the yaw of the pose.
+        ax, ay: Vector from the robot to the detection in the frame of the map [m]: J = [I, (-ay, ax)^T].
+        R: Covariances xx, xy, yy of the detections in the base frame, shape (D, 3) [m^2].
         d: Row of R.
     """
     xx, xy, yy = rotated(R, d, c, s)
@@ -99,12 +99,12 @@ def expected_spread(
 def in_map(
     centre: Float, covariance: Float, pose: Float, pose_covariance: Float
 ) -> tuple[Float, Float, Float]:
-    """Return detections in the frame of the map: positions, shape (D, 2) [m], their own covariances C R C^T,
-    and the covariances that the pose adds, J Sigma J^T, both of shape (D, 2, 2).
+    """Return detections in the frame of the map: positions, shape (D, 2) [m], own covariances C R C^T of the
+    detections, and the covariances that the pose adds, J Sigma J^T, both of shape (D, 2, 2) [m^2].
 
     Args:
-        centre: Positions in the base frame, shape (D, 2) [m].
-        covariance: Their covariances R in the base frame, shape (D, 2, 2).
+        centre: Positions of the detections in the base frame, shape (D, 2) [m].
+        covariance: Covariances R of the detections in the base frame, shape (D, 2, 2) [m^2].
         pose: x, y [m], yaw [rad] of the base in the map, shape (3,).
         pose_covariance: Covariance Sigma of the pose, shape (3, 3).
     """
@@ -123,9 +123,9 @@ def _put_in_map(
     Args:
         centre, covariance: Detections in the base frame, shapes (D, 2) [m] and (D, 2, 2) [m^2].
         pose, Sigma: Pose x, y, yaw, shape (3,), and its covariance, shape (3, 3).
-        place: Receives the positions in the frame of the map, shape (D, 2) [m].
-        own: Receives C R C^T, shape (D, 2, 2) [m^2].
-        added: Receives J Sigma J^T, shape (D, 2, 2) [m^2].
+        place: Filled with the positions in the frame of the map, shape (D, 2) [m].
+        own: Filled with C R C^T, shape (D, 2, 2) [m^2].
+        added: Filled with J Sigma J^T, shape (D, 2, 2) [m^2].
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
     for d in range(centre.shape[0]):
@@ -145,7 +145,7 @@ def spread_by_pose(position: Float, pose: Float, Sigma: Float) -> Float:
 
     Args:
         position: Positions in the frame of the map, shape (N, 2) [m].
-        pose: x, y [m], yaw [rad], shape (3,); J is taken at the difference of positions and pose.
+        pose: Pose x, y [m], yaw [rad] in the map, shape (3,); J is evaluated at the position minus the pose.
         Sigma: Covariance of the pose, shape (3, 3).
     """
     added = np.empty((position.shape[0], 2, 2))
@@ -174,7 +174,7 @@ def corrected(
     not wrapped.
 
     Args:
-        pose: Pose before.
+        pose: Pose before the correction.
         ax, ay: Vector from the robot to the detection in the frame of the map [m]; J as in `expected_spread`.
         S0, S1, S2: Covariance xx, xy, yy of the innovation [m^2], which must be invertible.
         y0, y1: Innovation: the landmark minus the detection, both in the frame of the map [m].
@@ -200,12 +200,12 @@ def corrected(
 
 @compiled_within
 def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
-    """Return cosine and sine of a yaw after a turn.
+    """Return cosine and sine of a yaw after a rotation.
 
     Args:
-        c, s: Cosine and sine of the yaw before the turn.
-        by: The turn [rad]; up to SMALL_TURN, cosine and sine are updated by a series.
-        yaw: The yaw after the turn [rad], which is used for larger turns only.
+        c, s: Cosine and sine of the yaw before the rotation.
+        by: Angle of the rotation [rad]; up to SMALL_TURN, cosine and sine are updated by a series.
+        yaw: Yaw after the rotation [rad], which is used for larger rotations only.
     """
     if abs(by) > SMALL_TURN:
         return np.cos(yaw), np.sin(yaw)
@@ -216,13 +216,14 @@ def turned(c: float, s: float, by: float, yaw: float) -> tuple[float, float]:
 
 @compiled_within
 def draw(mu: Float, P: Float, noise: Float, p: int, out: Float) -> None:
-    """Draw row p of `out` from the Gaussian N(mu, P): mu + L noise[p] with L L^T = P (Cholesky), yaw wrapped.
+    """Sample row p of `out` from the Gaussian N(mu, P): mu + L noise[p] with L L^T = P (Cholesky), yaw
+    wrapped.
 
     Args:
         mu: Mean x, y [m], yaw [rad], shape (3,).
         P: Covariance, shape (3, 3), which may be singular: a direction without variance gets no noise.
         noise: Standard normal numbers, shape (N, 3).
-        p: Row.
+        p: Row of `noise` and of `out`.
         out: Poses, shape (N, 3); row p is changed.
     """
     l00 = np.sqrt(max(P[0, 0], 0.0))
@@ -261,7 +262,7 @@ def solve(L: Float, b: Float, x: Float) -> None:
     Args:
         L: Result of `factorise`, shape (n, n), of which only the lower triangle is read.
         b: Right side, shape (n,), not changed unless it is the same array as x.
-        x: Receives the solution, shape (n,).
+        x: Filled with the solution, shape (n,).
     """
     n = b.shape[0]
     for a in range(n):

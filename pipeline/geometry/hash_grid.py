@@ -30,7 +30,7 @@ class Cells(NamedTuple):
 
     Attributes:
         head: First position of a cell, -1 for none, int32, shape (SIDE * SIDE,).
-        following: Next position in the chain, int32, shape (L,).
+        following: Next position in the chain, -1 for none, int32, shape (L,).
         cell: Cell of each position, int32, shape (L,).
     """
 
@@ -119,7 +119,7 @@ def holds_unseen(
     Args:
         cells, scale: Grid of the positions, and its cells per metre for searches within this radius.
         mean: Positions, x, y first, shape (L, 2 or more) [m].
-        seen: Whether each was seen, shape (L,).
+        seen: Whether each position was seen, shape (L,).
         x, y: Centre [m].
         radius2: Square of the radius [m^2].
     """

@@ -45,11 +45,11 @@ def interpolated(keyframes: Float, motions: Float, scans: Int, keyframe: Int, si
 
     Args:
         keyframes: Corrected poses, shape (K, 3).
-        motions: Motion by odometry from keyframe k - 1 to k, shape (K, 3); NaN without odometry, then nothing
-            is distributed.
+        motions: Motion by odometry from keyframe k - 1 to k, shape (K, 3); NaN if there is no odometry, then
+            nothing is distributed.
         scans: Scan of each keyframe, int64, shape (K,), ascending.
         keyframe: Row of the last keyframe before or at each scan, int64, shape (N,); 0 before the first one.
-        since: Motion by odometry from that keyframe to the scan, shape (N, 3).
+        since: Motion by odometry from this keyframe to the scan, shape (N, 3).
     """
     lacking = np.zeros_like(keyframes)
     if len(keyframes) > 1:
@@ -83,34 +83,36 @@ class PathCorrection:
     """The path before and after a correction.
 
     Attributes:
-        before, after: x, y [m], yaw [rad] of every scan, shape (N, 3), in the frame of the map.
+        before, after: Pose x, y [m], yaw [rad] of every scan in the map, shape (N, 3).
     """
 
     before: Float
     after: Float
 
     def largest(self, reach: float) -> float:
-        """Return a bound of the displacement of objects up to `reach` [m] from the pose with which they move:
-        the largest displacement of a scan and the arc of its rotation together [m]; 0 without scans."""
+        """Return an upper bound [m] of the displacement of objects up to `reach` [m] from the pose with
+        which they move: the maximum over the scans of displacement + `reach` |rotation|; 0 if there are no
+        scans."""
         step = self.after - self.before
         arc = reach * np.abs(wrap_angle(step[:, 2]))
         return float((np.hypot(*step[:, :2].T) + arc).max(initial=0.0))
 
     def followed_by(self, later: PathCorrection) -> PathCorrection:
-        """Return this correction and a later one as one. The path of the later one begins with the scans of
-        this one, shape (M, 3), M >= N."""
+        """Return this correction and a later one as one correction. The path of `later`, shape (M, 3) with M
+        >= N, begins with the scans of this correction."""
         return PathCorrection(np.concatenate([self.before, later.before[len(self.before) :]]), later.after)
 
     def moved(self, place: Float, scan: Int) -> tuple[Float, Float]:
         """Return the corrected positions of objects, shape (N, 2) [m], and their rotations, shape (N,) [rad].
 
-        An object moves rigidly with the nearest pose of the path, of one pose per SPACING, within NEAR of the
-        scan that observed it: the pass of the path that observed it decides, and the nearest pose of it has
-        the shortest lever. Without scans nothing moves. The arguments are unchanged.
+        Each object moves rigidly with one pose of the path `before`: the nearest to the object of the poses
+        within NEAR along the path of the scan that observed it, of which one per SPACING is considered. If
+        the path has no scans, positions are copied and rotations are 0. The arguments are unchanged.
 
         Args:
-            place: Positions before the correction, shape (N, 2) [m].
-            scan: int64, shape (N,): the scan that observed each object; the last scan for larger numbers.
+            place: Positions x, y in the map before the correction, shape (N, 2) [m].
+            scan: Number of the scan that observed each object, int64, shape (N,). Numbers beyond the path
+                mean the last scan.
         """
         if not len(self.before):
             return place.copy(), np.zeros(len(place))
@@ -124,8 +126,8 @@ class PathCorrection:
         return after[:, :2] + _rotated(place - before[:, :2], turn), turn
 
     def poses(self, pose: Float, scan: Int) -> Float:
-        """Return poses x, y [m], yaw [rad], shape (N, 3), moved rigidly with the scans that they belong to,
-        int64, shape (N,); yaws are wrapped.
+        """Return poses x, y [m], yaw [rad] in the map, shape (N, 3), moved rigidly with the poses of the
+        scans with the numbers `scan`, int64, shape (N,). Yaws are wrapped.
 
         Raises:
             IndexError: A scan is not in the path.

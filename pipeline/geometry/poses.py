@@ -76,11 +76,11 @@ class Pose3:
 
     @classmethod
     def from_quaternion(cls, t: ArrayLike, wxyz: ArrayLike) -> Pose3:
-        """Return the pose of a translation (3,) and a quaternion (4,) in the order w, x, y, z, which is
+        """Return the pose of a translation, shape (3,) [m], and a quaternion w, x, y, z, shape (4,), which is
         normalised.
 
         Raises:
-            ValueError: The quaternion has no length or a number is not finite.
+            ValueError: The length of the quaternion is 0 (up to 1e-9), or a number is not finite.
         """
         q = np.asarray(wxyz, dtype=np.float64)
         norm = float(np.linalg.norm(q))
@@ -163,7 +163,7 @@ def euler_rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:
             broadcast.
 
     Returns:
-        Shape (3, 3) for numbers, (N, 3, 3) for arrays.
+        Rotation matrices, shape (3, 3) for numbers, (N, 3, 3) for arrays.
     """
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     cy, sy = np.cos(yaw), np.sin(yaw)
@@ -176,8 +176,8 @@ def euler_rotation(roll: ArrayLike, pitch: ArrayLike, yaw: ArrayLike) -> Float:
 
 
 def interpolate(a: Pose2, b: Pose2, fraction: float) -> Pose2:
-    """Return the pose at a fraction between a (0) and b (1): linear in x and y, and in yaw along the shorter
-    turn, wrapped to [-pi, pi). Fractions below 0 or above 1 extrapolate."""
+    """Return the pose at a fraction between a (0) and b (1): linear in x and y, and in yaw along the smaller
+    rotation, wrapped to [-pi, pi). Fractions below 0 or above 1 extrapolate."""
     turn = float(wrap_angle(b.yaw - a.yaw))
     return Pose2(
         a.x + fraction * (b.x - a.x),

@@ -56,10 +56,10 @@ def shows_ground(terrain: Terrain) -> bool:
 
 @compiled
 def heights_of_places(places: Float, height: Float) -> Float:
-    """Return the heights of places above the ground, shape (N,) [m].
+    """Return the heights of positions above the ground, shape (N,) [m].
 
     Args:
-        places: Level sensor frame, shape (N, 3) [m]; x and y are finite.
+        places: Positions in the level sensor frame, shape (N, 3) [m]; x and y are finite.
         height: `Terrain.height`.
     """
     above = np.empty(places.shape[0])
@@ -81,8 +81,8 @@ def height_above(points: Float32, terrain: Terrain) -> Float32:
 
 @compiled
 def ring_at(distance: float) -> float:
-    """Return the (fractional) number of rings within a distance from the sensor, 0 or more [m]; less than
-    RINGS."""
+    """Return the (fractional) number of rings within a distance from the sensor [m], which is 0 or more; the
+    result is less than RINGS."""
     return float(RINGS * distance / (distance + HALF_WAY))
 
 
@@ -289,7 +289,7 @@ def _comes_first(points: Float32, i: int, other: int) -> bool:
     does not depend on the order of the points.
 
     Args:
-        points: Shape (N, 3) [m].
+        points: Points, shape (N, 3) [m].
         i, other: Rows of the two points.
     """
     x, y = points[i, X], points[i, Y]
@@ -343,10 +343,11 @@ def evidence(points: Float32, cell: Int32, lowest: Float, plane: Float) -> tuple
         plane: Trend: height at the origin [m] and slopes along x and y, shape (3,).
 
     Returns:
-        Mean height of the lowest layer above the plane, shape (SECTORS, rings) [m], NaN without a candidate;
-        and its weight from 0 (also without a candidate) to 1, same shape. With n returns in the layer and m
-        returns above it between OBJECT_BOTTOM and OBJECT_TOP, the weight is (n / (n + 2 m))^2; the spread of
-        the layer gives a lower limit, which rises to WIDE_WEIGHT for a layer wider than a trunk.
+        Mean height of the lowest layer above the plane, shape (SECTORS, rings) [m], NaN if there is no
+        candidate; and its weight from 0 (also without a candidate) to 1, same shape. With n returns in the
+        layer and m returns above it between OBJECT_BOTTOM and OBJECT_TOP, the weight is (n / (n + 2 m))^2;
+        the spread of the layer gives a lower limit, which rises to WIDE_WEIGHT for a layer wider than a
+        trunk.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     # One row per cell, so that each point accesses one cache line: residual, x and y of the lowest return;
@@ -416,7 +417,7 @@ def trend(lowest: Float, slope: float) -> Float:
         slope: Tangent of the maximum slope; a steeper plane is flattened to it.
 
     Returns:
-        Height at the origin [m] and slopes along x and y, shape (3,); zeros without candidates.
+        Height at the origin [m] and slopes along x and y, shape (3,); zeros if there are no candidates.
     """
     sectors, rings = lowest.shape[0], lowest.shape[1]
     rows = np.empty((sectors * rings, 3))
@@ -459,12 +460,13 @@ def trend(lowest: Float, slope: float) -> Float:
 @compiled
 def smooth_surface(height: Float, weight: Float, plane: Float) -> tuple[Float, Bool]:
     """Return the trend plus the membrane h that minimises sum w (h - z)^2 + sum c (h_i - h_j)^2 over
-    neighbouring cells i, j. Without candidates it is the trend.
+    neighbouring cells i, j. If there are no candidates, it is the trend.
 
     Rays and circles are solved in turn (alternating direction). Residuals have asymmetric Huber weights.
 
     Args:
-        height, weight: Candidates above the trend, shape (SECTORS, rings), see `evidence`.
+        height, weight: Heights of the candidates above the trend [m] and their weights, shape (SECTORS,
+            rings), see `evidence`.
         plane: Trend, shape (3,).
 
     Returns:
@@ -596,7 +598,8 @@ def _middle(sector: int, ring: int) -> tuple[float, float]:
 
 
 def find_terrain(points: Float32, parameters: Ground) -> Terrain:
-    """Return the terrain of one scan: level at height 0 and nowhere seen for a scan without finite points.
+    """Return the terrain of one scan: for a scan without finite points, it is level at height 0 and `seen` is
+    False everywhere.
 
     A cell with many returns above its lowest layer has a small weight, since that layer may belong to a
     trunk. The force that pulls the surface down to a candidate below it is stronger than the one that lifts
@@ -621,7 +624,7 @@ def in_band(points: Float32, height: Float32, parameters: Ground) -> Float32:
 
     Args:
         points: Points, float32, shape (N, 3) [m].
-        height: Their heights above the ground, float32, shape (N,) [m].
+        height: Heights of the points above the ground, float32, shape (N,) [m].
         parameters: The height band, which is compared in float32.
     """
     return _between(points, height, np.array([parameters.height_min, parameters.height_max], np.float32))
@@ -632,7 +635,7 @@ def _between(points: Float32, height: Float32, band: Float32) -> Float32:
     """Return the points with band[0] <= height <= band[1], float32, shape (M, 3) [m]; NaN is outside.
 
     Args:
-        points: Shape (N, 3) [m].
+        points: Points, shape (N, 3) [m].
         height: Height of each point, shape (N,) [m].
         band: Lowest and highest height, shape (2,) [m].
     """

@@ -34,7 +34,7 @@ def observe_cells(
         corner: Lower corner of each tile in the map frame, shape (T, 2) [m].
         at: Position of the sensor in the map frame, shape (2,) [m].
         yaw: Yaw of the sensor in the map frame [rad].
-        height, seen: Arrays of the Terrain of the scan.
+        height, seen: Attributes of the Terrain of the scan.
         reach: Maximum distance of the middle of a cell from the sensor [m].
 
     Returns:
@@ -94,7 +94,8 @@ Tile = tuple[int, int]
 
 
 def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -> dict[Tile, Float32]:
-    """Return the tiles after a correction of the path; the argument is not changed.
+    """Return a dict from indices of tiles to their cells after a correction of the path; the argument is not
+    changed.
 
     Each cell moves by whole cells, with the nearest scan of the path before the correction. Cells that
     coincide afterwards are averaged by their weights, and their weights and views are added. The number of
@@ -102,7 +103,7 @@ def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -
     left out.
 
     Args:
-        tiles: Cells by tile index, see HeightMapState; may be empty.
+        tiles: Dict from indices of tiles to their cells, see HeightMapState; may be empty.
         correction: Path before and after, with at least one scan.
     """
     from scipy.spatial import cKDTree
@@ -118,8 +119,8 @@ def corrected_tiles(tiles: Mapping[Tile, Float32], correction: PathCorrection) -
 
 
 def _tiles_of(place: Int, row: Float, order: Iterable[Tile]) -> dict[Tile, Float32]:
-    """Return tiles of cells. Cells that coincide are averaged by their weights, and their weights and views
-    are added.
+    """Return a dict from indices of tiles to their cells. Cells that coincide are averaged by their weights,
+    and their weights and views are added.
 
     Args:
         place: Indices of the cells along x and y of the whole map, shape (N, 2).
@@ -148,11 +149,12 @@ def _cells_of(tiles: Mapping[Tile, Float32]) -> tuple[Int, Float]:
 
 
 def merged_terrain(a: HeightMapState, b: HeightMapState, T_a_b: Pose2) -> HeightMapState:
-    """Return the terrain of two runs in the frame of the first, published, with the sensor at the end of the
-    second; both are unchanged. With more than MOST_TILES tiles, the least recently seen ones are left out.
+    """Return the terrain of two runs in the frame of the first, with a newly published map and the height of
+    the sensor at the end of the second; the arguments are unchanged. With more than MOST_TILES tiles, the
+    least recently seen ones are left out.
 
-    Each run has its own height 0; that of b is moved by the median difference of the cells that both know.
-    With fewer than LEAST of these, the heights of b are unknown in a, and the terrain of a is returned.
+    Each run has its own height 0; that of b is moved by the median difference of the cells that both know. If
+    both know fewer than LEAST cells, the terrain of a is returned.
 
     Args:
         a, b: Terrain of the two runs.
@@ -221,8 +223,8 @@ class HeightMapState:
     them.
 
     Attributes:
-        tiles: Cells of each tile by tile index along x and y, float32, shape (SIDE, SIDE, COLUMNS), least
-            recently seen first.
+        tiles: Dict from the index along x and y of a tile to its cells, float32, shape (SIDE, SIDE, COLUMNS),
+            least recently seen first.
         sensor_z: Height of the sensor in the map frame [m]; None before the first scan.
         scans: Number of scans.
         record: The most recently published map.
@@ -257,7 +259,7 @@ class HeightMapper:
 
         Args:
             terrain: Terrain in the level sensor frame.
-            T_map_base: Pose of the base.
+            T_map_base: Pose of the base in the map.
             sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
         """
         at = T_map_base.apply(np.asarray(sensor_offset[:2], np.float64))
@@ -298,13 +300,13 @@ class HeightMapper:
         return _record(self.state.tiles)
 
     def heights(self, places: Float) -> Float:
-        """Return the height of the ground in the frame of the map at places, shape (N,) [m].
+        """Return the height of the ground in the frame of the map at positions, shape (N,) [m].
 
-        A place takes the height of its cell. In an unknown cell it is the weighted mean of the known cells
-        among its eight neighbours; without any, its height is NaN.
+        It is the height of the cell that contains the position. In an unknown cell it is the weighted mean of
+        the known cells among the eight neighbours; NaN if none is known.
 
         Args:
-            places: Finite x, y in the frame of the map, shape (N, 2) [m].
+            places: Finite positions x, y in the frame of the map, shape (N, 2) [m].
         """
         cell = np.floor(places / CELL).astype(np.int64)
         return np.array([self._at(int(i), int(j)) for i, j in cell])
@@ -357,7 +359,7 @@ def _register(block: Float32, below: Float, weight: Float, before: float | None)
 
 
 def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
-    """Return the map of tiles as a table of the known cells, sorted by tile; without tiles an empty one. The
+    """Return the map of tiles as a table of the known cells, sorted by tile; empty if there are no tiles. The
     arrays are copies."""
     keys = sorted(tiles)
     cells = np.stack([tiles[key] for key in keys]) if keys else np.zeros((0, SIDE, SIDE, COLUMNS), np.float32)
@@ -375,11 +377,12 @@ def _record(tiles: Mapping[Tile, Float32]) -> HeightMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedHeightMap:
-    """HeightMapState as plain arrays for saving, with the tiles in their order; an unknown `sensor_z` is NaN.
+    """HeightMapState as arrays and numbers for saving, with the tiles in their order; an unknown `sensor_z`
+    is NaN.
 
     Attributes:
         tile: Tile indices, int64, shape (T, 2).
-        cells: float32, shape (T * SIDE * SIDE, COLUMNS).
+        cells: Cells of the tiles, float32, shape (T * SIDE * SIDE, COLUMNS).
     """
 
     tile: Int
@@ -390,7 +393,7 @@ class PackedHeightMap:
 
     @classmethod
     def of(cls, state: HeightMapState) -> PackedHeightMap:
-        """Return the state as plain arrays, which are copies except for the published map."""
+        """Return the state in this form; the arrays are copies except for the published map."""
         cells = np.zeros((len(state.tiles), SIDE, SIDE, COLUMNS), np.float32)
         for n, tile in enumerate(state.tiles.values()):
             cells[n] = tile
@@ -404,7 +407,7 @@ class PackedHeightMap:
 
     @classmethod
     def empty(cls) -> PackedHeightMap:
-        """Return the state before the first scan, as plain arrays."""
+        """Return the state before the first scan in this form."""
         return cls.of(HeightMapState({}, None, 0, no_height_map()))
 
     def unpacked(self) -> HeightMapState:

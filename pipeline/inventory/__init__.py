@@ -43,18 +43,22 @@ class PlotMap:
 
     Attributes:
         trees: All trees, confirmed; their observations are slices.
-        stems: Models of all candidates for trees, STEM of shape (K,), NaN where there is no circle.
+        stems: Models of all candidates for trees, STEM of shape (K,); NaN for a candidate with fewer than two
+            circles.
         place: Positions of the candidates, shape (K, 2) [m].
         circles: Circles of the candidates, shape (K, S, FIGURES), see `fit_circle` and `slice_heights`.
-        share: Votes of the random forest on the candidates, in the order of CLASSES, shape (K, 6).
-        verdict: See Verdict, int32, shape (K,).
-        tree_candidate: Row of each tree in these tables, shape (T,).
+        share: Shares of the votes of the random forest for the candidates, in the order of CLASSES, shape (K,
+            6).
+        verdict: Verdict of each candidate, int32, shape (K,).
+        tree_candidate: Row of each tree in the tables of the candidates, shape (T,).
         ground: Height map.
-        points: Thinned points between LOWEST and HIGHEST above the ground, shape (N, 4).
-        counts: Numbers of points: "read", "apart from the plot", "below the ground", "thinned", "in slices".
+        points: Thinned points between LOWEST and HIGHEST above the ground: x, y, z, height above the ground,
+            shape (N, 4) [m].
+        counts: Dict from "read", "apart from the plot", "below the ground", "thinned" and "in slices" to
+            numbers of points.
         voxel_size: Side of the voxels of the thinning [m].
         whole: Thinned points of all heights (x, y, z, height above the ground), shape (M, 4) [m].
-        crowns: Tree of each of these points, and the heights of the trees.
+        crowns: Tree of each point of `whole`, and the heights of the trees.
         warnings: Messages for the user.
     """
 
@@ -81,10 +85,10 @@ class PlotPoints:
     Attributes:
         ground: Height map.
         near: Points between LOWEST and HIGHEST above the ground, x, y, z, height [m].
-        slices: These points by height.
-        axes, features: Columns, see `find_columns`, strongest first.
+        slices: The points of `near` by height.
+        axes, features: Axes and features of the columns, see `find_columns`, strongest first.
         voxels: Points of all heights.
-        counts: Numbers of points by name, as in `PlotMap`.
+        counts: Dict from names to numbers of points, as in `PlotMap`.
     """
 
     ground: TerrainRaster
@@ -112,7 +116,7 @@ def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = pack
     Args:
         cloud: The cloud, which is read once.
         parameters: All parameters; those named in PARAMETERS are used.
-        forests: Returns the random forest by its name.
+        forests: Function of the name of a random forest and `is_seen_all_around` that returns the forest.
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or is larger than a plot.
@@ -128,7 +132,7 @@ class Inventory:
 
     Args:
         cloud: The cloud; it is read once.
-        forests: Returns the random forest by its name.
+        forests: Function of the name of a random forest and `is_seen_all_around` that returns the forest.
         folder: Folder of the temporary file with the points; None for that of the system.
     """
 
@@ -238,19 +242,19 @@ def ground_steps(
     most: int = 1 << 21,
     whole: Thinned | None = None,
 ) -> Generator[float, None, tuple[TerrainRaster, Thinned, dict[str, int]]]:
-    """Return the ground below a cloud, its thinned points (x, y, z, height above the ground) in a band, and
-    counts; yield the share of the whole inventory that is done after each part.
+    """Return the ground below a cloud, the thinned points of the cloud (x, y, z, height above the ground) in
+    a band, and counts; yield the share of the whole inventory that is done after each part.
 
     Args:
         cloud: The cloud, which is read three times.
         slope_max: Largest slope of the terrain against the plane of the plot [degrees].
         band: Lowest and highest height above the ground that is kept, both exclusive [m].
-        most: Largest number of points after thinning, a power of two.
-        whole: Receives the points of all heights.
+        most: Maximum number of points after thinning, a power of two.
+        whole: Table to which the points of all heights are added; None for none.
 
     Returns:
-        Ground; points, of which there may be none; and the numbers of points "read", "apart from the plot"
-        (left out) and "below the ground" (more than 0.3 m).
+        Ground; points, of which there may be none; and a dict from "read", "apart from the plot" (left out)
+        and "below the ground" (by more than 0.3 m) to numbers of points.
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER bytes.
@@ -298,7 +302,7 @@ def _trees(stems: Stems, arc_min: float, crowns: Crowns) -> Trees:
 
     Args:
         stems: Models of the trees, shape (T,).
-        arc_min: Least visible arc of a diameter [rad]; DBH is NaN otherwise, see `diameters`.
+        arc_min: Minimum visible arc of a diameter [rad]; DBH is NaN below it, see `diameters`.
         crowns: Heights of the trees.
     """
     n = len(stems)

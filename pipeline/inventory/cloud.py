@@ -19,7 +19,7 @@ from pipeline.types.records import CloudDescription, Float32, Int, WholeCloud
 class SpooledCloud:
     """A cloud that is read from its source once: later readings come from a temporary file without a name.
 
-    If the disk refuses, each reading comes from the source.
+    If the file cannot be written, each reading comes from the source.
 
     Args:
         cloud: The cloud.
@@ -37,7 +37,7 @@ class SpooledCloud:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Points left out in the reading of the source, by reason."""
+        """dict from reasons to numbers of points that were left out in the reading of the source."""
         return self._cloud.losses
 
     def parts(self) -> Iterator[Float32]:
@@ -46,7 +46,7 @@ class SpooledCloud:
         disk, stores nothing.
 
         Raises:
-            SourceError: Nothing can be read from the source.
+            SourceError: The source cannot be read.
         """
         if self._file is not None:
             yield from _read_points(self._file)
@@ -97,9 +97,9 @@ class Extent:
     """Extent of a plot.
 
     Attributes:
-        low, high: Corners, shape (2,) [m].
+        low, high: Minimum and maximum x, y of the plot, shape (2,) [m].
         points: Number of all points.
-        apart: Number of points outside, far from all others.
+        apart: Number of points in sparse squares outside of the plot.
     """
 
     low: Float
@@ -128,7 +128,7 @@ class ExtentFinder:
 
     def extent(self, where: str) -> Extent:
         """Return the bounds of the points in squares with at least LEAST points and those next to them (of
-        all points without such a square), and the numbers of all points and of those in other squares.
+        all points if there is no such square), and the numbers of all points and of those in other squares.
 
         Raises:
             SourceError: There are no points; `where` is the name of the cloud.
@@ -156,8 +156,8 @@ def _count(part: Float32, squares: dict[int, tuple[int, Float]]) -> None:
 
     Args:
         part: Points, shape (N, 3) [m], N at least 1.
-        squares: By key of the square, number of points and their bounds x, y low and x, y high, shape (4,)
-            [m].
+        squares: Dict from the key of a square to its number of points and their bounds x min, y min, x max, y
+            max, shape (4,) [m].
     """
     cell = np.floor(part[:, :2] / SQUARE).astype(np.int64) + (1 << 30)
     key = (cell[:, 0] << 32) + cell[:, 1]

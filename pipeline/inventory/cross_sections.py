@@ -30,7 +30,7 @@ RING = 0.5  # width of the ring around a circle, as a share of the radius; at le
 def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Float) -> float:
     """Find the circle through three of the points that has the most other points on it. Return the number of
     points on it minus the number inside, where a point on it counts less the farther it is from the circle; 0
-    without a circle with a positive result.
+    if no circle has a positive result.
 
     Points inside count against a circle, because the cross-section of a trunk is hollow and that of a bush is
     not. TRIES circles are tried, the first ones through the points next to the origin, the last ones through
@@ -42,7 +42,8 @@ def best_circle(xy: Float, tolerance: float, r_min: float, r_max: float, out: Fl
             outside of it.
         tolerance: Maximum distance of a point on the circle [m]; at most a third of its radius.
         r_min, r_max: Minimum and maximum radius [m].
-        out: Its first three values receive x, y and radius of the circle [m]; unchanged if the result is 0.
+        out: The first three values are set to x, y and radius of the circle [m]; unchanged if the result is
+            0.
     """
     n = xy.shape[0]
     best = 0.0
@@ -87,16 +88,16 @@ def _through_three(a: Float, b: Float, c: Float) -> tuple[float, float, float]:
 
 @compiled
 def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) -> bool:
-    """Fit a circle geometrically. Return whether there is one within the bounds with at least five points on
-    it; if not, `out` is undefined.
+    """Fit a circle geometrically. Return whether the fit stays within the bounds of the radius and has at
+    least five points on the circle; if not, `out` is undefined.
 
     Args:
         xy: Points, shape (N, 2) [m].
         reach: Points farther from the circle are ignored [m].
         r_min, r_max: Minimum and maximum radius [m].
         out: Initial x, y and radius in `out[:3]`; filled with the result, shape (FIGURES,): x, y, radius [m],
-            variances and covariance xx, xy, yy, rr [m^2], scatter [m], coverage, number of points on the
-            circle, and contrast.
+            variances and covariance xx, xy, yy, rr [m^2], scatter [m], covered angle [rad], number of points
+            on the circle, and contrast (`_contrast`).
     """
     n = xy.shape[0]
     x, y, r = out[0], out[1], out[2]
@@ -149,8 +150,8 @@ def fit_circle(xy: Float, reach: float, r_min: float, r_max: float, out: Float) 
 
 
 def without_scatter(radius: Float, scatter: Float) -> Float:
-    """Return radii without the bias that the scatter of the points causes [m], shape (N,), at least half of
-    the fitted ones; NaN stays NaN.
+    """Return the radii minus the bias scatter^2 / (2 radius) that the scatter of the points causes, shape
+    (N,) [m]; at least half of each fitted radius. If a radius or its scatter is NaN, the result is NaN.
 
     Points with an error of s in both directions are on average s^2 / 2 r farther from the centre (Rice).
 
@@ -190,7 +191,7 @@ def _coverage(xy: Float, x: float, y: float, r: float, tolerance: float) -> tupl
 @compiled
 def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered: float, on: float) -> float:
     """Return the ratio of the densities of points on the visible part of a circle and in the ring around it;
-    NaN without points on it.
+    NaN if there are no points on the circle.
 
     Args:
         xy: Points, shape (N, 2) [m].
@@ -209,8 +210,8 @@ def _contrast(xy: Float, x: float, y: float, r: float, tolerance: float, covered
 
 @compiled
 def share_inside(xy: Float, x: float, y: float, r: float) -> float:
-    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r; 0 without
-    points.
+    """Return the share of the points within 1.3 r of the centre of a circle that is within 0.7 r; 0 if there
+    are no points.
 
     Args:
         xy: Points, shape (N, 2) [m].
@@ -261,7 +262,7 @@ def cut(points: Float32) -> Slices:
     are left out.
 
     Args:
-        points: x, y, z, height above the ground [m], shape (N, 4); may be empty.
+        points: Points x, y, z and height above the ground, shape (N, 4) [m]; may be empty.
     """
     step = np.floor((points[:, 3] - LOWEST) / STEP)
     chosen = (step >= 0) & (step < _STEPS)
@@ -276,7 +277,8 @@ def cut(points: Float32) -> Slices:
 
 @compiled
 def points_around(slices: Slices, first: int, last: int, x: float, y: float, reach: float) -> Float:
-    """Return the points of steps of height within a reach of a position, shape (M, 2), M may be 0.
+    """Return the points x, y of some steps of height within a reach of a position, shape (M, 2) [m]; M may be
+    0.
 
     Args:
         slices: Points of the plot.

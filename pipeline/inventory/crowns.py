@@ -31,10 +31,10 @@ class Crowns:
 
     Attributes:
         tree: Row of the tree of each point, -1 for none, int32, shape (M,).
-        height: Height of the highest point above the ground at the stem, NaN where the top is not seen, shape
-            (T,) [m].
-        sigma: Its standard deviation [m], or NaN.
-        hidden: Reason why the height is not seen; "" where it is.
+        height: Height of the highest point above the ground at the stem, shape (T,) [m]; NaN where `hidden`
+            is not "".
+        sigma: Standard deviation of the height, shape (T,) [m]; NaN where the height is NaN.
+        hidden: Reason why the height of each tree is unknown, length T; "" where it is known.
     """
 
     tree: Int32
@@ -48,11 +48,11 @@ class Voxels:
     """The thinned points of a cloud as a graph of voxels.
 
     Attributes:
-        points: x, y, z, height above the ground, shape (M, 4) [m]; M may be 0.
+        points: Points x, y, z and height above the ground, shape (M, 4) [m]; M may be 0.
         side: Side of the cubes of the thinning [m].
         upper: Rows of the points higher than CELL, shape (U,): lower points connect all trees.
-        voxel: Voxel of each of these, shape (U,).
-        graph: Squared lengths of the steps between voxels, sparse, shape (K, K).
+        voxel: Voxel of each upper point, shape (U,).
+        graph: Squared lengths of the steps between voxels in units of CELL, sparse, shape (K, K).
     """
 
     points: Float32
@@ -67,7 +67,7 @@ def voxels_of(points: Float32, side: float) -> Voxels:
     the 80 voxels around a voxel whose distance is at most the square root of 5 cells.
 
     Args:
-        points: x, y, z, height above the ground, shape (M, 4) [m]; M may be 0.
+        points: Points x, y, z and height above the ground, shape (M, 4) [m]; M may be 0.
         side: Side of the cubes of the thinning [m].
     """
     from scipy.sparse import coo_matrix
@@ -148,9 +148,9 @@ def without_heights(crowns: Crowns, why: str) -> Crowns:
 
 
 def _nearest_stems(voxels: Voxels, stems: Stems) -> Int32:
-    """Return the tree from whose stem the shortest chain of voxels leads to each upper point, -1 where none
-    does, shape (U,). Chains begin in the voxels on the traced stems; a voxel on two stems belongs to the
-    first.
+    """Return the row of the tree from whose stem the shortest chain of voxels leads to each upper point, -1
+    for none, int32, shape (U,). Chains begin in the voxels on the traced stems; a voxel on two stems belongs
+    to the stem with the lower row.
 
     Args:
         voxels: The cloud.
@@ -179,11 +179,11 @@ def _nearest_stems(voxels: Voxels, stems: Stems) -> Int32:
 def _cut_off(points: Float, column: int) -> float:
     """Return the largest value of a column if the cloud is cut off there; infinite if it is not.
 
-    The cloud is cut off if a share of more than CUT of its vertical columns of voxels ends in its uppermost
-    CELL; without a cut this layer has the tip of a single tree.
+    The cloud is cut off if more than the share CUT of its vertical columns of voxels ends in its uppermost
+    CELL.
 
     Args:
-        points: shape (M, 4) [m], M at least 1.
+        points: Points x, y, z and height above the ground, shape (M, 4) [m], M at least 1.
         column: 2 for z, 3 for the height above the ground.
     """
     cells, which = np.unique(np.floor(points[:, :2] / CELL).astype(np.int64), axis=0, return_inverse=True)

@@ -45,8 +45,8 @@ Stems = NDArray[Any]  # of the type STEM
 
 @compiled
 def fit_line(height: Float, value: Float, weight: Float) -> tuple[float, float, float, float]:
-    """Fit a line through values over height robustly. Return the value at breast height, its change per
-    metre, and the standard deviations of both. A weak prior keeps the slope near 0.
+    """Fit a line through values over height robustly. Return the value at breast height, its change per metre
+    of height, and the standard deviations of both. A weak prior keeps the slope near 0.
 
     Args:
         height: Heights above the ground, shape (N,) [m], N at least 1.
@@ -98,8 +98,8 @@ def _describe(stem: Any, rows: Float, h: Float) -> None:  # noqa: ANN401 - a row
 
     Args:
         stem: Row of the type STEM; changed in place.
-        rows: Its circles, shape (N, FIGURES), N at least 2.
-        h: Their heights, shape (N,) [m].
+        rows: Circles of the stem, shape (N, FIGURES), N at least 2.
+        h: Heights of the circles above the ground, shape (N,) [m].
     """
     away = np.abs(h - BREAST)
     # A stem that is only visible higher up or lower down is described by the slices nearest to breast height.
@@ -128,7 +128,7 @@ def classify_stems(stems: Stems, share: Float, r_min: float, r_max: float) -> In
 
     Args:
         stems: Result of `describe_stems`.
-        share: Votes of the random forest, in the order of CLASSES, shape (K, 6).
+        share: Shares of the votes of the random forest, in the order of CLASSES, shape (K, 6).
         r_min, r_max: Minimum and maximum radius of a tree [m].
     """
     verdict = np.full(len(stems), Verdict.TREE, np.int32)
@@ -148,7 +148,7 @@ def stem_checks(stems: Stems, share: Float, r_min: float, r_max: float) -> tuple
 
     Args:
         stems: Result of `describe_stems`, shape (K,).
-        share: Votes of the random forest, in the order of CLASSES, shape (K, 6).
+        share: Shares of the votes of the random forest, in the order of CLASSES, shape (K, 6).
         r_min, r_max: Minimum and maximum radius of a tree [m].
     """
     r, span, contrast = stems["radius"], stems["last"] - stems["first"], stems["contrast"]
@@ -192,7 +192,7 @@ def diameters(stems: Stems, arc_min: float) -> tuple[Float, Float]:
 
     Args:
         stems: Result of `describe_stems`.
-        arc_min: Least visible arc [rad].
+        arc_min: Minimum visible arc [rad].
     """
     known = (stems["coverage"] >= arc_min) & (stems["near"] <= 0.5 * LOCAL) & (stems["slices"] >= 3)
     known &= stems["radius_sigma"] < 0.25 * stems["radius"]
@@ -203,16 +203,16 @@ def diameters(stems: Stems, arc_min: float) -> tuple[Float, Float]:
 
 
 def is_repeated(stems: Stems, axes: Float, verdict: Int32) -> Bool:
-    """Return which stems are duplicates, shape (K,): of stems at the same place, the trees come first, then
-    those with more slices, then the earlier ones; the others are repeated.
+    """Return which stems are duplicates, shape (K,). Of stems at the same position, one is kept: a tree
+    before others, then the one with more slices, then the earlier one.
 
-    Two stems are at the same place if the axis of one is inside of the other at the middle of the heights
-    that both have, or half-way between them. A column without a circle is at its own axis.
-    A stem that is not a tree is also repeated up to BESIDE outside of another one.
+    Two stems are at the same position if the axis of one is inside of the other at the middle of the heights
+    that both have, or half-way between them. A column without a circle is at its own axis. A stem that is not
+    a tree is also a duplicate up to BESIDE outside of a kept stem.
 
     Args:
         stems: Result of `describe_stems`, shape (K,).
-        axes: Axes of their columns, see `find_columns`, shape (K, 5).
+        axes: Axes of the columns of the stems, see `find_columns`, shape (K, 5).
         verdict: Result of `classify_stems`, shape (K,).
     """
     order = np.lexsort((np.arange(len(stems)), -stems["slices"], verdict != Verdict.TREE))

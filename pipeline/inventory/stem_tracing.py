@@ -41,7 +41,7 @@ def find_columns(points: Float32) -> Iterator[tuple[Float, Float]]:
     height in which stems are traced, and no column was ever absent.
 
     Args:
-        points: x, y, z, height above the ground [m], shape (N, 4); may be empty.
+        points: Points x, y, z and height above the ground, shape (N, 4) [m]; may be empty.
 
     Yields:
         Axes: x, y at 1.3 m above the ground [m], shift per metre of height, strength, shape (K, 5); and
@@ -71,14 +71,14 @@ def strongest_first(tiles: Sequence[tuple[Float, Float]]) -> tuple[Float, Float]
 
 
 def trace(slices: Slices, axes: Float, r_min: float, r_max: float) -> Float:
-    """Return the circles along the axes of columns, as in `fit_circle`, NaN in slices without one, shape (K,
-    S, FIGURES).
+    """Return the circles along the axes of K columns in each of S slices, with the values of `fit_circle`,
+    shape (K, S, FIGURES); NaN in slices without a circle.
 
     The first circle is that of all points up to the height in which columns are found, moved along the axis
     to breast height. From there the circle of each slice is fitted, upwards and downwards; it begins with the
     last one, moved along the axis. This is done with the points near the axis, where a thin stem is not
-    outnumbered by its surroundings, and with those of twice and four times the radius. The result is that
-    with the largest sum of visible arcs.
+    outnumbered by its surroundings, and with those of twice and four times the radius. Of these three
+    results, the one with the largest sum of visible arcs is returned.
 
     Args:
         slices: Slices of the plot.
@@ -90,8 +90,15 @@ def trace(slices: Slices, axes: Float, r_min: float, r_max: float) -> Float:
 
 @compiled
 def _trace(slices: Slices, axes: Float, height: Float, r_min: float, r_max: float) -> Float:
-    """Return the circles along the axes of columns, see `trace`, shape (K, S, FIGURES), for the heights of
-    `slice_heights`, shape (S,) [m]."""
+    """Return the circles along the axes of K columns, see `trace`, shape (K, S, FIGURES); NaN for slices
+    without a circle and for columns without a first circle.
+
+    Args:
+        slices: Slices of the plot.
+        axes: Axes of the columns, see `find_columns`.
+        height: Result of `slice_heights`: heights of S slices above the ground, shape (S,) [m].
+        r_min, r_max: Minimum and maximum radius [m].
+    """
     out = np.full((axes.shape[0], height.shape[0], FIGURES), np.nan)
     circles = np.empty((height.shape[0], FIGURES))
     for s in range(axes.shape[0]):
@@ -152,7 +159,7 @@ def _fits(slices: Slices, k: int, row: Float, r_min: float, r_max: float) -> boo
 
     Args:
         slices: Slices of the plot.
-        k: Number of the slice.
+        k: Index of the slice.
         row: Predicted x, y, radius first [m]; filled with the result, shape (FIGURES,).
         r_min, r_max: Minimum and maximum radius [m].
     """

@@ -32,7 +32,7 @@ class TerrainRaster:
     """Heights of the ground at the centres of the cells of a raster.
 
     Attributes:
-        low: Corner of the raster, shape (2,) [m].
+        low: Corner of the raster with the minimum x and y, shape (2,) [m].
         cell: Side of a cell [m].
         height: Heights at the centres of the cells, shape (columns, rows) [m]; interpolated where a cell
             has no ground returns.
@@ -132,7 +132,7 @@ def _keep_lowest(points: Float32, low: Float, lowest: Float32, count: Int32, occ
     """Add points to the tables of `LowestReturns`, in place; points outside are ignored.
 
     Args:
-        points: float32, shape (N, 3) [m].
+        points: Points, float32, shape (N, 3) [m].
         low: Corner of the raster, shape (2,) [m].
         lowest: KEPT lowest returns of each cell in ascending order, infinite where there are fewer, shape
             (columns, rows, KEPT, 3) [m].
@@ -207,7 +207,8 @@ def _continues_upwards(z: Float, occupied: UInt64) -> Bool:
 
 def _trend(ground: Float) -> Float:
     """Return a, b, c of the plane z = a x + b y + c through the lowest cells of squares of 4 m, fitted
-    robustly, shape (3,). With fewer than six squares it is level at their median height, without any at 0.
+    robustly, shape (3,). With fewer than six squares it is level at their median height; at 0 if there is
+    none.
 
     Args:
         ground: Lowest returns, shape (columns, rows, 3) [m], infinite z for none.
@@ -286,12 +287,12 @@ def _lowest_cone(z: Float, rise: float) -> Float:
 
 
 def _interpolated(places: Float, z: Float, centre: Float) -> Float:
-    """Return heights at the centres of cells: linear between the ground returns, the nearest one beyond them,
-    smoothed over neighbouring cells; 0 without returns.
+    """Return heights at the centres of cells, shape (columns, rows) [m]: linear between the ground returns,
+    that of the nearest return beyond them, smoothed over neighbouring cells; 0 if there are no returns.
 
     Args:
         places: Positions of the ground returns, shape (N, 2) [m].
-        z: Their heights, shape (N,) [m].
+        z: Heights of the ground returns, shape (N,) [m].
         centre: Centres of the cells, shape (columns, rows, 2) [m].
     """
     from scipy.interpolate import LinearNDInterpolator

@@ -22,8 +22,8 @@ def write_beside(path: Path) -> Iterator[Path]:
     disk and replaces `path` in one step; if the block raises, it is removed and `path` does not change.
 
     Raises:
-        StemmapError: The folder does not exist, `path` is a folder, or writing fails; an OSError of the block
-            counts as such.
+        StemmapError: The folder does not exist, `path` is a folder, or writing fails. An OSError of the block
+            is raised as StemmapError.
     """
     if not path.parent.is_dir():
         raise StemmapError(
@@ -49,7 +49,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
 
     Args:
         folder: The folder.
-        texts: Texts by name of the file.
+        texts: Dict from names of files to their texts, which are written as UTF-8.
 
     Raises:
         OSError: The folder cannot be created.
@@ -67,7 +67,7 @@ def _to_disk(path: Path) -> None:
     file exists. Nothing for folders on Windows.
 
     Raises:
-        OSError: The disk refuses.
+        OSError: The file or folder cannot be opened or written to the disk.
     """
     if path.is_dir() and os.name == "nt":
         return  # Windows cannot open folders

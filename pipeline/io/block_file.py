@@ -30,12 +30,12 @@ class BlockFile:
     Numbers begin at 0; the memory grows with the largest one.
 
     Args:
-        most: Size that the file may reach. A block that does not fit is not stored.
+        most: Maximum size of the file [bytes]. A block that does not fit is not stored.
 
     Attributes:
-        refusal: Why some blocks are not stored, for people; empty where all are.
-        refused: Number of the first of them; later ones may be smaller and fit.
-        notice: Which stored blocks could not be read, for people; empty where all could.
+        refusal: Reason why some blocks are not stored, for people; "" if all are stored.
+        refused: Number of the first block that was not stored; later ones may be smaller and be stored.
+        notice: Message for people that stored blocks could not be read; "" if all could be read.
     """
 
     def __init__(self, most: int = MOST_BYTES) -> None:
@@ -106,14 +106,15 @@ class BlockFile:
         return True
 
     def read_block(self, index: int, unpack: Callable[[bytes], B]) -> B | None:
-        """Return the content of a block; None if it is not stored or the file is closed.
+        """Return the result of `unpack` for the content of a block; None if the block is not stored or is
+        damaged, or the file is closed.
 
         A damaged block is removed from the index, so that it can be stored again; `notice` reports it.
 
         Args:
             index: Number of the block.
-            unpack: Returns the record of the bytes; it raises ValueError, KeyError, TypeError or
-                RuntimeError if they are damaged.
+            unpack: Function of the bytes of the block. A ValueError, KeyError, TypeError or RuntimeError that
+                it raises means that they are damaged.
         """
         if index not in self or self._file is None:
             return None
@@ -147,14 +148,14 @@ class BlockFile:
 
 
 def free_space(folder: Path | None) -> int:
-    """Return the number of free bytes on the disk of a folder; that of temporary files for None or a missing
-    folder."""
+    """Return the number of free bytes on the disk of a folder; for None or a missing folder, on the disk of
+    the folder of temporary files of the system."""
     return shutil.disk_usage(folder if folder is not None and folder.is_dir() else gettempdir()).free
 
 
 def _unnamed_file() -> Any:  # noqa: ANN401 - its class depends on the operating system
-    """Return an open file without a name in LARGE, or else in the folder of the system; None if neither is
-    possible."""
+    """Return an open file without a name in LARGE, or else in the folder of temporary files of the system;
+    None if neither is possible."""
     for place in (LARGE, None):
         try:
             return TemporaryFile(dir=place, buffering=0)

@@ -16,11 +16,11 @@ from pipeline.io.readers.base import COORDINATE_LIMIT
 
 
 def decoded(content: bytes) -> str:
-    """Return the text of a table that a spreadsheet wrote: UTF-16 if it begins with a byte order mark of
-    UTF-16, else UTF-8 if it is valid, with or without a mark, else Windows-1252.
+    """Return the text of the bytes of a table: UTF-16 if it begins with a byte order mark of UTF-16, else
+    UTF-8 if it is valid, with or without a mark, else Windows-1252.
 
     Raises:
-        UnicodeDecodeError: It is none of these, or has a zero byte, as binary files have.
+        UnicodeDecodeError: The bytes are none of these, or contain a zero byte (except in UTF-16).
     """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16")
@@ -33,21 +33,22 @@ def decoded(content: bytes) -> str:
 
 
 class CsvTable:
-    """A table with a header line; commas, semicolons or tabs, whichever is most frequent in the first line.
-    With semicolons, as spreadsheets of many languages write them, numbers may have decimal commas.
+    """A table with a header line, separated by commas, semicolons or tabs, whichever is most frequent in the
+    first line. With semicolons, numbers may have decimal commas.
 
     Args:
         text: The text.
-        what: What the table is, for errors: "table of trees".
+        what: Name of the kind of table for errors, e.g. "table of trees".
         where: Name of the table in errors.
 
     Attributes:
-        lines: Line number of each row in the file.
-        rows: Cells of each row that is not empty, without the header.
-        column: Index of each column by its name in lower case; of several with the same name the first.
+        lines: List of the line numbers, from 1, of the rows in the file.
+        rows: List of the rows that are not empty, each a list of its cells, without the header.
+        column: Dict from names of columns in lower case to their indices; of several columns with the same
+            name, the first one.
 
     Raises:
-        SourceError: The text is no CSV.
+        SourceError: The text is not a CSV.
     """
 
     def __init__(self, text: str, what: str, where: str) -> None:
@@ -70,7 +71,8 @@ class CsvTable:
         """Return the table of a file; `what` names it in errors.
 
         Raises:
-            SourceError: It cannot be read, is larger than `largest` bytes, or is no CSV; see `decoded`.
+            SourceError: The file cannot be read, is larger than `largest` bytes, is not text (`decoded`), or
+                is not a CSV.
         """
         try:
             if path.stat().st_size > largest:
@@ -94,10 +96,10 @@ class CsvTable:
         return [row[k].strip() if 0 <= k < len(row) else "" for row in self.rows]
 
     def numbers(self, name: str, *, required: bool = True) -> Float:
-        """Return the numbers of a column, shape (N,). Without `required`, empty cells, "nan" and "na" (also
-        in capitals) give NaN. A column that the table does not have counts as empty cells. In a column of a
-        table with semicolons in which a cell has a comma, the comma is the decimal sign and a point is an
-        error, because it may separate thousands.
+        """Return the numbers of a column, shape (N,). If `required` is False, empty cells, "nan" and "na"
+        (also in capitals) give NaN. A column that the table does not have counts as empty cells. In a column
+        of a table with semicolons in which a cell has a comma, the comma is the decimal sign and a point is
+        an error, because it may separate thousands.
 
         Raises:
             SourceError: A cell is not a finite number, or its magnitude is not less than COORDINATE_LIMIT.

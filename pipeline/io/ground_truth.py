@@ -45,8 +45,9 @@ def read_truth_trees(path: Path, *, dbh_unit: str | None = None) -> TruthTrees:
         dbh_unit: "m", "cm" or "mm" for a column `dbh` without a unit; None refuses such a column.
 
     Raises:
-        SourceError: It cannot be read, is larger than 8 MB, is not such a table, a number is beyond
-            COORDINATE_LIMIT, or the median diameter is outside of 5 mm to 3 m, which is another unit.
+        SourceError: The file cannot be read, is larger than 8 MB, has no columns of positions or a class that
+            is not one of KINDS, a number is invalid or beyond COORDINATE_LIMIT, the unit of diameters is
+            unknown, or their median is outside of 5 mm to 3 m.
     """
     return _trees_of(CsvTable.read(path, "table of trees", LARGEST_FILE), dbh_unit)
 
@@ -81,7 +82,8 @@ def _positions(table: CsvTable) -> tuple[Float, ...]:
     """Return x and y of each row, shape (N,) [m], from columns of coordinates or of azimuth and distance.
 
     Raises:
-        SourceError: The table has neither, or a cell is not a number or beyond COORDINATE_LIMIT.
+        SourceError: The table has neither of these columns, or a cell is not a number or beyond
+            COORDINATE_LIMIT.
     """
     x, y = table.find(_X), table.find(_Y)
     if x is not None and y is not None:
@@ -100,8 +102,8 @@ def _positions(table: CsvTable) -> tuple[Float, ...]:
 
 
 def _diameters(table: CsvTable, dbh_unit: str | None) -> Float:
-    """Return diameters [m], shape (N,); NaN without a column of diameters, and for 0 and negative numbers,
-    which other programs write for unmeasured ones.
+    """Return diameters [m], shape (N,); NaN if there is no column of diameters, and for 0 and negative
+    numbers.
 
     Args:
         table: The table.
@@ -135,8 +137,8 @@ def _diameters(table: CsvTable, dbh_unit: str | None) -> Float:
 
 
 def _kinds(table: CsvTable) -> tuple[str, ...]:
-    """Return the class of each row in lower case; "tree" for an empty cell, and for all rows without a column
-    of classes.
+    """Return the class of each row in lower case; "tree" for an empty cell, and for all rows if there is no
+    column of classes.
 
     Raises:
         SourceError: A class is not one of KINDS.
@@ -208,8 +210,8 @@ def read_truth(content: bytes, where: str) -> tuple[Truth, Sensor | None]:
         where: Name of the recording in errors.
 
     Raises:
-        SourceError: It is not JSON of this form and version, a coordinate is beyond 1e8, a property of the
-            sensor is out of bounds, or columns differ in length.
+        SourceError: The content is not JSON of this form and version, a coordinate is beyond 1e8, a property
+            of the sensor is out of bounds, or columns differ in length.
     """
     try:
         file = msgspec.json.decode(content, type=_TruthFile)
@@ -239,9 +241,10 @@ def _path(columns: _Path) -> TruthPath:
 
 
 def truth_json(sensor: Sensor, truth: Truth | None) -> bytes:
-    """Return the attachment with sensor, trees (dbh null where unknown) and path, as columns of JSON.
+    """Return the JSON of the attachment: "version", "sensor", and, if known, "trees" (columns x, y, dbh, null
+    where unknown, and kind) and "path" (columns stamp_ns, x, y, yaw).
 
-    A path in another frame than that of the map, or without yaw, is left out, because readers expect both.
+    A path in another frame than that of the map, or without finite yaws, is left out.
 
     Args:
         sensor: The LiDAR.

@@ -30,7 +30,7 @@ SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
 
 
 def number_text(value: float, digits: int) -> str:
-    """Return a decimal text with `digits` decimals, without exponent and without minus zero; empty for values
+    """Return a decimal text with `digits` decimals, without exponent and without minus zero; "" for values
     that are not finite."""
     if not math.isfinite(value):
         return ""
@@ -39,14 +39,13 @@ def number_text(value: float, digits: int) -> str:
 
 
 def _numbers(values: Iterable[float] | None, digits: int) -> Iterable[str]:
-    """Yield the texts of numbers with `digits` decimals, empty for values that are not finite; for None empty
-    texts without end."""
+    """Yield the texts of numbers by `number_text`; for None, yield "" endlessly."""
     return itertools.repeat("") if values is None else (number_text(value, digits) for value in values)
 
 
 def _seconds(stamp_ns: Int, start_ns: int) -> Iterable[str]:
-    """Return the times from `start_ns` to stamps [s] as texts; empty for a stamp below 0, which is
-    unknown."""
+    """Return the times from `start_ns` to stamps [s] as texts with three decimals; "" for a stamp below 0,
+    which is unknown."""
     return _numbers(np.where(stamp_ns >= 0, (stamp_ns - start_ns) * 1e-9, math.nan), 3)
 
 
@@ -98,12 +97,12 @@ DETECTION_COLUMNS = tuple(_DETECTIONS)
 
 
 def tree_rows(trees: Trees, start_ns: int, reviews: Mapping[int, str] | None = None) -> list[tuple[str, ...]]:
-    """Return the confirmed trees as rows of TREE_COLUMNS; unknown values are empty.
+    """Return the confirmed trees as rows of TREE_COLUMNS; unknown values are "".
 
     Args:
         trees: The map.
         start_ns: Time from which the seconds count [ns]; a stamp below 0 is unknown.
-        reviews: One of REVIEWS by the number of a tree; OPEN for other trees.
+        reviews: Dict from numbers of trees to one of REVIEWS; OPEN for other trees.
     """
     review = ((reviews or {}).get(number, OPEN) for number in trees.number.tolist())
     rows = zip(*(column(trees, start_ns) for column in _TREES.values()), review, strict=False)
@@ -111,14 +110,14 @@ def tree_rows(trees: Trees, start_ns: int, reviews: Mapping[int, str] | None = N
 
 
 def path_rows(path: Path, start_ns: int) -> list[tuple[str, ...]]:
-    """Return the path as rows of PATH_COLUMNS, one per scan; seconds count from `start_ns` [ns], and are
-    empty for a stamp below 0."""
+    """Return the path as rows of PATH_COLUMNS, one per scan; seconds count from `start_ns` [ns], and are ""
+    for a stamp below 0."""
     return list(zip(*(column(path, start_ns) for column in _PATH.values()), strict=True))
 
 
 def detection_rows(frame: Frame, start_ns: int) -> list[tuple[str, ...]]:
     """Return all clusters of a scan with their verdicts, in the frame of the map, as rows of
-    DETECTION_COLUMNS; unknown values are empty.
+    DETECTION_COLUMNS; unknown values are "".
 
     Args:
         frame: Results of the scan.
@@ -134,7 +133,7 @@ def _centres(frame: Frame) -> Float:
 
 
 def _known_degrees(angle: Float, known: Bool) -> Float:
-    """Return angles [rad] in degrees, shape (N,); NaN where they are not known."""
+    """Return angles [rad] in degrees, shape (N,); NaN where `known`, shape (N,), is False."""
     return np.where(known, np.degrees(angle), math.nan)
 
 
@@ -177,17 +176,17 @@ def geojson(
     reviews: Mapping[int, str] | None = None,
 ) -> str:
     """Return the text of a GeoJSON FeatureCollection with the confirmed trees. The properties are named as
-    TREE_COLUMNS, with null for unknown values; x and y are the geometry. Positions must be finite (else
-    ValueError).
+    TREE_COLUMNS, with null for unknown values; x and y are the geometry. Positions of confirmed trees must be
+    finite (else ValueError).
 
     RFC 7946 requires WGS84; a map without `lon_lat` has a member `coordinateFrame`.
 
     Args:
         trees: The map.
-        start_ns: Origin of the seconds.
+        start_ns: Time from which the seconds count [ns].
         frame: Description of the coordinates of `trees`; None means ROBOTS_FRAME.
-        lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees], if known. They become
-            the geometry, and x and y become properties.
+        lon_lat: Longitude and latitude of each confirmed tree, shape (T, 2) [degrees]; None if unknown. They
+            become the geometry, and x and y become properties.
         reviews: See `tree_rows`.
     """
     features = []
@@ -227,8 +226,8 @@ def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 class RunFiles:
-    """The output folder of `stemmap map`. Detections are written during the run, all else at its end; all
-    files appear under their names in `finish`.
+    """The output folder of `stemmap map`. Detections are written during the run, the other files at its end;
+    all files appear under their names in `finish`.
 
     Args:
         folder: The folder, which is created if necessary; files of an earlier run are replaced.
@@ -243,7 +242,7 @@ class RunFiles:
         earlier run or a header.
 
         Raises:
-            OSError: The folder cannot be created, or the disk refuses.
+            OSError: The folder cannot be created, or a file cannot be written.
         """
         self._folder = folder
         self._made_folder = not folder.exists()
@@ -262,7 +261,7 @@ class RunFiles:
 
     def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
         """After an exception, remove the incomplete files, and the folder if this object created it; errors
-        as `abandon`. Without one, nothing is done: call `finish` before."""
+        as in `abandon`. If there is no exception, nothing is done."""
         if error is not None:
             self.abandon()
 
@@ -291,11 +290,12 @@ class RunFiles:
             trees, path: The map; confirmed trees are written.
             start_ns: Time from which the seconds count [ns].
             run: Content of run.json, as JSON values.
-            state: State for a continuation; None without.
-            further: Texts of additional files, or of files to replace, by name.
+            state: Bytes of state.zip for a continuation; None for no state.
+            further: Dict from names of additional files, or of files to replace except run.json, to their
+                texts.
 
         Raises:
-            OSError: The disk refuses.
+            OSError: A file cannot be written or moved.
             ValueError: A number of `run` is not finite.
         """
         self._detections.close()

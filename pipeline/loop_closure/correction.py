@@ -25,7 +25,7 @@ class Restart(Generic[S]):
 
     Attributes:
         state: State of the mapper before the robot was lost.
-        motions: Scan number and motion of every scan since that state.
+        motions: Scan number and motion of each scan after `state`, in the order of time.
     """
 
     state: S
@@ -39,10 +39,10 @@ class Restart(Generic[S]):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelocalisedPose:
-    """A lost robot is located in the map, at a place to which it was carried.
+    """A lost robot is located in the map, at a position to which it was carried.
 
     Attributes:
-        T_map_base: Pose of the base.
+        T_map_base: Pose of the base in the map.
         covariance: Covariance of x, y [m], yaw [rad], shape (3, 3).
         stems: Number of trees that agree.
     """

@@ -42,14 +42,15 @@ class RunHistory:
     """Path and map of a run.
 
     Attributes:
-        stamp_ns: int64, time of each scan, shape (N,).
-        path: x, y [m], yaw [rad] at each scan, shape (N, 3).
+        stamp_ns: Time of each scan [ns], int64, shape (N,).
+        path: Pose x, y [m], yaw [rad] of the base in the map at each scan, shape (N, 3).
         trees: The trees of the map.
-        begun_since: Returns the landmarks that were begun at a scan or later, see FastSlam.begun_since.
+        begun_since: Function of a scan number that returns the landmarks begun at this scan or later, see
+            FastSlam.begun_since.
         T_map_particle: Pose of the particle with these landmarks at the newest scan.
         estimate: Pose at the newest scan.
         noise: Noise of the odometry.
-        motion: x, y [m], yaw [rad] by odometry from the scan before to each scan, shape (N, 3).
+        motion: Motion x, y [m], yaw [rad] by odometry from the scan before to each scan, shape (N, 3).
         placed: Scan at which the pose was last set from outside; the path begins there.
         closed: Scan at which the last loop was closed; the path before it has no drift left.
         contradicted: Whether the newest scan shows trees where known places have others; see
@@ -137,15 +138,16 @@ def loop_to(
     run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
     """Return the loop from the scan at which known trees were left to the newest scan, at which they are
-    found again; its anchor is the nearest scan to the found pose, up to the one at which they were left. The
-    trees count as left at `placed` or `closed` of the run at the earliest. None if they were left at
-    `last_mapped` or later, if the error of the position is below LEAST_GAP and the run is not `contradicted`,
-    or if the error is larger than the drift of the path can be.
+    found again. The anchor of the loop is the scan whose pose is nearest to `T_map_base`, among the scans up
+    to the one at which the trees were left. The trees count as left at `placed` or `closed` of the run at the
+    earliest. Return None if the trees were left at `last_mapped` or later, if the error of the position is
+    below LEAST_GAP and the run is not `contradicted`, or if the error is larger than the drift of the path
+    can be.
 
     Args:
         run: Path and map; unchanged.
         numbers: Numbers of the trees that agree, int64, shape (K,); at least one exists in the map.
-        T_map_base: Pose of the base by these trees.
+        T_map_base: Pose of the base in the map by these trees.
         R: Covariance of this pose, shape (3, 3).
         last_mapped: Last scan that changed the map.
         spread: Covariance of the pose, shape (3, 3); None uses the drift of the odometry since the trees were
@@ -176,7 +178,7 @@ def loop_to(
 
 
 def _gap(T_map_base: Pose2, pose: Float) -> Float:
-    """Return the difference T_map_base minus a pose x, y [m], yaw [rad], shape (3,), along the axes of the
+    """Return the difference x, y [m], yaw [rad], shape (3,), of T_map_base minus `pose` along the axes of the
     map, with the yaw wrapped."""
     gap = T_map_base.as_array() - pose
     gap[2] = wrap_angle(gap[2])
@@ -198,9 +200,9 @@ def through(T_map_local: Pose2, covariance: Float, T_local_base: Pose2, own: Flo
 
     Args:
         T_map_local: Pose of a local frame in the map, by a match.
-        covariance: Its covariance, shape (3, 3).
+        covariance: Covariance of T_map_local, shape (3, 3).
         T_local_base: Pose of the base in the local frame.
-        own: Its covariance, shape (3, 3), independent of `covariance`.
+        own: Covariance of T_local_base, shape (3, 3), independent of `covariance`.
     """
     C = np.eye(3)
     C[:2, :2] = T_map_local.rotation()
@@ -215,8 +217,8 @@ def _left(seen: Int, way: Float) -> int:
 
     A drifted scan may have associated some of the trees wrongly since, so the trees are grouped by the path
     at which they were last seen (groups are GROUP_APART from each other), and the result is the median scan
-    of the first group with at least a quarter of the trees and LEAST_LEFT trees. Without such a group it is
-    that of the first group.
+    of the first group with at least a quarter of the trees and LEAST_LEFT trees. If there is no such group,
+    it is the median scan of the first group.
 
     Args:
         seen: Scan in which each tree was seen last, int64, shape (K,), K > 0.

@@ -35,11 +35,12 @@ class RelocaliserState(Generic[S]):
     """State of the relocaliser between two scans.
 
     Attributes:
-        kept: The last two stored states of the mapper, older first, each with the next scan's number.
-        views: Number of views at the newer one.
-        motions: Scan number and motion of every scan since the older one.
+        kept: The last two stored states of the mapper, older first, as pairs of the number of the next scan
+            and the state.
+        views: Number of views at the newer stored state.
+        motions: Scan number and motion of each scan after the older stored state.
         local: Local map of a search; None while the robot knows where it is.
-        driven: Distance since the search began [m].
+        driven: Distance driven since the search began [m].
         since: First scan that mapped nothing because the robot was lost.
     """
 
@@ -84,8 +85,8 @@ class Relocaliser(Generic[S]):
         self.state = RelocaliserState()
 
     def needs_state(self, views: int, is_supported: bool) -> bool:
-        """Return whether `remember` must get the state of the mapper before this scan: while none is stored,
-        and where trees support the pose, SPACING views after the last one.
+        """Return whether `remember` must get the state of the mapper before this scan: if no state is stored,
+        or if the pose is supported and SPACING views have passed since the last stored state.
 
         Args:
             views: Number of scans that SLAM has used so far.
@@ -153,7 +154,7 @@ class Relocaliser(Generic[S]):
         Returns:
             The decision: a loop closure if the odometry can have led to the found pose, otherwise a
             relocalised pose; a failure after FARTHEST metres of search. None while the search continues, and
-            without a search.
+            if there is no search.
         """
         if self.state.local is None:
             return None
@@ -183,7 +184,7 @@ class Relocaliser(Generic[S]):
         `state`.
 
         Args:
-            local: State of the local map; its particles are kept in number.
+            local: State of the local map; the number of its particles is kept.
             index: Number of the scan.
             motion: Motion from the scan before; a measured pose is ignored, because it is in the frame of the
                 map.

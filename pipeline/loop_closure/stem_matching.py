@@ -94,7 +94,7 @@ def _walk_pairs(
 def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
     """Return a grid over stems, shape (N, 2) [m], N > 0: low corner x, y and cell size, shape (3,) [m]; first
     stem of each cell, int32, shape (W, H); and next stem in the same cell of each stem, int32, shape (N,); -1
-    without one. The cell is doubled from `cell` [m] until at most MOST_CELLS are needed."""
+    if there is none. The cell is doubled from `cell` [m] until at most MOST_CELLS are needed."""
     grid = np.empty(3)
     grid[0], grid[1], grid[2] = position[:, 0].min(), position[:, 1].min(), cell
     width = np.floor((position[:, 0].max() - grid[0]) / grid[2]) + 1.0
@@ -117,8 +117,8 @@ def cells_of(position: Float, cell: float) -> tuple[Float, Int32, Int32]:
 def nearest(
     x: float, y: float, reach: float, position: Float, grid: Float, first: Int32, following: Int32
 ) -> tuple[int, float]:
-    """Return row and squared distance [m^2] of the nearest stem nearer than a reach; the row -1 without one,
-    where the distance has no meaning.
+    """Return row and squared distance [m^2] of the nearest stem nearer than a reach; row -1 and an undefined
+    distance if there is none.
 
     Args:
         x, y: Position [m].
@@ -164,13 +164,14 @@ def search(
     """Align each base pair with all pairs of the map of equal length, and count the stems that agree.
 
     Args:
-        local, local_sigma, local_dbh, local_dbh_sigma: Local stems, shape (L, 2) [m], relative to their mean,
-            and their other columns, shape (L,), see `MapStems`.
+        local: Positions of the local stems relative to their mean, shape (L, 2) [m].
+        local_sigma, local_dbh, local_dbh_sigma: Other columns of the local stems, shape (L,), see `MapStems`.
         base: Pairs of local rows, int32, shape (B, 2).
-        reference, sigma, dbh, dbh_sigma: Stems of the map, likewise, N > 0.
+        reference: Positions of the stems of the map, shape (N, 2) [m], N > 0.
+        sigma, dbh, dbh_sigma: Other columns of the stems of the map, shape (N,).
         pair, length: Pairs of the map, see `pairs_within`.
         slack: Standard deviation of the deformation of a map within a constellation [m].
-        reach: Largest distance of two stems that agree [m], at most one cell of the grid.
+        reach: Maximum distance of two stems that agree [m], at most one cell of the grid.
         least: Hypotheses with fewer stems in agreement are dropped.
         most: Number of hypotheses after which no further base pair is tried.
         grid, first, following: Grid of the map, see `cells_of`.
@@ -286,7 +287,7 @@ def partners(
         local, local_sigma, local_dbh, local_dbh_sigma, reference, sigma, dbh, dbh_sigma: See `search`.
         grid, first, following: Grid of the map, see `cells_of`.
         slack: Standard deviation of the deformation of the map [m].
-        reach: Maximum distance [m].
+        reach: Maximum distance of the stems of a pair [m].
         of: Filled with the row of the map of each local stem, -1 for none, int64, shape (L,).
     """
     c, s = np.cos(pose[2]), np.sin(pose[2])
@@ -343,10 +344,10 @@ class MapStems:
     """Columns of N stems in the frame of one map.
 
     Attributes:
-        position: shape (N, 2) [m].
+        position: Positions x, y, shape (N, 2) [m].
         sigma: Standard deviation of a position in its worst direction, shape (N,) [m].
         dbh: Diameter at breast height, shape (N,) [m]; NaN if unknown.
-        dbh_sigma: Its standard deviation, shape (N,) [m]; NaN if unknown.
+        dbh_sigma: Standard deviation of the diameter, shape (N,) [m]; NaN if unknown.
     """
 
     position: Float
@@ -388,7 +389,8 @@ class MapStems:
 
 
 def worst_sigma(covariance: Float) -> Float:
-    """Return the larger standard deviation of covariances xx, xy, yy, shape (N, 3) -> (N,) [m]."""
+    """Return the standard deviation in the worst direction, shape (N,) [m], of covariances xx, xy, yy, shape
+    (N, 3) [m^2]."""
     xx, xy, yy = covariance[:, 0], covariance[:, 1], covariance[:, 2]
     largest: Float = 0.5 * (xx + yy) + np.hypot(0.5 * (xx - yy), xy)
     return np.sqrt(np.maximum(largest, 0.0))
@@ -431,7 +433,7 @@ def alignment_covariance(pose: Pose2, local: Float, reference: Float, variance: 
     """Return the covariance of an aligned pose x, y [m], yaw [rad], shape (3, 3): (sum J^T J / variance)^-1
     at the solution.
 
-    Where the residuals are larger than their variances, it grows by their ratio; it never shrinks.
+    It is multiplied by chi^2 per degree of freedom of the residuals if that is above 1.
 
     Args:
         pose: T_reference_local.
@@ -476,11 +478,11 @@ class Match:
     """Result of a search.
 
     Attributes:
-        pose: T_reference_local; None if it was refused.
+        pose: T_reference_local; None if it was refused or not found.
         covariance: Covariance of x, y [m], yaw [rad], shape (3, 3); zeros if refused.
         reason: Reason of the refusal, or None.
         local, reference: Rows of the stems that agree in the best pose, int64, shape (K,).
-        second: Number of stems that agree in the second best pose.
+        second: Number of stems that agree in the second best pose; 0 if there is none.
         false_alarms: Decimal logarithm of the expected number of equally good agreements by chance.
     """
 
@@ -527,15 +529,16 @@ def find_constellation(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Candidate:
-    """A refined pose x, y, yaw; the row of the map for each local stem, or -1; the number of pairs."""
+    """A refined pose x, y [m], yaw [rad] of the centred local stems in the map, shape (3,); the row of the
+    map of each local stem, -1 for none, int64, shape (L,); the number of pairs."""
 
     pose: Float
     of: Int
     found: int
 
     def is_same(self, other: _Candidate) -> bool:
-        """Return whether more than half of the pairs are those of another candidate. Both have the same local
-        stems."""
+        """Return whether more than half of the pairs of this candidate are pairs of `other` too. Both have
+        the same local stems."""
         return 2 * int(np.count_nonzero((self.of >= 0) & (self.of == other.of))) > self.found
 
 
@@ -583,7 +586,7 @@ class _Search:
     def checked(self, best: _Candidate, second: int) -> tuple[Pose2, Float, float, Refusal | None]:
         """Return the pose T_reference_local, its covariance, shape (3, 3), the decimal logarithm of the false
         alarms, and the reason of a refusal (None for none). `second` is the number of pairs of the second
-        best pose, 0 without one.
+        best pose, 0 if there is none.
 
         Raises:
             LinAlgError: The pairs do not determine the pose.

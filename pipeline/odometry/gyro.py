@@ -91,18 +91,19 @@ class Gyro:
 
     @property
     def proven(self) -> bool:
-        """Whether the turns of the gyroscope have agreed with those of the wheels; it stays True."""
+        """Whether the rotations by the gyroscope have agreed with those by the wheels, see `compare`; it
+        stays True."""
         return self._proven
 
     def compare(self, by_wheels: float, turn: Turn) -> None:
         """Add one step to the comparison of wheels and gyroscope, the slope of a line through all steps.
 
-        The gyroscope is `proven` once the wheels have turned by PROOF while the slope is between 1 / ALIKE
-        and ALIKE.
+        The gyroscope is `proven` once the rotations by the wheels sum up to PROOF while the slope is between
+        1 / ALIKE and ALIKE.
 
         Args:
-            by_wheels: Turn of the step by the wheels [rad].
-            turn: Turn of the same step by the gyroscope.
+            by_wheels: Rotation of the step by the wheels [rad].
+            turn: Rotation of the same step by the gyroscope.
         """
         way, square, product = self._turned
         way, square = way + abs(by_wheels), square + by_wheels**2
@@ -111,8 +112,8 @@ class Gyro:
         self._proven = self._proven or (way >= PROOF and alike)
 
     def turn(self, from_ns: int, to_ns: int) -> Turn | None:
-        """Return the turn between two times [ns] less the bias, with its sigma. None if readings are missing
-        for more than GAP_NS or are constant, or if the times are not in order."""
+        """Return the rotation between two times [ns] minus the bias [rad], with its sigma [rad]. None if
+        readings are missing for more than GAP_NS or are constant, or if the times are not in order."""
         angle = self._integral(from_ns, to_ns)
         if angle is None:
             return None
@@ -126,7 +127,7 @@ class Gyro:
         return Turn(angle, math.sqrt(variance))
 
     def rate(self, stamp_ns: int) -> float | None:
-        """Return the turn rate at a time [ns] less the bias [rad/s]: the mean of the readings within
+        """Return the turn rate [rad/s] at a time [ns] minus the bias: the mean of the readings within
         AROUND_NS. None without such a reading, or if the readings are constant."""
         near = [rate for _, rate in self._between(stamp_ns - AROUND_NS, stamp_ns + AROUND_NS)]
         return None if not near or self._is_dead else float(np.mean(near)) - self._bias
@@ -149,8 +150,9 @@ class Gyro:
         return found[::-1]
 
     def _integral(self, from_ns: int, to_ns: int) -> float | None:
-        """Return the turn between two times [ns], integrated by trapezoids [rad]; up to GAP_NS outside of the
-        readings the rate is constant. None if readings are missing or constant."""
+        """Return the rotation [rad] between two times [ns], integrated by trapezoids; up to GAP_NS outside of
+        the readings the rate is constant. None if the gap between readings exceeds GAP_NS, if the readings
+        are constant (`_is_dead`), or if `to_ns` is not after `from_ns`."""
         inside = self._between(from_ns - GAP_NS, to_ns + GAP_NS)
         if self._is_dead or not inside or to_ns <= from_ns:
             return None
@@ -166,20 +168,21 @@ class Gyro:
 def fused(
     step: Pose2, sigma: float, slack: tuple[float, float], turn: Turn
 ) -> tuple[Pose2, float, tuple[float, float], str]:
-    """Fuse a step of the wheels with the turn by the gyroscope.
+    """Fuse a step of the wheels with the rotation by the gyroscope.
 
-    The turns are weighted by their inverse variances; when they contradict each other the turn of the
-    gyroscope is used. The translation is rotated by half of the correction of the turn.
+    The two rotations are weighted by their inverse variances. If they differ by more than CONTRADICTION sigma
+    and more than CONTRADICTION_LEAST, that of the gyroscope is used, and HALF_TRACK times the difference is
+    added to the slack of the position. The translation is rotated by half of the correction.
 
     Args:
         step: Step by the wheels.
-        sigma: Standard deviation of its turn [rad].
+        sigma: Standard deviation of the rotation of the step by the wheels [rad].
         slack: Additional standard deviations of position [m] and heading [rad], see `Step`.
-        turn: Turn by the gyroscope.
+        turn: Rotation by the gyroscope.
 
     Returns:
-        The step, the standard deviation of its turn [rad], the remaining slack (heading 0), and the message
-        why the wheels are not trusted, "" if they are.
+        The corrected step, the standard deviation of its rotation [rad], the remaining slack (heading 0), and
+        the message SLIPPED if the rotations contradict each other, else "".
     """
     of_wheels, of_gyro = sigma**2 + slack[1] ** 2, turn.sigma**2
     gap = float(wrap_angle(turn.angle - step.yaw))

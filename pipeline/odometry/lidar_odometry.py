@@ -49,7 +49,8 @@ class LidarOdometry:
         T_base_lidar: Extrinsics of the LiDAR.
 
     Attributes:
-        losses: Scans without a pose, by reason.
+        losses: Dict from reasons to numbers of scans: those without a pose, and those whose pose is only the
+            initial guess.
     """
 
     def __init__(self, T_base_lidar: Pose3) -> None:
@@ -116,7 +117,8 @@ class LidarOdometry:
 
     def _useful(self, scan: Scan) -> tuple[Float, Float | None]:
         """Return the points to register in the sensor frame, shape (N, 3) [m], without those too near, too
-        far or too low, and their times after the stamp, shape (N,) [s]; None if the scan has no times."""
+        far or too low, and their times after the stamp, shape (N,) [s]; the times are None if the scan has
+        none."""
         points = scan.points.astype(np.float64)
         reach = np.sqrt(np.einsum("ij,ij->i", points, points))
         up = points @ self._T_base_lidar.R[2]
@@ -148,13 +150,13 @@ class LidarOdometry:
 
 
 def undistorted(points: Float, offset_s: Float | None, delta: Float, span_ns: int) -> Float:
-    """Return points transformed to the stamp of the scan with constant velocity, p' = p + (w x p + v) dt,
-    shape (N, 3).
+    """Return the points in the sensor frame at the stamp of the scan, shape (N, 3) [m], with constant
+    velocity: p' = p + (w x p + v) dt.
 
-    The linearisation is exact to a centimetre for the turns of a robot within one sweep.
+    The linearisation is exact to a centimetre for the rotations of a robot within one sweep.
 
     Args:
-        points: Points in the sensor frame [m], shape (N, 3).
+        points: Points in the sensor frame at their own times, shape (N, 3) [m].
         offset_s: Time of each point after the stamp [s], shape (N,); None returns the points unchanged (the
             same array).
         delta: Motion of the sensor in `span_ns`, shape (4, 4).

@@ -18,7 +18,7 @@ class OdometryEstimator(Protocol):
     """An estimator of odometry from the records of a source.
 
     Attributes:
-        losses: Number of scans without a pose, by reason.
+        losses: Dict from reasons to numbers of scans without a pose.
     """
 
     losses: dict[str, int]
@@ -27,7 +27,7 @@ class OdometryEstimator(Protocol):
         """Yield the records that replace one record; may yield none."""
 
     def end(self) -> None:
-        """Finish after the last record; may add to `losses`."""
+        """Finish after the last record; may change `losses`."""
 
 
 class OdometryOverride:
@@ -49,16 +49,16 @@ class OdometryOverride:
 
     @property
     def description(self) -> SourceDescription:
-        """Description of the source, with odometry, and with "+" and the digest of the file appended to its
-        digest if there is one."""
+        """Description of the source with `has_odometry` True. If the digest of the file is not empty,
+        `digest` is that of the source, "+" and that of the file."""
         known = self.source.description
         digest = f"{known.digest}+{self._digest}" if self._digest else known.digest
         return replace(known, has_odometry=True, digest=digest)
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of records that the source left out and of scans without a pose, by reason; a new
-        dictionary."""
+        """New dict from reasons to numbers of records that the source left out and of scans without a
+        pose."""
         total = dict(self.source.losses)
         for reason, count in self._motion.losses.items():
             count_loss(total, reason, count)
@@ -77,7 +77,7 @@ class OdometryOverride:
         return self._motion.add(record)
 
     def truth(self) -> Truth | None:
-        """Return the ground truth of the source; None without one."""
+        """Return the ground truth of the source; None if there is none."""
         return self.source.truth()
 
     def close(self) -> None:
@@ -102,17 +102,17 @@ class FileOdometry:
         T_base_lidar: Extrinsics of the LiDAR.
 
     Attributes:
-        losses: Rows without a scan, or scans without a row, by reason.
+        losses: Dict from reasons to numbers of rows without a scan, or of scans without a row; set by `end`.
 
     Raises:
-        SourceError: It cannot be read.
+        SourceError: The file cannot be read, or has another format.
     """
 
     def __init__(self, path: Path, T_base_lidar: Pose3) -> None:
         """Read the file of poses.
 
         Raises:
-            SourceError: It cannot be read, or has another format.
+            SourceError: The file cannot be read, or has another format.
         """
         try:
             self._times, self._poses = read_any_poses(path)

@@ -33,7 +33,8 @@ Tilt = tuple[float, float]  # roll, pitch [rad]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """Planar odometry without jumps; tilt is None for odometry in the plane."""
+    """Planar odometry T_odom_base without jumps at a time [ns], and tilt: roll, pitch [rad], None for
+    odometry in the plane."""
 
     stamp_ns: int
     pose: Pose2
@@ -41,7 +42,7 @@ class Reading:
 
 
 class Jump(NamedTuple):
-    """A step of the odometry that is impossible for a robot: distance [m] and absolute turn [rad]."""
+    """A step of the odometry that is impossible for a robot: distance [m] and absolute rotation [rad]."""
 
     distance: float
     turn: float
@@ -49,7 +50,7 @@ class Jump(NamedTuple):
 
 class Moving(NamedTuple):
     """Motion of the base at a time: T_odom_base, velocity x, y [m/s], yaw [rad/s] in the base frame, and tilt
-    (None for odometry in the plane)."""
+    (roll, pitch [rad]; None for odometry in the plane)."""
 
     pose: Pose2
     twist: tuple[float, float, float]
@@ -60,7 +61,8 @@ class OdometryBuffer:
     """The odometry of the last seconds, from which jumps are removed.
 
     Attributes:
-        standing_since: Time [ns] and pose since which the robot has not moved, None before the first reading.
+        standing_since: Time [ns] and pose T_odom_base since which the robot has not moved by STANDSTILL or
+            more; None before the first reading.
     """
 
     def __init__(self) -> None:
@@ -209,7 +211,7 @@ class PoseBuffer:
         Args:
             stamp_ns: Time of the scan [ns].
             T_odom_base: Odometry at the scan, None if unknown.
-            odometry_at: Returns T_odom_base at an earlier time [ns]; None without odometry.
+            odometry_at: Returns T_odom_base at an earlier time [ns]; None if there is no odometry.
         """
         near = min(self._places, key=lambda pose: abs(pose.stamp_ns - stamp_ns), default=None)
         if near is not None and abs(near.stamp_ns - stamp_ns) <= SAME_TIME_NS:
@@ -226,7 +228,8 @@ class PoseBuffer:
 
 def _carried(pose: PoseMeasurement, step: Pose2, stamp_ns: int) -> PoseMeasurement:
     """Return a pose measurement predicted to a later time: P' = F P F^T + Q, shared' = F shared, with the
-    Jacobian F of the step by the pose; Q has the sigma CARRIED times the distance and the turn of the step.
+    Jacobian F of the step by the pose; the diagonal of Q is the square of CARRIED times the distance (x and
+    y) and times the rotation (yaw) of the step.
 
     Args:
         pose: The measurement.
@@ -269,7 +272,7 @@ def steps(
     losses: Counter[str] | None = None,
 ) -> Iterator[Step]:
     """Yield a step for each scan: the scan with odometry and tilt interpolated to its time, the measured
-    pose, and the turn by the gyroscope.
+    pose, and the rotation by the gyroscope since the last step.
 
     A scan waits for the first odometry at or after its stamp, until a scan is WAIT_NS later or more than
     MOST_WAITING scans wait; then the last pose is used. A scan that is not later than the last one is left
@@ -280,7 +283,8 @@ def steps(
         records: Records in the order of arrival.
         odometry: "static" ignores odometry, so that no step has a pose and no scan waits; the other choices
             use it.
-        losses: Counter of what was left out, by reason, increased in place; None for none.
+        losses: Counter from reasons to numbers of records that were left out, increased in place; None to
+            discard them.
     """
     counted = Counter[str]() if losses is None else losses
     joiner = Synchroniser(use_odometry=odometry != "static", losses=counted)
@@ -295,7 +299,7 @@ class Synchroniser:
 
     Args:
         use_odometry: Whether odometry is used; without it no scan waits.
-        losses: Counts what was left out, by reason.
+        losses: Counter from reasons to numbers of records that were left out, increased in place.
     """
 
     def __init__(self, *, use_odometry: bool, losses: Counter[str]) -> None:
@@ -408,7 +412,7 @@ class Synchroniser:
         are removed, which is counted once and reported.
 
         They were ahead if the new reading, at `stamp_ns`, is AHEAD_NS or more before the last one, and is
-        nearer to the newest scan or odometry. False without a scan or odometry.
+        nearer to the newest scan or odometry. False if there is no scan or odometry.
         """
         last = self._turned_ns
         newest = self._odometry.newest
@@ -503,7 +507,7 @@ class Synchroniser:
 
     def _unreported(self, stamp_ns: int) -> Pose2 | None:
         """Return the motion by the odometry up to the last step that the pose of that step does not contain,
-        because the odometry was missing then and has returned before a time [ns]; None otherwise.
+        because the odometry was missing at that step and has returned by `stamp_ns` [ns]; None otherwise.
 
         The pose at the last step is interpolated between the readings before and after the gap.
         """
@@ -515,8 +519,8 @@ class Synchroniser:
         return self._stepped.inverse() @ self._odometry.pose_at(self._stepped_ns)
 
     def _turn_to(self, stamp_ns: int, pose: Pose2 | None, unreported: Pose2 | None) -> Turn | None:
-        """Return the turn since the last step by the gyroscope, None if unknown; it is compared with the
-        odometry (`Gyro.compare`) if neither is missing and the odometry is not doubted.
+        """Return the rotation since the last step by the gyroscope, None if unknown. It is compared with the
+        odometry (`Gyro.compare`) if both are known and the odometry is not doubted.
 
         Args:
             stamp_ns: Time of the scan [ns].
@@ -563,8 +567,8 @@ class Synchroniser:
         self._suspect("there is no odometry", (WALK_SPEED * seconds, WALK_TURN * seconds))
 
     def _tilt_at(self, stamp_ns: int) -> tuple[float, float] | None:
-        """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None without one, if it
-        is not a valid quaternion, and, with a warning, if it is more than STALE_NS away."""
+        """Return roll and pitch [rad] of the IMU orientation nearest to a time [ns]; None if there is none,
+        if it is not a valid quaternion, and, with a warning, if it is more than STALE_NS away."""
         if not self._imu:
             return None
         nearest = min(self._imu, key=lambda imu: abs(imu.stamp_ns - stamp_ns))
@@ -585,8 +589,8 @@ class Synchroniser:
 
 
 def _tilt_of(imu: Imu) -> tuple[float, float] | None:
-    """Return roll and pitch [rad] by the orientation of a reading; None without one, or if it is not finite
-    or not a valid quaternion."""
+    """Return roll and pitch [rad] by the orientation of a reading; None if there is none, or if it is not
+    finite or not a valid quaternion."""
     if imu.orientation is None or not np.all(np.isfinite(imu.orientation)):
         return None
     try:

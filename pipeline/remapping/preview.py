@@ -55,7 +55,7 @@ class ClusterTable:
     Above MOST_ROWS clusters or MOST_SCANS scans, every second scan is dropped, repeatedly.
 
     Attributes:
-        spacing: Stored are the scans whose number is a multiple of it, a power of two.
+        spacing: Power of two; scans whose number is a multiple of it are stored.
         start: First row of each stored scan, then the number of all rows.
     """
 
@@ -79,7 +79,7 @@ class ClusterTable:
 
         Args:
             index: Number of the scan; one that is no multiple of `spacing` is counted, not stored.
-            clusters: Its clusters; copied.
+            clusters: Clusters of the scan; copied.
             offset: Position of the sensor in the base frame, shape (3,) [m].
             lost: Whether the robot was lost, so that the pose is unusable.
         """
@@ -150,9 +150,9 @@ class ClusterTable:
         return verdict
 
     def places(self, path: Float, p: Parameters) -> tuple[Float, Int]:
-        """Group the clusters that are trees by their position in the map: return the mean positions, shape
-        (T, 2) [m], and the numbers of clusters, int64, shape (T,). Scans of a lost robot are omitted; at most
-        MOST_PLACES groups are returned.
+        """Group the clusters with the verdict TREE by their position in the map, see `_grouped`. Return the
+        mean position x, y of each of T groups, shape (T, 2) [m], and its number of clusters, int64, shape
+        (T,). Scans of a lost robot are omitted; at most MOST_PLACES groups are returned.
 
         Args:
             path: x, y [m], yaw [rad] of the base at each stored scan, shape (N, 3).
@@ -165,7 +165,8 @@ class ClusterTable:
         return _grouped(self._columns()["centre"], tree, start, pose, _reach(p), MOST_PLACES)
 
     def _columns(self) -> dict[str, Any]:
-        """Return the JUDGED_COLUMNS of the stored clusters by name; views that `put` may change."""
+        """Return a dict from the names in JUDGED_COLUMNS to the values of the stored clusters, views that
+        `put` may change."""
         return {name: self._rows.column(k)[: self.start[-1]] for k, name in enumerate(JUDGED_COLUMNS)}
 
 
@@ -190,10 +191,10 @@ class KnownMap:
     """A run as it is mapped.
 
     Attributes:
-        parameters: Parameters that it was mapped with.
-        clusters: Its clusters.
-        path: Its path.
-        columns: Its voxel columns; None without any.
+        parameters: Parameters with which the run was mapped.
+        clusters: Clusters of the run.
+        path: Path of the run.
+        columns: Voxel columns of the run; None if there is none.
     """
 
     parameters: Parameters
@@ -241,7 +242,8 @@ def preview_trees(
 
 
 class _Places(NamedTuple):
-    """Trees: place, number of clusters, and whether a voxel column is at the place, shape (T, ...)."""
+    """T trees: position x, y in the map, shape (T, 2) [m], number of clusters, shape (T,), and whether the
+    tree is that of a voxel column, shape (T,)."""
 
     place: Float
     hits: Int
@@ -280,9 +282,10 @@ def _columns(known: KnownMap, p: Parameters) -> Columns | None:
 
 
 def _all_places(known: KnownMap, table: ClusterTable, path: Float, p: Parameters) -> _Places:
-    """Return the trees of all scans. At a voxel column its class decides; elsewhere, trees have at least
-    `hits_to_confirm` clusters. Those of one stored scan count for all `spacing` scans of the run. Trees of
-    columns come first, at the clusters within REACH of the column if there are any (else with 0 hits).
+    """Return the trees of all scans: first one for each voxel column with the verdict TREE, then each group
+    of clusters (`ClusterTable.places`) with at least `hits_to_confirm` hits and no column within REACH. The
+    hits of a group are its clusters times `spacing`. The tree of a column has position and hits of the
+    nearest group within REACH; without one, the position of the column and 0 hits.
 
     Args:
         known: The run, for its columns.
@@ -314,19 +317,23 @@ def _with_sample(
     p: Parameters,
     sample: Mapping[int, SegmentedScan],
 ) -> _Places:
-    """Return the trees as a sample of scans changes them.
+    """Return the trees of all scans, corrected by a sample of scans that was segmented again.
 
-    A tree that is found less often in the sample gets fewer hits, and is removed below `hits_to_confirm`; one
-    with fewer than LEAST_HITS finds before is unchanged. What is found LEAST_HITS times and only now is a new
-    tree. The tree of a voxel column remains; where the columns change too, it remains if the sample finds it.
+    The clusters of the sample within REACH of a tree are counted with the parameters of the run (`old`) and
+    with `p` (`new`). If `old` is at least LEAST_HITS, the hits of the tree are multiplied by `new / old` and
+    rounded down, and a tree with fewer than `hits_to_confirm` hits is removed; otherwise the tree is
+    unchanged. The tree of a voxel column is not removed if the parameters of the columns are the same or
+    `new` is above 0; else it counts as a tree without column. A position with at least LEAST_HITS clusters
+    with `p` is a new tree if no tree, no voxel column and no position with the parameters of the run is
+    within REACH.
 
     Args:
         before: Trees of all scans with the segmentation of the run.
         known: The run.
-        table: Clusters of all scans.
-        path: x, y [m], yaw [rad] of the base at each scan, shape (N, 3).
+        table: Clusters of N scans.
+        path: Poses x, y [m], yaw [rad] of the base in the map at these scans, shape (N, 3).
         p: The other parameters.
-        sample: Segmented scans by number; numbers beyond the table are ignored.
+        sample: Scans segmented with `p`, a dict from the row in the table; rows of N or more are ignored.
     """
     scans = [k for k in sample if k < len(table)]
     part, fresh = table.of(scans), ClusterTable()
@@ -357,14 +364,14 @@ def _with_sample(
 
 
 def _sums(row: Int, hits: Int, rows: int) -> Int:
-    """Return the sum of the hits by row, int64, shape (rows,); entries with the row -1 are omitted. `row` and
-    `hits` have the same shape."""
+    """Return for each row from 0 to `rows` - 1 the sum of the entries of `hits` whose entry in `row`, of the
+    same shape, is this row, int64, shape (rows,). Entries with the row -1 are omitted."""
     valid = row >= 0
     return np.bincount(row[valid], hits[valid], rows).astype(np.int64)
 
 
 def _trees(known: _Places) -> Trees:
-    """Return places as confirmed trees with the numbers 1 to T and their hits as observations; diameters,
+    """Return T trees as confirmed `Trees` with the numbers 1 to T and the hits as observations; diameters,
     eccentricities and covariances are NaN, times and coverage 0."""
     place, hits, n = known.place, known.hits, len(known.place)
     unknown, none = np.full(n, np.nan), np.zeros(n, np.int64)
@@ -387,17 +394,18 @@ def _trees(known: _Places) -> Trees:
 def _grouped(
     centre: Float, tree: Bool, start: Int, pose: Float, reach: float, most: int
 ) -> tuple[Float, Int]:
-    """Group the clusters that are trees: each one joins the nearest place within reach, or begins a place.
-    Return the mean position of each place, shape (T, 2) [m], and its number of clusters, int64, shape (T,).
+    """Group the clusters that are trees, in their order: each joins the group whose mean position is nearest
+    and within `reach`, or begins a group. Return the mean position x, y of each of T groups in the map, shape
+    (T, 2) [m], and its number of clusters, int64, shape (T,).
 
     Args:
         centre: Positions in the level sensor frame, shape (K, 2) [m].
-        tree: Which of them are trees, shape (K,).
+        tree: Which clusters are trees, shape (K,).
         start: First row of each scan, then K, int64, shape (N + 1,).
         pose: x, y [m], yaw [rad] of the base in the map, then x, y of the sensor in the base frame, shape (N,
             5).
-        reach: Distance [m].
-        most: Maximum number of places; clusters that would begin further ones are omitted.
+        reach: Maximum distance between a cluster and the mean position of its group [m].
+        most: Maximum number of groups; clusters that would begin further ones are omitted.
     """
     place, hits, n = np.empty((most, 2)), np.zeros(most, np.int64), 0
     cells, scale = cells_for(most), per_metre(reach)

@@ -93,8 +93,8 @@ SEGMENTATION_CLASSIFICATION = ("method", "interval")  # they decide which scans 
 
 
 def segmentation_key(parameters: Parameters) -> bytes:
-    """Return sixteen bytes that differ where `pipeline.front_end.segment` may give another result; obstacle
-    parameters do not count."""
+    """Return a key of 16 bytes. It differs between parameters with which `pipeline.front_end.segment` may
+    give different results, apart from obstacle parameters."""
     values = {
         **{stage: getattr(parameters, stage).model_dump() for stage in SEGMENTATION_STAGES},
         "classification": parameters.classification.model_dump(include=set(SEGMENTATION_CLASSIFICATION)),
@@ -131,7 +131,7 @@ class ScanCaches:
     """The caches of one source, one for each set of segmentation parameters; the last few used are open.
 
     Args:
-        most: Size that a file may reach.
+        most: Maximum size of each file [bytes].
     """
 
     def __init__(self, most: int = MOST_BYTES) -> None:

@@ -55,7 +55,9 @@ class Surfels(NamedTuple):
     """Discs and balls as columns of length N, float32, in the frame of the world.
 
     Attributes:
-        points: shape (N, 3) [m]; normals: shape (N, 3), zero for balls; radius: shape (N,) [m].
+        points: Positions, shape (N, 3) [m].
+    normals: Unit normals of discs, zero for balls, shape (N, 3).
+    radius: Radius of the discs and balls, shape (N,) [m].
         blocks: Radius in which a point hides surfels behind it, 0 in foliage, shape (N,) [m].
     """
 
@@ -66,8 +68,8 @@ class Surfels(NamedTuple):
 
 
 def lay_surfels(points: Float32) -> Surfels:
-    """Return surfels at the points of a cloud, float32, shape (N, 3) [m]; balls that block nothing for a
-    cloud of NEIGHBOURS or fewer points. The array of points is not copied."""
+    """Return surfels at the points of a cloud, float32, shape (N, 3) [m]; for a cloud of NEIGHBOURS or fewer
+    points, balls that block nothing. The array of points is not copied."""
     from scipy.spatial import cKDTree
 
     n = len(points)
@@ -92,7 +94,7 @@ def _lay(
     Args:
         points: All points, shape (N, 3) [m].
         near: Rows of each point of the part and its neighbours, nearest first, shape (M, NEIGHBOURS + 1).
-        distance: Their distances, same shape [m].
+        distance: Distances of these rows from the point, same shape [m].
         normals, radius, blocks: Rows of the part in the columns of `Surfels`, which must be 0 for normals and
             blocks.
     """
@@ -132,7 +134,8 @@ def first_surfels(surfels: Surfels, R: Float, o: Float, beams: Float, optics: Op
     Args:
         surfels: The surfels.
         R, o: Pose of the sensor at each column, shapes (C, 3, 3) and (C, 3) [m].
-        beams: In the sensor's frame, shape (C, K, 3); column c looks along the azimuth pi - c 2 pi / C.
+        beams: Unit directions of the beams in the sensor frame, shape (C, K, 3); column c has the azimuth pi
+            - c 2 pi / C.
         optics: Beams of the sensor.
     """
     points, normals, radius, blocks = surfels.points, surfels.normals, surfels.radius, surfels.blocks
@@ -228,7 +231,8 @@ REFLECTANCE = 60.0  # of all returns: intensities of clouds have other scales
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlotGround:
-    """The ground of a plot in the frame of the first pose of the robot (see `SimulatedTerrain.evaluate`)."""
+    """The ground of a plot in the frame of the first pose of the robot: a height map in the frame of the
+    cloud, and position, shape (3,) [m], and yaw [rad] of the first pose in it."""
 
     height: TerrainRaster
     start: Float
@@ -289,8 +293,8 @@ def open_cloud_run(
         request: Requested options; a duration of 0 means one loop, of SHORTEST to LONGEST seconds. A longer
             loop is cut short with a warning.
         cloud: The cloud of the plot.
-        trees: Trees of the plot in the coordinates of the file, i.e. with the offset; None without ground
-            truth.
+        trees: Trees of the plot in the coordinates of the file, i.e. with the offset; None if there is no
+            ground truth.
         T_base_lidar: Extrinsics of the LiDAR; None uses those of simulated robots.
 
     Raises:
@@ -404,7 +408,7 @@ def loop_through(points: Float32, ground: TerrainRaster, where: str) -> Float:
     there is none, sparse vegetation counts as free.
 
     Args:
-        points: shape (N, 4): x, y, z, height above the ground [m].
+        points: Points x, y, z and height above the ground, shape (N, 4) [m].
         ground: Ground of the plot; the loop stays where ground was seen.
         where: Name of the cloud, for the error.
 
@@ -427,8 +431,8 @@ def _obstacles(points: Float32, ground: TerrainRaster) -> Int:
     extent of `ground`; points outside of it do not count.
 
     Args:
-        points: x, y, z and height above the ground, shape (N, 4) [m]; those above LOW and below HIGH are
-            obstacles.
+        points: Points x, y, z and height above the ground, shape (N, 4) [m]; those with a height between LOW
+            and HIGH are obstacles.
         ground: Ground of the plot.
     """
     times = round(ground.cell / CELL)
@@ -442,8 +446,8 @@ def _obstacles(points: Float32, ground: TerrainRaster) -> Int:
 
 
 def _clearance(free: Bool, ground: TerrainRaster) -> Float:
-    """Return the distance to obstacles of cells of SIDE [m], 0 in obstacles; cells far from visible ground
-    and outside of the raster are obstacles. The shape is half of that of `free`, rounded down.
+    """Return the distance of each cell of side SIDE to obstacles [m], 0 in obstacles; cells far from visible
+    ground and outside of the raster are obstacles. The shape is half of that of `free`, rounded down.
 
     Args:
         free: Whether each cell of side CELL is free, shape (R, C).
@@ -470,7 +474,7 @@ def _loop(clearance: Float, least: float) -> Float | None:
 
     Args:
         clearance: Distance of each cell to obstacles, shape (R, C) [m].
-        least: Least clearance [m].
+        least: Minimum clearance [m].
     """
     from scipy.ndimage import label
 

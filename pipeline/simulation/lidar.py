@@ -43,7 +43,7 @@ def count_echoes(
     Args:
         kind, shape, surface: Row of `Solids`.
         o, d: Origin [m] and unit direction of the beam, shape (3,).
-        d_next: Direction of the ray in the next column.
+        d_next: Unit direction of the ray in the next column, shape (3,).
         divergence: Full width of the beam [rad] times the number of columns.
     """
     ray = np.empty(3)
@@ -151,9 +151,9 @@ def measure(
     key: int,
     last: bool,
 ) -> tuple[Float, Float, Int32]:
-    """Return what the receiver reports: range [m] (0 without a return, for a lost weak echo and outside of
-    the measured ranges), reflectance 0..255 (0 without a return) and shape (row, GROUND or NOTHING), (C, K)
-    each.
+    """Return what the receiver reports: range [m] (0 if there is no return, for a lost weak echo and outside
+    of the measured ranges), reflectance 0..255 (0 if there is no return) and shape (row, GROUND or NOTHING),
+    shape (C, K) each.
 
     Args:
         ranges, hit: Result of `first_returns`, shape (C, K).
@@ -204,8 +204,8 @@ def scan_of_returns(
 
     Args:
         lidar: The sensor.
-        stamp_ns: Start of the sweep.
-        reported: Range of each echo of each beam [m], 0 without a return, shape (C, K, echoes).
+        stamp_ns: Time of the start of the sweep [ns].
+        reported: Range of each echo of each beam [m], 0 if there is no return, shape (C, K, echoes).
         reflectance, source: See `measure`; of the same shape.
     """
     column, ring, echo_number = np.nonzero(reported > 0.0)
@@ -227,18 +227,18 @@ class SpinningLidar:
     """A spinning LiDAR. The defaults are a VLP-16 at 10 Hz.
 
     Attributes:
-        columns: Shots per turn.
+        columns: Shots per revolution.
         rings: Number of lasers.
         lowest: Elevation of ring 0 [rad].
         ring_step: Angle between neighbouring rings [rad].
-        period_ns: Duration of a turn.
+        period_ns: Duration of a revolution [ns].
         range_min, range_max: Measured ranges [m].
         range_sigma: Standard deviation of a range [m].
         divergence: Full width of a beam [rad].
         pulse: Echoes nearer to one another than this are reported as one [m].
         strength: Range at which a perpendicular surface of reflectivity 1 gives a return in 63 % of the shots
             [m].
-        field: Half the width of the field of view in azimuth [rad].
+        field: Half of the width of the field of view in azimuth [rad].
         dual: Whether the last echo of a beam is reported too, where it is separate from the strongest one.
         name: Name of the sensor.
     """
@@ -281,8 +281,8 @@ class SpinningLidar:
         return offsets.astype(np.int32)
 
     def beams(self) -> Float:
-        """Return the unit directions of all rays in the sensor frame, shape (C, K, 3). The array is shared
-        between calls and must not be changed."""
+        """Return the unit directions of all rays in the sensor frame, shape (C, K, 3) for C columns and K
+        rings. The array is shared between calls and must not be changed."""
         return _beams(self)
 
     def at_scan(self, k: int) -> SpinningLidar:  # noqa: ARG002 - all turns are alike
@@ -290,7 +290,7 @@ class SpinningLidar:
         return self
 
     def sees(self, points: Float32) -> Bool:
-        """Return which points (N, 3) are in the field of view, shape (N,): all."""
+        """Return which points, shape (N, 3) [m], are in the field of view, shape (N,): all."""
         return np.ones(len(points), np.bool_)
 
     def _directions(self) -> Float:
@@ -343,8 +343,8 @@ class SolidStateLidar(SpinningLidar):
         return replace(self, pattern=self.pattern + k)
 
     def sees(self, points: Float32) -> Bool:
-        """Return which points (N, 3) in the sensor frame are in the cone of CONE around x, shape (N,); False
-        at the origin."""
+        """Return which points, shape (N, 3) [m], in the sensor frame are in the cone of CONE around x, shape
+        (N,); False at the origin."""
         ahead: Bool = points[:, 0] > np.cos(CONE) * np.linalg.norm(points, axis=1)
         return ahead
 
@@ -365,7 +365,8 @@ class Sweep:
 
     Attributes:
         scan: The scan as a driver gives it.
-        solid: Row in the solids, -2 for the ground, int32, shape (N,).
+        solid: Row of each point in the solids, -2 for the ground, -1 for a run through a cloud, int32, shape
+            (N,).
     """
 
     scan: Scan
@@ -375,8 +376,9 @@ class Sweep:
 def cast_beams(
     lidar: SpinningLidar, solids: Solids, terrain: SimulatedTerrain, R: Float, o: Float, key: int
 ) -> tuple[Float, Float, Int32]:
-    """Return the directions of the beams of a sweep in the world, shape (C, K, 3), and range [m] and shape of
-    the first return of each, see `first_returns`, shape (C, K) each.
+    """Return the directions of the beams of a sweep in the world, shape (C, K, 3), and range [m] and shape
+    (row of `solids`, GROUND or NOTHING) of the first return of each beam, see `first_returns`, shape (C, K)
+    each.
 
     Args:
         lidar: The sensor.
@@ -406,7 +408,7 @@ def sweep_scene(
         solids: All solids at this time, of any number.
         terrain: The ground.
         R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
-        stamp_ns: Start of the sweep.
+        stamp_ns: Time of the start of the sweep [ns].
         rng: Random generator of this sweep.
 
     Returns:

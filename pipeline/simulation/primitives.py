@@ -31,10 +31,10 @@ class Section:
 
     Attributes:
         oval, fluted: Relative amplitudes of two and of three lobes.
-        oval_phase, fluted_phase: Their directions [rad].
+        oval_phase, fluted_phase: Directions of the lobes [rad].
         bark: Depth of the furrows at the start of the stem [m]; it is proportional to the radius.
         furrows: Number of furrows around the stem.
-        furrow_phase: [rad].
+        furrow_phase: Phase of the furrows [rad].
     """
 
     oval: float = 0.0
@@ -63,14 +63,14 @@ class Solids(NamedTuple):
     """N shapes as columns.
 
     Attributes:
-        kind: int32, CONE, ELLIPSOID, BOX or STEM.
-        shape: float64, shape (N, 9). CONE and STEM: start (3), unit axis (3), length, radius at the start,
-            change of radius per metre. ELLIPSOID and BOX: centre (3), half sizes (3), cosine and sine
+        kind: Kind of each shape, int32: CONE, ELLIPSOID, BOX or STEM.
+        shape: Geometry, float64, shape (N, 9). CONE and STEM: start (3), unit axis (3), length, radius at the
+            start, change of radius per metre. ELLIPSOID and BOX: centre (3), half sizes (3), cosine and sine
             of the yaw, and for the ellipsoid the mean free path of light in it [m], 0 if solid.
-        capsule: float64, shape (N, 7): two ends (3 + 3) and the radius of the enclosing capsule.
-        surface: float64, shape (N, SURFACE): reflectivity 0..1, roughness of the surface [m], and of a STEM
-            the seven figures of its `Section`.
-        owner: int32: number of the object in the scene.
+        capsule: Two ends (3 + 3) and radius of the enclosing capsule, float64, shape (N, 7) [m].
+        surface: Surface, float64, shape (N, SURFACE): reflectivity 0..1, roughness of the surface [m], and of
+            a STEM the seven parameters of its `Section`.
+        owner: Number of the object in the scene, int32.
     """
 
     kind: Int32
@@ -86,9 +86,9 @@ class Solids(NamedTuple):
         return Solids(*map(np.concatenate, columns))
 
     def placed(self, offset: Float, yaw: float) -> Solids:
-        """Return the shapes turned by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]; these
-        shapes are not changed, and share the other columns with the result. Capsules and axes turn with the
-        shapes."""
+        """Return the shapes rotated by `yaw` [rad] about the z axis, then shifted by `offset` (3,) [m]; these
+        shapes are not changed, and share the other columns with the result. Capsules and axes are moved with
+        the shapes."""
         c, s = np.cos(yaw), np.sin(yaw)
         R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         shape, capsule = self.shape.copy(), self.capsule.copy()
@@ -121,11 +121,11 @@ class SolidsBuilder:
         """Add a tapered cylinder without caps from `start` to `end` (3,) [m] with its two radii [m].
 
         Args:
-            owner: Number of the object that it belongs to.
+            owner: Number of the object to which the shape belongs.
             start, end: Ends of the axis, shape (3,) [m]; they must differ.
             radii: Radius at `start` and at `end` [m].
             reflectivity: Share of the light that is reflected.
-            roughness: Largest random deviation of a range from the surface [m].
+            roughness: Maximum random deviation of a range from the surface [m].
         """
         a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
         length = float(np.linalg.norm(b - a))
@@ -145,7 +145,7 @@ class SolidsBuilder:
         """Add a stem: a tapered cylinder without caps, as in `cone`, with a section that is not round.
 
         Args:
-            owner: Number of the object that it belongs to.
+            owner: Number of the object to which the shape belongs.
             start, end: Ends of the axis, shape (3,) [m]; they must differ, which is not checked.
             radii: Radius r of `Section` at `start` and at `end` [m].
             section: Shape of the section.
@@ -169,10 +169,10 @@ class SolidsBuilder:
         """Add an ellipsoid.
 
         Args:
-            owner: Number of the object that it belongs to.
+            owner: Number of the object to which the shape belongs.
             centre: Centre, shape (3,) [m].
             half: Half sizes, shape (3,) [m].
-            yaw: Turn about z [rad].
+            yaw: Rotation about z [rad].
             free_path: Mean free path of light in a porous ellipsoid [m]; 0 for a solid one.
             reflectivity: Share of the light that is reflected.
         """
@@ -186,10 +186,10 @@ class SolidsBuilder:
         """Add an upright box.
 
         Args:
-            owner: Number of the object that it belongs to.
+            owner: Number of the object to which the shape belongs.
             centre: Centre, shape (3,) [m].
             half: Half sizes, shape (3,) [m].
-            yaw: Turn about z [rad].
+            yaw: Rotation about z [rad].
             reflectivity: Share of the light that is reflected.
         """
         c, h = np.asarray(centre, dtype=np.float64), np.asarray(half, dtype=np.float64)

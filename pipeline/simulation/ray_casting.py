@@ -22,7 +22,7 @@ class Optics(NamedTuple):
     """Beams and receiver of a LiDAR.
 
     Attributes:
-        lowest, ring_step: Elevation of ring 0 and between rings [rad].
+        lowest, ring_step: Elevation of ring 0, and angle between two rings [rad].
         range_min, range_max: Measured ranges [m].
         divergence: Full width of a beam [rad].
         pulse: Echoes nearer to one another than this are reported as one [m].
@@ -78,10 +78,10 @@ _MARCH, _TOUCH = 0.4, 5e-4  # share of the gap to the bark that is safe to advan
 @compiled
 def bark_radius(surface: Float, radius: float, depth: float, angle: float, height: float) -> float:
     """Return the radius of a stem in a direction [m], with lobes and furrows, see `primitives.Section`; the
-    furrows swing to and fro over FURROW_WAVE of height.
+    angle of the furrows oscillates over FURROW_WAVE of height.
 
     Args:
-        surface: Row of `Solids.surface`, which holds the figures of the section.
+        surface: Row of `Solids.surface` with the parameters of the section.
         radius: r at this height [m].
         depth: Depth of the furrows at this height [m].
         angle: Angle around the axis [rad].
@@ -96,8 +96,9 @@ def bark_radius(surface: Float, radius: float, depth: float, angle: float, heigh
 
 @compiled
 def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
-    """Return the range [m] at which a ray enters the bark of a stem, else MISS. From the mantle that encloses
-    the stem the ray advances by a share of the gap, which is small enough for furrows with a slope of 2.
+    """Return the range [m] at which a ray enters the bark of a stem from outside, MISS if it does not. From
+    the mantle that encloses the stem the ray advances by a share of the gap, which is small enough for
+    furrows with a slope of 2.
 
     Args:
         shape, surface: Rows of the stem, see `Solids`.
@@ -212,7 +213,7 @@ def meet_ground(terrain: Float, waves: Float, d: Float, farthest: float, rate: F
         terrain: `SimulatedTerrain.packed`, shape (W, 4).
         waves: Waves at the origin of the ray, see `waves_at`, shape (W, 3).
         d: Unit direction, shape (3,).
-        farthest: Largest range [m].
+        farthest: Maximum range [m].
         rate: Working space of shape (W,), overwritten.
     """
     count = terrain.shape[0]
@@ -298,14 +299,14 @@ def interval_of_capsule(
     """Return the angles that a capsule covers as seen by the sensor.
 
     Args:
-        capsule: Ends of its axis and its radius, shape (7,) [m].
+        capsule: Ends of the axis in the world, and radius, shape (7,) [m].
         R, o: Rotation (3, 3) and position (3,) [m] of the sensor in the world.
         lowest, highest: Elevations of the outer rings [rad].
 
     Returns:
-        Azimuth of its middle, half its width in azimuth (pi if the capsule is around or above the sensor),
-        lowest and highest elevation [rad], and the nearest range at which it can be met [m]. The width is -1
-        when the capsule is above or below all elevations.
+        Azimuth of the middle of the capsule, half of its width in azimuth (pi if the capsule is around or
+        above the sensor), lowest and highest elevation, in the sensor frame [rad], and the minimum range at
+        which it can be met [m]. The width is -1 when the capsule is above or below all elevations.
     """
     a, b = np.empty(3), np.empty(3)
     for i in range(3):
@@ -342,9 +343,9 @@ def window_of_capsule(
     """Return the rays of a sweep that can meet a capsule.
 
     Args:
-        capsule: Ends of its axis and its radius, shape (7,) [m].
+        capsule: Ends of the axis in the world, and radius, shape (7,) [m].
         R, o: Pose of the sensor in the world at each column, shapes (C, 3, 3) and (C, 3) [m].
-        lowest, ring_step: Elevation of the lowest ring, and between two rings [rad].
+        lowest, ring_step: Elevation of the lowest ring, and angle between two rings [rad].
         rings: Number of rings.
 
     Returns:
@@ -413,9 +414,9 @@ def ray_directions(R: Float, beams: Float) -> Float:
 
 @compiled
 def meet_solid(kind: int, shape: Float, surface: Float, o: Float, d: Float, chance: float) -> float:
-    """Return the range [m] of the first return from a shape, infinite without one. Solid shapes are met from
-    outside only. A ray passes a porous ellipsoid if the drawn depth is greater than its way in it; it may
-    begin inside.
+    """Return the range [m] of the first return from a shape, infinite if there is none. Solid shapes are met
+    from outside only. In a porous ellipsoid the depth of the return is -ln(chance) times the mean free path;
+    the ray passes the ellipsoid if this exceeds the length of its path in it, and may begin inside.
 
     Args:
         kind, shape, surface: Row of `Solids`.

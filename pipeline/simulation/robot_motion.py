@@ -28,9 +28,10 @@ _APART = 5  # samples; turns on the spot that are nearer to one another, or to a
 
 
 def sharp_cells(s: Float, yaw: Float) -> Bool:
-    """Return between which of N samples of a line and the next the robot turns on the spot, shape (N - 1,).
+    """Return for each cell between two of N samples of a line whether the robot rotates on the spot in it,
+    shape (N - 1,).
 
-    It does so where the turn exceeds YAW_RATE at the speed CREEP, and on cells between two such turns, or
+    It does so where the yaw rate at the speed CREEP exceeds YAW_RATE, and in cells between two such cells, or
     between one and an end of the line, that are at most _APART apart. The difference of the yaw is used,
     because a cusp between two samples has no curvature at them.
 
@@ -47,13 +48,16 @@ def sharp_cells(s: Float, yaw: Float) -> Bool:
 
 
 def neighbouring_curvature(sharp: Bool, s: Float, yaw: Float, closed: bool) -> Float:
-    """Return the curvature [1/m] at each sample, shape (N,), the mean change of yaw in its neighbouring cells
-    that are not sharp; 0 if both are.
+    """Return the curvature at each of N samples of a path, shape (N,) [1/m].
+
+    The curvature of a cell between two samples is the change of yaw per metre. A sample has the mean of its
+    two cells, of which sharp cells are left out; 0 if both are sharp. The first and the last sample of an
+    open path have one cell; those of a closed path share the first and the last cell.
 
     Args:
-        sharp: Whether each cell between two samples has a sharp turn, shape (N - 1,).
+        sharp: Whether the robot rotates on the spot in each cell, see `sharp_cells`, shape (N - 1,).
         s: Distance of each sample along the path, shape (N,) [m].
-        yaw: Yaw of each sample, shape (N,) [rad].
+        yaw: Yaw of each sample, not wrapped, shape (N,) [rad].
         closed: Whether the last sample is the first one.
     """
     slope = np.where(sharp, np.nan, np.diff(yaw) / np.diff(s))
@@ -77,12 +81,12 @@ def within_gains(v: Float, s: Float, curvature: Float) -> Float:
         v_i^2 <= v_(i -+ 1)^2 + 2 a ds  with  a = min(ACCELERATION, YAW_GAIN / (2 |k|))
         v_i^2 |dk / ds| <= YAW_GAIN / 2
 
-    so that the turn rate k v changes by no more than a |k| + v^2 |dk / ds| <= YAW_GAIN.
+    so that the yaw rate k v changes by no more than a |k| + v^2 |dk / ds| <= YAW_GAIN.
 
     Args:
         v: Limit at each sample, shape (N,) [m/s].
-        s: Distance along the line at each sample [m].
-        curvature: k at each sample, linear between two [1/m].
+        s: Distance along the line at each sample, shape (N,) [m].
+        curvature: Curvature k at each sample, linear between two samples, shape (N,) [1/m].
     """
     ds, k = np.diff(s), np.abs(curvature)
     bend = np.abs(np.diff(curvature)) / ds
@@ -100,14 +104,14 @@ def within_gains(v: Float, s: Float, curvature: Float) -> Float:
 
 
 class Spin(NamedTuple):
-    """A turn on the spot from rest to rest, as a share f of the distance and of the turn with f'' = gain, 0,
-    -gain.
+    """A rotation on the spot from rest to rest, as a share f of the distance and of the angle with f'' =
+    gain, 0, -gain.
 
     Attributes:
         begin, takes: Begin and duration [s].
         gain, ramp: Second derivative of f [1/s^2] and the duration of the acceleration [s].
         first, way: Begin and length along the line [m].
-        yaw, turn: Begin and angle of the turn [rad].
+        yaw, turn: Yaw at the begin and angle of the rotation [rad].
     """
 
     begin: float
@@ -121,13 +125,13 @@ class Spin(NamedTuple):
 
     @classmethod
     def over(cls, first: float, way: float, yaw: float, turn: float) -> Spin:
-        """Return the fastest turn within the limits of speed and acceleration; it begins at time 0.
+        """Return the fastest rotation within the limits of speed and acceleration; it begins at time 0.
 
         Args:
-            first: Distance along the course at which it begins [m].
-            way: Length of the course on which it is made, above 0 [m].
-            yaw: Yaw at its begin [rad].
-            turn: Angle [rad].
+            first: Distance along the course at which the rotation begins [m].
+            way: Length of the course on which the rotation is made, above 0 [m].
+            yaw: Yaw at the begin [rad].
+            turn: Angle of the rotation [rad].
         """
         rate = min(YAW_RATE / max(abs(turn), 1e-9), CREEP / way)
         gain = min(YAW_GAIN / max(abs(turn), 1e-9), ACCELERATION / way)
@@ -135,8 +139,8 @@ class Spin(NamedTuple):
         return cls(0.0, 1.0 / (gain * ramp) + ramp, gain, ramp, first, way, yaw, turn)
 
     def at(self, t: Float) -> tuple[Float, Float]:
-        """Return the share f of the turn and f' [1/s] at times of shape (N,) [s]; 0 and 0 before the turn, 1
-        and 0 after it."""
+        """Return the share f of the turn and f' [1/s] at times of shape (N,) [s]; 0 and 0 before the
+        rotation, 1 and 0 after it."""
         up = np.clip(t - self.begin, 0.0, self.takes)
         left = self.takes - up
         even = self.gain * self.ramp * (up - 0.5 * self.ramp)
@@ -155,10 +159,10 @@ class Drive:
 
     Attributes:
         t: Time since the start [s].
-        x, y: [m]; the first pose is the origin.
-        yaw: [rad], continuous, 0 at the start.
-        speed: [m/s] in the plane.
-        yaw_rate: [rad/s].
+        x, y: Position in the world [m]; the first pose is the origin.
+        yaw: Yaw [rad], continuous, 0 at the start.
+        speed: Speed in the plane [m/s].
+        yaw_rate: Yaw rate [rad/s].
     """
 
     t: Float
@@ -171,8 +175,8 @@ class Drive:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Course:
-    """The course in the plane, sampled every 2 cm. It begins at the origin along x; `yaw` is continuous,
-    `curvature` is in 1/m."""
+    """The course in the plane, sampled every 2 cm, as columns of length N: distance s, x, y [m], yaw [rad]
+    and curvature [1/m]. It begins at the origin along x; `yaw` is continuous."""
 
     s: Float
     x: Float
@@ -183,11 +187,12 @@ class Course:
 
 
 def lay_course(waypoints: Float, closed: bool) -> Course:
-    """Return a smooth course (cubic spline) through waypoints, moved and turned to begin at the origin along
+    """Return a smooth course (cubic spline) through waypoints, moved and rotated to begin at the origin along
     x.
 
     Args:
-        waypoints: Shape (N, 2) [m], no two in a row equal; the first is not repeated for a closed course.
+        waypoints: Waypoints x, y, shape (N, 2) [m], no two in a row equal; the first is not repeated for a
+            closed course.
         closed: Whether the course returns to the first waypoint; its last sample is the first one then.
     """
     knots = np.vstack([waypoints, waypoints[:1]]) if closed else waypoints
@@ -214,7 +219,7 @@ def drive_course(course: Course, speed: float, duration_s: float) -> Drive:
     Args:
         course: The course.
         speed: Speed on the straight [m/s]. Turns are driven at 0.5 rad/s at most; where the course reverses,
-            the robot stops and turns on the spot.
+            the robot stops and rotates on the spot.
         duration_s: Duration of the run [s]; the result is half a second longer.
     """
     until = duration_s + 0.5
@@ -262,8 +267,8 @@ def lap_time(course: Course, speed: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Timetable:
-    """Distance [m], speed [m/s] and time [s] between turns on the spot, these turns, and the course without
-    their curvature."""
+    """Distance [m], speed [m/s] and time [s] of samples outside of rotations on the spot, these rotations,
+    and the course without their curvature."""
 
     s: Float
     v: Float
@@ -339,7 +344,7 @@ class TrueMotion:
 
     Attributes:
         drive: Planar part.
-        z: Height [m] in the world.
+        z: Height in the world [m].
         roll, pitch: Tilt of the base [rad], R = Rz(yaw) Ry(pitch) Rx(roll).
     """
 
@@ -349,9 +354,9 @@ class TrueMotion:
     pitch: Float
 
     def at(self, t: Float) -> tuple[Float, Float]:
-        """Return rotations (N, 3, 3) and positions (N, 3) [m] of the base in the world at ascending times
-        (N,) since the start [s], interpolated; N is at least 1, and the first time is during the motion.
-        Later times than its end give the last pose."""
+        """Return rotations, shape (N, 3, 3), and positions, shape (N, 3) [m], of the base in the world at
+        ascending times t since the start, shape (N,) [s], interpolated; N is at least 1, and the first time
+        is during the motion. Later times than its end give the last pose."""
         first = max(int(t[0] * RATE_HZ) - 1, 0)
         part = slice(first, int(np.ceil(t[-1] * RATE_HZ)) + 2)
         d = self.drive
@@ -375,7 +380,7 @@ def lay_on_terrain(drive: Drive, terrain: TerrainModel, rng: np.random.Generator
     Args:
         drive: Planar motion.
         terrain: The ground.
-        rng: Draws the phases of the vibration.
+        rng: Random generator of the phases of the vibration.
     """
     z, gx, gy = terrain.evaluate(drive.x, drive.y).T
     c, s = np.cos(drive.yaw), np.sin(drive.yaw)
@@ -460,8 +465,8 @@ class Inertial:
     """Readings at 100 Hz in the base frame; columns of length N.
 
     Attributes:
-        angular_velocity: shape (N, 3) [rad/s].
-        linear_acceleration: shape (N, 3) [m/s^2], +9.81 along z at rest on level ground.
+        angular_velocity: Angular velocity, shape (N, 3) [rad/s].
+        linear_acceleration: Specific force, shape (N, 3) [m/s^2]; +9.81 along z at rest on level ground.
         attitude: Roll, pitch and yaw, shape (N, 3) [rad]; yaw starts at 0 and drifts.
     """
 

@@ -54,7 +54,7 @@ class SimulatedRun:
         lidar: The sensor.
         scene: SimulatedScene through which the robot drives.
         motion: True motion of the robot.
-        odometry: x, y [m], yaw [rad] by the wheels at 50 Hz, shape (N, 3).
+        odometry: Pose x, y [m], yaw [rad, not wrapped] by the wheels at 50 Hz, shape (N, 3).
         inertial: Readings of the IMU at 100 Hz.
         scans: Number of scans.
     """
@@ -69,8 +69,8 @@ class SimulatedRun:
     scans: int
 
     def sensor_poses(self, k: int) -> tuple[Float, Float, Float]:
-        """Return the poses of the LiDAR in scan k (from 0): time of each column since the start of the run
-        [s] (C,), rotations (C, 3, 3) and positions (C, 3) [m] in the world."""
+        """Return the poses of the LiDAR in scan k (from 0): time of each column since the start of the run,
+        shape (C,) [s], rotations, shape (C, 3, 3), and positions, shape (C, 3) [m], in the world."""
         times = (k * self.lidar.period_ns + self.lidar.column_offsets_ns().astype(np.int64)) / 1e9
         return times, *self.motion.sensor_at(times, self.T_base_lidar)
 
@@ -187,7 +187,7 @@ def random_stream(part: int, request: RunRequest, k: int = 0) -> np.random.Gener
 
     Args:
         part: SCENE, SHAKE, WHEELS, INERTIAL, SCAN or SENSE.
-        request: Its name, seed and drive are used.
+        request: Request, of which name, seed and drive are used.
         k: Number of the scan.
     """
     drive = [request.drive] if request.drive and part != SCENE else []

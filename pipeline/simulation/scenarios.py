@@ -32,7 +32,8 @@ class Scenario:
 
     Attributes:
         line: Description in one line.
-        waypoints: Waypoints of the course [m]; it is moved and turned to begin at the origin, along x.
+        waypoints: Waypoints x, y of the course [m]; the course is moved and rotated to begin at the origin,
+            along x.
         closed: Whether the course is a loop that is driven repeatedly.
         speed: Speed of the robot [m/s].
         duration_s: Default duration of the run [s].
@@ -40,16 +41,17 @@ class Scenario:
         slope: Slope of the terrain along x [degrees].
         waves: Amplitude of the longest wave of the terrain [m], and shortest wavelength [m].
         trees: Number of trees.
-        dbh: Smallest and largest DBH [m].
+        dbh: Minimum and maximum DBH [m].
         thin: Shape of the distribution of DBH; a larger value means more thin trees.
-        gap: Least distance between the surfaces of two trunks [m].
+        gap: Minimum distance between the surfaces of two trunks [m].
         branchy: Share of the trees with branches below 3.5 m.
         crown_base: Lowest and highest start of a crown [m].
         lean: Standard deviation of the lean [degrees].
         poles, bushes, standing, walking, boxes, undergrowth: Numbers of objects; standing and walking
             persons.
         placed: Objects at given positions in the frame of the map.
-        crossings: Persons who walk to and fro: from x, y to x, y [m], and their speed [m/s].
+        crossings: Persons who walk back and forth between two positions: x, y, x, y [m] and speed [m/s] of
+            each.
         obeys: Whether the robot slows down and stops for obstacles in its path.
         odometry: Default quality of the wheels.
     """
@@ -85,8 +87,8 @@ def _ring(radius: float, wobble: float, lobes: int, points: int) -> Waypoints:
     """Return a closed course around the origin as x, y [m], with the radius r + w cos(n a) at angle a.
 
     Args:
-        radius, wobble: r and w [m].
-        lobes: n.
+        radius, wobble: Mean radius r and amplitude w [m].
+        lobes: Number of lobes n.
         points: Number of waypoints; the first is not repeated.
     """
     angle = np.linspace(0.0, 2.0 * np.pi, points, endpoint=False)
@@ -216,8 +218,8 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def scenarios() -> dict[str, str]:
-    """Return the description of each scenario by its URI, e.g. "sim:stand"; runs through clouds are not
-    included."""
+    """Return a dict from the URI of each scenario, e.g. "sim:stand", to its description; runs through clouds
+    are not included."""
     return {f"sim:{name}": scenario.line for name, scenario in SCENARIOS.items()}
 
 
@@ -226,13 +228,13 @@ class WheelQuality:
     """Errors of wheel odometry.
 
     Attributes:
-        scale: Relative error of the distance; its sign is drawn.
+        scale: Relative error of the distance; its sign is random.
         slip: Share of the distance lost per unit of uphill slope.
-        turn_scale: Relative error of a turn; its sign is drawn.
-        turn_bias: False turn per metre [rad/m]; its sign is drawn.
-        distance_noise: Standard deviation of the distance [m] per square root of metre.
-        turn_noise: Standard deviation of the heading [rad] per square root of metre.
-        spins: How often the wheels spin on soft ground [1/m].
+        turn_scale: Relative error of a rotation; its sign is random.
+        turn_bias: False rotation per metre [rad/m]; its sign is random.
+        distance_noise: Standard deviation of the distance per square root of the distance [m/sqrt(m)].
+        turn_noise: Standard deviation of the heading per square root of the distance [rad/sqrt(m)].
+        spins: Number of spins of the wheels on soft ground per metre [1/m].
     """
 
     scale: float
@@ -353,12 +355,12 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
 
 
 def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
-    """Return the options of a URI by key; empty without a query.
+    """Return a dict from the keys to the values of the options of a URI; empty for an empty query.
 
     Args:
         uri: The URI, for errors.
-        query: Its part after "?", percent-encoded.
-        keys: Valid keys and what their values mean.
+        query: Part of the URI after "?", percent-encoded.
+        keys: Dict from valid keys to descriptions of their values.
 
     Raises:
         UsageError: The query is not key=value pairs, or a key is unknown or given twice.
@@ -390,19 +392,19 @@ def _refusal(uri: str, key: str, text: str) -> UsageError:
     Args:
         uri: The URI, for the message.
         key: Name of the option, one of `_KEYS`.
-        text: Its value.
+        text: Value of the option.
     """
     return UsageError(f"option {key} = {text!r} does not fit", where=uri, remedy=f"{key}: {_KEYS[key]}")
 
 
 def _whole(uri: str, key: str, text: str, most: int) -> int:
-    """Return a whole number from 0 to `most`.
+    """Return the integer of a text, from 0 to `most`.
 
     Args:
         uri: The URI, for the error.
         key: Name of the option.
-        text: Its value; ASCII digits only.
-        most: Largest number.
+        text: Value of the option; ASCII digits only.
+        most: Maximum number.
 
     Raises:
         UsageError: The text is not such a number.
@@ -421,7 +423,7 @@ def _real(uri: str, key: str, text: str, low: float, high: float) -> float:
     Args:
         uri: The URI, for the error.
         key: Name of the option.
-        text: Its value; ASCII digits only, an exponent is allowed.
+        text: Value of the option; ASCII digits only, an exponent is allowed.
         low, high: Bounds.
 
     Raises:

@@ -31,13 +31,13 @@ _BATCHES = (8, 16, 32, 64, 128, *[256] * 36)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Person:
-    """A person who stands and sways, or walks to and fro between two places.
+    """A person who stands and sways, or walks back and forth between two positions.
 
     Attributes:
         owner: Number of the object in the scene.
         start, end: Ends of the path, shape (2,) [m]; equal for a person who stands.
         heading: Heading of a person who stands [rad].
-        speed: [m/s], 0 for a person who stands.
+        speed: Speed [m/s], 0 for a person who stands.
         phase: Shift in time [s], so that no two persons move alike.
     """
 
@@ -80,9 +80,10 @@ class SimulatedScene:
         persons: All persons; even those who stand sway.
         truth: Trees (x, y of the axis at 1.3 m above the ground), poles, bushes, boxes ("other") and
             standing persons. Walking persons have no position, and undergrowth counts as ground.
-        kinds: Kind of each object by its number (`Solids.owner`), with "walker" and "undergrowth".
+        kinds: Kind of each object; the index is the number of the object (`Solids.owner`). They include
+            "walker" and "undergrowth".
         owners: Number of each object of the ground truth.
-        wind: How far the wind moves leaves that are 10 m above the ground, to each side [m].
+        wind: Amplitude of the motion of leaves 10 m above the ground by the wind [m].
     """
 
     terrain: SimulatedTerrain
@@ -113,8 +114,8 @@ class SimulatedScene:
 
     def _blown(self, t: float) -> Solids:
         """Return the solids at time t [s] with the leaves (porous ellipsoids) moved along x by the wind: each
-        swings with a phase of its own, in proportion to its height above the ground. `still` is not changed.
-        """
+        oscillates with a phase of its own and the amplitude `wind` times its height above the ground / 10 m.
+        `still` is not changed."""
         solids = self.still
         leaves = np.flatnonzero((solids.kind == ELLIPSOID) & (solids.shape[:, 8] > 0.0))
         x, y, z = solids.shape[leaves, :3].T
@@ -144,13 +145,14 @@ class Plot:
         self._taken = np.empty((0, 3))
 
     def from_course(self, places: Float) -> Float:
-        """Return the distances of places (N, 2) [m] from the line of the course, shape (N,) [m]."""
+        """Return the distances of positions, shape (N, 2) [m], from the line of the course, shape (N,)
+        [m]."""
         distance: Float = self._line.query(places)[0]
         return distance
 
     def from_objects(self, places: Float) -> Float:
-        """Return the distances of places (N, 2) [m] from the nearest surface of an object, shape (N,) [m];
-        negative inside of one, infinite without objects."""
+        """Return the distances of positions, shape (N, 2) [m], from the nearest surface of an object, shape
+        (N,) [m]; negative inside of an object, infinite if there are no objects."""
         if self._taken.shape[0] == 0:
             return np.full(places.shape[0], np.inf)
         away = np.hypot(places[:, :1] - self._taken[:, 0], places[:, 1:] - self._taken[:, 1])
@@ -175,17 +177,17 @@ class Plot:
 
         Args:
             radius: Radius of the object [m].
-            gap: Least distance between its surface and those of its neighbours [m].
-            near, far: Least and greatest distance of its surface from the course [m].
-            rng: Draws the positions.
+            gap: Minimum distance between the surfaces of the object and of its neighbours [m].
+            near, far: Minimum and maximum distance of the surface of the object from the course [m].
+            rng: Random generator of the positions.
             what: Name of the object, for the error.
-            edge: Greatest distance from the edge of the plot [m].
+            edge: Maximum distance of the position from the edge of the plot [m].
 
         Returns:
             x, y [m].
 
         Raises:
-            SourceError: The plot is full.
+            SourceError: No free position was found.
         """
         for count in _BATCHES:
             places = self.centre + self.half_side * rng.uniform(-1.0, 1.0, (count, 2))
@@ -213,10 +215,10 @@ def build_scene(scenario: Scenario, course: Course, rng: np.random.Generator) ->
     course.
 
     Args:
-        scenario: Numbers and sizes of the objects. Its number of trees includes placed ones, of which surplus
-            ones are left out.
+        scenario: Numbers and sizes of the objects. The number of trees includes the placed ones; placed trees
+            beyond this number are left out.
         course: Course of the robot, which stays free of random objects.
-        rng: Draws everything.
+        rng: Random generator.
 
     Raises:
         SourceError: There is no position left for an object.
@@ -315,7 +317,7 @@ class _Planter:
         self._persons.append(Person(owner, at, at, float(heading), 0.0, float(phase)))
 
     def _add_walker(self) -> None:
-        """Add a person who walks to and fro on a free line near the course, not to the ground truth.
+        """Add a person who walks back and forth on a free line near the course; not to the ground truth.
         SourceError if 2,000 random lines are not free."""
         rng, plot = self._rng, self._plot
         for _ in range(2000):

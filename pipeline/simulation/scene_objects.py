@@ -27,12 +27,12 @@ class SceneBuilder:
 
     Args:
         terrain: The ground on which objects are placed.
-        rng: Draws their shapes.
+        rng: Random generator of the shapes.
 
     Attributes:
         solids: Solids of all objects so far.
-        kinds: Kind of each object or part of an object by its number (`Solids.owner`).
-        truth: x, y [m], DBH [m] (NaN if not a tree) and kind of the objects of the ground truth.
+        kinds: Kind of each object or part of an object; the index is its number (`Solids.owner`).
+        truth: Tuples of x, y [m], DBH [m] (NaN if not a tree) and kind of the objects of the ground truth.
         owners: Numbers of the objects of the ground truth.
     """
 
@@ -71,7 +71,7 @@ class SceneBuilder:
         return np.array([x, y, self.terrain.height(np.array([x]), np.array([y]))[0]])
 
     def uniform(self, low: float, high: float) -> float:
-        """Draw a number from a uniform distribution between `low` and `high`; the generator advances."""
+        """Return a random number, uniform between `low` and `high`; the generator advances."""
         return float(self.rng.uniform(low, high))
 
 
@@ -107,7 +107,8 @@ def add_tree(
         dbh: Diameter at 1.3 m [m].
         lean: Shift of the axis per metre of height along x and y.
         top: Height of the tree above the ground [m].
-        crown_base: Lower end of the foliage [m]; a tree with a crown base at or above `top` has none.
+        crown_base: Height of the lower end of the foliage above the ground [m]; a tree with a crown base at
+            or above `top` has no foliage.
         branches: Number of branches below the crown.
     """
     rng, owner = scene.rng, scene.true_object("tree", x, y, dbh)
@@ -216,7 +217,7 @@ def add_shrub(
     Args:
         scene: The scene.
         x, y: Position [m].
-        radius, height: Bounds from which radius and height are drawn uniformly [m].
+        radius, height: Bounds of the uniform distributions of radius and height [m].
     """
     rng, owner, foot = scene.rng, scene.owner("foliage"), scene.foot(x, y)
     wide, tall, free_path = scene.uniform(*radius), scene.uniform(*height), scene.uniform(0.1, 0.45)
@@ -241,11 +242,11 @@ def add_foliage(
     """Add a porous ellipsoid with a random yaw.
 
     Args:
-        scene: Receives it.
-        owner: Number of its object.
+        scene: The scene to which the ellipsoid is added.
+        owner: Number of the object to which the ellipsoid belongs.
         centre: Centre, shape (3,) [m].
         half: Half sizes, shape (3,) [m].
-        free_path: Mean distance that a ray passes in it [m].
+        free_path: Mean free path of a ray in the ellipsoid [m].
         reflectivity: Share of the light that is reflected.
     """
     yaw = scene.uniform(0.0, np.pi)
@@ -263,7 +264,7 @@ def add_post(
     Args:
         scene: The scene.
         x, y: Position [m].
-        radius, height: Bounds from which radius and height are drawn uniformly [m].
+        radius, height: Bounds of the uniform distributions of radius and height [m].
     """
     post_of(scene, scene.owner("pole"), x, y, scene.uniform(*radius), scene.uniform(*height))
 
@@ -299,7 +300,7 @@ def add_motorcycle(scene: SceneBuilder, x: float, y: float) -> None:
 
 def add_hedge(scene: SceneBuilder, start: Float, end: Float) -> None:
     """Add a row of dense foliage from `start` to `end`, shape (2,) each [m], with a rough or a flat top, kind
-    "foliage"; not to the ground truth. No shape is added for equal places."""
+    "foliage"; not to the ground truth. No shape is added if `start` and `end` are equal."""
     rng, owner = scene.rng, scene.owner("foliage")
     height, half = scene.uniform(0.6, 2.6), scene.uniform(0.25, 0.6)
     free_path, rough = scene.uniform(0.05, 0.25), scene.uniform(0.02, 0.3)
@@ -322,7 +323,7 @@ def post_of(scene: SceneBuilder, owner: int, x: float, y: float, radius: float, 
     """Add a nearly upright post to an object.
 
     Args:
-        scene: Receives it.
+        scene: The scene to which the post is added.
         owner: Number of the object.
         x, y: Position of the foot [m].
         radius: Radius at the foot [m].

@@ -61,8 +61,8 @@ class SimulatedTerrain:
     """A plane with waves.
 
     Attributes:
-        packed: float64, shape (1 + W, 4). Row 0: slope along x, slope along y, height at the origin,
-            0. The others: amplitude [m], waves per metre along x and y, phase in turns.
+        packed: Plane and waves, float64, shape (1 + W, 4). Row 0: slope along x, slope along y, height at the
+            origin, 0. The others: amplitude [m], waves per metre along x and y, phase in turns.
     """
 
     packed: Float
@@ -76,10 +76,10 @@ class SimulatedTerrain:
 
         Args:
             slope: Slope of the plane along x (rise over run).
-            amplitude: Amplitude of the longest wave [m]; those of the others are proportional to their
-                length.
+            amplitude: Amplitude of the longest wave [m]; the amplitudes of the others are proportional to
+                their wavelengths.
             shortest: Shortest wavelength [m]; the longest is 3.1 times as long.
-            rng: Draws directions and phases.
+            rng: Random generator of directions and phases.
         """
         wavelengths = shortest * np.array([3.1, 2.2, 1.5, 1.0])
         directions = rng.uniform(0.0, np.pi, wavelengths.size)
@@ -101,7 +101,7 @@ class SimulatedTerrain:
 
         Args:
             depth: Depth of a ditch [m].
-            width: Its width at 60 % of the depth [m]; the profile is a Gaussian bell.
+            width: Width of a ditch at 60 % of the depth [m]; the profile is a Gaussian bell.
             spacing: Distance between two ditches [m].
             direction: Direction across the ditches [rad].
             phase: Position of the first ditch as a share of the spacing.

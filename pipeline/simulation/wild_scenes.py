@@ -28,7 +28,7 @@ class Uniform:
     Attributes:
         low, high: Bounds.
         unit: Unit, "" for a share or a count.
-        reason: Where the bounds come from.
+        reason: Reason of the bounds.
     """
 
     low: float
@@ -112,13 +112,13 @@ SENSORS = (
 def build_wild_scene(
     scenario: Scenario, course: Course, range_sigma: float, rng: np.random.Generator
 ) -> tuple[SpinningLidar, SimulatedScene]:
-    """Return the sensor, drawn from SENSORS, and the scene.
+    """Return a random sensor of SENSORS, and the scene.
 
     Args:
         scenario: Number of trees and size of the plot.
         course: Course of the robot.
         range_sigma: Standard deviation of a range [m].
-        rng: Draws everything.
+        rng: Random generator.
 
     Raises:
         SourceError: There is no position left for an object.
@@ -156,7 +156,7 @@ def _draw(name: str, rng: np.random.Generator) -> float:
 
 
 def _terrain(rng: np.random.Generator) -> SimulatedTerrain:
-    """Draw a terrain with waves and ditches."""
+    """Return a random terrain with waves and ditches."""
     slope, waves, shortest = (_draw(name, rng) for name in ("slope", "waves", "shortest wave"))
     depth, width, spacing = (_draw(f"ditch {name}", rng) for name in ("depth", "width", "spacing"))
     terrain = SimulatedTerrain.grow(slope, waves, shortest, rng)
@@ -177,8 +177,8 @@ def _add_object(scene: SceneBuilder, plot: Plot, name: str, x: float, y: float) 
 
 
 def draw_section(dbh: float, rng: np.random.Generator) -> Section:
-    """Return a random section of a stem of a DBH [m]; the depth of its furrows, limited to BARK, is that at
-    breast height."""
+    """Return a random section of a stem with the diameter `dbh` at breast height [m]. The depth of the
+    furrows is that at breast height, clipped to BARK."""
     return Section(
         oval=_draw("oval", rng),
         oval_phase=float(rng.uniform(0.0, np.pi)),
@@ -191,14 +191,14 @@ def draw_section(dbh: float, rng: np.random.Generator) -> Section:
 
 
 def add_wild_tree(scene: SceneBuilder, plot: Plot, x: float, y: float, dbh: float) -> None:
-    """Add a tree with crown, dead branches and undergrowth, to scene and ground truth. Its axis is at x, y
-    [m] at breast height, and a tape around it there has the length pi dbh [m].
+    """Add a tree with crown, dead branches and undergrowth to the scene, and the tree to the ground truth. At
+    breast height, the axis of the stem is at x, y and a tape around the stem has the length pi dbh.
 
     Args:
-        scene: Receives it; its generator draws the shape.
-        plot: Gives the distance from the course, on which no undergrowth grows. The position is not marked as
-            occupied.
-        x, y: Position [m].
+        scene: The scene to which the tree is added; its random generator determines the shape.
+        plot: The plot with the course of the robot, on which no undergrowth is added. The position is not
+            marked as occupied in it.
+        x, y: Position in the frame of the scene [m].
         dbh: Diameter at breast height [m].
     """
     rng = scene.rng
@@ -251,7 +251,7 @@ def add_wild_tree(scene: SceneBuilder, plot: Plot, x: float, y: float, dbh: floa
 
 
 def _towards(rng: np.random.Generator) -> Float:
-    """Return a random horizontal direction, shape (2,)."""
+    """Return a random horizontal unit vector, shape (2,)."""
     return unit_vector(rng.uniform(0.0, 2.0 * np.pi))[:2]
 
 
@@ -259,7 +259,7 @@ def _add_crown(scene: SceneBuilder, tip: Float, base: float, top: float, dbh: fl
     """Add three porous ellipsoids below the tip of a stem, kind "foliage".
 
     Args:
-        scene: Receives them.
+        scene: The scene to which the ellipsoids are added.
         tip: Upper end of the stem, shape (3,) [m].
         base, top: Height of the lower end of the crown and of the stem above the ground [m].
         dbh: Diameter of the stem, which scales the width [m].
@@ -275,12 +275,12 @@ def _add_crown(scene: SceneBuilder, tip: Float, base: float, top: float, dbh: fl
 
 
 def _add_undergrowth(scene: SceneBuilder, plot: Plot, x: float, y: float, radius: float) -> None:
-    """Add two to five plants around the foot of a stem, except where the robot drives; not to the ground
-    truth.
+    """Add two to five plants around the foot of a stem, except where the robot drives. They are not in the
+    ground truth.
 
     Args:
-        scene: Receives them.
-        plot: Gives the distance from the course.
+        scene: The scene to which the plants are added.
+        plot: The plot with the course of the robot.
         x, y: Middle of the stem [m].
         radius: Radius of the stem [m].
     """
@@ -303,7 +303,7 @@ def truth_in_view(
 ) -> TruthTrees:
     """Return the ground truth of a scene. A tree is HIDDEN if fewer than LEAST_BEAMS beams of all given scans
     meet its stem up to LOWER_STEM above the ground; leaves and stems before it stop beams. Persons and wind
-    are ignored. All trees are HIDDEN without scans.
+    are ignored. If there are no scans, all trees are HIDDEN.
 
     Args:
         lidar, scene: The sensor and the scene.

@@ -15,8 +15,8 @@ from pipeline.types.records import Detections, Float32, Int, Int32, Landmarks, P
 
 
 def hits_less_misses(hits: Int32, score: Float32 | Float, misses_per_hit: int) -> Float:
-    """Return the hits less the misses of landmarks, float64, shape (L,), from their scores; negative if
-    misses prevail.
+    """Return the hits (at most SCORE_MAX) minus the misses of landmarks, float64, shape (L,), from their
+    scores; negative if there are more misses.
 
     A score is hits - misses / misses_per_hit, and counts no more than SCORE_MAX hits.
 
@@ -50,8 +50,9 @@ class _Pairs(NamedTuple):
 
     Attributes:
         squared: Squared Mahalanobis distance of each pair.
-        cost: Determinant of its covariance; becomes its -2 log likelihood where detections compete.
-        landmark, detection: Its rows, int64.
+        cost: Determinant of the covariance of each pair; -2 log likelihood up to a constant once several
+            pairs have the same detection or landmark.
+        landmark, detection: Rows of landmark and detection of each pair, int64.
         of_detection: Number of pairs of each detection, int64, shape (D,).
     """
 
@@ -66,20 +67,20 @@ class _Pairs(NamedTuple):
 def associate(
     centre: Float, R: Float, mean: Float, covariance: Float, gate: float, distance_max: float
 ) -> tuple[Int, Float]:
-    """Associate detections with landmarks one to one, most likely pairs first. Without detections or
-    landmarks, no pair exists.
+    """Associate detections with landmarks one to one, pairs with the highest likelihood first. Without
+    detections or landmarks, no pair exists.
 
     Args:
         centre: Detections, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         mean: Landmarks in the same frame, shape (M, 2) [m].
-        covariance: Their covariances xx, xy, yy, shape (M, 3) [m^2].
+        covariance: Covariances xx, xy, yy of the landmarks, shape (M, 3) [m^2].
         gate: Maximum Mahalanobis distance [sigma].
         distance_max: Maximum distance [m].
 
     Returns:
         Row of the landmark of each detection, -1 for none, int64, shape (D,), and its squared Mahalanobis
-        distance, shape (D,), 0 without a landmark.
+        distance, shape (D,), 0 if there is no landmark.
     """
     detections = centre.shape[0]
     landmark_of = np.full(detections, -1, np.int64)
@@ -139,15 +140,16 @@ def _add_pairs(
     gate: float,
     distance_max: float,
 ) -> int:
-    """Fill `pairs` with those within the gate, in ascending order of landmark and detection; return their
-    number. Of pairs with equal cost the first one is preferred. A pair whose distance is NaN is within the
-    gate.
+    """Fill `pairs` with the pairs within `gate` and `distance_max`, in ascending order of landmark and
+    detection, and return their number. `cost` is the determinant of the covariance. A pair whose Mahalanobis
+    distance is NaN counts as within the gate.
 
     Args:
         pairs: The table; it must have room for all pairs within `distance_max`.
         cells, scale: Grid of the detections for searches within `distance_max`.
         centre, R: Detections in the map, shape (D, 2) [m], and covariances xx, xy, yy, shape (D, 3) [m^2].
-        mean, covariance: Landmarks, likewise.
+        mean, covariance: Landmarks in the map, shape (M, 2) [m], and covariances xx, xy, yy, shape (M, 3)
+            [m^2].
         gate: Maximum Mahalanobis distance.
         distance_max: Maximum distance [m].
     """

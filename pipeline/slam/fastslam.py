@@ -95,14 +95,14 @@ class FastSlam:
         Args:
             index: Number of the scan; seeds the random numbers of the scan.
             motion: T_base(t-1)_base(t) by the odometry, or the same with its uncertainty and a measured pose.
-            detections: Trees in the base frame; may be empty.
+            detections: Detected trees in the base frame; may be empty.
             clear_range: Free distance by azimuth in the base frame, shape (bins,) [m]; see
                 `detection.free_space`.
 
         Returns:
-            Pose after the scan with its health. `landmarks` contains only those of the best particle with
-            `hits_to_weigh` hits. `landmark_of` is the birth number of the landmark of each detection, -1 for
-            none; after a used scan each detection has one.
+            Pose after the scan with its health. `landmarks` contains only those of the best particle with at
+            least `hits_to_weigh` hits. `landmark_of` is the birth number of the landmark of each detection,
+            -1 for none; after a used scan each detection has one.
         """
         p = self.parameters
         noise, offset = draws(self.seed, index, p.particles)
@@ -188,7 +188,7 @@ class FastSlam:
         Args:
             index: Number of the scan, which seeds the random numbers.
             T_map_base: The pose.
-            covariance: Covariance of x, y [m], yaw [rad], shape (3, 3); the particles are drawn from it.
+            covariance: Covariance of x, y [m], yaw [rad], shape (3, 3), from which the particles are sampled.
         """
         self._put(index, T_map_base, covariance)
         graph = self.state.graph
@@ -206,12 +206,12 @@ class FastSlam:
         )
 
     def _put(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
-        """Draw all particles from a Gaussian, in place of `state`; they keep the map and the path of the best
-        particle.
+        """Replace `state` by one whose particles are sampled from a Gaussian, all with the map and the path
+        of the best particle, see `SlamState.placed`.
 
         Args:
             index: Number of the scan, which seeds the random numbers.
-            T_map_base: Mean.
+            T_map_base: Mean of the Gaussian.
             covariance: Covariance of x, y [m], yaw [rad], shape (3, 3); negative eigenvalues count as 0.
         """
         rng = np.random.default_rng([self.seed, index, PLACED])
@@ -234,8 +234,8 @@ class FastSlam:
         return self.is_keyframe and self.state.graph.is_due and not self.state.shared.begun
 
     def is_keyframe_every(self, distance: float) -> bool:
-        """Return whether the newest scan is the first keyframe at or after another multiple of `distance` [m]
-        of the driven path."""
+        """Return whether the newest scan is a keyframe and a multiple of `distance` [m] of the driven path
+        lies after the previous keyframe and not after this one. False for the first keyframe."""
         last = self.state.graph.keyframes[-2:]
         return self.is_keyframe and last[0].distance // distance < last[-1].distance // distance
 
@@ -268,9 +268,10 @@ class FastSlam:
         All particles continue from the corrected pose with the map of the best one, in which landmarks at the
         same place from before and after the loop are joined.
 
-        Associations with known landmarks in the present revisit were made at the drifted pose. With the loop
-        they are left out, and landmarks that it brings together are one tree. The loop is taken if its
-        solution has the larger support (`KeyframeGraph.support`).
+        Associations with old landmarks in the present revisit (`KeyframeGraph.revisit`) were made at the
+        drifted pose. In the solution with the loop they are left out, and landmarks that the loop brings to
+        the same position are joined. The loop is taken if its solution has the larger support
+        (`KeyframeGraph.support`).
 
         Args:
             index: Number of the scan, which seeds the random numbers.
@@ -315,14 +316,14 @@ class FastSlam:
         covariance: Float,
         names: tuple[Int, Int] | None = None,
     ) -> PathCorrection:
-        """Put all particles at the newest keyframe of a solution, which is the newest scan, with its path and
-        landmarks; return the correction of the path.
+        """Set all particles to the newest pose of a solution, with path and landmarks corrected by it; return
+        the correction of the path. The newest scan must be the newest keyframe of the graph.
 
         Args:
             index: Number of the newest scan.
             graph: The graph, with at least one keyframe.
-            solution: Its solution.
-            covariance: Covariance of the pose of the particles, shape (3, 3).
+            solution: Solution of the graph.
+            covariance: Covariance of x, y [m], yaw [rad] from which the particles are sampled, shape (3, 3).
             names: Landmarks that are joined; see `joined`. None for none.
         """
         before = self.state
@@ -352,13 +353,13 @@ class FastSlam:
 
     @property
     def is_lost(self) -> bool:
-        """Whether too few known trees are found where they should be visible; see `pose_quality.is_lost`."""
+        """Whether too few landmarks are detected where they should be visible, see `pose_quality.is_lost`."""
         return is_lost(self.state.recent)
 
     @property
     def is_supported(self) -> bool:
-        """Whether known trees were found where they should be visible, see `pose_quality.is_supported`. True
-        before any tree is known."""
+        """Whether landmarks are detected where they should be visible, see `pose_quality.is_supported`. True
+        before any landmark has `hits_to_weigh` hits."""
         return is_supported(self.state.recent)
 
     @property
@@ -384,7 +385,7 @@ class FastSlam:
         )
 
     def reset_health(self) -> None:
-        """Discard the running statistics that determine the health, except whether trees were mapped."""
+        """Set the running statistics that determine the health to their initial values, except `mapped`."""
         self.state = replace(self.state, recent=RunningStatistics(mapped=self.state.recent.mapped))
 
     def path(self) -> Float:
@@ -473,7 +474,7 @@ class FastSlam:
             state: State after the motion.
             trees: Motion since the last used scan, by odometry or by trees.
             centre: Detections in the base frame, shape (D, 2) [m]; D may be 0.
-            R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+            R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
             clear_range: Free distance by azimuth, shape (bins,) [m].
             noise: Standard normal numbers, shape (P, 3).
             measured: Pose that another source measured, if any.
@@ -534,8 +535,9 @@ class FastSlam:
     def _with_places(
         self, state: SlamState, births: Int, centre: Float, R: Float, estimate: PoseEstimate, reach: float
     ) -> SlamState:
-        """Return the state with the place of a scan, and with the known places that the scan confirms or
-        contradicts. Without detections, or without old places, no place is confirmed or contradicted.
+        """Return the state with the place of a scan, and with the old places that the scan confirms or
+        contradicts, see `agreement`. Without detections, or without old places, no place is confirmed or
+        contradicted.
 
         Args:
             state: State after the scan.
@@ -619,7 +621,7 @@ class FastSlam:
         Args:
             state: State after the motion.
             centre: Detections in the base frame, shape (D, 2) [m].
-            R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+            R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
             clear_range: Free distance by azimuth, shape (bins,) [m].
             places: States of the places in reach.
             rules: Parameters.
@@ -639,7 +641,7 @@ class FastSlam:
         Args:
             state: State with the shared errors before the motion.
             motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
-            covariance: Its covariance, shape (3, 3).
+            covariance: Covariance of the motion, shape (3, 3).
             measured: The measured pose, if any.
         """
         shared = state.shared.moved(motion, covariance)
@@ -667,7 +669,7 @@ def _at_scans(covariance: Float, graph: KeyframeGraph, scans: Int) -> Float:
 
 
 def _farthest(detections: Detections) -> float:
-    """Return the distance of the farthest detection from the base [m]; 0 without detections."""
+    """Return the distance of the farthest detection from the base [m]; 0 if there are no detections."""
     centre = detections.centre
     return math.sqrt(float((centre * centre).sum(axis=1).max(initial=0.0)))
 

@@ -36,15 +36,16 @@ class FrameUncertainty:
     Instances are immutable.
 
     Attributes:
-        serial: int64, shape (M,), ascending. Landmarks with this birth number or a later one, up to the next
-            serial, belong to the reference pose.
-        scan: int64, shape (M,): number of the scan of each reference pose.
+        serial: First birth number of each reference pose, int64, shape (M,), ascending. Landmarks with birth
+            numbers from it up to the next serial belong to the reference pose.
+        scan: Number of the scan of each reference pose, int64, shape (M,).
         pose: x, y [m], yaw [rad] of the reference poses, shape (M, 3).
-        covariance: Their covariances, shape (M, 3, 3). Of a smoothed one it is the part that comes from the
-            positions of its landmarks in the solution of a graph; all particles share these positions.
+        covariance: Covariances of x, y [m], yaw [rad] of the reference poses, shape (M, 3, 3). For a smoothed
+            reference pose it is the part that comes from the positions of its landmarks in the solution of a
+            graph, which all particles share.
         smoothed: Which reference poses are smoothed, shape (M,).
         hidden: Covariance of the error that all particles share, at the pose `at`, shape (3, 3).
-        at: x, y [m], yaw [rad], shape (3,).
+        at: Pose x, y [m], yaw [rad] of `hidden` in the map, shape (3,).
     """
 
     serial: Int = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -76,10 +77,10 @@ class FrameUncertainty:
         landmarks. A smoothed reference pose has `spread` in this mean, and its covariance is added to the
         result: it is an error of the map that all particles share. Without such landmarks the result is
         `spread` plus the transported `hidden`. Landmarks that precede all reference poses do not count. In
-        the state after it, `hidden` is the result less `spread`, and `at` is the pose.
+        the state after it, `hidden` is the result minus `spread`, and `at` is the pose.
 
         Args:
-            pose: x, y [m], yaw [rad], shape (3,).
+            pose: Pose x, y [m], yaw [rad] in the map, shape (3,).
             spread: Covariance of the particles, shape (3, 3).
             n_eff: Effective number of particles.
             mean, birth, hits: Positions [m], birth numbers and hits of the landmarks, shapes (L, 2), (L,) and
@@ -100,7 +101,7 @@ class FrameUncertainty:
         self, pose: Float, mean: Float, birth: Int, hits: Int32, hits_min: int, reach: float
     ) -> bool:
         """Return whether a landmark with `hits_min` hits or more, within `reach` [m] of the pose, belongs to
-        a reference pose. The arguments are those of `with_pose`. False without reference poses."""
+        a reference pose. The arguments are those of `with_pose`. False if there are no reference poses."""
         if not len(self.serial):
             return False
         near = np.hypot(*(mean - pose[:2]).T) <= reach
@@ -113,13 +114,13 @@ class FrameUncertainty:
 
         The result is `at_least(spread, least)`, or `by_landmarks` if its position variance is smaller: with
         two independent ways to find the pose, it is known at least as well as by the better one. In the state
-        after it, `hidden` is the result less `spread`; `at` is unchanged.
+        after it, `hidden` is the result minus `spread`; `at` is unchanged.
 
         Args:
             spread: Covariance of the particles, shape (3, 3).
             n_eff: Effective number of particles.
             least: Lower bound of the covariance by measured poses and odometry, shape (3, 3).
-            by_landmarks: Covariance by the landmarks in reach, shape (3, 3); None without any.
+            by_landmarks: Covariance by the landmarks in reach, shape (3, 3); None if there is none.
 
         Raises:
             LinAlgError: `spread` is not positive semidefinite.
@@ -154,8 +155,8 @@ class FrameUncertainty:
         )
 
     def without_unused(self, birth: Int) -> FrameUncertainty:
-        """Return the state without reference poses to which no landmark belongs, except the last one. It
-        differs for no landmark.
+        """Return the state without the reference poses to which no landmark belongs, except the last one. The
+        results of the other methods do not change for these landmarks.
 
         Args:
             birth: Birth numbers of all landmarks of all particles, int64, shape (L,).
@@ -183,12 +184,12 @@ class FrameUncertainty:
 
     def at_landmarks(self, birth: Int, position: Float) -> Float:
         """Return the covariance of the reference pose of each landmark, transported to its position, shape
-        (L, 2, 2) [m^2]; zeros without reference poses. Landmarks that precede all reference poses belong to
-        the first one.
+        (L, 2, 2) [m^2]; zeros if there are no reference poses. Landmarks that precede all reference poses
+        belong to the first one.
 
         Args:
             birth: Birth numbers of the landmarks, int64, shape (L,).
-            position: Their positions [m], shape (L, 2).
+            position: Positions x, y of the landmarks in the map, shape (L, 2) [m].
         """
         if not len(self.serial):
             return np.zeros((len(birth), 2, 2))
@@ -215,16 +216,16 @@ class FrameUncertainty:
         return replace(self, pose=pose, covariance=covariance, smoothed=np.ones(len(pose), np.bool_))
 
     def without_hidden(self) -> FrameUncertainty:
-        """Return the state with `hidden` = 0, for particles that are drawn with the complete covariance of
-        the pose. All reference poses remain."""
+        """Return the state with `hidden` = 0; all reference poses remain. It is for particles that are
+        sampled from the complete covariance of the pose."""
         return replace(self, hidden=np.zeros((3, 3)))
 
     def with_total(self, spread: Float, total: Float, at: Float) -> FrameUncertainty:
-        """Return the state in which `hidden` is what the particles lack of a covariance of the pose, in each
-        principal axis (`at_least`). All reference poses remain.
+        """Return the state in which `hidden` is `at_least(spread, total)` minus `spread`, and `at` is the
+        pose. All reference poses remain.
 
         Args:
-            spread: Covariance from which the particles are drawn, shape (3, 3).
+            spread: Covariance from which the particles are sampled, shape (3, 3).
             total: Covariance of the pose in the frame of the map, shape (3, 3).
             at: x, y [m], yaw [rad] of the pose, shape (3,).
 
@@ -241,11 +242,10 @@ def transported_covariance(covariance: Float, dx: float, dy: float) -> Float:
 
     Args:
         covariance: Sigma of x, y [m], yaw [rad] at the first pose, shape (3, 3).
-        dx, dy: From the first to the second position along the axes of the map [m].
+        dx, dy: Vector from the first to the second position along the axes of the map [m].
 
     Returns:
-        Covariance at the second pose, shape (3, 3). The product is written out, because library calls for
-        small matrices are slow.
+        Covariance of x, y [m], yaw [rad] at the second pose, shape (3, 3).
     """
     C, moved = covariance, np.empty((3, 3))
     t = C[2, 2]
@@ -306,8 +306,8 @@ def _with_frame(
 
 @compiled
 def at_least(spread: Float, least: Float, noise: float = 0.0) -> Float:
-    """Return `spread`, enlarged to the variance of `least` in each common principal axis where that is
-    larger.
+    """Return `spread`, shape (3, 3), enlarged to the variance of `least` in each common principal axis in
+    which that of `least` is larger.
 
     In the coordinates in which `spread` is the identity, let 1 + m be a variance of `least`. The result has
     the variance 1 + max(m - noise^2 / m, 0) (non-negative garrote; Gao 1998): an excess m below `noise` is

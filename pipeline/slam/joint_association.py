@@ -32,15 +32,15 @@ class JointSearch(NamedTuple):
 
     Attributes:
         detection: Detection of each level, lowest cost first, int64, shape (MOST,).
-        choices: Number of its landmarks, int64, shape (MOST,).
-        landmark: Its landmarks, lowest cost first, int64, shape (MOST, CHOICES).
+        choices: Number of landmarks of each level, int64, shape (MOST,).
+        landmark: Rows of the landmarks of each level, lowest cost first, int64, shape (MOST, CHOICES).
         new: Cost of a detection without landmark, shape (MOST,).
         least: Lower bound of the cost of this level and all later ones, shape (MOST + 1,).
         cost: Cost of all earlier levels, shape (MOST + 1,).
         pose: Pose before each level, see `_write_pose`, shape (MOST + 1, 9).
         next: Next choice of each level, int64, shape (MOST,).
         chosen: Landmark of each level in the present assignment, -1 for none, int64, shape (MOST,).
-        best: The same in the best assignment, int64, shape (MOST,).
+        best: Landmark of each level in the best assignment, -1 for none, int64, shape (MOST,).
     """
 
     detection: Int
@@ -81,7 +81,7 @@ def innovation(
 
     Args:
         pose: Pose of the robot with its covariance.
-        c, s: Cosine and sine of its yaw.
+        c, s: Cosine and sine of the yaw of the pose.
         centre, R: Detections in the base frame, shape (D, 2) [m], and covariances, shape (D, 3).
         d: Row of the detection.
         mean, covariance: Landmarks, shape (L, 2) [m], and covariances, shape (L, 3).
@@ -114,9 +114,9 @@ def choose_jointly(
     n: int,
     search: JointSearch,
 ) -> float:
-    """Find the most likely assignment of the detections of n levels, and write it to `search.best` (-1 for a
-    detection without landmark); return its -2 log likelihood. After MOST_STEPS steps the best assignment so
-    far is the result; n = 0 gives 0.
+    """Find the assignment with the highest likelihood of the detections of n levels, and write it to
+    `search.best` (-1 for a detection without landmark); return its -2 log likelihood. After MOST_STEPS steps
+    the best assignment so far is the result; n = 0 gives 0.
 
     Args:
         pose: Pose by the odometry and the pairs that were accepted before.
@@ -181,11 +181,11 @@ def _accept(
 
     Args:
         level: Level of the search, which decides about one detection.
-        choice: Row of `search.landmark[level]`; the number of its landmarks means none.
+        choice: Index in `search.landmark[level]`; `search.choices[level]` means no landmark.
         centre, R, mean, covariance: See `innovation`.
         hits: Hits of the landmarks, int32, shape (L,).
         gate2: Square of the gate.
-        hits_to_weigh: Minimum hits of a landmark that corrects the pose.
+        hits_to_weigh: Minimum number of hits of a landmark that corrects the pose.
         taken: Whether a landmark is taken, shape (L,).
         least: Cost of the best assignment so far.
         search: The search.

@@ -60,8 +60,8 @@ class Keyframe:
         distance: Distance driven until here [m].
         motion: x, y [m], yaw [rad] since the keyframe before, shape (3,).
         covariance: Covariance of `motion`, shape (3, 3); infinite where no odometry connects the two.
-        birth: int64, shape (D,): landmarks that were detected.
-        centre: Their positions in the frame of the base, shape (D, 2) [m].
+        birth: Birth numbers of the detected landmarks, int64, shape (D,).
+        centre: Positions of the landmarks in the frame of the base, shape (D, 2) [m].
         R: Covariances of the positions xx, xy, yy, shape (D, 3) [m^2].
     """
 
@@ -143,7 +143,7 @@ class LoopEdge:
     Attributes:
         scans: Scan numbers of both keyframes.
         motion: x, y [m], yaw [rad] from the first to the second, shape (3,).
-        covariance: Its covariance, shape (3, 3).
+        covariance: Covariance of the motion, shape (3, 3).
     """
 
     scans: tuple[int, int]
@@ -157,8 +157,8 @@ class Solution:
 
     Attributes:
         pose: x, y [m], yaw [rad] of each keyframe, shape (K, 3).
-        birth: int64, shape (L,), ascending: landmarks of the graph.
-        position: Their positions, shape (L, 2) [m].
+        birth: Birth numbers of the landmarks of the graph, int64, shape (L,), ascending.
+        position: Positions x, y of the landmarks in the map, shape (L, 2) [m].
         covariance: Covariance of each keyframe's pose with respect to the first one, shape (K, 3, 3).
         of_map: Part of these covariances that comes from the other poses and stems, shape (K, 3, 3), positive
             semidefinite. By the law of total variance it is Cov(x) - Cov(x | all others). Another pose that
@@ -199,7 +199,7 @@ class KeyframeGraph:
 
     @property
     def newest_scan(self) -> int:
-        """Scan number of the newest keyframe, -1 without one."""
+        """Scan number of the newest keyframe, -1 if there is none."""
         return self.keyframes[-1].scan if self.keyframes else -1
 
     def with_keyframe(self, keyframe: Keyframe, pose: Float) -> KeyframeGraph:
@@ -260,12 +260,12 @@ class KeyframeGraph:
         return self.revisits > 0 and grown >= max(GROWTH_MIN, GROWTH * len(self.keyframes))
 
     def renamed(self, birth: Int, name: Int) -> KeyframeGraph:
-        """Return the graph with other birth numbers for some landmarks, which are the same trees; unknown
-        birth numbers have no effect.
+        """Return the graph in which the birth numbers `birth` are replaced by those in `name`; birth numbers
+        that the graph does not have are ignored.
 
         Args:
-            birth: Their birth numbers, int64, shape (N,), ascending.
-            name: Their new birth numbers, int64, shape (N,).
+            birth: Present birth numbers, int64, shape (N,), ascending.
+            name: New birth numbers, int64, shape (N,).
         """
         if not len(birth):
             return self
@@ -303,8 +303,8 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(keyframes))
 
     def support(self, revisit: Revisit, solution: Solution) -> float:
-        """Return the number of detections of a revisit, each with its weight by the kernel in a solution of
-        the graph."""
+        """Return the sum of the kernel weights (`_weight`) of the detections of a revisit in a solution of
+        the graph. Detections of landmarks that the solution does not have do not count."""
         total = 0.0
         for keyframe, pose in zip(self.keyframes, solution.pose, strict=True):
             known = revisit.of(keyframe) & np.isin(keyframe.birth, solution.birth)
@@ -369,8 +369,8 @@ class KeyframeGraph:
             return None
 
     def _is_revisit(self, keyframe: Keyframe) -> bool:
-        """Return whether a keyframe shows at least two known stems for the first time in REVISIT_DISTANCE of
-        path; False while the path is shorter."""
+        """Return whether a keyframe detects at least two landmarks that were begun more than REVISIT_DISTANCE
+        of path ago and that no keyframe within this distance detected. False while the path is shorter."""
         recent: list[Int] = []
         first_birth = -1
         for before in reversed(self.keyframes):
@@ -730,12 +730,13 @@ def corrected_landmarks(
 def _moved_rigidly(
     place: Float, birth: Int, graph: KeyframeGraph, solution: Solution, path: Float
 ) -> tuple[Float, Float]:
-    """Return positions, each moved with the keyframe that began it, shape (L, 2) [m], and their rotations,
-    shape (L,) [rad]. Landmarks from before the first keyframe move with the first one.
+    """Return the positions of landmarks, each moved rigidly with the keyframe that began it, shape (L, 2)
+    [m], and the rotations of these keyframes, shape (L,) [rad]. Landmarks from before the first keyframe move
+    with the first one.
 
     Args:
         place: Positions of the landmarks, shape (L, 2) [m].
-        birth: Their birth numbers, int64, shape (L,).
+        birth: Birth numbers of the landmarks, int64, shape (L,).
         graph, solution: Keyframes and their corrected poses.
         path: Path before the correction, shape (N, 3).
     """
@@ -750,8 +751,8 @@ def _moved_rigidly(
 
 def same_trees(known: MapColumns, first_birth: int) -> tuple[Int, Int]:
     """Return pairs of landmarks within TWICE of each other, one begun before a loop and one after it, each
-    landmark in at most one pair (most likely pairs first): the birth numbers of the later ones, ascending,
-    and of the earlier ones, int64, shape (N,) each.
+    landmark in at most one pair (pairs with the highest likelihood first): the birth numbers of the later
+    ones, ascending, and of the earlier ones, int64, shape (N,) each.
 
     Args:
         known: Landmarks of one particle after the correction.

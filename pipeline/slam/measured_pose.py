@@ -41,11 +41,11 @@ class MeasuredPose(NamedTuple):
     """A measured pose, with the estimates that P particles have of the shared errors of its source.
 
     Attributes:
-        z: x, y [m], yaw [rad], shape (3,); shape (0,) if no pose was measured.
+        z: Measured pose x, y [m], yaw [rad] in the map, shape (3,); shape (0,) if no pose was measured.
         own: Covariance of the error of this pose that is independent of other poses, shape (3, 3).
         H: Effect of the shared errors on the pose, see `PoseMeasurement.shared`, shape (3, SHARED).
         mean: Estimated shared errors, shape (P, SHARED); P is 0 for a source without shared errors.
-        covariance: Their covariances, shape (P, SHARED, SHARED).
+        covariance: Covariances of the shared errors, shape (P, SHARED, SHARED).
     """
 
     z: Float
@@ -74,10 +74,10 @@ class SharedErrors:
 
     Attributes:
         mean: Estimated errors of each source and particle, shape (SOURCES, P, SHARED).
-        covariance: Their covariances, shape (SOURCES, P, SHARED, SHARED).
+        covariance: Covariances of the estimated errors, shape (SOURCES, P, SHARED, SHARED).
         joint: Covariance of the pose in the frame of the map and of the errors of all sources, by odometry
             and measured poses only, shape (3 + SOURCES * SHARED, 3 + SOURCES * SHARED).
-        at: x, y [m], yaw [rad] to which `joint` and `by_trees` refer, shape (3,).
+        at: Pose x, y [m], yaw [rad] to which `joint` and `by_trees` refer, shape (3,).
         by_trees: Covariance of the pose when landmarks last determined it, plus the odometry since then,
             shape (3, 3); shape (0, 0) before.
     """
@@ -101,7 +101,7 @@ class SharedErrors:
         Args:
             particles: Number of particles.
             pose: Estimated pose, shape (3,).
-            covariance: Its covariance in the frame of the map, shape (3, 3).
+            covariance: Covariance of the pose in the frame of the map, shape (3, 3).
         """
         one = np.eye(SHARED)
         joint = np.eye(POSE + SOURCES * SHARED)
@@ -129,7 +129,7 @@ class SharedErrors:
 
         Args:
             motion: x, y [m], yaw [rad] in the frame of the pose before, shape (3,).
-            motion_covariance: Its covariance, shape (3, 3).
+            motion_covariance: Covariance of the motion, shape (3, 3).
         """
         if not self.begun:
             return self
@@ -295,7 +295,7 @@ def within_gate(T_map_base: Pose2, covariance: Float, motion: Motion, noise: Noi
 
     Args:
         T_map_base: Pose before the motion.
-        covariance: Its covariance of x, y [m], yaw [rad], shape (3, 3).
+        covariance: Covariance of x, y [m], yaw [rad] of this pose, shape (3, 3).
         motion: Motion with the measured pose.
         noise: Noise of the odometry.
     """

@@ -26,7 +26,7 @@ class Noise(NamedTuple):
     Attributes:
         distance: Position noise [m/sqrt(m)].
         turn_distance: Heading noise by distance [rad/sqrt(m)].
-        turn: Heading noise by turning [rad/sqrt(rad)].
+        turn: Heading noise by rotation [rad/sqrt(rad)].
     """
 
     distance: float
@@ -45,7 +45,7 @@ def step_variances(x: float, y: float, yaw: float, noise: Noise) -> tuple[float,
 
     With the distance s = hypot(x, y), the position variance is (noise.distance)^2 s for x and for y [m^2],
     and the heading variance is (noise.turn_distance)^2 s + (noise.turn)^2 |yaw| [rad^2]. They are linear in
-    distance and turn, so that many short steps scatter the particles like one long step.
+    distance and rotation.
 
     Args:
         x, y, yaw: Step [m, m, rad].
@@ -65,8 +65,10 @@ class OdometryTrust(NamedTuple):
     Attributes:
         noise: Noise of an odometry without faults.
         distrust: 0 to 1; 1 directly after the trees contradicted the odometry, then decaying.
-        unobserved: Distance driven since two known trees were last recognised in one scan [m].
-        known_share: Running mean of the share of detections that belong to well-known trees, 0 to 1.
+        unobserved: Distance driven since the last scan in which two landmarks with at least `hits_to_weigh`
+            hits were detected [m].
+        known_share: Running mean of the share of detections of landmarks with at least `hits_to_weigh` hits,
+            0 to 1.
     """
 
     noise: Noise
@@ -81,8 +83,8 @@ def drift_variances(motion: Float, driven: float, trust: OdometryTrust) -> tuple
     faults.
 
     The distance beyond the net motion (a detour, or distance without known trees) counts both as distance and
-    as turn, because its composition is unknown. A heading error that accumulates uniformly over a distance s
-    displaces the end by the variance (heading variance) s^2 / 3, which is added to the position variance.
+    as rotation. A heading error that accumulates uniformly over a distance s displaces the end by the
+    variance (heading variance) s^2 / 3, which is added to the position variance.
 
     Args:
         motion: x, y [m], yaw [rad] since the last used scan, shape (3,).
@@ -148,7 +150,7 @@ class Motion(NamedTuple):
         step: T_base(t-1)_base(t) by the odometry.
         slack: Standard deviations that are added where the odometry is doubtful: position [m], heading [rad].
             Those of successive steps are of one velocity, so they add up linearly; see `advanced`.
-        doubt: Message with the reason of the doubt; empty without one.
+        doubt: Message with the reason of the doubt; empty if there is none.
         measured: Pose that another source measured at this scan, if any.
         turn_sigma: Standard deviation of the yaw of the step [rad] if a gyroscope measured it, else None.
         due: Whether the scan updates the filter even if the robot has moved less than `update_distance`.
@@ -192,10 +194,10 @@ def accumulated(
         p: Noise of the odometry and `update_distance`.
 
     Returns:
-        Motion, shape (3,); its covariance, shape (3, 3); the sum of the slack, shape (2,); and the distance
-        that the step counts towards `update_distance` [m], with TURN_AS_DISTANCE per radian; at least
-        `update_distance` for a step with slack, distrust or a measured pose. None if the step is zero and has
-        none of these.
+        Motion, shape (3,); covariance of the motion, shape (3, 3); the sum of the slack, shape (2,); and the
+        distance that the step counts towards `update_distance` [m], with TURN_AS_DISTANCE per radian; at
+        least `update_distance` for a step with slack, distrust or a measured pose. None if the step is zero
+        and has none of these.
     """
     step = motion.step
     news = motion.measured is not None
@@ -266,10 +268,10 @@ def stepped(
 
     Args:
         motion: x, y [m], yaw [rad], shape (3,).
-        covariance: Its covariance, shape (3, 3).
+        covariance: Covariance of the motion, shape (3, 3).
         x, y, yaw: Step in the frame in which the motion ends [m, m, rad].
         position: Variance of x and of y of the step [m^2].
-        heading: Variance of its yaw [rad^2].
+        heading: Variance of the yaw of the step [rad^2].
     """
     noise = np.zeros((3, 3))
     noise[0, 0] = noise[1, 1] = position
@@ -315,9 +317,8 @@ def correct_by_pose(mu: Float, P: Float, z: Float, R: Float) -> float:
 
 @compiled
 def inverted(S: Float) -> tuple[Float, float]:
-    """Return the inverse of a symmetric positive definite matrix of shape (3, 3), and its determinant.
-    Cofactors are used because the library function takes seven seconds to compile. For a singular matrix the
-    determinant is 0 and the inverse contains inf or NaN."""
+    """Return the inverse of a symmetric positive definite matrix of shape (3, 3), and its determinant. For a
+    singular matrix the determinant is 0 and the inverse contains inf or NaN."""
     inverse = np.empty((3, 3))
     for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
@@ -368,13 +369,13 @@ def weighted_pose(
     poses.
 
     The mean yaw is the direction of the weighted sum of unit vectors. The covariance is the weighted scatter
-    about the mean plus the covariance of the motion since the poses were drawn, rotated into the frame of the
-    poses.
+    about the mean plus the covariance of the motion since the poses were sampled, rotated into the frame of
+    the poses.
 
     Args:
         pose: x, y [m], yaw [rad] after the motion, shape (P, 3).
         weights: Weights with sum 1, shape (P,).
-        motion: Motion since the poses were drawn, the same for all, shape (3,).
+        motion: Motion since the poses were sampled, the same for all, shape (3,).
         motion_covariance: Covariance of `motion` in the frame in which it begins, shape (3, 3).
     """
     mean = np.zeros(3)

@@ -58,8 +58,8 @@ def normalised(log_weight: Float) -> Float:
 def low_variance_ancestors(weights: Float, offset: float) -> Int:
     """Return the row of the ancestor of each particle of the new generation, int64, shape (P,).
 
-    A particle of weight w is drawn floor(P w) or ceil(P w) times. Survivors keep their own slot, so that only
-    their copies have to be written: ancestors[k] == k for each particle k that is drawn.
+    A particle of weight w is selected floor(P w) or ceil(P w) times. Each selected particle k keeps its row:
+    ancestors[k] == k.
 
     Args:
         weights: Weights with sum 1, shape (P,).
@@ -149,13 +149,13 @@ class EstimatedPath:
     """The estimated pose of each scan. The record is immutable; a longer path shares the blocks of a shorter
     one.
 
-    The path of one particle is one sample of the posterior: its map may be turned about the first pose by the
-    whole uncertainty of the heading there. The estimate is the mean of the posterior, and trees, columns and
-    terrain are mapped at it.
+    The path of one particle is one sample of the posterior: its map may be rotated about the first pose by
+    the whole uncertainty of the heading there. The estimate is the mean of the posterior, and trees, columns
+    and terrain are mapped at it.
 
     Attributes:
-        blocks: float64, shape (BLOCK, 3) each: x, y [m], yaw [rad], oldest first.
-        newest: The scans after them, fewer than BLOCK, shape (N, 3).
+        blocks: Poses x, y [m], yaw [rad] in the map, oldest first, float64, shape (BLOCK, 3) each.
+        newest: Poses of the scans after the blocks, fewer than BLOCK, shape (N, 3).
     """
 
     blocks: tuple[Float, ...] = ()
@@ -203,9 +203,9 @@ class Generation:
     """The particles of one scan.
 
     Attributes:
-        pose: float32, shape (P, 3): pose of each particle before resampling.
-        ancestors: int64, shape (Q,): the particle from which each particle after the scan descends; None
-            without resampling.
+        pose: Pose x, y [m], yaw [rad] of each particle before resampling, float32, shape (P, 3).
+        ancestors: Row of the particle from which each particle after the scan descends, int64, shape (Q,);
+            None if the particles were not resampled.
     """
 
     pose: Float32
@@ -321,8 +321,8 @@ def _founders_after(
     scans: int, founders: tuple[Int, Int] | None, particles: int, ancestors: Int | None
 ) -> tuple[Int, Int]:
     """Return the founders after one more scan (see Genealogy); `scans`: number of scans before it. `founders`
-    is None before the first scan, and `ancestors`, shape (P,), None without resampling. `particles` is their
-    number P."""
+    is None before the first scan; `ancestors`, shape (P,), is None if the particles were not resampled.
+    `particles` is the number of particles before the scan."""
     newer, older = founders or (np.arange(particles),) * 2
     if scans % FOUNDED == 0:
         newer, older = np.arange(particles), newer
@@ -356,8 +356,8 @@ class TrajectoryBuffer:
 
     Args:
         stamp_ns: Times of the scans so far [ns], int64, shape (N,); None for none.
-        sigma: Their position sigmas [m], shape (N,).
-        motion: Their steps, shape (N, 3); see `motion`.
+        sigma: Standard deviations of the positions at the scans [m], shape (N,).
+        motion: Odometry steps of the scans, shape (N, 3); see `motion`.
     """
 
     def __init__(

@@ -29,13 +29,14 @@ class Maps(NamedTuple):
         mean: Positions, shape (N, ROOM, 2) [m].
         covariance: Covariances xx, xy, yy, shape (N, ROOM, 3) [m^2].
         hits: Number of detections, 0 for a place without landmark, int32, shape (N, ROOM).
-        score: Hits less weighted misses, float32, shape (N, ROOM); a landmark without score is removed.
+        score: Hits minus weighted misses, float32, shape (N, ROOM); a landmark whose score is not above 0 is
+            removed.
         birth: Serial number of the first detection of the landmark, int64, shape (N, ROOM). Landmarks of
             different particles with the same birth are the same tree.
         box: Minimum x, y and maximum x, y of all positions ever written to the block, shape (N, 4) [m].
         owners: Number of particles that use the block, int32, shape (N,).
         free: Unused rows of the pool, of which the first `free_count[0]` are valid, int32, shape (N,).
-        free_count: Their number, int64, shape (1,).
+        free_count: Number of valid entries of `free`, int64, shape (1,).
     """
 
     block: Int32
@@ -157,7 +158,7 @@ def with_room(maps: Maps, landmarks: int, rows: int) -> Maps:
 @compiled_within
 def _copy_row(maps: Maps, b: int, other: Maps, n: int) -> None:
     """Copy landmarks and bounding box of row b of the pool to row n of the pool of `other`, which may be the
-    same; `owners` and `free` are not changed. Loops compile faster than slices."""
+    same; `owners` and `free` are not changed."""
     for o in range(ROOM):
         other.mean[n, o, 0], other.mean[n, o, 1] = maps.mean[b, o, 0], maps.mean[b, o, 1]
         for a in range(3):
@@ -297,8 +298,8 @@ def _fill_in_reach(maps: Maps, pose: Float, reach: float, near: Int32, length: I
         maps: The maps.
         pose: Poses of the particles, x, y first, shape (P, 3).
         reach: Distance [m].
-        near: Receives the blocks of each particle, shape (P, K).
-        length: Receives their numbers, shape (P,).
+        near: Filled with the blocks of each particle, shape (P, K).
+        length: Filled with the number of blocks of each particle, shape (P,).
     """
     shared = 0
     for p in range(pose.shape[0]):
@@ -388,7 +389,7 @@ def kalman_update(
 
     Args:
         m: Positions of the landmarks, shape (L, 2) [m]; row j is updated.
-        Sigma: Their covariances xx, xy, yy, shape (L, 3) [m^2]; row j is updated.
+        Sigma: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2]; row j is updated.
         j: Row of the landmark.
         z0, z1: Measured position [m].
         R0, R1, R2: Covariance xx, xy, yy of the measurement [m^2].

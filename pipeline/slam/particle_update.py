@@ -42,11 +42,11 @@ class Rules(NamedTuple):
     """Parameters of the measurement update, see `Slam`.
 
     Attributes:
-        use_proposal: Whether detections correct the pose before it is drawn (FastSLAM 2.0); otherwise it is
-            drawn from the odometry (FastSLAM 1.0).
+        use_proposal: Whether detections correct the pose before it is sampled (FastSLAM 2.0); otherwise it is
+            sampled from the odometry (FastSLAM 1.0).
         gate: Maximum Mahalanobis distance of an association [sigma].
         distance_max: Maximum distance of an association [m].
-        hits_to_weigh: Minimum hits of a landmark that affects pose and weight.
+        hits_to_weigh: Minimum number of hits of a landmark that affects pose and weight.
         view_range: Maximum distance of a landmark that can be missed [m].
         miss: Decrease of the score of a landmark by one miss.
         miss_weight: Decrease of the log weight by one miss.
@@ -114,9 +114,8 @@ def near_for(landmarks: int) -> Near:
 
 @compiled
 def predict(pose: Float, motion: Float, covariance: Float, noise: Float, use_proposal: bool) -> Float:
-    """Return the poses after a motion, shape (P, 3). With `use_proposal` each pose is only moved, and
-    its yaw is not wrapped; otherwise it is drawn from the Gaussian about the moved pose, with a yaw in [-pi,
-    pi).
+    """Return the poses after a motion, shape (P, 3). With `use_proposal` each pose is only moved, and its yaw
+    is not wrapped; otherwise it is sampled from the Gaussian about the moved pose, with a yaw in [-pi, pi).
 
     Args:
         pose: x, y [m], yaw [rad] of each particle, shape (P, 3); unchanged.
@@ -166,7 +165,7 @@ def observe(
     mu: Float,
     P: Float,
 ) -> None:
-    """Update all particles with the detections of one scan: correct and draw poses, update, add, miss and
+    """Update all particles with the detections of one scan: correct and sample poses, update, add, miss and
     merge landmarks, and weigh. All results are written into the arguments.
 
     Args:
@@ -180,7 +179,7 @@ def observe(
             and (3, 3).
         noise: Standard normal numbers, shape (P, 3).
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         clear_range: Free range per direction [m], see `FastSlam.process`.
         reach: Distance beyond which landmarks are not used [m].
         first_birth: Birth number of the first detection; a detection d without landmark begins one with the
@@ -250,10 +249,10 @@ def _gather(
     Args:
         maps: Maps of the particles; unchanged.
         p: Row of the particle.
-        near_blocks, blocks: Its blocks in reach, int32, shape (P, K), of which row p has this number of valid
-            entries.
+        near_blocks: Blocks in reach of each particle, int32, shape (P, K).
+        blocks: Number of valid entries in row p of `near_blocks`.
         mu: x, y [m], yaw [rad] of the particle, shape (3,).
-        reach: Distance [m].
+        reach: Maximum distance from the pose [m].
         places: States of the places.
         near: Work arrays; filled from row 0.
 
@@ -322,7 +321,7 @@ def _learn(
         free: Number of unused places in `near.free`.
         landmark_of: Row of `near` of each detection, -1 for none, int64, shape (D,).
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         first_birth: Birth number of the first detection.
     """
     n = known
@@ -354,9 +353,13 @@ def _learn(
 
 @compiled_borrowing
 def _farthest_missed(clear_range: Float, view_range: float) -> float:
-    """Return the square of the distance beyond which no landmark can be missed in any direction [m^2]: of the
-    smaller of `view_range` [m] and the largest free range less BEHIND; 0 if no direction is free.
-    `clear_range` has the shape (bins,) [m]."""
+    """Return the square [m^2] of the distance beyond which no landmark can be missed: of the minimum of
+    `view_range` and the largest free range minus BEHIND; 0 if no free range exceeds BEHIND.
+
+    Args:
+        clear_range: Free range by azimuth, shape (bins,) [m].
+        view_range: Maximum range of the sensor [m].
+    """
     free = 0.0
     for k in range(clear_range.shape[0]):
         if clear_range[k] - BEHIND > free:
@@ -377,20 +380,21 @@ def _miss(
     rules: Rules,
     statistics: Float,
 ) -> float:
-    """Decrease the score of the landmarks in free view that were not seen and are not frozen by `rules.miss`;
-    return the number of well-known ones among them. Their hits, each at most MOST_HITS, are added to the
-    column MISSED of row p.
+    """Subtract `rules.miss` from the score of each missed landmark, and set `changed`. Return the number of
+    missed landmarks with at least `rules.hits_to_weigh` hits; their hits, each at most MOST_HITS, are added
+    to the column MISSED of row p.
 
-    A landmark is in free view if it is nearer than the free range in its direction less BEHIND.
+    A landmark is missed if it was not seen, is not frozen, is at most sqrt(`farthest`) away from the pose,
+    and is nearer than the free range in its direction minus BEHIND.
 
     Args:
         pose: Poses after the scan, shape (P, 3).
         p: Row of the particle.
         c, s: Cosine and sine of the yaw of the particle.
         near: Landmarks in reach; `score` and `changed` are written.
-        known: Number of landmarks known before the scan.
+        known: Number of landmarks that existed before the scan; they are the first rows of `near`.
         clear_range: Free range by azimuth in the base frame, shape (bins,) [m].
-        farthest: Result of `_farthest_missed` [m^2].
+        farthest: Result of `_farthest_missed` [m^2]; 0 if no landmark can be missed.
         rules: Parameters.
         statistics: Statistics by particle, shape (P, STATISTICS).
     """
@@ -477,7 +481,7 @@ def _shift(
         x, y, yaw: Pose before the motion [m, m, rad].
         c, s: Cosine and sine of `yaw`.
         motion: Motion by odometry, shape (3,).
-        mu: Corrected pose, shape (3,).
+        mu: Corrected pose x, y [m], yaw [rad] in the map, shape (3,).
         statistics: Statistics by particle, shape (P, STATISTICS).
         p: Row of the particle.
     """
@@ -544,9 +548,9 @@ def use_scan(
     rules: Rules,
     measured: MeasuredPose,
 ) -> tuple[Maps, Float, Float, float, Int]:
-    """Update poses, log weights, maps and shared errors (of `measured`) of all particles in place; the
-    greatest log weight is 0 then.
-    The arguments are those of `particle_update.observe`; there may be no detections.
+    """Update poses, log weights, maps and shared errors (of `measured`) of all particles in place. Afterwards
+    the maximum log weight is 0. The arguments are those of `particle_update.observe`; there may be no
+    detections.
 
     Returns:
         Maps, grown where they had no space for new landmarks (then the arrays of the argument are stale);

@@ -38,10 +38,10 @@ class Places:
     """M places along the path. Instances are immutable.
 
     Attributes:
-        birth: int64, shape (M,), ascending. Landmarks with this birth number or a later one, up to the next
-            row, belong to the place.
+        birth: First birth number of each place, int64, shape (M,), ascending. Landmarks with birth numbers
+            from it up to that of the next row belong to the place.
         distance: Distance driven at each place, shape (M,) [m].
-        seen: Distance driven when the place was last seen for certain, shape (M,) [m].
+        seen: Distance driven when the place was last seen, see `with_scan` and `with_seen`, shape (M,) [m].
         inactive: Which places the detections contradict, shape (M,).
         contradicted: Whether the last scan contradicts a place; then a loop is searched for.
     """
@@ -78,8 +78,8 @@ class Places:
         return replace(places, seen=seen, contradicted=False)
 
     def with_seen(self, distance: float, birth: Int) -> Places:
-        """Return the places after landmarks were seen for certain: their places and those within
-        REVISIT_DISTANCE of them along the path are active and seen.
+        """Return the places after the landmarks `birth` were seen: the places of these landmarks and those
+        within REVISIT_DISTANCE of them along the path are active and seen.
 
         Args:
             distance: Distance driven [m].
@@ -180,7 +180,7 @@ def agreement(
     pose: Pose, centre: Float, R: Float, mean: Float, covariance: Float
 ) -> tuple[float, Bool, Bool]:
     """Return the log odds that detections show the given landmarks and not others, which landmarks agree with
-    a detection, and which have a detection within WINDOW, shape (L,). The log odds are 0 without a landmark
+    a detection, and which have a detection within WINDOW, shape (L,). The log odds are 0 if no landmark is
     within WINDOW of a detection.
 
     A landmark agrees with one of the detections around it, which have the density rho, by chance with the
@@ -191,9 +191,9 @@ def agreement(
     Args:
         pose: Pose with its covariance relative to the active landmarks.
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         mean: Positions of the landmarks, shape (L, 2) [m].
-        covariance: Their covariances xx, xy, yy, shape (L, 3) [m^2].
+        covariance: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2].
     """
     c, s = np.cos(pose.yaw), np.sin(pose.yaw)
     n = mean.shape[0]

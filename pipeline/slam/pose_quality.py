@@ -29,16 +29,18 @@ SIGMA_FLOOR = np.array([1e-3, 1e-3, 1e-4])
 
 @dataclass(frozen=True, slots=True)
 class ScanStatistics:
-    """Statistics of one scan, means over the particles. "Well known" is a landmark with `slam.hits_to_weigh`
-    hits.
+    """Statistics of one scan, means over the particles. A landmark is well known if it has at least
+    `slam.hits_to_weigh` hits.
 
     Attributes:
         detections: Number of detections.
         recognised: Number of detections of well-known landmarks.
-        ambiguous: Number of detections with two likely landmarks.
-        found: Hits of the recognised landmarks, each limited to MOST_HITS.
-        missed: Hits of the well-known landmarks in free view that were not detected, limited likewise.
-        innovation: Normalised innovation squared per degree of freedom; NaN without a recognised landmark.
+        ambiguous: Number of detections whose two best pairs differ by less than `proposal.LIKELY`.
+        found: Sum of the hits, each at most MOST_HITS, of the well-known landmarks that were detected.
+        missed: Sum of the hits, each at most MOST_HITS, of the well-known landmarks in free view that were
+            not detected.
+        innovation: Normalised innovation squared per degree of freedom; NaN if no well-known landmark was
+            detected.
         odometry: Mahalanobis distance between the motion by SLAM and the odometry [sigma].
     """
 
@@ -74,8 +76,8 @@ def named_statistics(mean: Float, odometry: float, detections: int) -> ScanStati
 
 @compiled
 def mean_statistics(statistics: Float, weights: Float, motion_covariance: Float) -> tuple[Float, float]:
-    """Return the weighted mean of the columns, shape (STATISTICS,), and the Mahalanobis norm of its SHIFT
-    [sigma], with SIGMA_FLOOR squared added to the variances of the motion.
+    """Return the weighted mean of the columns over the particles, shape (STATISTICS,), and the Mahalanobis
+    norm of the mean SHIFT [sigma], with SIGMA_FLOOR squared added to the variances of the motion.
 
     Args:
         statistics: Statistics by particle, shape (P, STATISTICS).
@@ -94,7 +96,7 @@ def disagreement(by_trees: Float, by_odometry: Float, covariance: Float) -> floa
     """Return the Mahalanobis distance of two motions [sigma]. The yaw difference is wrapped.
 
     Args:
-        by_trees, by_odometry: x, y [m], yaw [rad], shape (3,).
+        by_trees, by_odometry: Motions x, y [m], yaw [rad], shape (3,).
         covariance: Covariance of the odometry, shape (3, 3); SIGMA_FLOOR squared is added to its diagonal.
     """
     shift = by_trees - by_odometry
@@ -147,19 +149,19 @@ TREE_MOTION_MAX, TREE_MOTION_STEP = 60, 2
 
 @dataclass(frozen=True, slots=True)
 class RunningStatistics:
-    """Running statistics after a scan. "Well known" is a landmark with `slam.hits_to_weigh` hits.
+    """Running statistics after a scan. A landmark is well known if it has at least `slam.hits_to_weigh` hits.
 
     Attributes:
         innovation: Running mean of the normalised innovation squared per degree of freedom.
-        found: Running mean of the hits of recognised landmarks, as a share of all well-known landmarks in
-            free view.
-        ambiguous: Running mean of the share of detections with two likely landmarks.
+        found: Running mean of `ScanStatistics.found` as a share of `found` plus `missed`, the well-known
+            landmarks in free view.
+        ambiguous: Running mean of the share of detections that `ScanStatistics.ambiguous` counts.
         odometry: Largest deviation from an odometry without doubt [sigma], decaying by FADING per scan.
-        alone: Distance driven since two known trees were last recognised in one scan [m].
-        mapped: Whether any well-known landmark was ever recognised.
+        alone: Distance driven since the last scan in which FEWEST well-known landmarks were detected [m].
+        mapped: Whether a well-known landmark was ever detected.
         distrust: 1 when the trees contradict the odometry, decaying with the time since (`decayed_distrust`).
         strange: Number of strange scans in a row, see STRANGE_LOST.
-        missed: Most hits of well-known landmarks that one of these scans missed.
+        missed: Maximum of `ScanStatistics.missed` over the present strange scans.
         familiar: Running mean of the share of detections that belong to well-known landmarks.
         led: Counter of the scans in which trees determined the motion while the odometry was doubted: plus
             TREE_MOTION_STEP for each, minus one for each scan without doubt.
@@ -185,8 +187,9 @@ class RunningStatistics:
     @property
     def is_tree_motion_reliable(self) -> bool:
         """Whether the motion that trees determine is trusted without the odometry: `led` is at least its
-        value after TREE_MOTION_SCANS successive scans, from 0, with a doubted odometry and enough recognised
-        trees. A doubted scan with too few trees sets `led` to 0; scans without doubt decrease it slowly."""
+        value after TREE_MOTION_SCANS successive scans, from 0, with a doubted odometry and enough detections
+        of well-known landmarks. A doubted scan with too few trees sets `led` to 0; scans without doubt
+        decrease it slowly."""
         return self.led >= TREE_MOTION_STEP * TREE_MOTION_SCANS
 
     def odometry_trust(self, noise: Noise) -> OdometryTrust:
@@ -221,7 +224,7 @@ def update_statistics(
     Args:
         recent: Statistics before the scan.
         scan: Statistics of the scan.
-        driven: Distance since the last used scan [m], with 1 m per radian of turn.
+        driven: Distance since the last used scan [m], with 1 m per radian of rotation.
         doubted: Doubts about the odometry at this scan.
     """
     expected, is_measured = scan.found + scan.missed, math.isfinite(scan.innovation)
@@ -249,8 +252,8 @@ def update_statistics(
 
 @compiled
 def distance_without_trees(alone: float, recognised: float, driven: float) -> float:
-    """Return the distance driven since two known trees were last recognised in one scan [m]: 0 after a scan
-    with FEWEST recognised trees.
+    """Return the distance driven since the last scan with at least FEWEST recognised trees [m]: 0 after such
+    a scan, else `alone` plus `driven`.
 
     Args:
         alone: The distance before [m].
@@ -269,11 +272,11 @@ def decayed_distrust(distrust: float, period: float) -> float:
 
 @compiled
 def updated_familiar(familiar: float, recognised: float, detections: int) -> float:
-    """Return the running mean of the share of detections of known trees after one more scan.
+    """Return the running mean of the share of detections of well-known landmarks after one more scan.
 
     Args:
         familiar: The mean before.
-        recognised: Number of recognised trees in the scan.
+        recognised: Number of detections of well-known landmarks in the scan.
         detections: Number of detections; with fewer than FEWEST the mean is unchanged.
     """
     if detections < FEWEST:
@@ -284,9 +287,10 @@ def updated_familiar(familiar: float, recognised: float, detections: int) -> flo
 def _tree_motion_count(before: int, scan: ScanStatistics, doubted: OdometryDoubt) -> int:
     """Return `RunningStatistics.led` after a scan; `before` is its value before.
 
-    Without doubt it decreases by 1, at least to 0. A doubted scan with TREES_WITHOUT_ODOMETRY recognised
-    trees, or MANY if the doubt is not reported, increases it by TREE_MOTION_STEP, at most to TREE_MOTION_MAX;
-    with fewer trees it becomes 0."""
+    If the odometry is not doubted, it decreases by 1, at least to 0. A doubted scan with
+    TREES_WITHOUT_ODOMETRY detections of well-known landmarks, or MANY if the doubt is not reported, increases
+    it by TREE_MOTION_STEP, at most to TREE_MOTION_MAX; with fewer it becomes 0.
+    """
     if not any(doubted):
         return max(before - 1, 0)
     leading = TREES_WITHOUT_ODOMETRY if doubted.reported else MANY
@@ -354,9 +358,8 @@ def pose_health(
 ) -> Health:
     """Return the quality of the pose after a scan.
 
-    The pose is lost if its sigma is too large or the known trees are not found, and weak if any figure
-    exceeds its limit. A doubted odometry makes it weak until trees have determined the motion for long
-    enough.
+    The state is "lost" if the standard deviation of the position exceeds SIGMA_WEAK or `is_lost` is True, and
+    "weak" if another rule of `_state_and_reason` applies, else "good".
 
     Args:
         recent: Running statistics after the scan.
@@ -364,7 +367,7 @@ def pose_health(
         n_eff: Effective number of particles.
         ancestors: Number of distinct ancestors, see Health.
         covariance: Covariance of x, y [m], yaw [rad] relative to the landmarks, shape (3, 3).
-        doubt: Message why the odometry is doubted; empty without doubt.
+        doubt: Message why the odometry is doubted; empty if there is no doubt.
     """
     sigma_xy = float(np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1])))
     state, reason = _state_and_reason(recent, sigma_xy, doubt)
@@ -415,13 +418,14 @@ def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) ->
 
 
 def is_lost(recent: RunningStatistics) -> bool:
-    """Return whether less than FOUND_LOST of the known trees (running mean) are found where they should be
-    visible, or whether nearly all of them were missed in STRANGE_LOST scans in a row. Before any tree is well
-    known the result is False."""
+    """Return whether `recent.found`, the share of landmarks in free view that were detected (running mean),
+    is below FOUND_LOST, or `recent.strange`, the number of strange scans in a row, is at least STRANGE_LOST.
+    False before any landmark with `hits_to_weigh` hits was detected."""
     return recent.mapped and (recent.found < FOUND_LOST or recent.strange >= STRANGE_LOST)
 
 
 def is_supported(recent: RunningStatistics) -> bool:
-    """Return whether the last scan showed trees where the map has them, and at least FOUND_WEAK of the known
-    trees (running mean) are found where they should be visible. It is True before any tree is known."""
+    """Return whether the last scan was not strange (`recent.strange` is 0) and `recent.found`, the share of
+    landmarks in free view that were detected (running mean), is at least FOUND_WEAK. True for initial
+    statistics."""
     return recent.strange == 0 and recent.found >= FOUND_WEAK

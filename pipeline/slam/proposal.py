@@ -29,14 +29,14 @@ class Room(NamedTuple):
     """Work arrays for the pairs of one particle, allocated once per scan.
 
     Attributes:
-        detection, landmark: Rows of each pair, int64, shape (pairs,).
+        detection, landmark: Rows of detection and landmark of each pair, int64, shape (pairs,).
         cost: -2 log likelihood of each pair up to a constant, shape (pairs,).
         order: Pairs in ascending cost, int64, shape (pairs,).
         best, second: The two lowest costs of each detection, shape (D,); infinite without such a pair.
         landmark_of: Landmark of each detection, -1 for none, int64, shape (D,).
         sequence: Detections in the order in which their pairs are collected, int64, shape (D,).
         taken: Whether a landmark has a detection, shape (L,).
-        ambiguous: Whether a detection is decided together with others, shape (D,).
+        ambiguous: Whether a detection is decided jointly with others, shape (D,).
         claimed: Pair of each landmark with the lowest cost, int64, shape (L,).
         search: Work arrays of the joint decision.
     """
@@ -96,9 +96,9 @@ def likely_pairs(
 
     Args:
         pose: Pose before the scan.
-        c, s: Cosine and sine of its yaw.
+        c, s: Cosine and sine of the yaw of the pose.
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         mean, covariance: Landmarks, see Maps.
         cells: Hash grid of the landmarks.
         scale: Cells per metre.
@@ -146,8 +146,9 @@ def find_ambiguous(pairs: int, found: int, room: Room) -> int:
     """Mark the ambiguous detections and reset `taken` of all landmarks of the pairs; return the number of
     ambiguous detections.
 
-    A detection is ambiguous if a second landmark is nearly as likely (LIKELY), or another detection is nearly
-    as likely for the same landmark.
+    A detection is ambiguous if the costs of its two best pairs differ by less than LIKELY, or if the cost of
+    a pair of it differs by less than LIKELY from that of the best pair of another detection with the same
+    landmark; the other detection is then ambiguous as well.
 
     Args:
         pairs: Number of pairs, which are sorted in `room.order`.
@@ -222,9 +223,8 @@ def _sort(cost: Float, order: Int, n: int) -> None:
 
 @compiled_within
 def _sort_sequence(room: Room, pairs: int, found: int) -> None:
-    """Write the detections in the order of their best pairs, then those without a pair, into `room.sequence`,
-    since the costs of the next particle have nearly the same order; `landmark_of` becomes -1. `landmark_of`
-    must be -1 for all detections before."""
+    """Write the detections in the order of their best pairs, then those without a pair, into `room.sequence`.
+    `landmark_of` must be -1 for all detections, and is so afterwards."""
     n = 0
     for i in range(pairs):
         d = room.detection[room.order[i]]
@@ -257,28 +257,31 @@ def recognise(
     statistics: Float,
     p: int,
 ) -> float:
-    """Associate detections with landmarks one to one, correct the pose, and return the log likelihood up to a
-    constant, in which each detection without well-known landmark counts like a pair at the gate.
+    """Associate detections with landmarks one to one, correct the pose, and return the log likelihood of the
+    detections up to a constant. Only landmarks with at least `hits_to_weigh` hits affect pose and likelihood;
+    each detection without such a landmark counts like a pair at the gate.
 
-    Pairs are accepted in the order of their likelihood, first those of detections with one likely landmark;
-    each pair is tested with the pose that the pairs before it corrected. Ambiguous detections are decided
-    together, see `choose_jointly`.
+    Pairs are accepted in the order of their likelihood, first those of unambiguous detections (see
+    `find_ambiguous`). Each pair is tested with the pose that the earlier pairs corrected. Then ambiguous
+    detections are decided jointly, see `choose_jointly`; those beyond MOST are decided last, one by one.
 
     Args:
-        mu, P: Pose before the scan, shape (3,), and its covariance, shape (3, 3); corrected in place.
+        mu, P: Predicted pose x, y [m], yaw [rad] of the base in the map, shape (3,), and its covariance,
+            shape (3, 3); corrected in place.
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         mean, covariance, hits: Landmarks of this particle, see Maps; rows that are not in `cells` are
             ignored.
         cells: Hash grid of the landmarks.
         scale: Cells per metre.
         gate: Maximum Mahalanobis distance [sigma].
         distance_max: Maximum distance [m].
-        hits_to_weigh: Minimum hits of a landmark that affects pose and likelihood.
+        hits_to_weigh: Minimum number of hits of a landmark that affects pose and likelihood.
         room: Work arrays; `landmark_of` is filled with the row of the landmark of each detection, -1 for
             none.
         statistics: Statistics of the scan by particle; the values of the scan are added to row p, except
-            MISSED and SHIFT. INNOVATION is the sum of squared Mahalanobis distances of well-known landmarks.
+            MISSED and SHIFT. INNOVATION is the sum of the squared Mahalanobis distances of pairs with at
+            least `hits_to_weigh` hits.
         p: Row of the particle.
     """
     gate2 = gate * gate
@@ -346,15 +349,15 @@ def _cost_of_new(
     hits_to_weigh: int,
     gate2: float,
 ) -> float:
-    """Return the decrease of the log likelihood by detections without a well-known landmark. Each counts like
-    a pair at the gate; otherwise particles that recognise nothing would get the largest weights.
+    """Return the decrease of the log likelihood by the detections without a landmark of at least
+    `hits_to_weigh` hits, each of which counts like a pair at the gate.
 
     Args:
         pose: Pose of the particle with its covariance.
         centre, R: Detections in the base frame, shape (D, 2) [m], and covariances xx, xy, yy, shape (D, 3).
-        hits: Hits of its landmarks.
+        hits: Hits of the landmarks of the particle, shape (L,).
         landmark_of: Row of the landmark of each detection, -1 for none.
-        hits_to_weigh: Least hits of a well-known landmark.
+        hits_to_weigh: Minimum number of hits.
         gate2: Square of the gate.
     """
     c, s, cost = 0.0, 0.0, 0.0

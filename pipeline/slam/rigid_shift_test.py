@@ -55,7 +55,8 @@ def estimate_rigid_shift(
     well: Bool,
     clear_range: Float,
 ) -> tuple[bool, bool, Float, Float]:
-    """Return whether the trees contradict the odometry by a rigid shift, and the pose that they determine.
+    """Test whether detections and landmarks contradict the odometry by a rigid shift, and estimate the pose
+    that they determine.
 
     Args:
         pose: x, y [m], yaw [rad] by the odometry, shape (3,).
@@ -63,16 +64,17 @@ def estimate_rigid_shift(
             `drift_variances`.
         trust: Trust in the odometry; distrust lowers the limits.
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         known: Landmarks in the frame of the map, shape (L, 2) [m].
-        spread: Their covariances xx, xy, yy, shape (L, 3) [m^2].
-        well: Which landmarks are well known, shape (L,).
+        spread: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2].
+        well: Which landmarks have at least `hits_to_weigh` hits, shape (L,).
         clear_range: Free distance by azimuth in the base frame, shape (bins,) [m].
 
     Returns:
-        Whether the shift is significant and enough pairs agree; whether it is significant with too few pairs
-        (SEVERAL); the pose x, y [m], yaw [rad] by the trees, shape (3,); and its covariance, shape (3, 3). If
-        both are False, pose and covariance have no meaning.
+        Whether the shift is significant and enough pairs agree (SEVERAL, or any number if `trust.distrust` is
+        above 0); whether it is significant but too few pairs agree; the pose x, y [m], yaw [rad] by the
+        trees, shape (3,); and the covariance of this pose, shape (3, 3). If both bools are False, pose and
+        covariance have no meaning.
     """
     # Pairs at the odometry, then pairs at the pose that these determine (iterative closest point; Besl, McKay
     # 1992), since a turn moves distant trees beyond NEAR.
@@ -113,7 +115,7 @@ class Fit(NamedTuple):
         agree: Number of agreeing pairs; 0 if they are too few or determine no motion, and then the other
             attributes have no meaning.
         place: Pose x, y [m], yaw [rad] after the motion, shape (3,).
-        covariance: Its covariance relative to the landmarks, shape (3, 3).
+        covariance: Covariance of the pose relative to the landmarks, shape (3, 3).
         misfit: Sum of squared normalised deviations per degree of freedom.
         votes: Landmarks that vote, shape (L,).
         voting: Number of pairs with these landmarks.
@@ -198,7 +200,7 @@ def _standing(
     people who walk slowly, a tree is within the gate of their motion as well.
 
     Args:
-        lever, off, variance: Results of `_pair_arrays` at the pose by odometry.
+        lever, off, variance: The first three results of `_pair_arrays` at the pose by odometry.
         position, heading: Variances of this pose [m^2, rad^2].
         shifted: Squared deviations at the shifted pose, shape (K,) [m^2].
         kept: Which pairs agree with the shifted pose, shape (K,).
@@ -214,9 +216,9 @@ def _standing(
 
 @compiled
 def _pairs(pose: Float, centre: Float, known: Float) -> Int:
-    """Return the detection of each landmark, -1 for none, int64, shape (L,): the nearest one of the
-    detections whose nearest landmark it is, at a distance below NEAR. Of equal distances the first row
-    counts. See `estimate_rigid_shift` for the arguments."""
+    """Return the detection of each landmark, -1 for none, int64, shape (L,): of the detections whose nearest
+    landmark within NEAR is this one, the nearest detection. Of equal distances the first row counts. See
+    `estimate_rigid_shift` for the arguments."""
     found, c, s = centre.shape[0], np.cos(pose[2]), np.sin(pose[2])
     owner = np.full(known.shape[0], -1, np.int64)
     least = np.full(known.shape[0], np.inf)
@@ -308,13 +310,14 @@ def _agreeing(
     larger.
 
     Args:
-        lever, off, variance: Results of `_pair_arrays`.
+        lever, off, variance: The first three results of `_pair_arrays`.
         motion: x, y [m], yaw [rad], shape (3,).
         may: Pairs that are considered, shape (K,).
         kept: Pairs by which the motion was estimated, shape (K,), at least one true; overwritten.
 
     Returns:
-        Number of agreeing pairs, and their sum of squared normalised deviations per degree of freedom.
+        Number of agreeing pairs, and the sum of their squared normalised deviations divided by the degrees of
+        freedom (2 n - 3, at least 1).
     """
     square, total, n = _deviations(lever, off, motion) / variance, 0.0, 0
     for k in range(lever.shape[0]):

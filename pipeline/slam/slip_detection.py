@@ -52,11 +52,11 @@ class TreeMotion(NamedTuple):
 
 
 def slip_message(motion: Float, corrected: bool, unsure: bool) -> str:
-    """Return the message why the odometry is doubted: STUCK, SLIPPED or UNSURE; empty without doubt.
+    """Return the message why the odometry is doubted: STUCK, SLIPPED or UNSURE; empty if there is no doubt.
 
     Args:
         motion: Motion by the odometry since the last used scan, shape (3,).
-        corrected: Whether trees contradicted it in this scan or in one of the last scans.
+        corrected: Whether trees contradicted the odometry in this scan or in one of the last scans.
         unsure: See TreeMotion.
     """
     stood = np.hypot(motion[0], motion[1]) < STOOD[0] and abs(motion[2]) < STOOD[1]
@@ -83,23 +83,23 @@ def motion_by_trees(
 ) -> TreeMotion:
     """Return the motion since the last used scan, from trees where they contradict the odometry.
 
-    If neither the rigid shift nor the search finds a contradiction, or the search is ambiguous, the result is
-    the odometry with its covariance. If its covariance was large (WIDE) and most detections match, the
-    covariance is reduced to that of an undisturbed odometry.
+    If neither the rigid shift nor the search contradicts the odometry, or the search is ambiguous, the result
+    is `motion` with `covariance`. If `covariance` is large (WIDE) and most detections match landmarks at the
+    pose by odometry, the covariance is reduced to that of an undisturbed odometry.
 
     Args:
         before: x, y [m], yaw [rad] in the frame of the map at the last used scan, shape (3,).
         motion: Motion by the odometry since then, shape (3,).
-        covariance: Its covariance with all doubts, shape (3, 3).
+        covariance: Covariance of the motion with all doubts, shape (3, 3).
         driven: Path length since then [m], see `drift_variances`.
         trust: Trust in the odometry. Its noise excludes doubts, since the test assumes an undisturbed
             odometry.
         centre: Detections in the base frame, shape (D, 2) [m].
-        R: Their covariances xx, xy, yy, shape (D, 3) [m^2].
+        R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         known: Landmarks within the view plus SEARCH, in the frame of the map, shape (L, 2) [m].
-        spread: Their covariances xx, xy, yy, shape (L, 3) [m^2].
-        hits_of: Their hits, shape (L,).
-        hits_to_weigh: Minimum hits of a well-known landmark.
+        spread: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2].
+        hits_of: Hits of the landmarks, shape (L,).
+        hits_to_weigh: Minimum number of hits of a landmark that counts as well known.
         gate: Association gate [sigma].
         clear_range: Free distance by azimuth in the base frame, shape (bins,) [m].
     """
@@ -134,7 +134,8 @@ def motion_by_trees(
 
 @compiled
 def _from(before: Float, place: Float) -> Float:
-    """Return the motion from pose `before` to pose `place` in the frame of `before`, shape (3,)."""
+    """Return the pose `place` relative to the pose `before`: x, y [m], yaw [rad], wrapped, shape (3,). Both
+    poses are x, y [m], yaw [rad] in the map."""
     c, s = np.cos(before[2]), np.sin(before[2])
     dx, dy = place[0] - before[0], place[1] - before[1]
     turn = (place[2] - before[2] + np.pi) % (2.0 * np.pi) - np.pi
@@ -157,14 +158,14 @@ def count_matches(
         pose: x, y [m], yaw [rad] by the odometry, shape (3,).
         centre: Detections in the base frame, shape (D, 2) [m].
         sigma: Standard deviation of each detection [m], shape (D,).
-        landmarks: Well-known landmarks in the frame of the map, shape (L, 2) [m].
+        landmarks: Landmarks with at least `hits_to_weigh` hits in the frame of the map, shape (L, 2) [m].
         position: Variance of x and of y of the pose [m^2].
-        heading: Variance of its yaw [rad^2].
+        heading: Variance of the yaw of the pose [rad^2].
         gate: Maximum distance of a match [sigma].
 
     Returns:
-        Number of matches; number of expected matches, which is the smaller of D and the number of landmarks
-        within the range of the detections; and the number of matches of uniformly distributed detections. All
+        Number of matches; number of expected matches, the minimum of D and the number of landmarks nearer
+        than the farthest detection; and the mean number of matches of uniformly distributed detections. All
         are 0 with fewer than FEWEST detections or landmarks.
     """
     found = centre.shape[0]

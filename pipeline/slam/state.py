@@ -29,7 +29,7 @@ class SlamState:
         motion_covariance: Covariance of `motion`, shape (3, 3).
         slack: Sum of the slack of position [m] and heading [rad] of the odometry since trees or a measured
             pose last determined the pose, shape (2,), see `motion.advanced`.
-        since_update: Distance driven since the last used scan, with 1 m per radian of turn [m].
+        since_update: Distance driven since the last used scan [m], with 1 m per radian of rotation.
         detections: Number of detections in all scans so far; the next detection gets this birth number.
         views: Number of scans whose detections were used.
         best: Row of the best particle, whose map is reported.
@@ -40,7 +40,7 @@ class SlamState:
         graph: Graph of keyframes and landmarks.
         keyframe_motion: Motion by odometry since the last keyframe, shape (3,).
         keyframe_covariance: Covariance of `keyframe_motion`, shape (3, 3).
-        distance: Distance driven, with 1 m per radian of turn [m].
+        distance: Distance driven [m], with 1 m per radian of rotation.
         since_keyframe: Detections of the scans since the last keyframe.
         places: Places of the path, and which of them are active.
         shared: Errors that the measured poses of one source share. They are not saved, because the source of
@@ -140,7 +140,7 @@ class SlamState:
     def with_particles(self, particles: int) -> SlamState:
         """Return the state resampled to another number of particles, systematically by their weights with the
         offset 1/2, with equal weights; the state itself if the number is unchanged. `best` is the first copy
-        of the best particle, or the next drawn particle if it is not drawn."""
+        of the best particle, or the next selected particle if the best one is not selected."""
         if particles == len(self.pose):
             return self
         weights = normalised(self.log_weight)
@@ -156,7 +156,7 @@ class SlamState:
     def _drawn(self, rows: np.ndarray[tuple[int], np.dtype[np.int64]]) -> SlamState:
         """Return the state with copies of the poses, weights, maps and shared errors of the given rows,
         int64, shape (P,), which may repeat. The ancestry and the row `best` remain those of the state; the
-        caller redraws them."""
+        caller replaces them."""
         return replace(
             self,
             pose=self.pose[rows],

@@ -25,14 +25,14 @@ class ControlFit:
     """Rigid motion from the map to a reference system, fitted by least squares.
 
     Attributes:
-        pose: T_crs_map.
+        pose: T_crs_map, pose of the map in the reference system.
         residuals: Known minus transformed position of each point, shape (N, 2) [m].
         rms: Root mean square length of the residuals [m].
         sigma_point: Standard deviation of one coordinate of a point, from the residuals with 2 N - 3 degrees
             of freedom [m].
         sigma: Standard deviation of a coordinate of a position at the centre of the points [m].
-        sigma_turn: Standard deviation of the rotation [rad]; inf if all points are at one place in the map,
-            which leaves the rotation unknown.
+        sigma_turn: Standard deviation of the rotation [rad]; inf if all points are at one position in the
+            map.
     """
 
     pose: Pose2
@@ -56,7 +56,7 @@ def fit_control_points(
             CONTRADICTION times this is refused.
 
     Raises:
-        StemmapError: There are fewer than two points, they are at one place in either frame (RMS distance
+        StemmapError: There are fewer than two points, they are at one position in either frame (RMS distance
             from their mean below SPREAD_MIN), or they contradict one another: in their scale, the order of
             their axes, or their residuals. The message names the cause.
     """
@@ -116,8 +116,8 @@ def _residual_words(residuals: Float, names: Sequence[str]) -> str:
 
 
 def fit_rigid_pairs(local: Float, known: Float) -> ControlFit:
-    """Return the fit of two or more pairs of points, without any check. Points that are all at one place in
-    the map give the rotation 0 with the standard deviation inf.
+    """Return the fit of two or more pairs of points, without any check. Points that are all at one position
+    in the map give the rotation 0 with the standard deviation inf.
 
     Args:
         local: Positions in the map, shape (N, 2) [m].

@@ -39,7 +39,7 @@ class DetectionFunction:
 
     def mean(self, available: Float) -> tuple[float, float]:
         """Return the mean probability over an area and its standard error (delta method), 0 for an infinite
-        `sigma`; both NaN without area.
+        `sigma`; both NaN if `available` is empty.
 
         Args:
             available: Distance of each cell of the area [m], cells of equal size, shape (K,).
@@ -70,7 +70,7 @@ def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | No
 
     Returns:
         The function; sigma is inf if constant detection explains the distances as well, else from 1/20 to 20
-        times the largest distance of the area. None with fewer than LEAST_TREES trees or without area.
+        times the largest distance of the area. None if there are fewer than LEAST_TREES trees or no cells.
     """
     from scipy.optimize import minimize_scalar
 

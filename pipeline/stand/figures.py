@@ -20,14 +20,14 @@ INCH_10 = 25.4  # cm
 
 
 class Estimate(NamedTuple):
-    """A figure with its standard error; NaN where unknown."""
+    """A stand parameter with its standard error; NaN where unknown."""
 
     value: float = math.nan
     se: float = math.nan
 
 
 class DiameterClass(NamedTuple):
-    """One class of diameters: limits [cm], number of trees, stems and basal area per hectare."""
+    """One class of diameters: limits [cm], number of trees, stems [1/ha] and basal area [m^2/ha]."""
 
     low: float
     high: float
@@ -41,9 +41,10 @@ class PlotTrees:
     """The trees of a plot; columns of length T.
 
     Attributes:
-        position: shape (T, 2) [m].
-        dbh, dbh_sigma: [m]; NaN where unknown.
-        volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None without a volume formula.
+        position: Positions x, y in the map, shape (T, 2) [m].
+        dbh, dbh_sigma: Diameters at breast height and their standard deviations [m]; NaN where unknown.
+        volume, volume_sigma: Volumes of the stems [m^3], NaN where unknown; None if there is no volume
+            formula.
     """
 
     position: Float
@@ -60,17 +61,18 @@ class PlotTrees:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StandFigures:
-    """Figures of a plot.
+    """Stand parameters of a plot.
 
     Attributes:
         area, seen: Area of the plot and its observed part [m^2].
         trees: Number of trees of at least the minimum diameter in the observed part.
-        without_dbh: How many of them have no diameter; they count with the mean basal area of the others.
-        with_volume: How many of them have a volume; None without a volume formula.
+        without_dbh: Number of these trees without a diameter; they count with the mean basal area of the
+            others.
+        with_volume: Number of these trees with a volume; None if there is no volume formula.
         detection: Mean probability that a tree in the observed part is found.
-        values: Figures by name, see FIGURES. Those that end in `_plain` refer to the whole area, without any
-            correction; `_corrected` are corrected for the probability of detection; the others refer to the
-            observed area.
+        values: Dict from the names in FIGURES, which has their units, to estimates. Names that end in
+            `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
+            probability of detection; the others refer to the observed area.
         classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area.
         warnings: Messages for the user.
     """
@@ -115,27 +117,27 @@ def stand_figures(
     detection: tuple[float, float],
     parameters: Stand,
 ) -> StandFigures:
-    """Return the figures of a plot.
+    """Return the stand parameters of a plot.
 
-    Standard errors describe the figures of this plot, not of the stand around it: they contain the errors of
-    the diameters, the trees of the part that was not observed, and the trees that were not detected. A plot
-    that is observed completely, with certain detection and exact diameters of all trees, has standard errors
-    of 0, except for the figures of the spatial pattern.
+    Standard errors are those of this plot, not of the stand around it: they contain the errors of the
+    diameters, the trees of the part that was not observed, and the trees that were not detected. A plot that
+    is observed completely, with certain detection and exact diameters of all trees, has standard errors of 0,
+    except for the parameters of the spatial pattern.
 
     Args:
         trees: Trees in the observed part, of any diameter.
-        outside: Trees in the rest of the plot, which only the `_plain` figures count.
+        outside: Trees in the rest of the plot, which count only in the `_plain` values.
         area: Area of the plot [m^2].
-        seen: Its observed part [m^2].
+        seen: Area of the observed part of the plot [m^2].
         perimeter: Length of the border of the observed part [m], for the edge correction of the Clark-Evans
             index.
         detection: Mean probability of detection in the observed part and its standard error; NaN if unknown.
         parameters: Limits of diameters and classes.
 
     Returns:
-        The figures. Those that are unknown are NaN: all but `_plain` ones without observed area, corrected
-        ones without a probability above 0, those of diameters without a diameter, those of volumes without a
-        volume. `_plain` figures have no standard error. In `v_ha`, trees without a volume count as 0.
+        The stand parameters. Unknown ones are NaN: all but the `_plain` ones if no area was observed, the
+        corrected ones if the probability is not above 0, those of diameters and volumes if no tree has one.
+        `_plain` figures have no standard error. In `v_ha`, trees without a volume count as 0.
 
     Raises:
         ValueError: The plot has no area.
@@ -195,9 +197,10 @@ def stand_figures(
 
 
 def combined(plots: Mapping[str, StandFigures]) -> dict[str, Estimate]:
-    """Return the mean of each figure over plots, with the standard error of the variation between plots
-    (ratio estimator). The weights are the observed areas; those of `_plain` figures are the whole areas. The
-    error is NaN with one plot. Plots without the figure do not count; a figure that none has is NaN."""
+    """Return a dict from the names in FIGURES to means over plots, with the standard error of the variation
+    between plots (ratio estimator). The weights are the observed areas, for `_plain` names the whole areas.
+    The error is NaN for one plot. Plots in which a value is NaN do not count; if all are NaN, so is the
+    mean."""
     result = {}
     for name in FIGURES:
         rows = [
@@ -223,7 +226,7 @@ def _least_basal(parameters: Stand) -> float:
 def _basal_areas(trees: PlotTrees) -> tuple[Float, Float]:
     """Return the basal area of each tree [m^2] and its variance [m^4], shape (T,) each. A tree without a
     diameter has the mean, and the variance among the others (of a single one its square); all are NaN if no
-    tree has one. An unknown standard deviation of a diameter counts as 0."""
+    tree has a diameter. An unknown standard deviation of a diameter counts as 0."""
     d, sigma = trees.dbh, np.nan_to_num(trees.dbh_sigma)
     known = np.isfinite(d)
     basal = 0.25 * math.pi * np.square(d)
@@ -246,9 +249,9 @@ def _threshold_variance(trees: PlotTrees, least: float) -> float:
 
 
 def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: Stand) -> dict[str, Estimate]:
-    """Return the figures "dg_cm", "mean_dbh_cm", "dominant_dbh_cm" and "sdi"; empty without a diameter. Their
-    errors: jackknife over trees, reduced by the share `found` of all trees, and the errors of the diameters.
-    `seen` is the observed area [m^2]."""
+    """Return a dict from "dg_cm", "mean_dbh_cm", "dominant_dbh_cm" and "sdi" to estimates; empty if no tree
+    has a diameter. The standard errors contain the jackknife over trees, reduced by the share `found` of all
+    trees, and the errors of the diameters. `seen` is the observed area [m^2]."""
     known = np.isfinite(trees.dbh)
     d, sigma = 100.0 * trees.dbh[known], 100.0 * np.nan_to_num(trees.dbh_sigma[known])
     if not len(d):
@@ -283,10 +286,11 @@ def _diameter_figures(trees: PlotTrees, found: float, seen: float, parameters: S
 def _with_error(
     figure: Callable[[Float], tuple[float, Float]], d: Float, sigma: Float, found: float
 ) -> Estimate:
-    """Return a figure with its standard error, which is NaN for a single tree of an incomplete plot.
+    """Return a stand parameter with its standard error, which is NaN for a single tree of an incomplete plot.
 
     Args:
-        figure: Returns the figure of diameters, and its derivatives by them, shape (N,).
+        figure: Function of the diameters, shape (N,) [cm], that returns the stand parameter and its
+            derivatives with respect to the diameters, shape (N,).
         d, sigma: Diameters and their standard deviations, shape (N,), N at least 1 [cm].
         found: Share of all trees that was found and observed.
     """
@@ -301,10 +305,10 @@ def _with_error(
 
 
 def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estimate]:
-    """Return the figures "nearest_neighbour_m", the mean distance to the nearest neighbour, and
-    "clark_evans", the index with the edge correction of Donnelly (1978): 1 for random positions, less for
-    clusters, more for regular ones. The error of the index is that of random positions. Empty for fewer than
-    two trees.
+    """Return a dict from names to estimates: "nearest_neighbour_m", the mean distance to the nearest
+    neighbour [m], and "clark_evans", the index with the edge correction of Donnelly (1978): 1 for random
+    positions, less for clusters, more for regular ones. The error of the index is that of random positions.
+    Empty for fewer than two trees.
 
     Args:
         position: Positions of the trees, shape (N, 2) [m].
@@ -327,9 +331,9 @@ def _pattern(position: Float, area: float, perimeter: float) -> dict[str, Estima
 
 def _classes(trees: PlotTrees, share: float, seen: float, parameters: Stand) -> tuple[DiameterClass, ...]:
     """Return the diameter classes from that of the minimum diameter to that of the thickest tree, empty ones
-    included; none without a diameter. The first class begins at the minimum diameter, which makes it narrower
-    unless that is a multiple of the width. Trees without a diameter are left out; thinner ones than the
-    minimum count in the first class.
+    included; none if no tree has a diameter. The first class begins at the minimum diameter, which makes it
+    narrower unless that is a multiple of the width. Trees without a diameter are left out; thinner ones than
+    the minimum count in the first class.
 
     Args:
         trees: Trees of the observed part.

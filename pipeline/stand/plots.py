@@ -30,14 +30,15 @@ class SamplePlot:
 
     Attributes:
         name: Name for people, unique in a list of plots.
-        shape: Its area, a shapely Polygon or MultiPolygon in the frame of the map [m].
+        shape: Area of the plot, a shapely Polygon or MultiPolygon in the frame of the map [m].
     """
 
     name: str
     shape: Any
 
     def contains(self, points: Float) -> Bool:
-        """Return whether the plot contains each point, shape (N, 2); points on its border count."""
+        """Return whether the plot contains each point, shape (N,); points on its border count. `points` are
+        positions in the map, shape (N, 2) [m]."""
         points = np.reshape(points, (-1, 2))
         inside: Bool = shapely.intersects_xy(self.shape, points[:, 0], points[:, 1])
         return inside
@@ -60,10 +61,10 @@ def rectangle(name: str, x: float, y: float, length: float, width: float, turn: 
     """Return a rectangle.
 
     Args:
-        name: Its name.
-        x, y: Its centre [m].
-        length, width: Along and across its axis [m].
-        turn: Angle of its axis from x towards y [rad].
+        name: Name of the plot.
+        x, y: Centre in the map [m].
+        length, width: Sides along and across the axis of the rectangle [m].
+        turn: Angle of the axis from x towards y [rad].
 
     Raises:
         StemmapError: A number is not finite, or the area is 0 or larger than AREA_MAX.
@@ -85,9 +86,9 @@ def plot_of(name: str, shape: Mapping[str, Any]) -> SamplePlot:
     """Return the plot of a shape as it is stored.
 
     Args:
-        name: Its name.
-        shape: `kind` "circle" with x, y, radius [m]; "rectangle" with x, y, length, width [m] and turn_deg;
-            or "polygon" with `polygons`, the coordinates of a GeoJSON MultiPolygon [m].
+        name: Name of the plot.
+        shape: Dict with the key `kind`: "circle" with x, y, radius [m]; "rectangle" with x, y, length, width
+            [m] and turn_deg; or "polygon" with `polygons`, the coordinates of a GeoJSON MultiPolygon [m].
 
     Raises:
         StemmapError: The plot cannot be used, see `checked`.
@@ -109,8 +110,8 @@ def checked(plot: SamplePlot) -> SamplePlot:
     """Return the plot itself, if it can be used.
 
     Raises:
-        StemmapError: It is not an area, crosses itself, is empty, is larger than AREA_MAX or has coordinates
-            that are not finite.
+        StemmapError: The plot is not an area, crosses itself, is empty, is larger than AREA_MAX or has
+            coordinates that are not finite.
     """
     shape, problem = plot.shape, ""
     if shape is None or shape.is_empty or shape.geom_type not in ("Polygon", "MultiPolygon"):
@@ -133,7 +134,7 @@ def along(path: Float, every: float, radius: float) -> list[SamplePlot]:
 
     Args:
         path: Positions, shape (N, 2) [m].
-        every: Distance along the path between two centres [m].
+        every: Distance along the path between the centres of two neighbouring circles [m].
         radius: Radius of the circles [m].
 
     Raises:
@@ -168,7 +169,7 @@ def centres_along(path: Float, every: float) -> Float:
 
 
 def seen_plot(name: str, seen: SeenArea) -> SamplePlot:
-    """Return the whole observed area as a plot with this name.
+    """Return the whole observed area as a plot with the name `name`.
 
     Raises:
         StemmapError: Nothing was observed, or the area is larger than AREA_MAX.
@@ -186,8 +187,8 @@ def within_reach(seen: SeenArea, parameters: Stand) -> SeenArea:
 
 def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> DetectionFunction:
     """Return the probability of detection over distance, fitted to all trees in the observed area of at least
-    the minimum diameter or without one. It is certain (CERTAIN) if the parameter `correction` is "none", with
-    fewer than LEAST_TREES trees, or if the distances are unknown."""
+    the minimum diameter or without one. It is 1 (CERTAIN) if the parameter `correction` is "none", if there
+    are fewer than LEAST_TREES trees, or if all distances of the area are unknown."""
     if parameters.correction == "none" or not np.isfinite(seen.nearest).any():
         return CERTAIN
     rows = seen.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
@@ -197,8 +198,9 @@ def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> D
 def figures_of(
     plots: Sequence[SamplePlot], trees: PlotTrees, seen: SeenArea, parameters: Stand
 ) -> dict[str, StandFigures]:
-    """Return the figures of each plot by its name, see `StandFigures`. A plot of which more than 99.5 % was
-    observed counts as observed completely. Detection is certain in a plot with a cell of unknown distance.
+    """Return a dict from the names of the plots to their stand parameters. A plot of which more than 99.5 %
+    was observed counts as observed completely. The probability of detection is 1 in a plot with a cell of
+    unknown distance.
 
     Args:
         plots: Plots with unique names.

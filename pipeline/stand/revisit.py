@@ -28,10 +28,11 @@ class VisitTrees:
     """The trees of a visit; columns of length T.
 
     Attributes:
-        number: int64, number of the tree in its own map.
-        position: shape (T, 2) [m].
-        sigma: Standard deviation of a coordinate [m].
-        dbh, dbh_sigma: [m]; NaN if unknown.
+        number: Number of the tree in the map of this visit, int64.
+        position: Positions x, y in the frame of this visit, shape (T, 2) [m].
+        sigma: Standard deviation of a coordinate of the position, shape (T,) [m].
+        dbh, dbh_sigma: Diameters at breast height and their standard deviations, shape (T,) [m]; NaN if
+            unknown.
     """
 
     number: Int
@@ -48,14 +49,15 @@ class VisitComparison:
     Attributes:
         T_a_b: Pose of the frame of b in that of a.
         b_of: Row of b of each tree of a, -1 for none, int64.
-        reach: Largest distance of a pair [m].
+        reach: Maximum distance of a pair [m].
         stems: Number of stems that agreed in the alignment; 0 if the frames were taken as equal.
         shift: Distance of the two positions of each pair, in the order of a, shape (P,) [m].
         growth, growth_sigma: Diameter in b minus that in a, and its standard deviation, shape (P,) [m]; NaN
             if unknown.
-        significant: Whether the growth of a pair is significant: at most FALSE_DISCOVERIES of them are
-            expected to be false (Benjamini and Hochberg 1995).
-        moved: Whether the positions of a pair differ by more than those of the other pairs explain.
+        significant: Whether the growth of a pair is significant: at most the share FALSE_DISCOVERIES of these
+            pairs is expected to be false (Benjamini and Hochberg 1995), shape (P,).
+        moved: Whether the positions of a pair differ by more than MOVED_SIGMAS standard deviations and
+            MOVED_MIN, shape (P,).
     """
 
     T_a_b: Pose2
@@ -70,11 +72,12 @@ class VisitComparison:
 
 
 def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tuple[Pose2, int]:
-    """Return the pose of b in the frame of a and the number of stems that agree, without an initial pose. A
-    larger and larger distortion of the maps (SLACKS) is tried, in place of the parameter `slack`.
+    """Return the pose of b in the frame of a and the number of stems that agree, without an initial pose. The
+    distortions of the maps in SLACKS are tried in ascending order in place of the parameter `slack`, until a
+    pose is found.
 
     Raises:
-        StemmapError: The stems do not agree with certainty.
+        StemmapError: No pose is found, see `find_constellation`.
     """
     centre_a, centre_b = (np.nanmean(v.position, axis=0) if len(v.number) else np.zeros(2) for v in (a, b))
     stems = [
@@ -104,9 +107,9 @@ def compare_visits(
     Args:
         a, b: The visits.
         T_a_b: Pose of the frame of b in that of a.
-        reach: Largest distance of a pair [m].
-        refine: Whether the pose is fitted again to the pairs, without outliers; with fewer than three it
-            stays.
+        reach: Maximum distance of the two positions of a pair [m].
+        refine: Whether the pose is fitted again to the pairs, without outliers; with fewer than three pairs
+            it is unchanged.
         stems: Number of stems that agreed in the alignment, for the result.
     """
     for _ in range(_ROUNDS if refine else 0):

@@ -30,9 +30,10 @@ class SeenArea:
 
     Attributes:
         cell: Side of the square cells [m].
-        place: int64, shape (K, 2): the cell spans from place * cell to (place + 1) * cell [m].
+        place: Indices of the cell along x and y of the map, int64, shape (K, 2); the cell spans from place *
+            cell to (place + 1) * cell [m].
         nearest: Distance of the nearest free view [m]; NaN if unknown, as for a whole cloud.
-        views: int64, number of recorded scans with a free view of the cell; 0 if unknown.
+        views: Number of recorded scans with a free view of the cell, int64; 0 if unknown.
     """
 
     cell: float
@@ -61,11 +62,12 @@ class SeenArea:
 
     def joined(self, other: SeenArea, T_map_other: Pose2 | None = None) -> SeenArea:
         """Return the union with the area of another drive, which has cells of the same size (not checked). A
-        cell of both has the smaller distance and the sum of the views.
+        cell in both areas has the smaller distance and the sum of the views.
 
         Args:
             other: The other area.
-            T_map_other: Pose of its frame in the frame of this area; None if they are the same.
+            T_map_other: Pose of the frame of `other` in the frame of this area; None if both frames are the
+                same.
         """
         if T_map_other is None:
             place, nearest, views = other.place, other.nearest, other.views
@@ -86,13 +88,13 @@ class SeenArea:
 
 
 def _grouped(place: Int, nearest: Float, views: Int, of_views: np.ufunc) -> tuple[Int, Float, Int]:
-    """Return one row per cell, sorted by place, with the smallest distance (NaN where all are) and the views
-    combined by `of_views`, beginning with 0.
+    """Return cells, distances [m] and views with one row per cell, sorted by cell, with the smallest distance
+    (NaN if all are NaN) and the views combined by `of_views`, beginning with 0.
 
     Args:
         place: Cells, shape (N, 2), which may repeat; N may be 0.
-        nearest: Distance of a free view of each [m], shape (N,).
-        views: Number of views of each, shape (N,).
+        nearest: Distance of a free view of each cell, shape (N,) [m].
+        views: Number of views of each cell, shape (N,).
         of_views: np.add or np.maximum.
     """
     if not len(place):
@@ -114,8 +116,8 @@ def covered_area(points: Float) -> SeenArea:
     GAP closed. Distances and numbers of views are unknown.
 
     Args:
-        points: Positions, shape (N, 2) [m], closer to one another than CELL. They count to the millimetre, so
-            that the offset of a file does not change a cell.
+        points: Positions x, y, shape (N, 2) [m], closer to one another than CELL. They count to the
+            millimetre, so that the offset of a file does not change a cell.
     """
     from scipy.ndimage import binary_closing
 
@@ -140,9 +142,9 @@ class ViewSelection:
         self._views: Counter[tuple[int, int, int]] = Counter()
 
     def take(self, T_map_base: Pose2) -> bool:
-        """Return whether the view of a scan with this pose is recorded; then it counts as the last one. It is
-        the first, or SPACING or TURN away from the last one, and its cell of this size and sector have fewer
-        than MOST_VIEWS."""
+        """Return whether the view of a scan with this pose is recorded; then its pose becomes the last one.
+        It is recorded if it is the first or at least SPACING or TURN away from the last one, and its cell of
+        side SPACING and its sector of TURN have fewer than MOST_VIEWS views."""
         if self._last is not None:
             step = self._last.inverse() @ T_map_base
             if math.hypot(step.x, step.y) < SPACING and abs(step.yaw) < TURN:
@@ -170,7 +172,7 @@ class SeenRecorder:
         """Record a scan, in place of one of the same time.
 
         Args:
-            stamp_ns: Its time.
+            stamp_ns: Time of the scan [ns].
             free: Free range by direction in the base frame, shape (BINS,) [m], see
                 `pipeline.detection.free_space.clear_range`; copied, limited to RANGE.
         """

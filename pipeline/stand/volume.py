@@ -38,7 +38,7 @@ class VolumeFormula:
 
     Attributes:
         text: The formula as it was written.
-        expression: Its syntax tree, which contains nothing else.
+        expression: Syntax tree of the formula, which has only elements of the grammar.
     """
 
     text: str
@@ -81,7 +81,8 @@ class VolumeFormula:
         Unknown standard deviations count as 0; where the volume is NaN, its standard deviation is 0.
 
         Args:
-            dbh, dbh_sigma, height, height_sigma: Shape (T,) [m]; NaN where unknown.
+            dbh, dbh_sigma, height, height_sigma: Diameters, heights and their standard deviations, shape (T,)
+                [m]; NaN where unknown.
         """
         d, h = np.nan_to_num(dbh_sigma), np.nan_to_num(height_sigma)
         volume = self(dbh, height)
@@ -93,7 +94,7 @@ class VolumeFormula:
 
 def _half_range(volume: Float, above: Float, below: Float) -> Float:
     """Return the change of a volume within one standard deviation of a measurement, shape (T,) [m^3]: the
-    mean of both sides, or that of the side with a volume; 0 without any.
+    mean of both sides, or that of the side with a volume; 0 if there is none.
 
     Args:
         volume: The volume; NaN where it is unknown.
@@ -113,7 +114,7 @@ def _check(node: ast.AST, levels: int) -> None:
         levels: Number of nested operations that it may have.
 
     Raises:
-        FormulaError: It has more, or something else.
+        FormulaError: The expression has more levels, or an element that is not of the grammar.
     """
     if levels < 0:
         raise FormulaError(f"the formula is nested deeper than {DEEPEST} operations")

@@ -61,12 +61,12 @@ def update_rows(
 
     Args:
         x: States of all trees, shape (T, 4) [m, m/s].
-        P: Their covariances, shape (T, 4, 4).
+        P: Covariances of the states, shape (T, 4, 4).
         rows: Row of the tree of each measurement, without duplicates, shape (D,).
         dt: Time since the last update of each of these trees, shape (D,) [s].
         acceleration_sigma: Standard deviation of the acceleration [m/s^2].
-        z: Measured positions, shape (D, 2) [m].
-        R: Their covariances, shape (D, 2, 2) [m^2].
+        z: Measured positions in the map, shape (D, 2) [m].
+        R: Covariances of the measured positions, shape (D, 2, 2) [m^2].
     """
     _update_rows(x, P, rows, dt, acceleration_sigma, z, R, np.empty((4, 2)), np.empty((4, 4)))
 
@@ -117,8 +117,8 @@ def correct(x: Float, P: Float, z: Float, R: Float, K: Float, M: Float) -> None:
     The Joseph form keeps P symmetric and positive.
 
     Args:
-        x, P: State, shape (4,), and its covariance, shape (4, 4).
-        z, R: Measured position and its covariance; only the first two rows and columns are used.
+        x, P: State, shape (4,), and covariance of the state, shape (4, 4).
+        z, R: Measured position x, y and its covariance; only the first two rows and columns are used.
         K, M: Work arrays, shapes (4, 2) and (4, 4).
     """
     y0, y1 = z[0] - x[0], z[1] - x[1]
@@ -272,8 +272,8 @@ def _mean(C: Float) -> float:
 def weight(own: float, shared: float, R: float, B: float) -> float:
     """Return the w that minimises the variance of the fused estimate, in closed form for scalar variances.
 
-    Any other w within LEAST and MOST is consistent as well, only less accurate. Without shared variances the
-    result is 0.5.
+    Any other w within LEAST and MOST is consistent as well, only less accurate. If both shared variances are
+    below NOTHING, the result is 0.5.
 
     Args:
         own, shared: Own and shared variance of the tree [m^2].

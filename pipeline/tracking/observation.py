@@ -51,8 +51,8 @@ def add_observations(
     Args:
         tracks: The tracks.
         rows: Row of the track of each detection, without duplicates, shape (D,).
-        position: Positions in the map, shape (D, 2) [m].
-        pose: Pose of the robot, shape (3,).
+        position: Positions of the detections in the map, shape (D, 2) [m].
+        pose: Pose x, y [m], yaw [rad] of the robot in the map, shape (3,).
         eccentricity, radius, radius_sigma, arc: See `Detections`, shape (D,). The arc is limited to what one
             view can show, see `widest_view`.
         above_breast: Height of the radius above breast height, shape (D,) [m]; NaN where the ground is
@@ -131,7 +131,7 @@ class FigureLimits(NamedTuple):
 
 @compiled
 def table_figures(tracks: Rows, limits: FigureLimits) -> tuple[Float, Float, Float, Float, Bool]:
-    """Return the attributes of all tracks for the tree table by these limits, each of shape (T,).
+    """Return the attributes of all tracks for the tree table, each of shape (T,).
 
     Returns:
         Observed arc [rad]; DBH [m]; its standard deviation [m]; mean eccentricity; and which tracks are
@@ -180,9 +180,9 @@ def is_confirmed(verdict: int, hits: int, score: float, limits: FigureLimits) ->
     """Return whether a track is a tree: by the class of its voxel column if it has one, else by its hits.
 
     Args:
-        verdict: Class of the voxel column, see `Verdict`; -1 without a class.
+        verdict: Class of the voxel column, see `Verdict`; -1 if there is no class.
         hits: Number of detections; at least `limits.hits_to_confirm` are required.
-        score: Hits less misses; must be positive.
+        score: Hits minus misses; must be positive.
         limits: See FigureLimits.
     """
     if verdict >= 0:

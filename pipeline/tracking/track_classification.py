@@ -55,14 +55,15 @@ def classify(
     Args:
         tracks: The tracks, changed in place.
         scan: Pose of the robot.
-        axis: Axes of the columns, x, y first, shape (C, 2 or more) [m].
+        axis: Axes of the columns in the map, x, y first, shape (C, 2 or more) [m].
         votes: Shares of the votes in the order of CLASSES, shape (C, 6).
         verdict: Classes by votes and rules, shape (C,), changed in place by `confirm_round`.
         tree_share, range_max: See `Classification`.
         hits_to_confirm: See `Tracking`.
 
     Returns:
-        Rows of the tree columns without a track, int64, where the caller begins new tracks.
+        Rows of the tree columns without a track, int64, those with most votes for tree first. The caller
+        begins new tracks there.
     """
     columns = verdict.shape[0]
     cells, scale = cells_for(columns), per_metre(NEIGHBOUR)
@@ -83,7 +84,8 @@ def confirm_round(
     verdict: Int32,
     tree_share: float,
 ) -> None:
-    """Make trees of columns whose track was fitted as a circle from most sides, in place.
+    """Change the class of columns to tree, in place, if a track within ROUND_REACH has at least ROUND_FITS
+    radii and ROUND_SIDES observed sectors.
 
     Such an object is round and upright, so that the votes for bush, wall and other count little:
     v_tree / (v_round + 0.1 v_else) must be at least `tree_share`, with the shares v of the votes, and neither
@@ -118,7 +120,7 @@ def _is_tree_if_round(votes: Float, verdict: int, tree_share: float) -> bool:
     Args:
         votes: Shares of the votes of the column in the order of CLASSES, shape (6,).
         verdict: Class of the column; only a class by votes other than tree can change.
-        tree_share: Least share, inclusive.
+        tree_share: Minimum share, inclusive.
     """
     voted, below, most = False, 0.0, 0.0
     for k in range(_KINDS.shape[0]):
@@ -253,9 +255,9 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
     """Assign each tree column to one track, which becomes a tree; an assigned track without detections moves
     to the axis. Several columns may be assigned to one stem.
 
-    Each column in their order takes the track within REACH that is most likely (see `_likeliest`) and not
-    assigned yet. The class of a column depends on its surroundings, up to RING_FAR: at a column without a
-    track or with one without detections, but with a detected track in its surroundings
+    Each column in their order takes the track within REACH with the highest likelihood (see `_likeliest`)
+    that is not assigned yet. The class of a column depends on its surroundings, up to RING_FAR: at a column
+    without a track or with one without detections, but with a detected track in its surroundings
     (`_detected_stem_near`), that track is the stem, and the column is its undergrowth or a branch.
 
     Args:
@@ -295,9 +297,8 @@ def _assign_trees(tracks: Rows, axis: Float, trees: Int, fewest: int) -> Int:
 
 @compiled_within
 def _detected_stem_near(tracks: Rows, cells: Cells, scale: float, x: float, y: float, fewest: int) -> int:
-    """Return the row of the track with most detections within RING_FAR of an axis, the lowest of equal ones;
-    -1 for none. It is a tree or a candidate: without class, or of a class by votes for which roundness is
-    evidence against (`_may_be_stem`).
+    """Return the row of the track with most detections within RING_FAR of an axis that may be a stem
+    (`_may_be_stem`), the lowest row of equal ones; -1 for none.
 
     Args:
         tracks: The tracks.
@@ -341,7 +342,8 @@ def _may_be_stem(verdict: int) -> bool:
 
 @compiled_within
 def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, y: float) -> int:
-    """Return the row of the most likely track within REACH of an axis that is not taken; -1 for none.
+    """Return the row of the track with the highest likelihood within REACH of an axis that is not in `taken`;
+    -1 for none.
 
     The likelihood of a track with the distance d is (1 + ln(1 + hits)) exp(-d^2 / (2 OWN^2)); of equal ones
     the lowest row is returned. Hits without the distance would prefer branches near a stem, which are
@@ -370,11 +372,11 @@ def _likeliest(tracks: Rows, taken: Bool, cells: Cells, scale: float, x: float, 
 
 @compiled
 def nearest_other(place: Float, other: Float, reach: float) -> Int:
-    """Return for each position the row of the nearest other position within a reach, int64, shape (N,); -1
-    for none.
+    """Return for each row of `place` the row of the nearest position in `other` within a reach, int64, shape
+    (N,); -1 for none.
 
     Args:
-        place: Positions, x, y first, shape (N, 2 or more) [m].
+        place: Positions to search from, x, y first, shape (N, 2 or more) [m].
         other: Other positions, x, y first, shape (M, 2 or more) [m]. The lowest row is returned of equally
             near ones.
         reach: Distance [m] above 0; a nearest position at this distance or farther does not count.

@@ -18,10 +18,11 @@ class ScanPose(NamedTuple):
     """Pose of the robot at a scan.
 
     Attributes:
-        stamp_ns: Time of the scan.
+        stamp_ns: Time of the scan [ns].
         pose: x, y [m], yaw [rad] in the frame of the map, shape (3,).
         covariance: Covariance of the pose in the frame of the map, shape (3, 3).
-        relative: Covariance of the pose relative to the landmarks around, shape (3, 3).
+        relative: Covariance of the pose relative to the landmarks around the robot, frame of the map, shape
+            (3, 3).
     """
 
     stamp_ns: int
@@ -41,25 +42,25 @@ class TrackTable:
     """Tracks, one row per tree; all columns have the length T.
 
     Attributes:
-        number: int64, ascending; a number is never reused.
-        landmark: int64, birth number of the landmark of the tree; -1 for a tree that only a voxel column
+        number: Number of the tree, int64, ascending; a number is never reused.
+        landmark: Birth number of the landmark of the tree, int64; -1 for a tree that only a voxel column
             supports.
-        x: State x, y [m], vx, vy [m/s], shape (T, 4).
+        x: State x, y [m], vx, vy [m/s] in the map, shape (T, 4).
         P: Covariance of the state, shape (T, 4, 4).
         shared: Part of P that comes from the poses of the robot, shape (T, 2, 2) [m^2].
-        stamp_ns: int64, time of the last observation.
-        first_ns: int64, time of the first observation.
-        hits: int64, number of observations, see `Trees`.
-        score: Score of the landmark: hits less misses, see `Landmarks`.
+        stamp_ns: Time of the last observation [ns], int64.
+        first_ns: Time of the first observation [ns], int64.
+        hits: Number of observations, int64, see `Trees`.
+        score: Score of the landmark: hits minus misses, see `Landmarks`.
         eccentricity: Sum of the finite eccentricities of the observations.
-        eccentricities: int64, number of them.
+        eccentricities: Number of finite eccentricities, int64.
         radius: Sum of weights times radii [1/m^3].
         radius_weight: Sum of weights (see `add_observations`) [1/m^4].
         radius_reach: Sum of weights times distances of the sensor [1/m^3].
         radius_above: Sum of weights times distances from breast height [1/m^3].
-        radii: int64, number of radii.
-        sides: int64, bit k is set when sector k around the trunk was observed.
-        verdict: int64, class of the voxel column of the tree, see `Verdict`; -1 for unknown.
+        radii: Number of summed radii, int64.
+        sides: Observed sectors, int64; bit k is set when sector k around the trunk was observed.
+        verdict: Class of the voxel column of the tree, see `Verdict`, int64; -1 for unknown.
     """
 
     number: Int
@@ -120,11 +121,11 @@ class TrackTable:
         consecutive numbers.
 
         Args:
-            number: Number of the first one.
-            stamp_ns: Time of the scan.
-            position: Positions, shape (K, 2) [m].
-            own: Covariances of the measurements, shape (K, 2, 2).
-            shared: Covariances that the pose adds, shape (K, 2, 2).
+            number: Number of the first track.
+            stamp_ns: Time of the scan [ns].
+            position: Positions in the map, shape (K, 2) [m].
+            own: Covariances of the measurements, shape (K, 2, 2) [m^2].
+            shared: Covariances that the pose adds, shape (K, 2, 2) [m^2].
             velocity_sigma: Standard deviation of the velocities [m/s].
         """
         t = cls.empty(len(position))
@@ -149,7 +150,8 @@ class TrackTable:
         return TrackTable(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     def extended(self, more: TrackTable) -> TrackTable:
-        """Return these rows, followed by others, as copies. The caller keeps the numbers ascending."""
+        """Return the rows of this table followed by those of `more`, as copies. The caller keeps the numbers
+        ascending."""
         return TrackTable(
             *(np.concatenate([getattr(self, f.name), getattr(more, f.name)]) for f in fields(self))
         )
@@ -186,11 +188,11 @@ class Rows(NamedTuple):
 def join(rows: Rows, old: int, young: int) -> None:
     """Join the track of row `young` to that of row `old`, in place.
 
-    Both are parts of one trunk. The one whose landmark has the larger score gives landmark, state, covariance
-    and time of the last observation: a part that is a branch or undergrowth can be decimetres beside the
-    trunk. Counts and sums are added (a last scan that observed both counts once). The class is tree if one is
-    a tree; a track without class gets that of the other one. The row `old` keeps its number. The row `young`
-    stays unchanged; the caller removes it.
+    The track whose landmark has the larger score (`old` for equal scores) gives landmark, state, covariance
+    and time of the last observation. The larger score and the earlier first observation are kept. Counts and
+    sums are added (a last scan that observed both counts once). The class is tree if one is a tree; a track
+    without class gets that of the other one. The row `old` keeps its number. The row `young` stays unchanged;
+    the caller removes it.
     """
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, sides, verdict = rows.hits, rows.sides, rows.verdict

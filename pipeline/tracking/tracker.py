@@ -58,13 +58,14 @@ class Tracker:
     ) -> None:
         """Update the trees with the detections of one scan, in place.
 
-        They are assigned to the landmarks; those without landmark and voxel column are removed, and one whose
-        trunk has two landmarks may take the other one. Detected trees are filtered and described. A tree
-        begins at each new landmark farther than `proximity_radius` from all trees, and trees nearer than that
-        to a detected one are joined.
+        The trees are assigned to the landmarks (`follow`, `take_better_landmarks`); trees without a landmark
+        and a tree column are removed. Detected trees are updated by the Kalman filter, and their attributes
+        by `add_observations`. A tree begins at each detected landmark without a tree that is at least
+        `proximity_radius` from all trees. Trees nearer than `proximity_radius` to a detected tree are joined
+        with it.
 
         Args:
-            stamp_ns: Time of the scan, not before the last one.
+            stamp_ns: Time of the scan [ns], not before the last one.
             estimate: Pose by SLAM (Eq. 9), with the landmark of each detection (-1 for none).
             detections: Detections in the base frame; may be empty.
             landmarks: Landmarks of SLAM after the scan.
@@ -115,9 +116,9 @@ class Tracker:
         landmarks: Landmarks,
         of_map: Float,
     ) -> None:
-        """Move the trees in place with a corrected path. Those with a landmark get its corrected position,
-        and the error of the map there in place of the errors of the poses that observed them. Trees without a
-        landmark within LOOP_DISTANCE and without a tree column are removed.
+        """Move the trees in place with a corrected path. Trees with a landmark get the position of the
+        landmark, and `of_map` in place of the shared part of their covariance. Trees without a landmark
+        within LOOP_DISTANCE and without a tree column are removed.
 
         Trees that share a landmark afterwards are joined. Velocities and covariances are rotated with the
         path.
@@ -154,12 +155,12 @@ class Tracker:
         at each tree column without one. The pose is that of the last scan of `process` or `correct`.
 
         Args:
-            stamp_ns: Time of the scan.
+            stamp_ns: Time of the scan [ns].
             columns: Columns with the verdicts of votes and rules.
             parameters: Parameters of the classification.
 
         Returns:
-            The columns, of which those that `confirm_round` changes are trees; the argument is unchanged.
+            A copy of the columns with the verdicts after `confirm_round`; the argument is unchanged.
         """
         verdict = columns.verdict.copy()
         scan = self._scan._replace(stamp_ns=stamp_ns)
@@ -181,8 +182,9 @@ class Tracker:
         classify_new(self.tracks.as_rows(), columns.axis, columns.verdict)
 
     def trees(self) -> Trees:
-        """Return the attributes of all trees, confirmed or not (Table 2), by number; the columns are copies.
-        SHARED_COVARIANCE is added to the covariances. Diameters are NaN where they are unknown."""
+        """Return the attributes of all trees, confirmed or not (Table 2), in ascending order of number; the
+        columns are copies. SHARED_COVARIANCE is added to the covariances. Diameters are NaN where they are
+        unknown."""
         t, p = self.tracks, self.parameters
         limits = FigureLimits(p.hits_to_confirm, np.radians(p.dbh_arc_min), p.out_of_round, p.taper_sigma)
         coverage, dbh, dbh_sigma, eccentricity, confirmed = table_figures(t.as_rows(), limits)
@@ -205,7 +207,7 @@ class Tracker:
         self, stamp_ns: int, estimate: PoseEstimate, landmarks: Landmarks, gate: float, distance_max: float
     ) -> ScanPose:
         """Assign the trees to the landmarks, and return the pose of the robot, which is stored as that of the
-        last scan. Trees whose landmarks were merged are joined: the older one stays and gets the data of
+        last scan. Trees whose landmarks were merged are joined: the older tree stays and gets the data of
         both. Trees that have neither a landmark nor a tree column are removed.
 
         Args:
@@ -228,12 +230,12 @@ class Tracker:
         """Restart the filters of trees at their landmarks, in place, where their detections are beyond the
         gate; the velocity is kept.
 
-        That happens when SLAM corrects its map, or when another particle with another map is the best one.
+        Landmarks of these trees must exist in `landmarks`.
 
         Args:
             rows: Rows of trees with a detection, shape (K,).
             position: Positions of the detections in the map, shape (K, 2) [m].
-            own: Their own covariances, shape (K, 2, 2).
+            own: Own covariances of the detections, shape (K, 2, 2) [m^2].
             landmarks: The landmarks.
         """
         t, scan = self.tracks, self._scan
@@ -259,8 +261,8 @@ class Tracker:
         others in `tracks`.
 
         Args:
-            stamp_ns: Time of the scan.
-            landmark: Birth numbers of their landmarks, shape (K,); -1 for none.
+            stamp_ns: Time of the scan [ns].
+            landmark: Birth numbers of the landmarks of the trees, shape (K,); -1 for none.
             position: Positions in the map, shape (K, 2) [m].
             own: Covariances of the measurements, shape (K, 2, 2) [m^2].
             added: Covariances that the pose adds, shape (K, 2, 2) [m^2].
@@ -300,9 +302,9 @@ def follow(
         rows: Tracks; landmark, score and, for joined tracks, all columns are changed.
         scan: Pose of the robot.
         birth: Birth numbers of the landmarks, int64, shape (L,).
-        position: Their positions, shape (L, 2) [m].
-        covariance: Their covariances xx, xy, yy, shape (L, 3) [m^2].
-        score: Their hits less misses, shape (L,).
+        position: Positions of the landmarks in the map, shape (L, 2) [m].
+        covariance: Covariances xx, xy, yy of the landmarks, shape (L, 3) [m^2].
+        score: Scores of the landmarks, hits minus misses, shape (L,).
         gate, distance_max: Maximum Mahalanobis [sigma] and Euclidean [m] distance between a track and a new
             landmark.
 
@@ -388,20 +390,19 @@ def take_better_landmarks(
     score: Float,
     radius: float,
 ) -> None:
-    """Give a tree that is not detected, and began within SAME_VISIT_NS, the landmark of a detection without
-    tree next to it, in place, if this landmark has the higher score or the tree has no landmark. Both
-    landmarks are of one trunk: the first views of a distant trunk can be wrong by more than the gate of later
-    ones.
+    """Assign landmarks of detections without a track to the nearest track within `radius`, in place. The
+    track must be without a detection in this scan and have begun at most SAME_VISIT_NS ago. It takes the
+    landmark if this has a higher score than its own landmark or it has none.
 
     Args:
         rows: Tracks; landmark and score are changed.
-        stamp_ns: Time of the scan.
+        stamp_ns: Time of the scan [ns].
         row: Row of the track of each detection, -1 for none, int64, shape (D,); changed.
         births: Birth number of the landmark of each detection, shape (D,); -1 for none.
         position: Positions of the detections in the map, shape (D, 2) [m].
         birth: Birth numbers of the landmarks, int64, shape (L,).
-        score: Their hits less misses, shape (L,).
-        radius: Distance below which a detection is of a tree [m].
+        score: Scores of the landmarks, hits minus misses, shape (L,).
+        radius: Distance below which a detection belongs to a track [m].
     """
     detected = np.zeros(rows.number.shape[0], np.bool_)
     for d in range(row.shape[0]):
@@ -430,7 +431,7 @@ def take_better_landmarks(
 def merge_near(rows: Rows, seen: Int, radius: float) -> Bool:
     """Join the tracks that are nearer than a radius to a track that moved, in place.
 
-    The lower row, which is the older track, keeps its number, with the better landmark of both; see `join`.
+    The lower row, which is the older track, remains; see `join`.
 
     Args:
         rows: Tracks.

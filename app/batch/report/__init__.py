@@ -40,12 +40,12 @@ _PATH_POINTS = 2000
 
 @functools.cache
 def _catalogue() -> dict[str, dict[str, str]]:
-    """Return texts.toml: the texts by key of each language."""
+    """Return the content of texts.toml: a dict from each language to a dict from keys to texts."""
     return tomllib.loads((files(__package__) / "texts.toml").read_text(encoding="utf-8"))
 
 
 def texts_of(language: str) -> dict[str, str]:
-    """Return the texts of a language by key, from texts.toml.
+    """Return a dict from the keys in texts.toml to the texts of a language.
 
     Raises:
         StemmapError: The language is unknown.
@@ -57,11 +57,11 @@ def texts_of(language: str) -> dict[str, str]:
 
 
 def translated(message: str, texts: dict[str, str]) -> str:
-    """Return a warning about stand figures in a language; one that is not in the catalogue unchanged.
+    """Return a warning about stand parameters in a language; unchanged if it is not in the catalogue.
 
     Args:
         message: The warning, in English.
-        texts: Texts of the language.
+        texts: Dict from keys to texts of the language, see `texts_of`.
     """
     for key, english in texts_of("en").items():
         if not key.startswith("warning_"):
@@ -176,8 +176,8 @@ def report_page(
 
 
 def map_date(folder: FilePath) -> datetime.date:
-    """Return the date on which the map of a run was written: that of its run.json, in local time; raises
-    OSError without this file. Copies by `reviewed_run` keep it."""
+    """Return the date, in local time, at which run.json of a run was modified last; OSError without this
+    file. Copies by `reviewed_run` keep it."""
     return datetime.datetime.fromtimestamp((folder / "run.json").stat().st_mtime).astimezone().date()
 
 
@@ -220,7 +220,7 @@ def changed_parameters(changed: Mapping[str, Any], number: Numbers) -> list[tupl
     English, as they are declared; one that this version does not have has the title "".
 
     Args:
-        changed: Values by dotted name.
+        changed: Dict from dotted names to values.
         number: Format of the language.
     """
     specs = {spec.name: spec for spec in field_specs()}
@@ -253,9 +253,9 @@ def georeference_words(frame: MapFrame, texts: dict[str, str], number: Numbers) 
 
 
 def _digits(estimate: Estimate, least: int | None = None) -> int:
-    """Return the number of decimals of a figure and its standard error: `least`, by default what the size of
-    the figure deserves (0 from 100 on and where not finite, 1 from 10 on, else 2), and more, up to 3, where
-    the error would be rounded to 0."""
+    """Return the number of decimals of an estimate and its standard error. It is `least`, or more, up to 3,
+    if the standard error would be rounded to 0. The default of `least` is 0 for values of 100 or more and
+    values that are not finite, 1 for values of 10 or more, else 2."""
     size = abs(estimate.value)
     if least is None:
         least = 0 if not math.isfinite(size) or size >= 100 else 1 if size >= 10 else 2
@@ -308,7 +308,8 @@ def _map_scale(least: float) -> float:
 def stand_map(
     run: ExportedRun, whole: StandResult, plots: Sequence[SamplePlot], texts: dict[str, str], number: Numbers
 ) -> dict[str, Any]:
-    """Return what the template draws on the map: sizes in millimetres of a page, north (or y) upwards.
+    """Return the elements of the map as a dict for the template. Lengths are in millimetres of a page; north
+    (or y) is at the top, and y coordinates count downwards.
 
     Args:
         run: The run, in the coordinates of its files.
@@ -318,10 +319,11 @@ def stand_map(
         number: Format of the language.
 
     Returns:
-        `width`, `height`; `seen` and `path` (SVG path data; `path` is "" for a whole cloud); `plots` (name,
-            path data, x and y of the name); `trees` (x, y, radius, number or "" if there are more than 400,
-            whether the diameter is known; else it is drawn as 15 cm); the scale bar, `bar` (length) and
-            `bar_text`; `scale` as text, such as "1 : 200"; and `up`, the word at the axis that points up.
+        A dict with `width` and `height`; `seen` and `path`, SVG path data (`path` is "" for a whole cloud);
+        `plots`, a list of (name, path data, x and y of the name); `trees`, a list of (x, y, radius, number,
+        whether the diameter is known), where the number is "" if there are more than 400 trees and an unknown
+        diameter is rendered as 15 cm; the scale bar, `bar` (length) and `bar_text`; `scale` as text, such as
+        "1 : 200"; and `up`, the word at the axis that points up.
     """
     import shapely
 
@@ -384,13 +386,13 @@ def stand_map(
 
 
 def histogram(whole: StandResult, texts: dict[str, str], number: Numbers) -> dict[str, Any]:
-    """Return what the template draws of the diameter classes, without bars if there are no classes.
+    """Return the content of the histogram of the diameter classes as a dict for the template.
 
     Coordinates are in mm, y downwards. Keys: `width` and `height` of the drawing; `bars` (stems per hectare),
-    each with `x`, `y`, `width`, `height`, `middle` (x), `edge` (x of the lower limit of the class), `high`
-    and `low` (y of plus and minus one standard error, at least 0) and `label`, the lower limit of the class
-    [cm] as text; `last`, the upper limit of the last class, "" without one; `marks` of the axis as y and
-    text; and `title`.
+    a list of dicts, empty if there are no classes, with `x`, `y`, `width`, `height`, `middle` (x), `edge` (x
+    of the lower limit of the class), `high` and `low` (y of plus and minus one standard error, at least 0)
+    and `label`, the lower limit of the class [cm] as text; `last`, the upper limit of the last class, "" if
+    there is none; `marks` of the axis, a list of (y, text); and `title`.
 
     Args:
         whole: Stand figures of the whole observed area.
@@ -434,12 +436,12 @@ def write_report(page: str, file: FilePath) -> None:
     takes at most two minutes.
 
     Args:
-        page: Its HTML.
+        page: HTML of the report.
         file: File .html or .pdf; its folder must exist.
 
     Raises:
-        StemmapError: The suffix is another one, an HTML file cannot be written, there is no Chromium, or it
-            failed.
+        StemmapError: The suffix is another one, an HTML file cannot be written, there is no Chromium, or
+            Chromium failed.
         OSError: A PDF cannot be written.
     """
     suffix = file.suffix.lower()

@@ -52,11 +52,11 @@ class ConnectionLimit:
 
     @contextmanager
     def place(self, role: Role) -> Iterator[None]:
-        """Take a place inside the context.
+        """Count one connection of a role inside the context.
 
         Raises:
-            WebSocketException: None is left for this role. It closes a websocket that is not accepted yet
-                with 1013.
+            WebSocketException: MOST connections of this role are counted already. It closes a websocket that
+                is not accepted yet with 1013.
         """
         if self._taken[role] >= MOST[role]:
             raise WebSocketException(WS_1013_TRY_AGAIN_LATER)
@@ -264,13 +264,14 @@ class Edit(Body):
 
 
 async def edited(dashboard: Dashboard, edit: Edit, payload: dict[str, Any], status: int = 200) -> Response:
-    """Return a response with further values, the number of edits so far (`serial`), and how many edits of
-    this browser can be undone (`undo`) and redone (`redo`). Raises StemmapError if the store cannot be used.
+    """Return a JSON response with the keys of `payload`, `serial`, the number of edits so far, and `undo` and
+    `redo`, the numbers of edits of this browser that can be undone and redone. Raises StemmapError if the
+    store cannot be used.
 
     Args:
         dashboard: The dashboard.
         edit: The edit, with its browser.
-        payload: Further values.
+        payload: Further keys and values of the response.
         status: HTTP status.
     """
     serial = dashboard.annotation_editor.serial

@@ -162,29 +162,29 @@ async def export_geojson(dashboard: Dash) -> Response:
 
 
 def _rows(dashboard: Dashboard) -> list[dict[str, Any]]:
-    """Return the annotations of the open run, see `row_payload`, those of a whole cloud in the coordinates of
-    its file."""
+    """Return the annotations of objects of the open run as dicts, see `row_payload`; for a whole cloud, in
+    the coordinates of the file."""
     x, y = dashboard.offset
     rows = [row_payload(row) for row in dashboard.annotation_editor.rows]
     return [{**row, "x": row["x"] + x, "y": row["y"] + y} for row in rows]
 
 
 def _feature(row: dict[str, Any]) -> dict[str, Any]:
-    """Return an annotation, see `_rows`, as a GeoJSON point at its x and y, with its `id` and the properties
-    `class`, `dbh_cm`, `who` and `edited`."""
+    """Return an annotation, see `_rows`, as a GeoJSON feature (dict): a point at x, y with the `id` of the
+    annotation and the properties `class`, `dbh_cm`, `who` and `edited` (time as text)."""
     properties = {"class": row["kind"], "dbh_cm": row["dbh_cm"], "who": row["who"], "edited": _when(row)}
     geometry = {"type": "Point", "coordinates": [row["x"], row["y"]]}
     return {"type": "Feature", "id": row["id"], "geometry": geometry, "properties": properties}
 
 
 def _row(row: dict[str, Any]) -> list[str]:
-    """Return an annotation as the cells of `_Columns`."""
+    """Return an annotation, see `_rows`, as the cells of `_Columns`; the DBH is "" if it is unknown."""
     dbh = "" if row["dbh_cm"] is None else f"{row['dbh_cm']:.2f}"
     return [f"{row['x']:.4f}", f"{row['y']:.4f}", dbh, row["kind"], row["who"], _when(row)]
 
 
 def _when(row: dict[str, Any]) -> str:
-    """Return the time of the last edit as text."""
+    """Return the time of the last edit of an annotation, see `_rows`, as text."""
     return moment(row["at_s"] * 1_000_000_000)
 
 
@@ -198,7 +198,7 @@ def _check(content: Content, row: int) -> None:
 
     Args:
         content: The row.
-        row: Its number, from 0 on.
+        row: Index of the row, from 0 on.
     """
     if max(abs(content.x), abs(content.y)) > FARTHEST_M:
         raise BadRequestError(f"row {row + 1} is farther than {FARTHEST_M:.0f} m from the origin")

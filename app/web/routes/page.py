@@ -81,8 +81,9 @@ def all_robots(request: Request) -> Response:
 
 @router.get("/api/access")
 def access(request: Request) -> Response:
-    """GET /api/access: return `role`, `viewer_link` and `viewers`, the number of pages that are open with it
-    (both for an owner, else null), and `robots`, the address of the fleet's page (null without a fleet)."""
+    """GET /api/access: return an object with `role`, "owner" or "viewer"; `viewer_link`, the address
+    "/?token=...", and `viewers`, the number of pages that are open with it (both null for a viewer); and
+    `robots`, the address of the page of the fleet (null without a fleet)."""
     role, tokens = role_of(request.scope), _tokens(request)
     owns = role == "owner"
     return json_reply(
@@ -130,9 +131,10 @@ def viser_page(request: Request) -> Response:
 
 
 def lead_on(request: Request, port: int) -> Response:
-    """Redirect (303) to another port of this host, with a ticket that opens it once for the same role.
-    Redirects are kept in histories and logs, so they must not contain the token."""
+    """Return a redirect (303) to another port of this host, with a ticket that opens it once for the same
+    role."""
     role = role_of(request.scope)
+    # Redirects are kept in histories and logs, so they must not contain the token.
     once = ticket(_tokens(request).token(role), port, role)
     hostname = urlsplit(f"//{request.headers['host']}").hostname or "127.0.0.1"
     host = f"[{hostname}]" if ":" in hostname else hostname

@@ -129,8 +129,8 @@ async def download(dashboard: Dash) -> Response:
 
 @router.get("/sets")
 async def saved_sets(dashboard: Dash) -> Response:
-    """GET /api/sets: return name, author and time of the saved parameter sets, see
-    `ParameterSets.as_plain`."""
+    """GET /api/sets: return the result of `ParameterSets.as_plain`: name, author and time of each saved
+    set."""
     return json_reply(dashboard.sets.as_plain())
 
 

@@ -123,9 +123,9 @@ class _ImportPlots(Edit):
 
 @router.get("/plots", dependencies=[ViewerTurn])
 async def figures(dashboard: Dash, parameters: FigureParameters) -> Response:
-    """Return the stand figures of the whole observed area (`all`) and of the plots (`plots`, null without
-    plots), see `app.batch.stand.stand_record`, and the reason why a part is missing (`problem`). All are
-    empty before the first map."""
+    """Return an object with `all` and `plots`, the results of `app.batch.stand.stand_record` for the whole
+    observed area and for the plots, and `problem`, the reason why one of them is missing, else "". `plots` is
+    null if there are no plots, and both are null before the first map."""
     if dashboard.shown is None:
         return json_reply({"all": None, "plots": None, "problem": ""})
     return json_reply(await asyncio.to_thread(_figures, ShownRun.of(dashboard), parameters))
@@ -196,9 +196,9 @@ async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response
 
 
 async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, dict[str, Any]]]) -> Response:
-    """Add plots, given by name ("" for the next free number) and shape, in one edit, and return the
-    response 201 with their `ids`; raises BadRequestError if one is not valid, a name is taken or there would
-    be too many."""
+    """Add plots in one edit, and return the response 201 with their `ids`, see `edited`. `plots` has the name
+    ("" for the next free number) and the shape (dict, see `plot_of`) of each plot. Raises BadRequestError if
+    a shape or name is not valid, a name is taken or there would be too many plots or corners."""
     taken, contents = _names(dashboard), []
     for name, shape in plots:
         name = _checked_name(name, taken) if name else _free("", taken)
@@ -233,8 +233,9 @@ def _checked_name(name: str, taken: set[str]) -> str:
 
 
 def _free(name: str, taken: set[str]) -> str:
-    """Return a name that is not in `taken`: the name itself or with a number in parentheses; without a name,
-    or for one that is not printable, the next free number as text. `taken` does not change."""
+    """Return a name that is not in `taken`: the name itself if it is free, else the name with the next free
+    number from 2 in parentheses. For an empty name, return the next free number from 1 as text; for a name
+    that is not printable, the next free number from 2. `taken` is not modified."""
     if name and name.isprintable() and name not in taken:
         return name
     names = (f"{name} ({k})" if name and name.isprintable() else str(k) for k in count(2 if name else 1))
@@ -247,8 +248,9 @@ def _corners(plot: Mapping[str, Any]) -> int:
 
 
 def _written(files: Mapping[str, str], folder: FilePath) -> FilePath:
-    """Write files, given in base64 by name, to a folder; return the path of the one that is read, the first
-    by the order of SUFFIXES. Raises BadRequestError if there is none, or for other text than base64."""
+    """Write files, a dict from names to their bytes in base64, to a folder. Return the path of the file that
+    is read: the first one with a suffix of SUFFIXES, in the order of SUFFIXES. Raises BadRequestError if
+    there is none, or for other text than base64."""
     from app.batch.plot_files import SUFFIXES
 
     for name, text in files.items():
@@ -266,8 +268,8 @@ def _written(files: Mapping[str, str], folder: FilePath) -> FilePath:
 
 
 def _figures(run: ShownRun, parameters: Stand) -> dict[str, Any]:
-    """Return the figures of the route `figures`; those of the whole area are None only if nothing was
-    observed, and those of the plots also if all plots are outside."""
+    """Return the content of the response of the route `figures` as a dict. A StemmapError of `stand_of`
+    becomes `problem`; parts that are not computed are None."""
     from app.batch.stand import stand_of, stand_record
 
     found: dict[str, Any] = {"all": None, "plots": None, "problem": ""}
@@ -369,14 +371,15 @@ async def georeference(body: _Georeference, dashboard: Dash) -> Response:
 
 
 def _named(point: dict[str, Any], number: int, offset: tuple[float, float]) -> dict[str, Any]:
-    """Return a control point as a new dict with a name, by default the number of its tree or `number`, and
-    with its place moved and rounded to micrometres; x and y of a tree are None. Raises BadRequestError
-    without a tree and a place.
+    """Return a control point as a new dict with a name. For a tree, the default name is the number of the
+    tree, and `x` and `y` are None. For another point, the default name is `number`, and `offset` is added to
+    `x` and `y`, rounded to micrometres. Raises BadRequestError for a point with neither a tree nor `x` and
+    `y`.
 
     Args:
-        point: See `app.batch.georeference.ControlPoint`.
-        number: Its number, for a mark without a name.
-        offset: Motion of its place [m].
+        point: The fields of `app.batch.georeference.ControlPoint`.
+        number: Number of the point.
+        offset: x, y [m] that are added to the position.
     """
     if point["tree"] is not None:
         return {**point, "name": point["name"] or str(point["tree"]), "x": None, "y": None}

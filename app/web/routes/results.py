@@ -164,8 +164,8 @@ async def pairs(dashboard: Dash) -> Response:
 
 @router.get("/doubts")
 async def doubts(dashboard: Dash) -> Response:
-    """Return the share of votes that a tree needs (`needed`) and the votes on each tree (`trees`, see
-    `doubts_of`), the most uncertain first; no trees before the first map."""
+    """Return an object with `needed`, the share of votes that a tree needs, and `trees`, the result of
+    `doubts_of`; no trees before the first map."""
     share = dashboard.parameters.parameters.classification.tree_share
     shown = dashboard.shown
     rows = [] if shown is None else await asyncio.to_thread(doubts_of, shown.frame, share)
@@ -194,8 +194,9 @@ async def tree_story(number: Number, dashboard: Dash) -> Response:
 
 @router.get("/camera", dependencies=[ViewerTurn])
 async def camera(dashboard: Dash, shown: NewestScan) -> Response:
-    """Return the stamp of the camera picture of the current scan, and the boxes of trees and clusters in it,
-    see `CameraView.look`; 404 without a picture, 409 before the first map, 503 if the worker is busy."""
+    """Return the result of `CameraView.look` for the current scan: the stamp of the camera picture, and the
+    boxes of trees and clusters in it; 404 without a picture, 409 before the first map, 503 if the worker is
+    busy."""
     return json_reply(await dashboard.camera.look(shown.frame, dashboard.path))
 
 
@@ -219,9 +220,10 @@ async def tree_picture(number: Number, dashboard: Dash, shown: NewestScan) -> Re
 
 @router.get("/section", dependencies=[ViewerTurn, Depends(newest_scan)])
 async def section(dashboard: Dash) -> Response:
-    """Return the accumulated points at breast height seen from above as a binary block: in the header `side`
-    of a cell and `origin`, the lower left corner of cell (0, 0) [m], and the array `cells`, the occupied
-    cells along x and y, int32, shape (N, 2); 409 before the first map, 503 if the worker is busy."""
+    """Return the accumulated points at breast height seen from above as a binary block, see `binary_payload`.
+    The header has `side`, the side of a cell [m], and `origin`, x, y of the lower left corner of cell (0, 0)
+    in the map [m]. The array `cells` has the indices of the occupied cells along x and y, int32, shape (N,
+    2). 409 before the first map, 503 if the worker is busy."""
     found = await dashboard.worker_client.section()
     return bytes_reply(binary_payload({"side": found.side, "origin": found.origin}, {"cells": found.cells}))
 

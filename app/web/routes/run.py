@@ -153,8 +153,8 @@ async def inside(body: _Uninspected, settings: Deployment, any_file: AnyFile) ->
 
 @router.get("/sources")
 async def sources(dashboard: Dash, settings: Deployment) -> Response:
-    """GET /api/sources: return `scenarios` (`uri`, `doc`) and `recordings` (see `_listed`) that can be
-    opened, of the latter at most 500."""
+    """GET /api/sources: return an object with `scenarios`, a list of objects with `uri` and `doc`, and
+    `recordings`, a list of at most 500 results of `_listed`."""
     from pipeline.io.readers.simulated import scenarios
 
     try:
@@ -171,8 +171,14 @@ async def sources(dashboard: Dash, settings: Deployment) -> Response:
 
 
 def _listed(path: Path, name: str, uploaded: dict[str, dict[str, Any]]) -> dict[str, str]:
-    """Return the path of a recording (`uri`) with its `name`, and with original name and format (`doc`) if it
-    was uploaded."""
+    """Return a dict with the path of a recording (`uri`), `name` and `doc`. For an uploaded recording, `name`
+    is the original name and `doc` "FORMAT, uploaded"; otherwise `doc` is "".
+
+    Args:
+        path: The recording.
+        name: Name of a recording that was not uploaded.
+        uploaded: Result of `RunRecords.uploads`.
+    """
     known = uploaded.get(path.name)
     if known is None:
         return {"uri": str(path), "name": name, "doc": ""}
@@ -180,8 +186,8 @@ def _listed(path: Path, name: str, uploaded: dict[str, dict[str, Any]]) -> dict[
 
 
 def recordings(folders: Sequence[Path]) -> list[tuple[Path, str]]:
-    """Return at most 500 files and folders in the data folders, in their order and sorted in each, with their
-    paths inside of the data folder.
+    """Return (path, path inside of the data folder) of at most 500 recordings, files or folders, in the data
+    folders: in the order of the data folders and sorted in each.
 
     They are recognised by their names. A folder that is no recording is searched as well, at most three
     levels deep and not through links; the search ends after 5,000 entries. Hidden files, finished maps, and
@@ -200,7 +206,8 @@ _Kind = Literal["recording", "folder", "other"]
 
 
 def _entries(folder: Path, levels: int = _LEVELS) -> Iterator[tuple[Path, _Kind]]:
-    """Yield the entries of a folder, sorted, and those of folders in it that are no recording."""
+    """Yield (path, kind) of each entry of a folder, sorted, see `_kind_of`. Each entry of kind "folder" is
+    followed by its own entries, down to `levels` levels. A folder that cannot be read has none."""
     inside: list[Path] = []
     with contextlib.suppress(OSError):
         inside = sorted(folder.iterdir())
@@ -212,8 +219,9 @@ def _entries(folder: Path, levels: int = _LEVELS) -> Iterator[tuple[Path, _Kind]
 
 
 def _kind_of(path: Path) -> _Kind:
-    """Return whether a file or folder is a recording by its name or the names in it, or a folder that may
-    contain some."""
+    """Return "recording" for a file or folder that is a recording by its name or the names in it; "folder"
+    for another folder that is no link; "other" for hidden entries, finished runs, links to other folders,
+    other files and entries that cannot be read."""
     from pipeline.io.readers import expected_format, folder_opener
 
     with contextlib.suppress(OSError):

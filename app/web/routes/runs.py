@@ -71,9 +71,10 @@ class _Name(Body):
 
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
-    """GET /api/runs: return at most 500 runs without their maps (`runs`, see `_row`), the last changed first,
-    each with the number of annotations of its recording (`annotated`), finished folders (`folders`, each with
-    `key`, `name` and `changed_s`), and the number of the open run (`open`, null if it is not recorded)."""
+    """GET /api/runs: return an object with `runs`, at most 500 results of `_row`, the last changed first,
+    each with `annotated`, the number of annotations of the recording; `folders`, the finished folders,
+    each with `key`, `name` and `changed_s`; and `open`, the number of the open run (null if it is not
+    recorded)."""
     await dashboard.run_recorder.write_now()
     rows, annotated = await dashboard.store.ask(
         lambda store: (store.book.listed(), store.annotation_counts())
@@ -97,9 +98,11 @@ async def compare_runs(dashboard: Dash, settings: Deployment, a: _KeyInQuery, b:
     output folders ("folder:NAME"). Maps of the same recording share a frame; others are aligned by the
     distances between their stems or, if that fails, compared without alignment, and `how` has the reason.
 
-    Return both runs, `a` (the earlier visit) and `b`; the tables of `app.sources.inspection_process.visits`;
-    `b_path`, the path of b in the frame of a as [x, y]; and `parameters`, `name`, `a` and `b` of each
-    parameter that differs. 404 if a run does not exist, 409 if its files cannot be read."""
+    Return an object with both runs, `a` (the earlier visit) and `b`, see `_whole`; the keys of
+    `app.sources.inspection_process.visits`; `b_path`, the path of b in the frame of a as a list of [x, y]
+    [m]; and `parameters`, see `_changed_parameters`. 404 if a run does not exist, 409 if its files cannot be
+    read.
+    """
     first, second = await _whole(a, settings, dashboard), await _whole(b, settings, dashboard)
     async with AsyncExitStack() as stack:
         paths = (
@@ -215,14 +218,14 @@ async def _run_folder(
     afterwards. The files have the reviews of the trees, and the reference system of the map if there is one.
 
     Args:
-        key: "open" or its number for the open run, as it is now; number of a record; or "folder:" and the
-            name of a finished folder.
+        key: "open" or the number of the open run, for its present state; number of another record; or
+            "folder:" and the name of a finished folder.
         settings: Settings with the data folders.
         dashboard: The dashboard with its store.
 
     Raises:
         UnknownError: There is no such run.
-        StemmapError: It has no result files, they are damaged, or nothing is mapped yet.
+        StemmapError: The run has no result files, they are damaged, or nothing is mapped yet.
     """
     if key in (_OPEN, str(dashboard.run_recorder.record)):
         run = ShownRun.of(dashboard)
@@ -283,7 +286,8 @@ async def _visit_path(
 
 
 def _number(key: str) -> int:
-    """Return the number of a record; raises UnknownError for another key."""
+    """Return the number of a record from its key; UnknownError unless the key is a number up to
+    LARGEST_NUMBER."""
     if not key.isdecimal() or int(key) > LARGEST_NUMBER:
         raise UnknownError("there is no such run", where=key[:100])
     return int(key)
@@ -297,9 +301,9 @@ async def _done(dashboard: Dashboard, number: int, work: Callable[[RunRecords], 
 
 
 async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str, Any]:
-    """Return a run as the page receives it: the columns of its record (see `_row`) or the values of its
-    folder (see `app.sources.inspection_process.finished`), with `key`, `map`, `revisions` (see `_revision`;
-    [] for a folder) and `differences` from the preset.
+    """Return a run as a dict of JSON values: the keys of `_row` for a record, or of
+    `app.sources.inspection_process.finished` for a folder, with `key`, `map`, `revisions` (list of
+    `_revision`; [] for a folder) and `differences`, see `_differences`.
 
     Args:
         key: Number of a record, or "folder:" and the name of a finished folder.
@@ -308,7 +312,7 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
 
     Raises:
         UnknownError: There is no such run.
-        StemmapError: It cannot be read.
+        StemmapError: The folder of the run cannot be read.
     """
     if key.startswith(_FOLDER):
         name = key.removeprefix(_FOLDER)
@@ -323,8 +327,12 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
 
 
 def _changed_parameters(a: dict[str, Any], b: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return `name` and both values, `a` and `b`, of each parameter that differs; None for one that a run
-    does not have."""
+    """Return a list of a dict for each parameter that differs, with `name` and the values `a` and `b`; None
+    in place of a value that a run does not have and of NaN and infinity.
+
+    Args:
+        a, b: Dicts from dotted names to values.
+    """
     names = dict.fromkeys([*a, *b])
     return [
         {"name": name, "a": _plain(a.get(name)), "b": _plain(b.get(name))}
@@ -339,8 +347,8 @@ def _plain(value: Any) -> Any:  # noqa: ANN401 - whatever a parameter is
 
 
 def _differences(name: str, parameters: dict[str, Any]) -> dict[str, Any]:
-    """Return the values by dotted name that differ from those of a preset, without parameters that it does
-    not have; empty for an unknown preset."""
+    """Return a dict from dotted names to the values that differ from those of the preset `name`, without
+    parameters that the preset does not have; empty for an unknown preset."""
     if name not in PRESETS:
         return {}
     usual = dict(preset(name).flat())
@@ -348,9 +356,9 @@ def _differences(name: str, parameters: dict[str, Any]) -> dict[str, Any]:
 
 
 def _row(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a record for the page: its columns and `source`, without `map`, `revisions`, `run` and
-    `deleted_ns`, and `key`, its number as text. Its times are `begun_s` and `changed_s`, whole seconds since
-    1970."""
+    """Return a record as a dict for the dashboard: the entries of `row` (see `RunRecords.listed`) except
+    `map`, `revisions`, `run` and `deleted_ns`, and `key`, the number of the record as text. `begun_ns` and
+    `changed_ns` become `begun_s` and `changed_s`, integers [s since 1970]."""
     kept = {
         name: value for name, value in row.items() if name not in ("map", "revisions", "run", "deleted_ns")
     }
@@ -359,15 +367,15 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _revision(row: dict[str, Any]) -> dict[str, Any]:
-    """Return a change of parameters for the page: `revision`, `time_s` in the run, `who`, `preset`, `changes`
-    and its time `at_s`, whole seconds since 1970."""
+    """Return a change of parameters as a dict for the dashboard: `revision`, `time_s` [s since the first
+    scan], `who`, `preset`, `changes` and `at_s`, the time of the change as an integer [s since 1970]."""
     names = ("revision", "time_s", "who", "preset", "changes")
     return {**{name: row[name] for name in names}, "at_s": row["at_ns"] // 10**9}
 
 
 def _changed_s(folder: FilePath) -> int | None:
-    """Return the time of the last change of run.json in a finished folder, whole seconds since 1970; None if
-    it was removed."""
+    """Return the time of the last change of run.json in a finished folder as an integer [s since 1970]; None
+    if it does not exist."""
     try:
         return int((folder / "run.json").stat().st_mtime)
     except OSError:  # it was removed a moment ago
@@ -375,15 +383,14 @@ def _changed_s(folder: FilePath) -> int | None:
 
 
 def _folders(settings: Settings) -> dict[str, int | None]:
-    """Return the time of the last change [s since 1970] of each finished folder by name; None if it was
-    removed meanwhile."""
+    """Return a dict from the name of each finished folder to the result of `_changed_s`."""
     return {name: _changed_s(path) for name, path in _finished_folders(settings).items()}
 
 
 def _finished_folders(settings: Settings) -> dict[str, FilePath]:
-    """Return the folders of finished runs in the data folders by name, at most 500; of two with the same name
-    the first. Links that point outside of the data folders, and data folders that cannot be read, are left
-    out."""
+    """Return a dict from names to paths of at most 500 folders of finished runs in the data folders; of two
+    with the same name the first one counts. Links that point outside of their data folder, and data folders
+    that cannot be read, are left out."""
     found: dict[str, FilePath] = {}
     for folder in settings.data_folders:
         try:

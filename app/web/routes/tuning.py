@@ -28,10 +28,10 @@ class _Sensitivity(Body):
 
 @router.get("/search")
 async def search_state(dashboard: Dash, settings: Deployment, any_file: AnyFile) -> Response:
-    """GET /api/search: return the progress of the search (see `TuneSearch.as_plain`), its possible `goals`
-    (`name`, `words`), the parameters that are suggested with their ranges (`sensible`, "NAME=LOW..HIGH"), and
-    the other recorded `runs`, of which at most `most_runs` can be chosen; they are left out if the store
-    cannot be read."""
+    """GET /api/search: return the keys of `TuneSearch.as_plain`; `goals`, a list of objects with `name` and
+    `words`; `sensible`, a list of suggested parameters "NAME=LOW..HIGH"; `runs`, a list of the other recorded
+    runs (see `OtherRun.as_plain`), empty if the store cannot be read; and `most_runs`, the maximum number of
+    runs that can be chosen."""
     try:
         runs = [run.as_plain() for run in await _others(dashboard, settings, any_file)]
     except StemmapError:  # the open run can still be searched over
@@ -162,11 +162,12 @@ async def _plan(dashboard: Dashboard, settings: Settings, any_file: bool, wanted
 
 
 async def _others(dashboard: Dashboard, settings: Settings, any_file: bool) -> list[OtherRun]:
-    """Return the recorded runs besides the open one whose sources may be opened.
+    """Return the recorded runs except the open one, see `other_runs`; runs that may not be opened are
+    included with `why_not`.
 
     Args:
-        dashboard: Its store and its open run.
-        settings: Permitted folders.
+        dashboard: The dashboard with its store and its open run.
+        settings: Settings with the permitted folders.
         any_file: Whether the caller may open every file.
 
     Raises:

@@ -41,7 +41,8 @@ def _origin_and_args(kind: Any) -> tuple[Any, tuple[Any, ...]]:  # noqa: ANN401
 
 
 class _Blob:
-    """Bytes of arrays, each at a multiple of eight bytes; see `encode` for `planes`."""
+    """Bytes of arrays one after the other, each at an offset of a multiple of 8 bytes; see `encode` for
+    `planes`."""
 
     def __init__(self, planes: bool) -> None:
         """Begin an empty block; with `planes` the first bytes of all numbers of an array come first, then the
@@ -51,8 +52,9 @@ class _Blob:
         self._planes = planes
 
     def add(self, array: np.ndarray[Any, Any]) -> dict[str, Any]:
-        """Append the bytes of an array, and return its description for JSON: "dtype" (little-endian),
-        "shape", and "at", its position [bytes]."""
+        """Append the bytes of a little-endian array, padded to a multiple of 8 bytes. Return its description,
+        a dict of JSON values: "dtype", the NumPy type with "<"; "shape", a list; and "at", the offset of the
+        first byte in the block. The byte order of other arrays is not converted."""
         data = np.ascontiguousarray(array)
         at = self.length
         raw = (
@@ -66,12 +68,13 @@ class _Blob:
 
 
 def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: ANN401 - any record
-    """Return a record as JSON values (not text) and the bytes of its arrays. Numbers that are not finite
-    become texts; fields with NOT_SAVED are omitted.
+    """Return a record as JSON values (not text) and the bytes of its arrays. A dataclass becomes a dict of
+    its fields, without those with NOT_SAVED; a tuple becomes a list; an array becomes its description
+    (`_Blob.add`); a float that is not finite becomes a string.
 
     Args:
-        record: A record of arrays, numbers, texts, None, tuples, lists, dicts and other records; keys of
-            dicts become texts.
+        record: A dataclass, or other value of arrays, numbers, strings, None, tuples, lists, dicts and
+            dataclasses; keys of dicts become strings.
         planes: Whether the first bytes of all numbers of an array come first, then the second ones, and so
             on, which compresses better.
 
@@ -85,8 +88,7 @@ def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: 
 
 def record_bytes(record: Any) -> bytes:  # noqa: ANN401 - any record
     """Return a record as bytes that compress well: the length of the JSON text (4 bytes, little-endian), the
-    text, and the arrays in planes. Numbers that are not finite become texts; fields with NOT_SAVED are
-    omitted.
+    text, and the arrays in planes. Values are encoded as by `encode`.
 
     Raises:
         TypeError: A value has a type that `encode` does not know.
@@ -97,7 +99,7 @@ def record_bytes(record: Any) -> bytes:  # noqa: ANN401 - any record
 
 
 def record_of(kind: type[R], data: bytes) -> R:
-    """Return the record of a type that `record_bytes` was given.
+    """Return the record of type `kind` from the result of `record_bytes`.
 
     Raises:
         ValueError: The bytes are damaged. Damaged bytes can also raise KeyError, TypeError or RuntimeError.
@@ -109,8 +111,8 @@ def record_of(kind: type[R], data: bytes) -> R:
 
 
 def _encoded(value: Any, blob: _Blob) -> Any:  # noqa: ANN401
-    """Return a value as JSON values, with its arrays added to `blob`: a dataclass as a table of its saved
-    fields, a tuple as a list, an array as its description, a number that is not finite as text.
+    """Return a value as JSON values, with its arrays added to `blob`: a dataclass as a dict of its saved
+    fields, a tuple as a list, an array as its description, a float that is not finite as a string.
 
     Raises:
         TypeError: A value has another type.
@@ -198,11 +200,11 @@ def _decoded(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN
 
 
 def _record(kind: Any, tree: Any, blob: _Block, name: str) -> Any:  # noqa: ANN401
-    """Return a dataclass of type `kind` from a table of its saved fields. A missing field with ADDED gets the
-    value of its function of the other fields, or its default.
+    """Return a dataclass of type `kind` from a dict of its saved fields. A missing field with ADDED gets the
+    result of the function ADDED for a dict of the other fields, or its default if ADDED is None.
 
     Raises:
-        ValueError: `tree` is not a table, or has other fields.
+        ValueError: `tree` is not a dict, or has other fields.
     """
     wanted = _saved(kind)
     if not isinstance(tree, dict):
@@ -239,11 +241,11 @@ def _tuple(of: tuple[Any, ...], tree: Any, blob: _Block, name: str) -> tuple[Any
 
 
 def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
-    """Return a number, truth value or text of type `kind`. An integer is also accepted as float, and so are
-    the texts "nan", "inf" and "-inf".
+    """Return a value of type `kind`: int, float, bool or str. An integer is also accepted as float, and so
+    are the strings "nan", "inf" and "-inf".
 
     Raises:
-        ValueError: The value has another type, or is an integer of 64 bits or more.
+        ValueError: The value has another type, or is an integer with a magnitude of 2^63 or more.
     """
     if kind is float and isinstance(tree, str) and tree in ("nan", "inf", "-inf"):
         return float(tree)
@@ -257,11 +259,11 @@ def _number(kind: Any, tree: Any, name: str) -> Any:  # noqa: ANN401
 
 
 def _array(scalar: Any, tree: Any, blob: _Block, name: str) -> np.ndarray[Any, Any]:  # noqa: ANN401
-    """Return a copy of an array with elements of type `scalar` by its description: a table of "dtype"
-    (little-endian), "shape" and "at", its position in the block [bytes].
+    """Return a copy of an array with elements of type `scalar` by its description, see `_Blob.add`.
 
     Raises:
-        ValueError: It has another type, no valid shape (1 to 8 dimensions), or is not inside of the block.
+        ValueError: The array has another type, no valid shape (1 to 8 dimensions), or is not inside of the
+            block.
     """
     dtype = np.dtype(scalar)
     if not isinstance(tree, dict) or tree.get("dtype") != dtype.newbyteorder("<").str:
@@ -295,8 +297,8 @@ def write_archive(tree: Any, blob: bytes) -> bytes:  # noqa: ANN401 - any JSON
     """Return the bytes of a zip with `tree.json` and `arrays.bin`; the same state gives the same bytes.
 
     Args:
-        tree: JSON without NaN and infinity (else ValueError).
-        blob: The arrays to which it refers.
+        tree: JSON values without NaN and infinity (else ValueError).
+        blob: Bytes of the arrays to which `tree` refers.
     """
     text = json.dumps(tree, allow_nan=False, separators=(",", ":")).encode()
     file = io.BytesIO()
@@ -317,7 +319,7 @@ def read_archive(data: bytes, where: str) -> tuple[Any, bytes]:
         where: Name of the file in errors.
 
     Raises:
-        StemmapError: It is damaged, is another file, or declares sizes that are too large.
+        StemmapError: The archive is damaged, is another file, or declares sizes that are too large.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -344,8 +346,8 @@ def _entry(archive: zipfile.ZipFile, name: str, largest: int) -> bytes:
 
     Raises:
         KeyError: There is no such file.
-        ValueError: It is compressed in another way, declares more than `largest` bytes or an implausible
-            ratio, or has another size than declared.
+        ValueError: The file is compressed in another way, declares more than `largest` bytes or an
+            implausible ratio, or has another size than declared.
     """
     entry = archive.getinfo(name)
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):

@@ -36,8 +36,8 @@ class MergedMap:
     Attributes:
         map: Trees, landmarks and paths of both maps.
         number_of: Number of each tree of the second map in the merged map, shape (T,).
-        distance: Distance of each tree of the second map from the tree that it was joined with, NaN without
-            one, shape (T,) [m].
+        distance: Distance of each tree of the second map from the tree of the first map with which it was
+            joined, NaN if it was not joined, shape (T,) [m].
     """
 
     map: SavedMap
@@ -56,7 +56,7 @@ def merge_maps(
     Args:
         a, b: The maps.
         T_a_b: Pose of the frame of b in that of a.
-        covariance: Its covariance of x, y [m], yaw [rad], shape (3, 3).
+        covariance: Covariance of T_a_b, x, y [m], yaw [rad], shape (3, 3).
         stamp_shift_ns: Added to the times of b [ns], which must then be after those of a; this is not
             checked.
         parameters: Parameters of all stages.
@@ -117,7 +117,7 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
 
     Args:
         tracks: The tracks.
-        T: Pose of their frame in the new one.
+        T: Pose of the frame of the tracks in the new frame.
         covariance: Covariance of T, shape (3, 3); it is added to that of the positions, as a shared part.
         shift_ns: Added to all times [ns].
     """
@@ -139,14 +139,14 @@ def _moved_tracks(tracks: TrackTable, T: Pose2, covariance: Float, shift_ns: int
 
 def _moved_path(b: SavedMap, T: Pose2) -> Float:
     """Return the path of a map in another frame, x, y [m], yaw [rad, wrapped], shape (N, 3); T is the pose of
-    its frame in the new one."""
+    the frame of the map in the new frame."""
     poses = b.slam.path.poses()
     return np.column_stack([T.apply(poses[:, :2]), wrap_angle(poses[:, 2] + T.yaw)])
 
 
 def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, reach: float) -> SlamState:
-    """Return the state of SLAM of the merged map: all particles have the best map of a with the landmarks of
-    the best map of b that are at none of its own, at the end of the second run.
+    """Return the state of SLAM of the merged map: all particles have the best map of a and those landmarks of
+    the best map of b that no landmark of a is associated with, and the last pose of `path`.
 
     Args:
         a, b: States of SLAM of the two maps.
@@ -184,7 +184,7 @@ def _slam(a: SlamState, b: SlamState, T: Pose2, covariance: Float, path: Float, 
 
 def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameUncertainty:
     """Return the uncertainty of the frame of the merged map: the records of both runs. Those of b are moved
-    by T and the uncertainty of T is added; without records of b, those of a are returned.
+    by T and the uncertainty of T is added. If b has no records, those of a are returned.
 
     Args:
         a, b: States of the runs.
@@ -212,8 +212,9 @@ def _frame(a: SlamState, b: SlamState, T: Pose2, covariance: Float) -> FrameUnce
 
 
 def _memory(a: PackedVoxelMap, b: PackedVoxelMap, T: Pose2, scan: int, most: int) -> PackedVoxelMap:
-    """Return the voxels of a with the means of those of b, each added as often as it was seen in b, up to
-    MOST_RETURNS. No tile of the result is due for classification; a and b are unchanged.
+    """Return the voxels of a, to which the mean of each voxel of b is added as often as the voxel has
+    returns, at most MOST_RETURNS times. No tile of the result is due for classification; a and b are
+    unchanged.
 
     Args:
         a, b: Voxel maps.
@@ -245,8 +246,8 @@ def _columns(a: Columns, b: Columns, T: Pose2) -> Columns:
 
 
 def _apart(place: Float, other: Float) -> Bool:
-    """Return which positions, shape (N, 2) [m], are more than SAME from all other ones, shape (M, 2) [m];
-    all if either is empty."""
+    """Return which positions `place`, shape (N, 2) [m], are more than SAME from all positions `other`, shape
+    (M, 2) [m]; shape (N,). All are if `other` is empty."""
     from scipy.spatial import cKDTree
 
     if not len(place) or not len(other):

@@ -82,7 +82,7 @@ class SavedMap:
         """Return the state for a mapper, checked; it shares arrays with this record.
 
         Raises:
-            ValueError: Its parts, which come from a file, contradict each other.
+            ValueError: Parts of the record contradict each other, or a number is not finite.
         """
         _check_slam(self.slam)
         n = len(self.slam.genealogy)
@@ -122,8 +122,8 @@ class SavedMap:
         return RelocaliserState(local=local, driven=driven, since=since)
 
     def trees(self, parameters: Parameters) -> Trees:
-        """Return the trees of the map, confirmed or not, with the confirmation and diameters by the
-        parameters of tracking."""
+        """Return the trees of the map, confirmed or not, with attributes by `parameters.tracking`, see
+        `Tracker.trees`."""
         tracker = Tracker(parameters.tracking)
         tracker.tracks, tracker.next_number = self.tracks, self.next_number
         return tracker.trees()
@@ -165,7 +165,7 @@ def _check_frame(frame: FrameUncertainty, scans: int) -> None:
     """Check shapes, order and finiteness of the reference poses of a path with this number of scans.
 
     Raises:
-        ValueError: They do not fit.
+        ValueError: The reference poses do not fit.
     """
     marks = len(frame.serial)
     _check_columns(frame, FrameUncertainty(), marks)
@@ -181,7 +181,7 @@ def _check_graph(slam: SlamState, scans: int) -> None:
     covariances that are positive definite or (of motions) infinite.
 
     Raises:
-        ValueError: It does not fit.
+        ValueError: The graph does not fit.
     """
     graph, K = slam.graph, len(slam.graph.keyframes)
     if graph.pose.shape != (K, 3) or K > KEYFRAMES_MAX or not 0 <= graph.solved <= K:
@@ -220,7 +220,7 @@ def _check_places(places: Places) -> None:
     """Check shapes, order and finiteness of the places.
 
     Raises:
-        ValueError: They do not fit.
+        ValueError: The places do not fit.
     """
     _check_columns(places, Places(), len(places.birth))
     _check_finite(places.distance, places.seen)
@@ -244,8 +244,8 @@ def _within(rows: Int, size: int) -> bool:
 
 
 def _check_columns(record: Any, template: Any, rows: int) -> None:  # noqa: ANN401 - a dataclass of arrays
-    """Check the shapes of the arrays of a record: those of a template without rows have this number of rows,
-    others the shape of the template.
+    """Check the shapes of the arrays of a record: an array without rows in the template must have `rows` rows
+    and the same further dimensions, any other array the shape of that in the template.
 
     Raises:
         ValueError: An array has another shape.

@@ -27,7 +27,8 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         options: Choices of the user; None for the defaults.
 
     Raises:
-        SourceError: It does not exist, has an unknown format, is damaged, or is a live robot.
+        SourceError: The file or folder does not exist, has an unknown format or is damaged, or the URI is
+            that of a live robot.
         UsageError: The scheme of the URI is unknown, or its scenario or options are not valid.
     """
     chosen = options or SourceOptions()
@@ -52,7 +53,7 @@ def check_existence(uri: str) -> None:
     """Check that a URI without a scheme names a file or a folder; a URI with a scheme is not checked.
 
     Raises:
-        SourceError: There is none, or the path is not valid.
+        SourceError: There is no such file or folder, or the path is not valid.
     """
     try:
         if _SCHEME.match(uri) is None and not Path(uri).expanduser().exists():
@@ -93,8 +94,9 @@ def _find_opener(path: Path, uri: str) -> Opener:
     """Return the opener for a path. `uri` is the path as the user wrote it, for errors.
 
     Raises:
-        SourceError: It does not exist, is empty, is neither a file nor a folder, or has an unknown format.
-        OSError: It cannot be read.
+        SourceError: The path does not exist, is an empty file, is neither a file nor a folder, or has an
+            unknown format.
+        OSError: The file or folder cannot be read.
     """
     if "\0" in uri or not path.exists():
         raise _no_such_file(uri)
@@ -155,9 +157,9 @@ class Format:
 
     Attributes:
         words: Name for the user.
-        magic: First bytes of the file; () when only its name identifies it.
+        magic: Possible first bytes of the file; () if only its name identifies it.
         suffixes: Usual suffixes in lower case.
-        open: Opens the source.
+        open: Function of URI, path and options that opens the source.
         is_cloud: Whether it is a whole cloud.
     """
 
@@ -203,7 +205,7 @@ def file_format(path: Path, head: bytes) -> Format | None:
 
     Args:
         path: The file; it is not opened.
-        head: Its first bytes.
+        head: First bytes of the file.
     """
     if path.suffix.lower() == ".npz":  # a .zip by its contents
         return expected_format(path)
@@ -239,7 +241,8 @@ def recordings_in(folder: Path) -> list[str]:
 
 
 def named(names: list[str]) -> str:
-    """Return the first five names as text for a message, with the number of the others; "" without names."""
+    """Return the first five names as text for a message, with the number of the others; "" if there are no
+    names."""
     more = len(names) - _MOST_NAMED
     return ", ".join(names[:_MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 

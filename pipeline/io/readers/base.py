@@ -24,12 +24,12 @@ class RecordedTopic:
     """A topic of a recording, whether it is read or not.
 
     Attributes:
-        name, type: e.g. "/velodyne_points" and "sensor_msgs/msg/PointCloud2".
+        name, type: Name and message type, e.g. "/velodyne_points" and "sensor_msgs/msg/PointCloud2".
         messages: Number of messages.
-        read_as: Role in which it is read ("scan", "odometry", "imu", "gnss", "pose", "camera",
-            "transforms"), or "".
+        read_as: Role in which it is read ("scan", "odometry", "imu", "gnss", "pose", "camera", "transforms");
+            "" if it is not read.
         fits: First role that `--topic` can give it, "" when there is none.
-        why_not: Why it is not read, "" when it is.
+        why_not: Reason why it is not read; "" if it is read.
     """
 
     name: str
@@ -47,7 +47,7 @@ class Revision:
     Attributes:
         revision: Number of the revision in the run.
         from_scan: First scan that is mapped with them.
-        values: Values by stage and name; not checked here.
+        values: Dict from stages to dicts from names of parameters to values; not checked here.
     """
 
     revision: int
@@ -60,13 +60,13 @@ class SourceDescription:
     """What is known of a source before its first scan is read.
 
     Attributes:
-        uri: As the user wrote it.
+        uri: URI of the source as the user wrote it.
         kind: Name of the format, e.g. "ROS 2 MCAP".
         sensor: The LiDAR.
         T_base_lidar: Extrinsics of the LiDAR.
         has_odometry, has_imu: Whether the source yields such records.
-        scans: Number of scans, None when it is not known before the end.
-        start_ns, end_ns: Time of the first and last scan, None when not known.
+        scans: Number of scans; None if it is not known before the end.
+        start_ns, end_ns: Times of the first and the last scan [ns]; None if unknown.
         digest: SHA-256 (hex) of the file contents, or of the definition of a simulated scenario.
         preset: Parameter preset for this kind of source.
         topics: Topics of a recording of messages; () for other sources.
@@ -99,8 +99,8 @@ class SourceOptions:
     """Choices of the user for a source.
 
     Attributes:
-        topics: Topic by role ("scan", "odometry", "imu", "gnss", "pose", "camera"); other roles are found by
-            type.
+        topics: Dict from roles ("scan", "odometry", "imu", "gnss", "pose", "camera") to topics; topics of
+            other roles are found by type.
         T_base_lidar: Extrinsics of the LiDAR; None means those of the source, else identity.
         seed: Random seed of simulated runs.
         as_live: Of the recording of a live run: read only the messages that the live run mapped.
@@ -126,8 +126,9 @@ class Source(Protocol):
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of records left out on opening and so far in the latest reading, by reason, e.g. {"scans
-        without points": 3}. Each call of `records` begins a new count; empty if nothing was left out."""
+        """dict from reasons to numbers of records left out on opening and so far in the latest reading, e.g.
+        {"scans without points": 3}. Each call of `records` begins a new count; empty if nothing was left
+        out."""
 
     def records(self) -> Iterator[Record]:
         """Yield all records in the order of time."""
@@ -160,7 +161,7 @@ class FileSource:
 
     @property
     def losses(self) -> dict[str, int]:
-        """Number of records left out on opening and in the latest reading, by reason; a new dictionary."""
+        """New dict from reasons to numbers of records left out on opening and in the latest reading."""
         total = dict(self._damage)
         for reason, number in self._losses.items():
             count_loss(total, reason, number)
@@ -175,8 +176,8 @@ class FileSource:
 
 
 def count_loss(losses: dict[str, int], reason: str, number: int = 1) -> None:
-    """Add a number of left-out records to the losses of one reason, in place. A new reason is added also with
-    the number 0, so callers check it before."""
+    """Add a number of left-out records to the losses of one reason, in place. A new reason is added even if
+    the number is 0."""
     losses[reason] = losses.get(reason, 0) + number
 
 

@@ -29,7 +29,7 @@ class Camera:
     """A pinhole camera on the robot, without lens distortion.
 
     Attributes:
-        topic: Topic of its pictures.
+        topic: Topic of the pictures.
         width, height: Size of a picture [pixels].
         K: Camera matrix, shape (3, 3) [pixels].
         T_base_camera: Extrinsics; the axes of the camera are x right, y down, z ahead.
@@ -60,10 +60,10 @@ class Picture:
     """One picture as it was recorded.
 
     Attributes:
-        stamp_ns: Time of the picture.
+        stamp_ns: Time of the picture [ns].
         encoding: "" for a file (JPEG, PNG), else the encoding of raw pixels, e.g. "rgb8".
         width, height, step: Size of raw pixels and bytes per row; 0 for a file.
-        data: Bytes.
+        data: Bytes of the file or of the raw pixels.
     """
 
     stamp_ns: int
@@ -78,13 +78,13 @@ def find_camera(
     container: Container, tree: TransformTree, base: str, topic: str
 ) -> tuple[Camera | None, str]:
     """Return the camera of a topic and "", or None and the reason. Of the CameraInfo topics, the one with the
-    most similar name is used, and of its first 20 messages the first valid one. Its distortion is ignored.
+    most similar name is used, and of its first 20 messages the first valid one. The distortion is ignored.
 
     Args:
         container: The recording.
         tree: Fixed transforms.
         base: Name of the base frame.
-        topic: Topic of its pictures.
+        topic: Topic of the pictures.
     """
     channels: dict[int, Channel] = {channel.number: channel for channel in container.channels}
     near = sorted(
@@ -124,7 +124,7 @@ def picture_of(message: Message, channels: Mapping[int, Channel], stamp_ns: int)
 
     Args:
         message: Image or CompressedImage.
-        channels: Channels by number.
+        channels: Dict from numbers to channels.
         stamp_ns: Time of the picture [ns].
     """
     if len(message.payload) > BYTES_LIMIT:
@@ -151,11 +151,11 @@ SHOWN_NS = 1_000_000_000
 
 
 def nearest(stamps: Int, wanted_ns: Int) -> tuple[Int, Bool]:
-    """Return the stamp nearest to each time, and whether it is close enough to be of the same place.
+    """Return the stamp nearest to each time, and whether it is within SAME_TIME_NS of the time.
 
     Args:
-        stamps: Stamps in ascending order [ns], shape (N,), N >= 1.
-        wanted_ns: Times [ns], shape (M,).
+        stamps: Stamps of pictures in ascending order, shape (N,), N >= 1 [ns].
+        wanted_ns: Times for which stamps are searched, shape (M,) [ns].
 
     Returns:
         The nearest stamps [ns], shape (M,), the earlier one of two that are equally near; and whether each
@@ -195,7 +195,7 @@ def time_beside(stamp_ns: int | None, log_ns: int, offset_ns: int) -> int:
     stamp is missing, 0, or of another clock (_OTHER_CLOCK_NS).
 
     Args:
-        stamp_ns: Stamp in its message, None without one.
+        stamp_ns: Stamp in the message of the picture [ns]; None if there is none.
         log_ns: Time of arrival [ns].
         offset_ns: Stamp minus arrival of the first scan of the run [ns].
     """
@@ -241,8 +241,8 @@ class MessageSource(FileSource):
         raise NotImplementedError
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a picture [ns] by the stamp in its message (None without one), or None if it is
-        impossible. Subclasses implement it."""
+        """Return the time of a picture [ns] by the stamp in its message (None if there is none), or None if
+        it is impossible. Subclasses implement it."""
         raise NotImplementedError
 
     def picture_stamps(self) -> list[int]:

@@ -32,7 +32,7 @@ def open_cloud(uri: str) -> WholeCloud:
     """Open a whole cloud by its first bytes or its suffix: E57, LAS or LAZ, else a PLY, NumPy or PCD file.
 
     Raises:
-        SourceError: It does not exist, has an unknown format, or is damaged.
+        SourceError: The file does not exist, has an unknown format, or is damaged.
     """
     try:
         path = Path(uri).expanduser()
@@ -52,14 +52,15 @@ def open_cloud(uri: str) -> WholeCloud:
 
 
 def is_place(xyz: Float) -> NDArray[np.bool_]:
-    """Return which rows of shape (N, 3) [m] are finite and within the limit of coordinates, shape (N,)."""
+    """Return which positions, shape (N, 3) [m], are finite with magnitudes below COORDINATE_LIMIT, shape
+    (N,)."""
     with np.errstate(invalid="ignore"):
         return np.asarray((np.isfinite(xyz) & (np.abs(xyz) < COORDINATE_LIMIT)).all(axis=1))
 
 
 def offset_for(middle: Float) -> Float:
-    """Return the offset of a cloud by a position in it, shape (3,) [m]: per axis 0 below 1000 m in magnitude,
-    else rounded to 100 m.
+    """Return the offset of a cloud by a position in it, shape (3,) [m]: per axis, 0 for a magnitude below
+    1000 m, else the position rounded to 100 m.
 
     The offset has whole hundreds of metres, so 32 bits hold the rest of the coordinates without loss.
     """
@@ -72,12 +73,12 @@ class CloudFile:
     A subclass opens the file (`_open`), calls `_describe`, and yields the points (`_read`).
 
     Args:
-        uri: As the user wrote it.
+        uri: Path as the user wrote it.
         path: The file.
 
     Raises:
-        SourceError: It has another format, or is damaged.
-        OSError: It cannot be read.
+        SourceError: The file has another format, is damaged, or has no valid point.
+        OSError: The file cannot be read.
     """
 
     name: str  # of the format, in errors
@@ -87,8 +88,8 @@ class CloudFile:
         """Open the file and read its description and its first points.
 
         Raises:
-            SourceError: It has another format, is damaged, or has no valid point.
-            OSError: It cannot be read.
+            SourceError: The file has another format, is damaged, or has no valid point.
+            OSError: The file cannot be read.
         """
         self._uri, self._path = uri, path
         self.losses: dict[str, int] = {}
@@ -97,12 +98,12 @@ class CloudFile:
 
     def parts(self) -> Iterator[Float32]:
         """Yield all points part by part, relative to `description.offset`, float32, shape (N, 3) [m]; parts
-        may be empty. `losses` is reset; points without coordinates, and those missing after a damage, are
+        may be empty. `losses` is reset; points without valid coordinates, and those missing after damage, are
         counted in it.
 
         Raises:
             SourceError: The file is damaged before its first point.
-            OSError: It cannot be read.
+            OSError: The file cannot be read.
         """
         self.losses = {}
         read = 0
@@ -151,8 +152,7 @@ class CloudFile:
 
     @contextmanager
     def _one_error(self) -> Iterator[None]:
-        """Turn whatever a library raises for a damaged file into a SourceError; SourceError and OSError pass
-        unchanged."""
+        """Raise any exception of a library as a SourceError; SourceError and OSError pass unchanged."""
         try:
             yield
         except (SourceError, OSError):
@@ -177,9 +177,9 @@ class TableCloud(CloudFile):
         """Return the description by the header of the table, which is stored for reading.
 
         Raises:
-            ScanFileError: It is no such table, or its data is damaged.
+            ScanFileError: The file is not such a table, or its data is damaged.
             SourceError: No point has valid coordinates.
-            OSError: It cannot be read.
+            OSError: The file cannot be read.
         """
         self._table = table = open_table(self._path)
         attributes = tuple(name for name in table.names if name not in ("x", "y", "z"))
@@ -271,9 +271,9 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
         and the version.
 
     Raises:
-        SourceError: It is no LAS file, the sizes contradict each other, there are no or too many points, or
-            none before the first damage.
-        OSError: It cannot be read.
+        SourceError: The file is not a LAS file, the sizes contradict each other, there are no or too many
+            points, or none before the first damage.
+        OSError: The file cannot be read.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -311,7 +311,8 @@ def _check_las(path: Path, uri: str) -> tuple[int, int, bool, str]:
 def _check_items(
     file: IO[bytes], at: int, end: int, records: int, length: int, uri: str
 ) -> tuple[bytes, int]:
-    """Check that the compressed items of a point are together as long as a point (LASzip, `laszip.check`).
+    """Check that the sum of the lengths of the compressed items of a point is the length of a point (LASzip,
+    `laszip.check`).
 
     The decoder allocates memory by their sizes: up to 65,535 bytes per point.
 
@@ -323,7 +324,7 @@ def _check_items(
         uri: Name of the file in errors.
 
     Returns:
-        The record of LASzip, b"" if there is none, and the number of layers of a chunk; 0 without layers.
+        The record of LASzip, b"" if there is none, and the number of layers of a chunk, 0 if it has none.
 
     Raises:
         SourceError: The lengths differ.
@@ -351,7 +352,7 @@ def _check_items(
 def _points_before_damage(file: IO[bytes], first: int, length: int, record: bytes, layers: int) -> int:
     """Return the number of points in the chunks before the first one whose layers are longer than the chunk.
 
-    The decoder allocates memory by the lengths of the layers.
+    A chunk that is cut off also ends the count.
 
     Args:
         file: The opened file.
@@ -401,7 +402,7 @@ def _check_chunks(file: IO[bytes], first: int, size: int, uri: str) -> None:
 
 def _crs_of(header: laspy.LasHeader) -> str:
     """Return the coordinate reference system of the header: WKT, or "EPSG:" with the number of the projected
-    or else geographic system; "" without one."""
+    or else geographic system; "" if there is none."""
     for record in header.vlrs:
         if record.record_id == 2112:
             wkt = str(getattr(record, "string", "")).strip("\0 \n")
@@ -465,7 +466,8 @@ class E57Cloud(CloudFile):
                     yield len(xyz), xyz
 
     def _station(self, file: Any, station: int) -> Iterator[Float]:  # noqa: ANN401 - pye57 has no types
-        """Yield the points of a station in the frame of the file, (N, 3) [m]; NaN for invalid ones.
+        """Yield the points of a station in the frame of the file in parts, shape (N, 3) [m]; NaN for invalid
+        ones.
 
         Raises:
             SourceError: The points have no coordinates.
@@ -503,16 +505,16 @@ class E57Cloud(CloudFile):
 
 
 def _pose(header: Any) -> tuple[Float, Float]:  # noqa: ANN401
-    """Return rotation (3, 3) and translation (3,) [m] of a station in the frame of the file; identity by
-    default."""
+    """Return rotation, shape (3, 3), and translation, shape (3,) [m], of a station in the frame of the file;
+    those of the identity if the header has no pose."""
     if not header.has_pose():
         return np.eye(3), np.zeros(3)
     return np.asarray(header.rotation_matrix, np.float64), np.asarray(header.translation, np.float64)
 
 
 def _cartesian(columns: dict[str, Float], axes: tuple[str, ...]) -> Float:
-    """Return positions, shape (N, 3) [m], from the three columns `axes`: Cartesian, or range [m], azimuth and
-    elevation [rad]."""
+    """Return positions, shape (N, 3) [m], from the three columns of `columns` with the names `axes`:
+    Cartesian, or range [m], azimuth and elevation [rad]."""
     first, second, third = (columns[name] for name in axes)
     if axes == _CARTESIAN:
         return np.stack([first, second, third], axis=1)

@@ -44,9 +44,9 @@ class Channel:
 
     Attributes:
         number: Number of the channel in the file.
-        topic: e.g. "/velodyne_points".
-        msgtype: In the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
-        encoding: "cdr" (ROS 2), "ros1", or "" when the file does not name it.
+        topic: Name of the topic, e.g. "/velodyne_points".
+        msgtype: Message type in the ROS 2 spelling, e.g. "sensor_msgs/msg/PointCloud2".
+        encoding: Encoding: "cdr" (ROS 2), "ros1", or "" if the file does not name it.
         count: Number of messages.
     """
 
@@ -59,7 +59,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A recorded message: number of its channel, time of recording, and bytes."""
+    """A recorded message: number of its channel, time of recording [ns], and bytes."""
 
     channel: int
     log_ns: int
@@ -72,8 +72,8 @@ class Container:
     Attributes:
         kind: Name of the format, e.g. "ROS 2 MCAP".
         channels: All channels.
-        damage: Parts that could not be read when the file was opened, by reason.
-        clock_steps: How often the clock of the recorder was set back. Later times are shifted, so
+        damage: Dict from reasons to numbers of parts that could not be read when the file was opened.
+        clock_steps: Number of times that the clock of the recorder was set back. Later times are shifted, so
             that they continue in the order of the file.
     """
 
@@ -100,7 +100,7 @@ class Container:
         Args:
             numbers: Numbers of the channels that are read.
             start_ns: Earlier times of recording [ns] are left out; None for none.
-            losses: Counts the messages that cannot be read, by reason; changed in place.
+            losses: Dict from reasons to numbers of messages that cannot be read; increased in place.
         """
         raise NotImplementedError
 
@@ -108,7 +108,7 @@ class Container:
         """Return the bytes of a file attached to the recording, None when there is none of this name.
 
         Raises:
-            SourceError: It is longer than `limit` bytes or damaged.
+            SourceError: The attachment is longer than `limit` bytes or damaged.
         """
         del name, limit
         return None
@@ -126,7 +126,7 @@ class IndexedContainer(Container):
 
     def tail_ns(self, numbers: Collection[int]) -> int:
         """Return the time of the last message but two of some channels [ns], of the first one if there are
-        fewer; 0 without any."""
+        fewer; 0 if there is none."""
         rows = np.flatnonzero(np.isin(self.index[:, 0], list(numbers)))
         return int(self.index[rows[-TAIL:][0], 1]) if len(rows) else 0
 
@@ -135,7 +135,7 @@ class IndexedContainer(Container):
     ) -> Iterator[Message]:
         """Yield the messages of some channels in the order of their times of recording, from `start_ns` [ns]
         on (None: all). Those that cannot be read are counted in `losses` as `unreadable`; a payload that
-        cannot be unpacked is b"". SourceError if the disk refuses."""
+        cannot be unpacked is b"". SourceError if the file cannot be read."""
         first = 0 if start_ns is None else int(np.searchsorted(self.index[:, 1], start_ns))
         for row in first + np.flatnonzero(np.isin(self.index[first:, 0], list(numbers))):
             number, log_ns, place = self.index[row].tolist()
@@ -150,8 +150,8 @@ class IndexedContainer(Container):
 
         Args:
             channels: All channels.
-            index: Channel, time of recording [ns] and place of each message in the order of the file, int64,
-                shape (N, 3).
+            index: Channel, time of recording [ns] and location (see `ChunkedFile`) of each message in the
+                order of the file, int64, shape (N, 3).
         """
         self.index = index[np.argsort(index[:, 1], kind="stable")]
         counts = dict(
@@ -164,9 +164,9 @@ class IndexedContainer(Container):
         implement it.
 
         Args:
-            number: Number of its channel.
+            number: Number of the channel of the message.
             log_ns: Time of recording by the index [ns].
-            place: Place of the message.
+            place: Location of the message, the third column of the index.
         """
         raise NotImplementedError
 
@@ -205,7 +205,7 @@ def damaged(what: str, path: object) -> SourceError:
     """Return the error for a file that cannot be read at all.
 
     Args:
-        what: What is wrong with it.
+        what: Description of the damage.
         path: The file.
     """
     return SourceError(what, where=str(path), remedy="Copy the file again, or record it again.")
@@ -281,12 +281,12 @@ class Chunk:
     """A run of records in a file.
 
     Attributes:
-        offset, length: Of the packed bytes.
-        compression: As the file names it, "" for none.
-        size: Bytes after unpacking.
+        offset, length: Offset in the file and length of the packed bytes.
+        compression: Name of the compression in the file; "" for none.
+        size: Number of bytes after unpacking.
         crc: CRC-32 of the unpacked bytes, 0 when the file has none.
-        index: Channel, time of recording [ns] and offset in the unpacked bytes of its messages, int64, shape
-            (N, 3) each; empty if the file has no index of the chunk.
+        index: List of arrays, int64, shape (N, 3), of channel, time of recording [ns] and offset in the
+            unpacked bytes of the messages; empty if the file has no index of the chunk.
         index_is_whole: False if a part of the index may be missing.
     """
 
@@ -303,8 +303,8 @@ class ChunkedFile(IndexedContainer):
     """A file with messages in compressed chunks.
 
     The headers of all records are read, so a file that was cut during a recording gives all its whole chunks.
-    A format reads the records (`_read_index`, `_record`). The place of a message in the index is the number
-    of its chunk (upper 32 bits) and its offset in the unpacked chunk.
+    A format reads the records (`_read_index`, `_record`). The location of a message in the index is the
+    number of its chunk (upper 32 bits) and its offset in the unpacked chunk (lower 32 bits).
 
     Raises:
         SourceError: The file cannot be opened, has another format, or holds no messages that can be read.
@@ -358,7 +358,7 @@ class ChunkedFile(IndexedContainer):
         Subclasses implement it.
 
         Args:
-            end: Length of the file.
+            end: Length of the file [bytes].
 
         Raises:
             SourceError: The file has another format.
@@ -371,18 +371,18 @@ class ChunkedFile(IndexedContainer):
         implement it.
 
         Raises:
-            BrokenChunkError: It cannot be read.
-            DAMAGE: The same.
+            BrokenChunkError: The record cannot be read.
+            DAMAGE: The record cannot be parsed.
         """
         raise NotImplementedError
 
     # --- shared ---
 
     def _read(self, offset: int, size: int) -> bytes:
-        """Return `size` bytes from a position, fewer at the end of the file.
+        """Return `size` bytes from the byte `offset` of the file on, fewer at the end of the file.
 
         Raises:
-            SourceError: The disk refuses.
+            SourceError: The file cannot be read.
         """
         try:
             self._file.seek(offset)
@@ -395,8 +395,8 @@ class ChunkedFile(IndexedContainer):
         because chunks may overlap in time.
 
         Raises:
-            BrokenChunkError: It is damaged.
-            SourceError: The disk refuses.
+            BrokenChunkError: The chunk is damaged.
+            SourceError: The file cannot be read.
         """
         if chunk.offset in self._unpacked:
             raw = self._unpacked.pop(chunk.offset)
@@ -414,7 +414,8 @@ class ChunkedFile(IndexedContainer):
         return sum(len(raw or b"") for raw in self._unpacked.values())
 
     def _unpack(self, chunk: Chunk) -> bytes | None:
-        """Return the unpacked bytes of a chunk, None if it is damaged; SourceError if the disk refuses."""
+        """Return the unpacked bytes of a chunk, None if it is damaged; SourceError if the file cannot be
+        read."""
         try:
             packed = self._read(chunk.offset, chunk.length) if chunk.length <= BLOCK_LIMIT else b""
             raw = unpack(packed, chunk.compression, chunk.size)
@@ -423,9 +424,9 @@ class ChunkedFile(IndexedContainer):
         return raw if not chunk.crc or zlib.crc32(raw) == chunk.crc else None
 
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
-        """Return the message at a place, with its payload as it is stored; None if it cannot be read or is
-        not of the channel `number`. Its time is that of its own record, shifted behind steps of the clock,
-        because the time in the index may be damaged. SourceError if the disk refuses."""
+        """Return the message at the location `place` (see `ChunkedFile`), with its payload as it is stored;
+        None if it cannot be read or is not of the channel `number`. Its time is that of its own record,
+        shifted behind steps of the clock, not that in the index. SourceError if the file cannot be read."""
         del log_ns
         try:
             message, _ = self._record(self._bytes_of(self._chunks[place >> 32]), place & 0xFFFFFFFF)
@@ -439,8 +440,8 @@ class ChunkedFile(IndexedContainer):
     def _rows_of(self, chunk: Chunk) -> Int:
         """Return the index of a chunk in the order of the file, int64, shape (N, 3); it is built from the
         messages of the chunk if the file has no complete one, or an impossible one. Then it ends at the first
-        damaged record, or after MOST_IN_CHUNK messages, which is counted in `damage`. SourceError if the disk
-        refuses."""
+        damaged record, or after MOST_IN_CHUNK messages, which is counted in `damage`. SourceError if the file
+        cannot be read."""
         if chunk.index and chunk.index_is_whole:
             rows = np.concatenate(chunk.index)
             rows = rows[np.argsort(rows[:, 2], kind="stable")]

@@ -64,7 +64,7 @@ class MessageList(Container):
         self.channels = [replace(channel, count=counts[channel.number]) for channel in channels]
 
     def tail_ns(self, numbers: Collection[int]) -> int:
-        """Return the time of the last message of some channels [ns], 0 without one."""
+        """Return the time of the last message of some channels [ns], 0 if there is none."""
         return max((m.log_ns for m in self._messages if m.channel in numbers), default=0)
 
     def messages(
@@ -90,8 +90,9 @@ class ArrivalReader:
         options: Topics and extrinsics chosen by the user.
 
     Attributes:
-        description: None until a second after the first scan, or until ten scans.
-        losses: Records left out so far, by reason.
+        description: Description of the source; None until OPENING_NS after the first scan, or until
+            OPENING_SCANS scans.
+        losses: Dict from reasons to numbers of records left out so far.
     """
 
     def __init__(self, uri: str, kind: str, channels: Sequence[Channel], options: SourceOptions) -> None:
@@ -167,7 +168,7 @@ class ArrivalReader:
         another OPENING_NS from `now_ns` on and return [].
 
         Raises:
-            SourceError: That failed _TRIES times.
+            SourceError: No scan could be read _TRIES times.
         """
         heard = MessageList(self._kind, self._channels, self._opening)
         try:
@@ -185,7 +186,7 @@ class ArrivalReader:
 
     def _records_of(self, source: RosSource, message: Message) -> list[Record]:
         """Return the records of a message, after notices of the source with the time of the first record (0
-        without one)."""
+        if there is none)."""
         records = list(source.records_of(message, self.losses))
         if source.notices:
             stamp_ns = records[0].stamp_ns if records else 0
@@ -221,9 +222,10 @@ class LiveCamera:
         self._found: tuple[str, Camera | None, str] | None = None
 
     def add(self, message: Message) -> bool:
-        """Process a message of any channel: store pictures (the last MOST_PICTURES, MOST_BYTES), the latest
-        CameraInfo and the first _MOST_FIXED fixed transforms, larger ones than _LARGEST_STORED omitted.
-        Return whether only the camera uses it."""
+        """Process a message of any channel: store pictures (at most the last MOST_PICTURES and MOST_BYTES),
+        the latest CameraInfo and the first _MOST_FIXED fixed transforms; CameraInfo and transforms larger
+        than _LARGEST_STORED are omitted. Return whether the message is a picture or CameraInfo, which only
+        the camera uses."""
         number = message.channel
         if number not in self._numbers:
             if number in self._channels and len(self._fixed) < _MOST_FIXED:
@@ -282,7 +284,7 @@ class LiveCamera:
 
 def fixed_transforms(container: Container) -> TransformTree:
     """Return the fixed transforms in the first FIXED_MESSAGES messages of the topics "tf_static" of a
-    container; without any, an empty tree."""
+    container; an empty tree if there are none."""
     mounting = Extrinsics(container)
     mounting.read(frozenset(c.number for c in container.channels if is_fixed(c.topic)), frozenset())
     return mounting.tree
@@ -304,7 +306,8 @@ class LiveRunHeader(msgspec.Struct, frozen=True):
     Attributes:
         version: Version of this record.
         uri: Address of the robot.
-        topics: Topics that were read, in the order of their channel numbers; the first one has the scans.
+        topics: Topics that were read, in the order of their channel numbers; the first topic is that of the
+            scans.
         seed, odometry, preset: Settings of the run.
         camera: Topics of pictures and their CameraInfo, which are not mapped.
     """
@@ -324,10 +327,10 @@ def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
 
     Args:
         container: The file.
-        where: Its name in errors.
+        where: Name of the file in errors.
 
     Raises:
-        SourceError: They are of another version, or name no topic or more than _MOST_TOPICS.
+        SourceError: The settings are of another version, or name no topic or more than _MOST_TOPICS.
     """
     try:
         content = container.attachment(NAME, _LIMIT)
@@ -346,14 +349,14 @@ class LiveRecording(MessageSource):
     """Source that reads the recording of a live run: the same records in the same order.
 
     Args:
-        uri: As the user wrote it.
+        uri: Path of the recording as the user wrote it.
         container: The recording; the source closes it.
         run: Settings of the live run.
         paths: Files of the recording, for the digest.
-        options: Extrinsics, where the user knows better.
+        options: Choices of the user.
 
     Raises:
-        SourceError: It has no scan that can be read.
+        SourceError: A topic is missing, or the recording has no scan that can be read.
     """
 
     def __init__(
@@ -403,7 +406,8 @@ class LiveRecording(MessageSource):
         return ArrivalReader(self._uri, KIND, self._channels, self._options)
 
     def _opened_reader(self) -> ArrivalReader:
-        """Return a reader that has read up to its description, or to the end; without a scan it has none.
+        """Return a reader that has read up to its description, or to the end; if there is no scan, its
+        description is None.
 
         Raises:
             SourceError: None of the scans can be read.
@@ -422,7 +426,7 @@ class LiveRecording(MessageSource):
         only its last parameters apply, from the first scan on, and a warning is added.
 
         Args:
-            known: Description of its first messages as a live run.
+            known: Description of the first messages of the recording as a live run.
             paths: Files of the recording.
 
         Raises:
@@ -464,8 +468,8 @@ class LiveRecording(MessageSource):
                 yield message
 
     def _read_skipped(self) -> dict[int, set[int]]:
-        """Return the log times [ns] of the messages that the live run did not map, by channel; at most
-        _MOST_SKIPPED are read, later notes are ignored."""
+        """Return a dict from numbers of channels to the log times [ns] of the messages that the live run did
+        not map. At most _MOST_SKIPPED times are read; later notes are ignored."""
         skipped: dict[int, set[int]] = {c.number: set() for c in self._channels}
         numbers = {c.topic: c.number for c in self._channels}
         total = 0
@@ -526,12 +530,12 @@ def open_recording(uri: str, path: Path, options: SourceOptions) -> Source:
     read.
 
     Args:
-        uri: As the user wrote it.
+        uri: Path as the user wrote it.
         path: A file (.mcap, .db3, .bag), or the folder that a ROS 2 recorder wrote.
         options: Choices of the user.
 
     Raises:
-        SourceError: It is no recording that can be read, or has no scans.
+        SourceError: The recording cannot be read, or has no scans.
         OSError: A file or folder cannot be read.
     """
     paths = bag_files(path) if path.is_dir() else [path]

@@ -44,7 +44,7 @@ class McapFile(ChunkedFile):
     """An MCAP file as a container of messages.
 
     Raises:
-        SourceError: It cannot be opened, is not an MCAP file, or has no channels.
+        SourceError: The file cannot be opened, is not an MCAP file, or has no channels.
     """
 
     kind = "ROS 2 MCAP"
@@ -53,7 +53,7 @@ class McapFile(ChunkedFile):
         """Return the bytes of the first attachment of a name, None if there is none.
 
         Raises:
-            SourceError: It is longer than `limit` bytes, is damaged, or has a wrong checksum.
+            SourceError: The attachment is longer than `limit` bytes, is damaged, or has a wrong checksum.
         """
         for opcode, offset, length in self._further:
             if opcode != Opcode.ATTACHMENT or _attachment_name(self._read(offset, 4096)) != name:
@@ -75,10 +75,10 @@ class McapFile(ChunkedFile):
 
     def whole_records(self) -> Iterator[records.McapRecord]:
         """Yield all definitions, attachments, metadata and messages that can be read; other chunks and
-        records are counted in `damage`. Attachments with a wrong checksum are among these. Chunks are yielded
-        in the order of the file, with the times that they have there, and with their own definitions, which
-        repeat earlier ones. Of a chunk that is damaged in part the records before the damage are yielded.
-        SourceError if the disk refuses."""
+        records are counted in `damage`. Attachments with a wrong checksum count as damaged. Chunks are
+        yielded in the order of the file, with the times that they have there, and with their own definitions,
+        which repeat earlier ones. Of a chunk that is damaged in part the records before the damage are
+        yielded. SourceError if the file cannot be read."""
         yield from self._schemas.values()
         yield from self._definitions.values()
         for opcode, offset, length in self._further:
@@ -113,7 +113,7 @@ class McapFile(ChunkedFile):
         summary for later chunks and count the bytes in between as damage.
 
         Raises:
-            SourceError: The file is no MCAP file.
+            SourceError: The file is not an MCAP file.
         """
         self._schemas: dict[int, records.Schema] = {}
         self._definitions: dict[int, records.Channel] = {}
@@ -143,8 +143,8 @@ class McapFile(ChunkedFile):
                 count_loss(self.damage, NOT_FINISHED)
 
     def _read_summary(self, after: int) -> int:
-        """Add the channels of the summary and the chunks after a position [bytes]; return where these chunks
-        begin, 0 without a summary or chunk."""
+        """Add the channels of the summary and the chunks after a position [bytes]; return the position
+        [bytes] at which the first of these chunks begins, 0 if there is no summary or no such chunk."""
         try:
             with self._path.open("rb") as file:
                 summary = SeekingReader(file, record_size_limit=BLOCK_LIMIT).get_summary()
@@ -169,7 +169,7 @@ class McapFile(ChunkedFile):
 
         Args:
             opcode: Type of the record.
-            body: First byte of its contents in the file.
+            body: Position of its contents in the file [bytes].
             length: Length of its contents [bytes].
         """
         try:
@@ -183,15 +183,15 @@ class McapFile(ChunkedFile):
 
     def _take(self, opcode: int, body: int, length: int) -> None:
         """Store the contents of a record: type, channel, chunk, its index, or message; of an attachment or
-        metadata the position. Other kinds are ignored.
+        metadata, only the position is stored. Other kinds are ignored.
 
         Args:
             opcode: Kind of the record.
-            body: Position of its contents in the file.
+            body: Position of its contents in the file [bytes].
             length: Length of its contents [bytes].
 
         Raises:
-            DAMAGE: It is damaged.
+            DAMAGE: The record is damaged.
         """
         match opcode:
             case Opcode.SCHEMA | Opcode.CHANNEL:
@@ -235,7 +235,8 @@ class McapFile(ChunkedFile):
             self._add_channel(records.Channel.read(stream))
 
     def _add_channel(self, channel: records.Channel) -> None:
-        """Add a channel; without a known schema its type is "". An earlier one of this number is replaced."""
+        """Add a channel; if its schema is unknown, its type is "". An earlier channel with the same number is
+        replaced."""
         schema = self._schemas.get(channel.schema_id)
         msgtype = "" if schema is None else ros2_type_name(schema.name)
         self._definitions[channel.id] = channel
@@ -257,7 +258,7 @@ class McapFile(ChunkedFile):
 
         Raises:
             BrokenChunkError: The record is longer than the chunk, or its time is impossible.
-            DAMAGE: It cannot be parsed.
+            DAMAGE: The record cannot be parsed.
         """
         opcode, length = RECORD.unpack_from(raw, at)
         at += RECORD.size

@@ -38,12 +38,12 @@ class RigidFit:
 
     Attributes:
         T_map_other: The rigid motion.
-        centre: Centre of the path it was fitted to, in the map [m], shape (2,).
+        centre: Centre of the fitted part of the path in the map, shape (2,) [m].
         sigma: Standard deviation of the shift [m].
         yaw_sigma: Standard deviation of the rotation [rad].
         residual: RMS distance of the positions from the path [m].
-        length: Extent of the path it was fitted to [m].
-        rate_hz: Rate of the positions; their errors change slowly, so those of a second count as one.
+        length: Extent of the fitted part of the path [m].
+        rate_hz: Rate of the positions [Hz]; the positions of one second count as one.
     """
 
     T_map_other: Pose2
@@ -62,7 +62,7 @@ class RigidFit:
         Args:
             x, y: Position in the map [m].
             sigma: Standard deviation of the shift of the frame [m].
-            yaw_sigma: Standard deviation of its rotation about `centre` [rad].
+            yaw_sigma: Standard deviation of the rotation of the frame about `centre` [rad].
             heading_sigma: Standard deviation of the difference of the headings [rad].
         """
         dx, dy = x - self.centre[0], y - self.centre[1]
@@ -80,7 +80,7 @@ def interpolated(at_ns: Int, stamp_ns: Sequence[int], path: Float) -> Float:
     its end values apply.
 
     Args:
-        at_ns: Times [ns], shape (K,).
+        at_ns: Times of the result, shape (K,) [ns].
         stamp_ns: Times of the path, ascending [ns], length N > 0.
         path: Columns of the path, shape (N, C).
     """
@@ -104,11 +104,11 @@ def fit_rigid(
     """Fit the pose of another frame in the map.
 
     Args:
-        at_ns: Times of the positions, ascending, shape (K,).
-        positions: Positions in the other frame [m], shape (K, 2).
-        sigma: Standard deviation of each position [m], shape (K,).
-        stamp_ns: Times of the odometry, ascending, shape (N,).
-        path: Positions of the base by odometry in the map frame [m], shape (N, 2).
+        at_ns: Times of the positions, ascending, shape (K,) [ns].
+        positions: Positions in the other frame, shape (K, 2) [m].
+        sigma: Standard deviation of each position, shape (K,) [m].
+        stamp_ns: Times of the odometry, ascending, shape (N,) [ns].
+        path: Positions of the base by odometry in the map frame, shape (N, 2) [m].
         shortest: Shortest extent of the path for a fit [m].
         what, unknown: For messages: name of the positions, and what a short path does not determine.
 
@@ -163,7 +163,7 @@ class Fix:
     """A position by GNSS.
 
     Attributes:
-        stamp_ns: Time.
+        stamp_ns: Time [ns].
         latitude, longitude: WGS84 [deg].
         sigma: Standard deviation of each horizontal coordinate [m].
     """
@@ -233,7 +233,7 @@ class GnssFrame:
     Attributes:
         plane: Projection of fixes.
         fit: Pose of the plane in the map.
-        lever: Distance of the antenna from the base [m]; it counts as an error.
+        lever: Horizontal distance of the antenna from the base [m]; it counts as an error.
     """
 
     plane: Plane
@@ -255,9 +255,9 @@ class GnssFrame:
         )
 
     def measurement(self, fix: Fix) -> PoseMeasurement:
-        """Return a fix as measurement of the position of the base in the map, with the errors of the fix, the
-        lever and the plane; those of the fixes of one second count as one. Its heading is unknown: yaw 0 with
-        the variance NO_HEADING."""
+        """Return a fix as measurement of the position of the base in the map, with the errors of the fix, of
+        the distance of the antenna and of the plane; those of the fixes of one second count as one. Its
+        heading is unknown: yaw 0 with the variance NO_HEADING."""
         T = self.fit.T_map_other
         c, s = math.cos(T.yaw), math.sin(T.yaw)
         east, north = self.plane.place(fix)
@@ -277,9 +277,10 @@ def align_fixes(
 
     Args:
         fixes: Fixes in the order of time; the first one is the origin of the plane.
-        stamp_ns: Times of the odometry, ascending, shape (N,).
-        path: Positions of the base by odometry in the map frame [m], shape (N, 2) or with more columns.
-        lever: Distance of the antenna from the base [m].
+        stamp_ns: Times of the odometry, ascending, shape (N,) [ns].
+        path: Positions x, y of the base by odometry in the map frame, shape (N, 2 or more) [m]; further
+            columns are ignored.
+        lever: Horizontal distance of the antenna from the base [m].
 
     Returns:
         The frame and "", or None and the reason why there is none, see `fit_rigid`.
@@ -323,8 +324,8 @@ class OtherPose:
     """Pose of the base by another SLAM, in its map frame.
 
     Attributes:
-        stamp_ns: Time.
-        T_other_base: The pose.
+        stamp_ns: Time [ns].
+        T_other_base: Pose of the base in the other frame.
         covariance: Covariance of x, y [m], yaw [rad] in the other frame, shape (3, 3).
     """
 
@@ -345,9 +346,9 @@ class OtherPose:
 
         Args:
             stamp_ns: Time [ns].
-            T_other_child: Pose in the message.
-            covariance: Covariance of x, y, z [m], roll, pitch, yaw [rad], 36 numbers.
-            T_child_base: Pose of the base in the frame of the message; None for the base itself.
+            T_other_child: Pose in the message, of its child frame in the other frame.
+            covariance: Covariance of x, y, z [m], roll, pitch, yaw [rad], 36 numbers row by row.
+            T_child_base: Pose of the base in the child frame; None if the child frame is the base.
 
         Raises:
             NoPoseError: The covariance in the plane is not finite, not symmetric or not positive definite.
@@ -368,11 +369,11 @@ class OtherFrame:
 
     Attributes:
         fit: Pose of the other frame by positions.
-        sigma: Standard deviation of its shift [m], with the drift of the odometry.
-        yaw_sigma: Standard deviation of its rotation [rad], with the drift of the odometry.
+        sigma: Standard deviation of the shift of the frame [m], with the drift of the odometry.
+        yaw_sigma: Standard deviation of the rotation of the frame [rad], with the drift of the odometry.
         turn: Heading in the map minus heading in the other map [rad], None when headings cannot be used.
         turn_sigma: Standard deviation of `turn` [rad].
-        from_ns: End of the stretch; later poses count.
+        from_ns: Time of the end of the fitted stretch [ns]; only later poses are used.
     """
 
     fit: RigidFit
@@ -395,8 +396,8 @@ class OtherFrame:
 
     def measurement(self, pose: OtherPose) -> PoseMeasurement | None:
         """Return the pose in the map with the errors of the pose and of the frame, and the gate GATE; those
-        of the poses of one second count as one. None for poses up to and at `from_ns`, which do not count.
-        Without `turn` the heading is unknown: yaw 0 with the variance NO_HEADING."""
+        of the poses of one second count as one. None for a pose that is not later than `from_ns`. If `turn`
+        is None, the heading is unknown: yaw 0 with the variance NO_HEADING."""
         if pose.stamp_ns <= self.from_ns:
             return None
         T, rate = self.fit.T_map_other, max(self.fit.rate_hz, 1.0)
@@ -421,8 +422,8 @@ def align_poses(
     """Fit the pose of the other frame in the map.
 
     Args:
-        poses: In the order of time.
-        stamp_ns: Times of the odometry, ascending, shape (N,).
+        poses: Poses in the order of time.
+        stamp_ns: Times of the odometry, ascending, shape (N,) [ns].
         path: Poses of the base by odometry in the map frame: x, y [m], yaw [rad], shape (N, 3).
 
     Returns:
@@ -477,12 +478,13 @@ class _Kind:
 
     Attributes:
         role: "gnss" or "pose".
-        field: Field of `SourceDescription` that describes their use.
+        field: Field of `SourceDescription` that describes the use of the readings.
         title, plural, short, unknown: For messages: name, plural, short plural, and what a short drive does
             not determine.
-        read: Decodes a message: the reading, None when there is none in it, and the name of its frame.
-        align: Fits the frame: readings, times and poses of the odometry, lever -> frame, or None and the
-            reason.
+        read: Function of a message and its time [ns] that returns the reading, None if the message has none,
+            and the name of its frame.
+        align: Function of readings, times [ns] and poses of the odometry, and distance of the sensor from the
+            base [m] that returns the frame and "", or None and the reason.
         shortest, longest: Distance from the start for the first fit, and for the last one [m].
         early: Whether a recording uses the first good fit, as a live run does, or the last one.
     """
@@ -509,11 +511,11 @@ class FrameAlignment:
         decoder: Decoder of the messages.
         kind: Kind of the readings.
         readings, odometry: Numbers of the channels of the readings and of the odometry.
-        start_ns: Time of the first scan, which is the origin of the map.
+        start_ns: Time of the first scan [ns]; the pose at this time is the origin of the map.
         early: Whether a fit before `kind.longest` is accepted.
 
     Attributes:
-        refused: Why the readings are not used, "" while that is open.
+        refused: Reason why the readings are not used; "" while this is not decided.
     """
 
     def __init__(
@@ -562,8 +564,8 @@ class FrameAlignment:
         return found, why
 
     def _add_odometry(self, odometry: Odometry) -> None:
-        """Add a pose to the path, unless it is less than _APART_NS after the last one. The pose nearest to
-        the first scan becomes the origin of the map."""
+        """Add a pose to the path, unless it is less than _APART_NS after the last one. The pose nearest in
+        time to the first scan becomes the origin of the map."""
         off_ns = abs(odometry.stamp_ns - self._start_ns)
         if self._origin is None or off_ns < abs(self._origin[0] - self._start_ns):
             self._origin = (odometry.stamp_ns, odometry.T_odom_base)
@@ -607,8 +609,10 @@ class FrameAlignment:
         return found if found is not None and found.yaw_sigma <= NORTH_SIGMA else None
 
     def _fit(self, T_odom_start: Pose3) -> tuple[Any, str]:
-        """Return the frame by all readings so far and "", or None and the reason. `T_odom_start` is the pose
-        of the base at the origin of the map."""
+        """Fit the frame to all readings so far with `kind.align`. Return the frame (GnssFrame or OtherFrame)
+        and "", or None and the reason why it is unknown. The map frame is the planar pose `T_odom_start` of
+        the base at the first scan. The horizontal distance of the sensor from the base is 0 if the transforms
+        do not contain it."""
         start = T_odom_start.planar().inverse()
         path = np.array([(start @ pose.planar()).as_array() for _, pose in self._path])
         linked = self._decoder.place_of(self._frame)
@@ -621,10 +625,11 @@ class FrameAlignments:
 
     Args:
         container: The messages that are known when the source is opened.
-        decoder: Decoder of the messages; it gets the frames.
+        decoder: Decoder of the messages; the frames are stored in its `frames`.
         topics: Topics that are read.
         odometry: Numbers of the channels of odometry.
-        times_of: Yields what a message contains with its times.
+        times_of: Function of a message and a dict of losses that yields the contents of the message with
+            their times.
 
     Attributes:
         numbers: Channels whose messages are used, or may be used later.
@@ -657,8 +662,8 @@ class FrameAlignments:
 
     def begin(self, description: SourceDescription, *, live: bool) -> SourceDescription:
         """Align the frames of a recording, or prepare the alignment for a live run. Frames that are found are
-        passed to the decoder. Return the description with how the readings are used, or with a warning why
-        they are not.
+        stored in `frames` of the decoder by role. Return the description with how the readings are used, or
+        with a warning why they are not.
 
         Args:
             description: Description of the source.
@@ -710,8 +715,8 @@ class FrameAlignments:
             self._open.remove(alignment)
 
     def _align_recording(self, alignment: FrameAlignment) -> tuple[Any, str]:
-        """Return the frame by the first _MOST_READINGS messages of a recording and a text that does not
-        count, or None and the reason. Reading ends when the frame is known or refused."""
+        """Return the frame by the first _MOST_READINGS messages of a recording and a text to be ignored, or
+        None and the reason why the frame is unknown. Reading ends when the frame is known or refused."""
         messages = self._container.messages(alignment.readings | self._odometry, None, {})
         for message in islice(messages, _MOST_READINGS):
             for stamped in self._times_of(message, {}):

@@ -50,11 +50,12 @@ class Clock:
     topics use different clocks, the times of recording are used.
 
     Args:
-        offsets_ns: Stamp minus time of recording of the first message of each topic, None without a stamp.
+        offsets_ns: Stamp minus time of recording of the first message of each topic [ns]; None if it has no
+            stamp.
 
     Attributes:
         by_stamp: Whether stamps are used.
-        offset_ns: Time minus time of recording, roughly.
+        offset_ns: Approximate time of a message minus its time of recording [ns].
     """
 
     def __init__(self, offsets_ns: list[int | None]) -> None:
@@ -68,9 +69,8 @@ class Clock:
 
     def time_of(self, stamp_ns: int | None, message: Message) -> int | None:
         """Return the time of a message [ns]: its stamp, or its time of recording plus `offset_ns` if stamps
-        are not used, or the stamp is missing or does not fit (`is_stepped`). None if that is not in [0,
-        2^63).
-        """
+        are not used, or the stamp is missing or does not fit (`is_stepped`). None if the result is not in [0,
+        2^63)."""
         time_ns = stamp_ns
         if not self.by_stamp or time_ns is None or self.is_stepped(time_ns, message):
             time_ns = message.log_ns + self.offset_ns
@@ -96,9 +96,9 @@ class _ChannelClock:
 class ClockStepFilter(Clock):
     """A clock of a live robot whose times continue evenly when the robot's clock is set (NTP, GNSS, reboot).
 
-    Late messages lower stamp minus arrival, so a step forward is a stamp that is further ahead of its arrival
-    than any before, and a step back is a stamp that is earlier than the newest. The first channel that shows
-    a step measures its size; the others use the same size.
+    A step forward is a stamp minus arrival that exceeds the maximum of the channel by more than STEP_NS; a
+    step back is a stamp that is more than STEP_NS before the newest. The first channel that shows a step
+    measures its size; the others use the same size.
 
     Args:
         offsets_ns: As for Clock.
@@ -115,9 +115,8 @@ class ClockStepFilter(Clock):
     def time_of(self, stamp_ns: int | None, message: Message) -> int | None:
         """Return the time of a message [ns], with the steps of the clock removed; call it in the order of
         arrival. If stamps are not used it is the time of arrival. A stamp that is missing or zero is replaced
-        by the time of arrival plus the known offset. None if such a message, or one with another clock, is
-        the first of its channel. A step adds a notice.
-        """
+        by the time of arrival plus the known offset. None if such a message is the first of its channel, or
+        if the first stamp of the channel is of another clock. A step adds a notice."""
         if not self.by_stamp:
             return message.log_ns
         known = self._channels.get(message.channel)
@@ -170,7 +169,7 @@ class ClockStepFilter(Clock):
 
 @dataclass(frozen=True, slots=True)
 class Stamped(Generic[T_co]):
-    """Contents with a time; of two with the same time the lower rank comes first."""
+    """Contents with a time [ns]; of two with the same time the lower rank comes first."""
 
     stamp_ns: int
     rank: int
@@ -184,7 +183,7 @@ def in_order_of_stamps(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -
 
     Args:
         arrivals: Contents in the order of arrival.
-        losses: Counts contents that are left out; changed in place.
+        losses: Dict from reasons to numbers of contents that are left out; increased in place.
     """
     heap: list[tuple[int, int, int, Stamped[T]]] = []
     newest = last = -(2**63)

@@ -55,9 +55,9 @@ class PointTable:
         kind: Name of the format, e.g. "PLY binary".
         points: Number of points by the header.
         names: Names of the columns with one number per point, in lower case; x, y and z are among them.
-        parts: Yields all points in parts, each with columns of equal length. Numbers need not be finite. A
-            file that is cut or damaged yields the points before the damage. Raises ScanFileError when nothing
-            can be read, and OSError.
+        parts: Function that yields all points in parts, dicts from names to columns of equal length. Numbers
+            need not be finite. Of a file that is cut or damaged, the points before the damage are yielded.
+            Raises ScanFileError if no point can be read, and OSError.
     """
 
     kind: str
@@ -70,8 +70,8 @@ def open_table(path: Path) -> PointTable:
     """Return the table of a file, whose format is found by its contents; only the header is read.
 
     Raises:
-        ScanFileError: It has none of these formats, contradicts itself, or has no x, y and z.
-        OSError: It cannot be read.
+        ScanFileError: The file has none of these formats, contradicts itself, or has no x, y and z.
+        OSError: The file cannot be read.
     """
     with path.open("rb") as file:
         head = file.read(_HEADER_LIMIT)
@@ -88,15 +88,17 @@ def open_table(path: Path) -> PointTable:
 
 
 def read_columns(path: Path, losses: dict[str, int]) -> Columns:
-    """Return all columns of a file by name, shape (N,) each; of a damaged file the points before the damage.
+    """Return a dict from the names of the columns of a file in lower case to the columns, shape (N,) each; of
+    a damaged file, with the points before the damage.
 
     Args:
         path: A PLY, NumPy or PCD file.
-        losses: Counts the points that the header promises and the file does not hold; changed in place.
+        losses: Dict from reasons to numbers; the number of points in the header that the file does not have
+            is added in place.
 
     Raises:
-        ScanFileError: It cannot be read, or promises more than POINT_LIMIT points.
-        OSError: It cannot be read.
+        ScanFileError: No point can be read, or the header has more than POINT_LIMIT points.
+        OSError: The file cannot be read.
     """
     table = open_table(path)
     if table.points > POINT_LIMIT:
@@ -112,8 +114,8 @@ def read_columns(path: Path, losses: dict[str, int]) -> Columns:
 
 
 def _column_names(fields: list[str]) -> list[str]:
-    """Return the names of columns in lower case without the prefix of CloudCompare. Empty and repeated names
-    become "*" and their number; such columns are not used."""
+    """Return the names of columns in lower case without the prefix of CloudCompare. Empty and repeated names,
+    and "_", become "*" and the index of the column; such columns are not used."""
     names: list[str] = []
     for k, field in enumerate(fields):
         name = field.lower().removeprefix("scalar_")
@@ -151,10 +153,10 @@ class _Stream:
     """Binary records of the points, or of some of their columns.
 
     Attributes:
-        start: First byte in the file, or in the member of a zip.
-        dtype: One record.
-        room: Bytes of the file, or of the unpacked member by the directory of the zip.
-        member: Name in the zip, None for other files.
+        start: Offset of the first byte in the file, or in the member of a zip.
+        dtype: Type of one record.
+        room: Size [bytes] of the file, or of the unpacked member by the directory of the zip.
+        member: Name of the member in the zip; None for other files.
     """
 
     start: int
@@ -168,7 +170,7 @@ class _Stream:
         Args:
             path: The file.
             points: Number of points by the header. If the file has fewer, only whole records are yielded.
-            stack: Closes the file, when the caller closes the stack.
+            stack: Stack on which the file is opened; the caller closes it.
         """
         file: IO[bytes]
         if self.member is None:
@@ -189,8 +191,8 @@ class _Stream:
 
 
 def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) -> PointTable:
-    """Return the table of streams with the same points. Its parts end at the first damage; damage before the
-    first point raises ScanFileError.
+    """Return the table of streams with the same points. Its parts end at the first damage; they raise
+    ScanFileError if the data is damaged before the first point.
 
     Args:
         path: The file.
@@ -232,15 +234,15 @@ def _binary_table(path: Path, kind: str, points: int, streams: list[_Stream]) ->
 def _text_table(
     path: Path, kind: str, points: int, dtype: np.dtype[Any], start: int, skipped: int = 0
 ) -> PointTable:
-    """Return the table of lines of text. Damaged lines are left out of its parts; without any valid line
-    ScanFileError is raised.
+    """Return the table of lines of text. Damaged lines are left out of its parts; these raise ScanFileError
+    if no line is valid.
 
     Args:
         path: The file.
         kind: Name of the format.
         points: Number of points by the header.
         dtype: Types of the numbers of a point; a field of several values has its count as shape.
-        start: First byte after the header.
+        start: Offset of the first byte after the header.
         skipped: Number of lines before the points.
 
     Raises:
@@ -293,12 +295,12 @@ _PCD_TYPES |= {(kind, size): f"<{kind.lower()}{size}" for kind in "IU" for size 
 
 
 def _open_pcd(path: Path, head: bytes) -> PointTable:
-    """Return the table of a PCD file with these first bytes.
+    """Return the table of a PCD file, whose first bytes are `head`.
 
     Raises:
         ScanFileError: The header is damaged, lacks x, y or z, or promises too many points, or packed data of
             more than WHOLE_LIMIT bytes.
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     dtype, points, data, start = _pcd_header(head)
     kind = f"PCD {data}"
@@ -335,11 +337,11 @@ def _open_pcd(path: Path, head: bytes) -> PointTable:
 
 def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int]:
     """Return the type of a point, the number of points, the kind of the data ("ascii", "binary" or
-    "binary_compressed"), and the length of the header. A field of several values has its count as shape, and
-    a name that is not used.
+    "binary_compressed"), and the length of the header [bytes]. A field of several values has its count as
+    shape, and a name that is not used.
 
     Raises:
-        ScanFileError: It is not a header of a PCD file, or contradicts itself.
+        ScanFileError: The bytes are not a header of a PCD file, or the header contradicts itself.
     """
     entries: dict[str, list[str]] = {}
     at = 0
@@ -380,7 +382,7 @@ def _pcd_header(head: bytes) -> tuple[np.dtype[np.void], int, str, int]:
 
 
 def _whole_number(word: str) -> int:
-    """Return a decimal number of up to 18 digits.
+    """Return the integer of a word of up to 18 decimal digits.
 
     Raises:
         ValueError: The word is not such a number.
@@ -460,12 +462,17 @@ _PlyElement = tuple[str, int, list[tuple[str, str]]]
 
 
 def _open_ply(path: Path, head: bytes) -> PointTable:
-    """Return the table of the vertices of a PLY file with these first bytes.
+    """Return the table of the first element "vertex", "point" or "points" of a PLY file. Its points are read
+    later.
+
+    Args:
+        path: The file.
+        head: The first bytes of the file, with the whole header.
 
     Raises:
-        ScanFileError: The header is damaged, has no vertices with x, y and z, or has lists in the vertices
-            or, in a binary file, before them.
-        OSError: It cannot be read.
+        ScanFileError: The header is damaged, there is no such element, it has no x, y or z, or it has list
+            properties. In a binary file, also if an element before it has list properties.
+        OSError: The size of a binary file cannot be read.
     """
     order, elements, start = _ply_header(head)
     place = next((k for k, e in enumerate(elements) if e[0] in ("vertex", "point", "points")), None)
@@ -486,10 +493,10 @@ def _open_ply(path: Path, head: bytes) -> PointTable:
 
 
 def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
-    """Return the byte order ("" for text), the elements, and the length of the header.
+    """Return the byte order ("" for text), the elements, and the length of the header [bytes].
 
     Raises:
-        ScanFileError: It is not a header of a PLY file.
+        ScanFileError: The bytes are not a header of a PLY file.
     """
     order: str | None = None
     elements: list[_PlyElement] = []
@@ -532,10 +539,10 @@ class _NumpyArray:
     """An array of an .npy file or of a member of an .npz file.
 
     Attributes:
-        member: Name in the .npz, None for an .npy.
-        start: Bytes of its header.
-        room: Bytes of the file, or of the unpacked member by the directory of the zip.
-        shape, dtype, fortran: As in its header.
+        member: Name of the array in the .npz; None for an .npy.
+        start: Length of the header [bytes].
+        room: Size [bytes] of the file, or of the unpacked member by the directory of the zip.
+        shape, dtype, fortran: Shape, type and order of the array by its header.
     """
 
     member: str | None
@@ -577,8 +584,8 @@ class _NumpyArray:
         return [_Stream(self.start, np.dtype([(name, self.dtype) for name in names]), self.room, self.member)]
 
     def column(self, name: str, number: int = 0) -> _Stream:
-        """Return the stream of the column with this index, whose numbers are stored one after the other,
-        under a name."""
+        """Return the stream of the column with the index `number`, whose numbers are stored one after the
+        other, with the name `name`."""
         start = self.start + number * self.shape[0] * self.dtype.itemsize
         return _Stream(start, np.dtype([(name, self.dtype)]), self.room, self.member)
 
@@ -589,7 +596,7 @@ def _open_npz(path: Path) -> PointTable:
 
     Raises:
         ScanFileError: The file is damaged or has no such array.
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     arrays: dict[str, _NumpyArray] = {}
     reason = "it holds no arrays"
@@ -627,10 +634,10 @@ def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
     Args:
         file: File at the beginning of the array.
         member: Name of the array in an .npz, None for an .npy.
-        size: Bytes of the file or of the unpacked member.
+        size: Size of the file or of the unpacked member [bytes].
 
     Raises:
-        ScanFileError: It is damaged, or the array holds Python objects (pickles) or is too large.
+        ScanFileError: The header is damaged, or the array holds Python objects (pickles) or is too large.
     """
     head = io.BytesIO(file.read(_NPY_HEADER_LIMIT))  # no header decides how much is read
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

@@ -32,13 +32,13 @@ def read_poses(path: Path) -> list[Pose3]:
     """Return poses of the LiDAR (x forward) from a file, one per row.
 
     A row has the 12 numbers of a 3 x 4 matrix. KITTI writes the poses of its left camera (x right, y down, z
-    forward); others write those of the LiDAR. With a file `calib.txt` with a row `Tr:` in the same folder,
-    they are KITTI poses. Otherwise the motion decides: a robot moves along z of a camera or along x of a
-    LiDAR.
+    forward); others write those of the LiDAR. If a file `calib.txt` with a valid row `Tr:` is in the same
+    folder, they are KITTI poses. Otherwise the motion decides: a robot moves along z of a camera or along x
+    of a LiDAR.
 
     Raises:
-        TextError: It has another format, or positions beyond 1e8 m.
-        OSError: It cannot be read.
+        TextError: The file has another format, matrices that are not rotations, or positions beyond 1e8 m.
+        OSError: The file cannot be read.
     """
     rows = read_table(path, 12).reshape(-1, 3, 4)
     _check_positions(rows[:, :, 3])
@@ -60,9 +60,9 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
     shape (N,), or KITTI rows (times None, see `read_poses`).
 
     Raises:
-        TextError: It has neither format, times that do not ascend, quaternions of no length, or positions
-            beyond 1e8 m.
-        OSError: It cannot be read.
+        TextError: The file has neither format, times that do not ascend, a quaternion of length 0, or
+            positions beyond 1e8 m.
+        OSError: The file cannot be read.
     """
     lines = _lines(path)
     if not lines or len(lines[0]) != TUM_COLUMNS:
@@ -102,11 +102,12 @@ def seconds_ns(text: str) -> int:
 
 
 def read_times(path: Path) -> Int:
-    """Read times [ns], int64, shape (N,), one per row, in seconds or as dates with times of day (UTC).
+    """Return the times of a file [ns], int64, shape (N,), one per row, in seconds or as dates with times of
+    day (UTC).
 
     Raises:
-        TextError: It has another format, no rows, or its times go back; equal times are accepted.
-        OSError: It cannot be read.
+        TextError: The file has another format, no rows, or times that decrease; equal times are accepted.
+        OSError: The file cannot be read.
     """
     try:
         times = np.rint(read_table(path, 1) * 1e9).astype(np.int64).ravel()
@@ -131,8 +132,8 @@ def _text(path: Path) -> str:
     """Return the text of a file.
 
     Raises:
-        TextError: It is longer than TEXT_LIMIT, or is not UTF-8.
-        OSError: It cannot be read.
+        TextError: The file is larger than TEXT_LIMIT, or is not UTF-8.
+        OSError: The file cannot be read.
     """
     if path.stat().st_size > TEXT_LIMIT:
         raise TextError(f"it is longer than {TEXT_LIMIT >> 20} MB")
@@ -146,25 +147,26 @@ def _lines(path: Path) -> list[list[str]]:
     """Return the words of each line that is not empty and does not begin with #.
 
     Raises:
-        TextError: It is longer than TEXT_LIMIT, or is not UTF-8.
-        OSError: It cannot be read.
+        TextError: The file is larger than TEXT_LIMIT, or is not UTF-8.
+        OSError: The file cannot be read.
     """
     return [line.split() for line in _text(path).split("\n") if line.strip() and not line.startswith("#")]
 
 
 def read_table(path: Path, columns: int) -> Float:
-    """Read rows of finite numbers with a magnitude below 1e10, shape (rows, columns), at least one row; empty
-    lines and lines that begin with # are skipped.
+    """Return the rows of a file of finite numbers with magnitudes below 1e10, shape (rows, columns), at least
+    one row; empty lines and lines that begin with # are skipped.
 
     Raises:
-        TextError: It has another format.
-        OSError: It cannot be read.
+        TextError: The file has no rows, a row with another number of words, or a word that is not such a
+            number.
+        OSError: The file cannot be read.
     """
     return _table(_lines(path), columns)
 
 
 def _table(lines: list[list[str]], columns: int) -> Float:
-    """Return words as finite numbers below 1e10, shape (rows, columns).
+    """Return the words of lines as finite numbers with magnitudes below 1e10, shape (rows, columns).
 
     Raises:
         TextError: There are no rows, a row has another length, or a word is not such a number.
@@ -181,11 +183,11 @@ def _table(lines: list[list[str]], columns: int) -> Float:
 
 
 def _date(line: str) -> int:
-    """Parse a time like 2011-09-26 13:02:25.964389445 as nanoseconds since 1970 (UTC); further digits are
+    """Return a time like 2011-09-26 13:02:25.964389445 as nanoseconds since 1970 (UTC); further digits are
     ignored.
 
     Raises:
-        TextError: It is no time.
+        TextError: The line is not such a time.
     """
     whole, _, fraction = line.strip().partition(".")
     try:
@@ -230,12 +232,12 @@ _FAR_NS = 1_000_000_000
 
 
 def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
-    """Return the pose interpolated at a time. Outside of the times the nearest pose applies; None if the time
+    """Return the pose interpolated at a time. Outside of the times it is the nearest pose; None if the time
     is more than _FAR_NS from the rows before and after it.
 
     Args:
-        times: Times of the poses, ascending [ns], shape (N,), N >= 1.
-        poses: Poses, N of them.
+        times: Times of the poses, ascending, shape (N,), N >= 1 [ns].
+        poses: The N poses.
         stamp_ns: The time [ns].
     """
     after = int(np.searchsorted(times, stamp_ns))
@@ -251,7 +253,8 @@ def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
 
 
 def between(first: Pose3, second: Pose3, fraction: float) -> Pose3:
-    """Return the pose between two poses: the position on a line, the attitude by slerp the shorter way.
+    """Return the pose between two poses: the position on a line, the attitude by slerp along the smaller
+    rotation.
 
     Args:
         first, second: The poses, finite.
@@ -300,11 +303,11 @@ def parse_table(text: bytes, columns: int) -> tuple[Float, int]:
     damaged and left out; "nan" is a number.
 
     Args:
-        text: ASCII.
+        text: Text in ASCII.
         columns: Numbers per line.
 
     Returns:
-        The numbers, float64 of shape (rows, columns), and how many lines are damaged.
+        The numbers, float64, shape (rows, columns), and the number of damaged lines.
     """
     try:
         with warnings.catch_warnings():

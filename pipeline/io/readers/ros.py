@@ -38,7 +38,7 @@ class RosSource(MessageSource):
     """Source of records from ROS messages, in a recording or live.
 
     Args:
-        uri: As the user wrote it.
+        uri: URI as the user wrote it.
         container: The recording, or the first messages of a live run; the source closes it.
         paths: Files of the recording, for the digest.
         options: Topics and extrinsics chosen by the user.
@@ -48,7 +48,8 @@ class RosSource(MessageSource):
         notices: New messages for the user from `records_of`; whoever shows them clears the list.
 
     Raises:
-        SourceError: It has no scans, or none of the first ones can be read.
+        SourceError: There are no scans, none of the first ones can be read, or a topic chosen by the user
+            does not fit.
     """
 
     def __init__(
@@ -58,7 +59,7 @@ class RosSource(MessageSource):
         poses.
 
         Raises:
-            SourceError: It has no scans, none of the first ones can be read, or a topic chosen by the user
+            SourceError: There are no scans, none of the first ones can be read, or a topic chosen by the user
                 does not fit.
             OSError: A file cannot be read.
         """
@@ -107,7 +108,7 @@ class RosSource(MessageSource):
 
         Args:
             message: The message.
-            losses: Counts contents that cannot be used.
+            losses: Dict from reasons to numbers of contents that cannot be used; increased in place.
         """
         if message.channel in self._wanted or message.channel in self._alignments.numbers:
             for stamped in self._times_of(message, losses):
@@ -120,8 +121,8 @@ class RosSource(MessageSource):
 
     def fixes(self) -> list[Fix]:
         """Return all GNSS fixes of the recording with their times by the clock of the source, in the order of
-        recording. Messages that are damaged, have no fix or an impossible time are left out; [] without a
-        GNSS topic."""
+        recording. Messages that are damaged, have no fix or an impossible time are left out; [] if there is
+        no GNSS topic."""
         found = []
         for message in self._container.messages(self._topics.numbers("gnss"), None, {}):
             for stamped in self._stamped(message, {}):
@@ -151,8 +152,9 @@ class RosSource(MessageSource):
             yield from self._times_of(message, losses)
 
     def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
-        """Yield the contents of a message with their times: the message itself, or the odometry in a message
-        of moving transforms. Impossible times are counted in `losses`."""
+        """Yield the message itself with its time, or, for a channel of moving transforms, each odometry that
+        the message contains with its time; see `_stamped` and `_transforms`. Entries with an impossible time
+        are omitted and counted in `losses`. Errors of decoding transforms are raised."""
         if message.channel in self._moving:
             return self._transforms(message, losses)
         return self._stamped(message, losses)
@@ -190,9 +192,9 @@ class RosSource(MessageSource):
                     yield Stamped(time_ns, 0, Odometry(time_ns, pose))
 
     def _upright(self, scan: Scan) -> Scan:
-        """Return a scan whose rings are numbered from below, as defined for `Scan`. The scan itself if it has
-        no ring numbers, or if those of the first scan were numbered so; rings beyond those of the sensor
-        become 0."""
+        """Return a scan whose rings are numbered from below, as defined for `Scan`. It is the argument if it
+        has no ring numbers, or if the rings of the first scan were numbered from below. Rings above the
+        number of rings of the sensor become 0."""
         if self._top_ring is None or scan.ring is None:
             return scan
         return replace(scan, ring=np.maximum(self._top_ring - scan.ring, 0).astype(np.int32))
@@ -200,8 +202,8 @@ class RosSource(MessageSource):
     # --- opening ---------------------------------------------------------------------------------
 
     def _clock_offset(self, numbers: frozenset[int]) -> int | None:
-        """Return stamp minus time of recording of the first message of some channels [ns]; None without a
-        message, without a stamp, and for a stamp of 0."""
+        """Return stamp minus time of recording of the first message of some channels [ns]; None if there is
+        no message, or its stamp is missing or 0."""
         for message in islice(self._container.messages(numbers, None, {}), 1):
             stamp_ns = header_stamp(self._channels[message.channel], message.payload)
             return stamp_ns - message.log_ns if stamp_ns else None
@@ -238,7 +240,7 @@ class RosSource(MessageSource):
 
     def _is_clock_set(self) -> bool:
         """Return whether no stamp of the last scans (`Container.tail_ns`) fits to their times of recording
-        (`Clock.is_stepped`); False without stamps."""
+        (`Clock.is_stepped`); False if there are no stamps."""
         numbers = self._topics.numbers("scan")
         stamps = [
             self._clock.is_stepped(stamp_ns, message)
@@ -281,7 +283,7 @@ class RosSource(MessageSource):
 
         Args:
             first: First scan.
-            frame: Name of its frame.
+            frame: Name of the frame of the first scan.
             sensor: The LiDAR.
             digest: Digest of the files.
             options: Extrinsics chosen by the user; without them, those of the transforms, else identity.

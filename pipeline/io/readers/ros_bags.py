@@ -40,7 +40,7 @@ class Db3File(IndexedContainer):
     """A SQLite bag as a container of messages. The file is opened for reading only.
 
     Raises:
-        SourceError: It is not a bag, or its tables cannot be read.
+        SourceError: The file is not a bag, or its tables cannot be read.
     """
 
     kind = "ROS 2 bag (db3)"
@@ -51,7 +51,7 @@ class Db3File(IndexedContainer):
         clock are shifted.
 
         Raises:
-            SourceError: It is not a bag, or its tables cannot be read.
+            SourceError: The file is not a bag, or its tables cannot be read.
         """
         self._path = path
         self.damage = {}
@@ -90,9 +90,9 @@ class Db3File(IndexedContainer):
         return Message(number, log_ns, found[0])
 
     def _check_tables(self) -> None:
-        """Check that the tables are plain.
+        """Check that `messages` and `topics` are tables without computed columns.
 
-        Views, virtual tables and computed columns can compute without end; recorders write none.
+        Views and virtual tables are refused.
 
         Raises:
             SourceError: `messages` or `topics` is not such a table.
@@ -120,8 +120,8 @@ class Db3File(IndexedContainer):
         return np.array(rows, dtype=np.int64).reshape(-1, 3)
 
     def _read_channels(self) -> list[Channel]:
-        """Return the channels by number; those with an impossible number are left out, as their messages
-        are."""
+        """Return the channels in the order of their numbers; those with an impossible number are left out, as
+        are their messages."""
         rows = self._database.execute("SELECT id, name, type, serialization_format FROM topics ORDER BY id")
         return [
             Channel(int(number), str(topic), ros2_type_name(str(msgtype)), str(encoding or ""))
@@ -157,7 +157,7 @@ def bag_files(folder: Path) -> list[Path]:
 
 
 def _natural(path: Path) -> tuple[int, str]:
-    """Return the sort key of a part of a recording by its number: recorders write ..._0, ..._1, ..., ..._10.
+    """Return the sort key of a part of a recording: the number after the last "_" of the name, and the name.
     A name without a number comes first."""
     tail = path.stem.rpartition("_")[2]
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
@@ -207,7 +207,7 @@ class BagFolder(IndexedContainer):
         """Return the bytes of an attachment of the first file that has one of this name; None if none has.
 
         Raises:
-            SourceError: It is longer than `limit` bytes or damaged.
+            SourceError: The attachment is longer than `limit` bytes or damaged.
         """
         found = (part.attachment(name, limit) for part in self._parts)
         return next((content for content in found if content is not None), None)
@@ -218,8 +218,8 @@ class BagFolder(IndexedContainer):
             part.close()
 
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
-        """Return the message at a place of the file to which the channel belongs; None if it cannot be
-        read."""
+        """Return the message at the location `place` in the file to which the channel belongs; None if it
+        cannot be read."""
         part, own = divmod(number, _STRIDE)
         message = self._parts[part]._message(own, log_ns, place)
         return None if message is None else replace(message, channel=number)
@@ -236,7 +236,8 @@ class BagFile(ChunkedFile):
     """A ROS 1 bag as a container of messages.
 
     Raises:
-        SourceError: It cannot be opened, is not a bag of version 2.0, is encrypted, or has no connections.
+        SourceError: The file cannot be opened, is not a bag of version 2.0, is encrypted, or has no
+            connections.
     """
 
     kind = "ROS 1 bag"
@@ -245,7 +246,7 @@ class BagFile(ChunkedFile):
         """Read the headers of all records from the start of the file up to a cut; damage is counted.
 
         Raises:
-            SourceError: It is not a bag of version 2.0, or is encrypted.
+            SourceError: The file is not a bag of version 2.0, or is encrypted.
         """
         if self._read(0, len(MAGIC)) != MAGIC:
             raise damaged("not a ROS 1 bag of version 2.0", self._path)
@@ -277,8 +278,8 @@ class BagFile(ChunkedFile):
         other kinds are ignored.
 
         Args:
-            header: Fields of its header.
-            body: Position of its contents in the file.
+            header: Fields of the header of the record.
+            body: Position of its contents in the file [bytes].
             length: Length of its contents [bytes].
 
         Raises:
@@ -320,7 +321,7 @@ class BagFile(ChunkedFile):
 
         Raises:
             BrokenChunkError: The record is longer than the chunk, or has no header.
-            DAMAGE: It cannot be parsed.
+            DAMAGE: The record cannot be parsed.
         """
         (header_size,) = LENGTH.unpack_from(raw, at)
         (length,) = LENGTH.unpack_from(raw, at + 4 + header_size)
@@ -339,7 +340,7 @@ class BagFile(ChunkedFile):
 
 
 def _fields(header: bytes) -> Header:
-    """Parse the name=value fields of the header of a record.
+    """Return a dict from names to values of the name=value fields of the header of a record.
 
     Raises:
         ValueError: A field is longer than the header or has no name.
@@ -362,7 +363,7 @@ def open_bag(path: Path) -> IndexedContainer:
     """Open a file of recorded messages by its contents.
 
     Raises:
-        SourceError: It has another format, or cannot be read.
+        SourceError: The file has another format, or cannot be read.
     """
     try:
         with path.open("rb") as file:

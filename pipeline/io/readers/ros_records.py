@@ -51,8 +51,8 @@ def decode_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2, stamp_ns: int) -> Sc
 
     The time of a point is read from a field named t, time, timestamp, time_offset or offset_time: integers
     are nanoseconds; floating numbers are seconds after the stamp, or times since 1970 in a unit inferred from
-    their size. If one time is farther than 2 s from the stamp, no times are used. Points that are not valid
-    returns are left out, see `clean_scan`.
+    their size. See `point_offsets`; if one time is farther than 2 s from the stamp, no times are used. Points
+    that are not valid returns are left out, see `clean_scan`.
 
     Raises:
         LayoutError: Width, height, steps, fields and length of the data do not fit together.
@@ -88,8 +88,8 @@ def _table(cloud: ros2.sensor_msgs__msg__PointCloud2) -> NDArray[np.void]:
 
 
 def _dtype(cloud: ros2.sensor_msgs__msg__PointCloud2, step: int) -> np.dtype[np.void]:
-    """Return the type of a point of `step` bytes: the fields that are read, by name, the first one of each
-    name.
+    """Return the structured type of a point of `step` bytes with the fields that are read; of several fields
+    with one name, the first one.
 
     Raises:
         LayoutError: A field is outside of the point, or x, y or z is missing or not a floating number.
@@ -158,13 +158,13 @@ class RecordDecoder:
     """Decodes the messages of one recording into records.
 
     Args:
-        channels: Channels of the recording by number.
+        channels: Dict from numbers to channels of the recording.
         tree: Fixed transforms.
 
     Attributes:
-        base: Name of the base frame, "" when there is none.
-        frames: Frames of pose measurements by role: "gnss" (GnssFrame), "pose" (OtherFrame). Readings in a
-            frame that is not known are not used.
+        base: Name of the base frame; "" if there is none.
+        frames: Dict from the roles "gnss" and "pose" to the frames of their measurements, GnssFrame and
+            OtherFrame. Readings of a role that is missing are not used.
         poses: Numbers of the channels with poses of another SLAM.
     """
 
@@ -181,9 +181,9 @@ class RecordDecoder:
 
         Args:
             message: The message.
-            stamp_ns: Its time [ns].
-            losses: Counts messages that cannot be used; changed in place. A measured pose whose frame is not
-                known yet is not counted.
+            stamp_ns: Time of the message [ns].
+            losses: Dict from reasons to numbers of messages that cannot be used; increased in place. A
+                measured pose whose frame is not known yet is not counted.
         """
         channel = self._channels[message.channel]
         try:
@@ -213,9 +213,10 @@ class RecordDecoder:
         """Return a scan, the name of its frame, and the product number of the sensor (0 if unknown).
 
         Args:
-            message: Cloud, laser scan or packets.
+            message: PointCloud2, LaserScan or VelodyneScan.
             stamp_ns: Time of the scan [ns].
-            losses: Counts packets that are no data packets; changed in place.
+            losses: Dict from reasons to numbers; the number of packets that are not data packets is added in
+                place.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
@@ -240,7 +241,7 @@ class RecordDecoder:
         """Decode a message as the type of its channel.
 
         Raises:
-            Exception: Of many kinds, when it is damaged.
+            Exception: Of many kinds, when the message is damaged.
         """
         return decode(self._channels[message.channel], message.payload)
 
@@ -270,7 +271,7 @@ class RecordDecoder:
             stamp_ns: Time of the pose [ns].
 
         Raises:
-            NoPoseError: Its covariance in the plane is not finite, not symmetric or not positive definite.
+            NoPoseError: The covariance in the plane is not finite, not symmetric or not positive definite.
             Exception: Of many kinds, when the message is damaged.
         """
         decoded: ros2.nav_msgs__msg__Odometry = self.message(message)  # the other type has the same fields
@@ -287,7 +288,8 @@ class RecordDecoder:
         return self._tree.find(self.base, frame)
 
     def _gnss_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
-        """Return the measurement of a fix; None if the frame of GNSS is unknown, and, counted, without a fix.
+        """Return the measurement of a fix; None if the frame of GNSS is unknown, or if the message has no
+        fix, which is counted in `losses`.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
@@ -303,7 +305,7 @@ class RecordDecoder:
 
     def _other_measurement(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> Record | None:
         """Return the measurement of a pose of another SLAM; None if its covariance is invalid (counted), its
-        frame is unknown, or it does not count yet.
+        frame is unknown, or it is not later than `OtherFrame.from_ns`.
 
         Raises:
             Exception: Of many kinds, when the message is damaged.
@@ -317,7 +319,7 @@ class RecordDecoder:
         return frame.measurement(pose) if isinstance(frame, OtherFrame) else None
 
     def _odometry(self, message: Message, stamp_ns: int) -> Odometry:
-        """Return the odometry in a message, with this time [ns].
+        """Return the odometry in a message, with the time `stamp_ns` [ns].
 
         Raises:
             ValueError: The pose is not finite or its quaternion is zero.

@@ -26,16 +26,17 @@ def clean_scan(
     offset_ns: NDArray[np.generic] | None = None,
     dropped: int = 0,
 ) -> Scan:
-    """Return a scan without invalid returns: rows that are not finite, with a coordinate of RANGE_LIMIT or
-    more, or at the origin (all coordinates up to NEAR_LIMIT). If none is left out, arrays that have the type
-    of `Scan` already are shared with it.
+    """Return a scan without invalid returns: points that are not finite, have a coordinate with a magnitude
+    of RANGE_LIMIT or more, or are at the origin (all magnitudes up to NEAR_LIMIT). If no point is left out,
+    arrays that already have the type of `Scan` are shared with the result.
 
     Args:
         stamp_ns: Time of the scan [ns].
         points: Points in the sensor frame, shape (N, 3) [m].
-        reflectance: Reflectances, shape (N,), or None; NaN becomes 0, and infinite numbers are limited.
+        reflectance: Reflectances, shape (N,), or None. NaN becomes 0, infinite numbers become the largest
+            float32 of their sign.
         ring: Ring numbers, shape (N,), or None.
-        offset_ns: Times of the points after the stamp [ns], shape (N,), or None.
+        offset_ns: Times of the points after the stamp, shape (N,) [ns], or None.
         dropped: Number of returns that were left out before; the rows left out here are added.
     """
     with np.errstate(invalid="ignore", over="ignore"):
@@ -63,8 +64,8 @@ def clean_scan(
 
 
 def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
-    """Return a column as float32, with NaN as 0 and infinite numbers limited; None for None. A contiguous
-    float32 column is not copied but changed in place."""
+    """Return a column as float32, with NaN as 0 and infinite numbers as the largest float32 of their sign;
+    None for None. A contiguous float32 column is not copied but changed in place."""
     if values is None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
@@ -90,7 +91,7 @@ def first_of(
     """Return the first of some columns that exists, None if none exists.
 
     Args:
-        columns: Columns by name.
+        columns: Dict from names to columns.
         names: Names in the order of preference.
     """
     return next((columns[name] for name in names if name in columns), None)
@@ -105,12 +106,12 @@ def is_ring(ring: NDArray[np.generic]) -> bool:
 
 
 def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64] | None:
-    """Return the times of points relative to the stamp [ns], shape (N,), or None when they are impossible.
+    """Return the times of points relative to the stamp [ns], shape (N,), or None if they are impossible.
 
     Integers are nanoseconds after the stamp, or since 1970 if the first one is above 1e15; floating numbers
-    are seconds after the stamp, or times since 1970 in a unit inferred from their size. If one time is
-    farther than 2 s from the stamp, all are impossible; so is an empty column. A floating number that is not
-    finite counts as the time of the stamp.
+    are seconds after the stamp, or times since 1970 in s, ms, us or ns if the largest is above 1e8, 1e11,
+    1e14 or 1e17. If one time is farther than 2 s from the stamp, all are impossible; so is an empty column. A
+    floating number that is not finite counts as the time of the stamp.
     """
     if not len(time):
         return None
@@ -136,7 +137,7 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
 
 
 def _unit(largest: float) -> float | None:
-    """Return the unit [s] of times since 1970 by the largest one, None when times are relative."""
+    """Return the unit [s] of times since 1970 by the largest time, None if times are relative (up to 1e8)."""
     for limit, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest > limit:
             return unit
@@ -149,7 +150,7 @@ def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
 
     Args:
         stamp_ns: Time of the scan [ns].
-        columns: Columns of shape (N,) by name; x, y and z [m] are among them.
+        columns: Dict from names to columns, shape (N,); x, y and z [m] are among them.
     """
     kind = np.float64 if any(columns[axis].dtype.itemsize > 4 for axis in "xyz") else np.float32
     with np.errstate(invalid="ignore", over="ignore"):
@@ -173,8 +174,9 @@ def sensor_of(scan: Scan) -> Sensor:
     """Infer the sensor from a scan: number of rings, their step in elevation, and the step in azimuth; the
     range sigma is 0.03 m.
 
-    Without a ring column only a VLP-16 is recognised, by its elevations; else `rings` is 0, as it is with
-    fewer than 100 points. Steps that are unknown are those of `Sensor`.
+    If the scan has no ring numbers, it is a VLP-16 if the elevations are those of this sensor, else `rings`
+    is 0. For fewer than 100 points `rings` is 0 too. An unknown azimuth step is that of `Sensor`, an unknown
+    ring step 0.
     """
     if len(scan.points) < 100:
         return Sensor(range_sigma=0.03)
@@ -212,8 +214,8 @@ def _in_steps_of_vlp_16(scan: Scan) -> bool:
 
 
 def rings_descend(scan: Scan) -> bool:
-    """Return whether ring 0 has the highest elevation, as some drivers number rings. False without ring
-    numbers or with fewer than two rings."""
+    """Return whether ring 0 has the highest elevation, as some drivers number rings. False if there are no
+    ring numbers or fewer than two rings with known elevations."""
     elevation = _elevations(scan) if scan.ring is not None and len(scan.points) else np.zeros(0)
     elevation = elevation[np.isfinite(elevation)]
     return len(elevation) >= 2 and float(np.median(np.diff(elevation))) < 0.0

@@ -42,10 +42,10 @@ class ScanFolder(FileSource):
     (1645000000.25.pcd), else those of TUM rows. TUM rows are matched to scans by time where both have times.
 
     Args:
-        uri: As the user wrote it.
+        uri: Path as the user wrote it.
         path: One file, the folder with the files, or a folder with a folder `velodyne`. Of several formats
             .bin is read, else .pcd, else the one with the most files.
-        options: Extrinsics.
+        options: Choices of the user, of which the extrinsics are used.
 
     Raises:
         SourceError: There are no files, or none of the first ones holds a scan.
@@ -118,7 +118,7 @@ class ScanFolder(FileSource):
         """Return the first scan with points among the first _TRIES files, at the time 0.
 
         Raises:
-            SourceError: None of them has points.
+            SourceError: None of these files has points.
         """
         reason = ""
         for file in self._files[:_TRIES]:
@@ -141,7 +141,7 @@ class ScanFolder(FileSource):
         Args:
             places: Folders, searched in this order.
             names: Names of the files.
-            read: Returns the contents of a file.
+            read: Function of a path that returns the contents of the file.
         """
         for path in [place / name for place in places for name in names]:
             try:
@@ -172,7 +172,7 @@ class ScanFolder(FileSource):
 
     def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3 | None] | None:
         """Return the pose of each scan (None for scans without one) by the first file of poses that fits;
-        None without one. Times of its rows replace those of scans without times. Arguments as in
+        None if there is none. Times of its rows replace those of scans without times. Arguments as in
         `_read_stamps`."""
         for path, (times, poses) in self._read_texts(places, POSES, read_any_poses):
             found = self._fitting(path.name, times, poses, numbers)
@@ -184,12 +184,13 @@ class ScanFolder(FileSource):
     def _fitting(
         self, name: str, times: Int | None, poses: list[Pose3], numbers: Int
     ) -> list[Pose3 | None] | None:
-        """Return the pose of each scan, or None, with a warning, if the rows of a file do not belong to the
-        scans. Times of the rows become those of scans without times.
+        """Return a list of the pose of each scan, None for a scan without a pose. The result is None, with a
+        warning, if the rows of the file do not belong to the scans. Times of the rows become those of scans
+        without times.
 
         Args:
             name: Name of the file.
-            times: Times of its rows [ns], or None.
+            times: Times of the rows of the file [ns]; None if it has none.
             poses: Pose of each row.
             numbers: Number in the name of each scan file.
         """
@@ -212,7 +213,7 @@ class ScanFolder(FileSource):
 
         Args:
             name: Name of the file.
-            count: Number of its rows.
+            count: Number of rows of the file.
             numbers: Number in the name of each scan file.
         """
         if count > int(numbers[-1]):
@@ -242,14 +243,15 @@ def _scan_files(path: Path) -> tuple[str, list[Path]]:
 
 
 def _in_order(files: list[Path]) -> list[Path]:
-    """Return files by the times or else the numbers in their names, not by the last digits of times."""
+    """Return files sorted by the times in their names if all names are times, else by the numbers at the ends
+    of their names."""
     by_time = all(_TIME_NAME.fullmatch(file.stem) for file in files)
     return sorted(files, key=lambda f: (_name_ns(f.stem) if by_time else _number(f), f.name))
 
 
 def _times_in_names(files: list[Path]) -> Int | None:
-    """Return the times in the names of the files [ns], int64, shape (N,); None if a name is no time, or they
-    do not ascend strictly."""
+    """Return the times in the names of the files [ns], int64, shape (N,); None if a name is not a time, or
+    the times do not strictly ascend."""
     if not all(_TIME_NAME.fullmatch(file.stem) for file in files):
         return None
     stamps = [_name_ns(file.stem) for file in files]
@@ -267,8 +269,8 @@ def _name_ns(stem: str) -> int:
 
 
 def _number(file: Path) -> int:
-    """Return the number at the end of the name of a file, by its last nine digits at most; -1 without digits
-    there."""
+    """Return the number at the end of the name of a file, of which at most the last nine digits are used; -1
+    if it does not end with a digit."""
     match = re.search(r"[0-9]{1,9}$", file.stem)
     return int(match.group()) if match else -1
 
@@ -285,11 +287,11 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
     Args:
         path: The file.
         stamp_ns: Time of the scan [ns].
-        losses: Counts what is left out; changed in place.
+        losses: Dict from reasons to numbers of what is left out; increased in place.
 
     Raises:
-        ScanFileError: It is too large, or most of its rows are no positions.
-        OSError: It cannot be read.
+        ScanFileError: The file is too large, or most of its rows are not positions.
+        OSError: The file cannot be read.
     """
     size = path.stat().st_size
     if size > POINT_LIMIT * _KITTI_ROW:
@@ -306,12 +308,12 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 
 def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a PCD, PLY or NumPy file as a scan at a time [ns]. Rows of NaN in organised clouds are no returns;
-    points that the file promises but does not hold are counted in `losses`, in place.
+    """Read a PCD, PLY or NumPy file as a scan at a time [ns]. Points of NaN are left out; points of the
+    header that the file does not have are counted in `losses`, in place.
 
     Raises:
-        ScanFileError: It is damaged, has no x, y and z, or promises more than POINT_LIMIT points.
-        OSError: It cannot be read.
+        ScanFileError: The file is damaged, has no x, y and z, or its header has more than POINT_LIMIT points.
+        OSError: The file cannot be read.
     """
     return scan_of(stamp_ns, read_columns(path, losses))
 
@@ -321,8 +323,8 @@ def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
     frame; points that are missing, withheld or without coordinates are counted in `losses`, in place.
 
     Raises:
-        ScanFileError: It is damaged or too large.
-        OSError: It cannot be read.
+        ScanFileError: The file is damaged, has no valid point, or has more than POINT_LIMIT points.
+        OSError: The file cannot be read.
     """
     from pipeline.io.readers.clouds import LasCloud
 
@@ -343,7 +345,7 @@ def load_las(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 def _kitti_sensor(scan: Scan) -> Sensor:
     """Return an HDL-64 when the scan looks like one: all around, dense, and from -25 to +3 degrees; otherwise
-    what `sensor_of` infers. The scan has points."""
+    the result of `sensor_of`. The scan has points."""
     points = scan.points.astype(np.float64)
     elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
     low, high = np.percentile(elevation, [0.5, 99.5])

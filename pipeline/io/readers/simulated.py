@@ -33,7 +33,7 @@ class SimulatedSource(FileSource):
         """Describe a simulated run; nothing is simulated.
 
         Args:
-            uri: As the user wrote it.
+            uri: URI as the user wrote it.
             run: The run.
             knows_trees: Whether the ground truth has trees.
             kind: Name of the format.
@@ -85,11 +85,13 @@ def open_simulated(uri: str, options: SourceOptions | None = None) -> SimulatedS
     """Open `sim:NAME?seed=&sigma=&odometry=&duration=&trees=`.
 
     `options.seed` applies when the URI has no seed; `options.T_base_lidar` are the extrinsics of the
-    simulated LiDAR. `sim:cloud?file=&truth=` is a drive through the real cloud of a plot.
+    simulated LiDAR; None uses the default of the simulation. `sim:cloud?file=&truth=` is a drive through the
+    real cloud of a plot.
 
     Raises:
-        UsageError: No such scenario or option, or a value out of bounds.
-        SourceError: A file cannot be read, or an object has no place in the scene.
+        UsageError: There is no such scenario or option, or a value is out of bounds.
+        SourceError: A file cannot be read, there is no free position for an object in the scene, or no path
+            for a robot.
     """
     chosen = SourceOptions() if options is None else options
     request = parse_uri(uri, chosen.seed)
@@ -102,7 +104,7 @@ def _open_cloud(uri: str, request: RunRequest, options: SourceOptions) -> Simula
     """Open a drive through the real cloud of a plot.
 
     Args:
-        uri: As the user wrote it.
+        uri: URI as the user wrote it.
         request: Scenario and options of the URI.
         options: Choices of the user.
 
@@ -122,12 +124,12 @@ def open_cloud_drive(uri: str, file: Path, options: SourceOptions) -> SimulatedS
     """Open a whole cloud as a run: a simulated robot drives through it (`sim:cloud?file=`).
 
     Args:
-        uri: As the user wrote it.
-        file: The cloud.
-        options: Choices of the user, of which seed and extrinsics count.
+        uri: Path as the user wrote it.
+        file: File of the cloud.
+        options: Choices of the user, of which seed and extrinsics are used.
 
     Raises:
-        SourceError: It cannot be read, or has no path for a robot.
+        SourceError: The cloud cannot be read, or has no path for a robot.
     """
     from pipeline.io.readers.clouds import open_cloud
     from pipeline.simulation.cloud_run import open_cloud_run

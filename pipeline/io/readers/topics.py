@@ -106,7 +106,7 @@ class Topic:
 
     Attributes:
         name, msgtype: Name and message type.
-        numbers: Numbers of its channels.
+        numbers: Numbers of the channels of the topic.
         count: Number of messages of all channels.
     """
 
@@ -121,7 +121,7 @@ class Topics:
     """Topics of a recording.
 
     Attributes:
-        chosen: Topic that is read by role; a role without a topic is missing.
+        chosen: Dict from roles to the topics that are read; a role without a topic is missing.
         every: All topics.
     """
 
@@ -129,7 +129,7 @@ class Topics:
     every: tuple[Topic, ...]
 
     def numbers(self, role: str) -> frozenset[int]:
-        """Return the numbers of the channels that are read in a role; empty without a topic."""
+        """Return the numbers of the channels that are read in a role; empty if the role has no topic."""
         topic = self.chosen.get(role)
         return frozenset() if topic is None else topic.numbers
 
@@ -160,14 +160,14 @@ def is_fixed(topic: str) -> bool:
 
 
 def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where: str) -> Topics:
-    """Return the topics that are read by role, and all topics.
+    """Return the topic that is read in each role, and all topics.
 
     Args:
         channels: Channels of the recording.
-        wanted: Topic by role ("scan", "odometry", "imu", "gnss", "pose", "camera") chosen by the user; other
-            roles get the topic of their type with most messages. Exceptions: "pose" is read only if it is
-            chosen, its topic is not odometry, and a planar laser gives scans only without another topic of
-            scans.
+        wanted: Dict from roles ("scan", "odometry", "imu", "gnss", "pose", "camera") to topics chosen by the
+            user. Other roles get the topic of their type with most messages. Exceptions: "pose" is read only
+            if it is chosen; its topic is not used as odometry; LaserScan is used only if there is no other
+            topic of scans.
         where: Name of the recording in errors.
 
     Raises:
@@ -191,7 +191,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
 
 
 def _role_of(topic: Topic) -> str:
-    """Return the first role that the type of a topic fits, "" without one."""
+    """Return the first role that the type of a topic fits, "" if there is none."""
     return next((role for role, types in TYPES_BY_ROLE.items() if topic.msgtype in types), "")
 
 
@@ -233,14 +233,14 @@ def _group(channels: Iterable[Channel]) -> list[Topic]:
 
 def _choose(topics: list[Topic], role: str, wanted: Mapping[str, str], where: str) -> Topic | None:
     """Return the topic of a role with the most messages, of equal ones that of the type named first in
-    TYPES_BY_ROLE, then the first by name; None if there is none with messages. A planar laser is chosen only
-    without another scan topic, and the pose of another SLAM is not odometry.
+    TYPES_BY_ROLE, then the first by name; None if there is none with messages. LaserScan is chosen only if
+    there is no other topic of scans, and the topic of the role "pose" is not chosen as odometry.
 
     Args:
         topics: Topics of the recording.
         role: The role.
-        wanted: Topic by role chosen by the user, which may have no messages. Without a choice the role "pose"
-            has no topic.
+        wanted: Dict from roles to topics chosen by the user, which may have no messages. If "pose" is
+            missing, this role has no topic.
         where: Name of the recording in errors.
 
     Raises:

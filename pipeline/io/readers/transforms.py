@@ -19,8 +19,8 @@ FARTHEST = 1e9
 
 
 class TransformTree:
-    """Fixed transforms between frames. Names are compared as they are: `frame_name` removes leading slashes
-    before."""
+    """Fixed transforms between frames. Names are compared exactly; callers remove leading slashes by
+    `frame_name`."""
 
     def __init__(self) -> None:
         """Create a tree without transforms."""
@@ -37,8 +37,8 @@ class TransformTree:
         return frame in self._links
 
     def find(self, target: str, source: str) -> Pose3 | None:
-        """Return `T_target_source` along the fewest links; None if the frames are not linked. The identity
-        for equal names, known or not."""
+        """Return `T_target_source` along the fewest links; None if the frames are not linked. For equal names
+        it is the identity, also if they are unknown."""
         reached = {target: Pose3.identity()}
         border = [target]
         while border and source not in reached:
@@ -53,7 +53,7 @@ class TransformTree:
 
 
 def frame_name(name: object) -> str:
-    """Return the name of a frame as text without leading slashes, which some ROS 1 messages have."""
+    """Return the name of a frame as a string without leading slashes."""
     return str(name).lstrip("/")
 
 
@@ -103,10 +103,10 @@ class Extrinsics:
         self.odometry_link: tuple[str, str] | None = None
 
     def read(self, fixed: frozenset[int], moving: frozenset[int]) -> None:
-        """Add the transforms of the first messages of some channels to `tree`, and set `odometry_link`.
-        Moving channels contribute only transforms that do not change and do not begin at a world frame; fixed
-        ones replace them. Damaged messages are ignored. `odometry_link` stays None without a moving transform
-        of an odometry in the first MOVING_MESSAGES messages.
+        """Add the transforms of the first messages of some channels to `tree`, and set `odometry_link`. Of
+        moving channels, only transforms that do not change and whose parent is not a world frame (_WORLD) are
+        added; fixed transforms replace them. Damaged messages are ignored. `odometry_link` stays None if the
+        first MOVING_MESSAGES moving messages have no transform of an odometry (`is_odometry_link`).
 
         Args:
             fixed, moving: Numbers of the channels of fixed and of moving transforms.
@@ -127,9 +127,9 @@ class Extrinsics:
         return next((name for name in usual if self.tree.knows(name)), "")
 
     def _links(self, numbers: frozenset[int], limit: int, *, steady: bool) -> dict[tuple[str, str], Pose3]:
-        """Return the transforms of the first messages by parent and child, each with its first pose. With
-        `steady`, set `odometry_link` to the first transform that is odometry, and leave out transforms that
-        change or begin at a world frame (_WORLD).
+        """Return a dict from (parent, child) to the first pose T_parent_child in the first messages of some
+        channels. With `steady`, set `odometry_link` to the first transform that is odometry, and leave out
+        transforms that change or begin at a world frame (_WORLD).
 
         Args:
             numbers: Numbers of channels with transforms.

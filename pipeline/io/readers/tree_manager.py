@@ -34,7 +34,7 @@ COLUMNS = (*AXIS, *PLACE, DBH, "dbh_approximation", "score", "reconstructed", "n
 
 
 def state_name(frame: int) -> str:
-    """Return the name of the file of a frame."""
+    """Return the name of the file of the frame with the number `frame`."""
     return f"TreeManagerState_{frame}.csv"
 
 
@@ -104,7 +104,7 @@ def _write(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
     that are in no frame.
 
     Raises:
-        OSError: The disk refuses.
+        OSError: A file cannot be written.
     """
     poses = [Pose2(x, y, yaw) for x, y, yaw in zip(path.x, path.y, path.yaw, strict=True)]
     known = np.flatnonzero(trees.confirmed)
@@ -151,7 +151,7 @@ class TreeManagerSource(FileSource):
     """The folder as a source of scans with stems, and of odometry.
 
     Args:
-        uri: As the user wrote it.
+        uri: Path as the user wrote it.
         path: The folder.
         options: Extrinsics; the trajectory is that of the sensor.
 
@@ -219,7 +219,7 @@ class TreeManagerSource(FileSource):
         Args:
             file: The file of the frame.
             stamp_ns: Time of the scan [ns].
-            losses: Counts files and rows that cannot be read.
+            losses: Dict from reasons to numbers of files and rows that cannot be read; increased in place.
         """
         try:
             table, at, damaged = _read_frame(file, self._uri)
@@ -238,12 +238,12 @@ class TreeManagerSource(FileSource):
 
 
 def _read_frame(file: Path, uri: str) -> tuple[Float, dict[str, int], int]:
-    """Read the table of a file: its rows, shape (N, columns), with NaN for empty fields; the index of each
-    column by name; and the number of damaged rows.
+    """Return the rows of a file, shape (N, columns), with NaN for empty fields; a dict from the names of the
+    columns to their indices; and the number of damaged rows.
 
     Raises:
-        SourceError: It is too large, or its header lacks a column of PLACE.
-        OSError: It cannot be read.
+        SourceError: The file is too large, or its header lacks a column of PLACE.
+        OSError: The file cannot be read.
     """
     with file.open("rb") as opened:
         text = opened.read(CSV_LIMIT + 1)
@@ -275,7 +275,7 @@ def _axes(table: Float, at: dict[str, int]) -> Float:
 
     Args:
         table: Rows of the file, shape (N, columns).
-        at: Index of each column by name.
+        at: Dict from the names of the columns to their indices.
     """
     if not all(name in at for name in STEM_AXIS):
         return np.full((len(table), 3), np.nan)
@@ -288,7 +288,7 @@ def _axes(table: Float, at: dict[str, int]) -> Float:
 
 def _dbh(table: Float, at: dict[str, int]) -> Float:
     """Return the diameters in a table [m], shape (N,); NaN for missing ones and those that are not between 0
-    and DBH_LIMIT. `at` is the index of each column by name."""
+    and DBH_LIMIT. `at` is a dict from the names of the columns to their indices."""
     if DBH not in at:
         return np.full(len(table), np.nan)
     dbh = table[:, at[DBH]]
@@ -297,8 +297,8 @@ def _dbh(table: Float, at: dict[str, int]) -> Float:
 
 
 def _numbers(body: bytes, columns: int) -> tuple[Float, int]:
-    """Return the rows of numbers, shape (N, columns), with NaN for an empty field, and the number of damaged
-    rows."""
+    """Return the rows of numbers in the text `body`, shape (N, columns), with NaN for an empty field and 1
+    and 0 for True and False, and the number of damaged rows."""
     text = (b"\n" + body + b"\n").replace(b"\r", b"").replace(b"True", b"1").replace(b"False", b"0")
     for gap, filled in ((b",,", b",nan,"), (b",,", b",nan,"), (b",\n", b",nan\n"), (b"\n,", b"\nnan,")):
         text = text.replace(gap, filled)
@@ -310,7 +310,7 @@ def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
 
     Raises:
         SourceError: The file is missing, damaged, or its times do not ascend.
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     remedy = "It needs a row `time x y z qx qy qz qw` for each TreeManagerState file."
     try:
@@ -337,7 +337,7 @@ def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:
         uri: The source, for errors.
 
     Raises:
-        SourceError: Neither fits.
+        SourceError: There are neither enough rows nor as many rows as files.
     """
     files = len(number)
     if int(number[-1]) < count and len(np.unique(number)) == files:

@@ -57,8 +57,7 @@ class PacketError(Exception):
 def is_data_packet(packet: bytes) -> bool:
     """Return whether the bytes are a data packet of a known sensor.
 
-    The decoder accepts any 1206 bytes, so the flags and azimuths of the twelve blocks and the product number
-    are checked before.
+    The length, the flags and azimuths of the twelve blocks, and the product number are checked.
     """
     if len(packet) != PACKET_BYTES or packet[PRODUCT] not in SENSORS:
         return False
@@ -67,7 +66,8 @@ def is_data_packet(packet: bytes) -> bool:
 
 
 class Rotation:
-    """Finds the packets of one sensor with which a sweep begins: after a full rotation, or after a pause."""
+    """Finds the packets of one sensor with which a sweep begins: after a full revolution, or after a pause of
+    more than GAP_NS."""
 
     def __init__(self) -> None:
         """Begin before the first packet."""
@@ -75,12 +75,12 @@ class Rotation:
         self._stamp_ns = self._turned = 0
 
     def begins(self, azimuth: int, stamp_ns: int) -> bool:
-        """Process the next packet; return whether a sweep begins with it: after a full turn, or a pause of
-        more than GAP_NS; the first packet begins none.
+        """Process the next packet; return whether a sweep begins with it: after a full revolution, or a pause
+        of more than GAP_NS. The result is False for the first packet.
 
         Args:
-            azimuth: Azimuth of its first block [0.01 degrees].
-            stamp_ns: Its time of arrival [ns].
+            azimuth: Azimuth of the first block of the packet [0.01 degrees].
+            stamp_ns: Time of arrival of the packet [ns].
         """
         before = self._azimuth
         step = 0 if before is None else (azimuth - before) % _TURN
@@ -106,12 +106,13 @@ class PacketDecoder:
 
         Args:
             stamp_ns: Stamp of the scan [ns].
-            stamps_ns: Time of arrival of each packet [ns]. The times of the points are derived from the last
-                one and limited to 2 s about the stamp.
-            packets: In the order of time.
+            stamps_ns: Time of arrival of each packet [ns]. The times of the points are derived from that of
+                the last packet and clipped to 2 s before and after the stamp.
+            packets: Packets in the order of time.
 
         Raises:
-            PacketError: There are no packets, or the decoder refuses them.
+            PacketError: There are no packets, the numbers of stamps and packets differ, or the decoder
+                refuses the packets.
         """
         if not packets:
             raise PacketError("no packets")
@@ -169,16 +170,17 @@ Packets = NDArray[np.void]  # of PACKET, in the order of the file
 
 
 class PcapSource(FileSource):
-    """Source of the scans of a .pcap file. A scan is one rotation, stamped with its last packet's arrival.
+    """Source of the scans of a .pcap file. A scan is one revolution; its stamp is the time of arrival of its
+    last packet.
 
     Args:
-        uri: As the user wrote it.
+        uri: Path as the user wrote it.
         path: The file.
-        options: Extrinsics.
+        options: Choices of the user, of which the extrinsics are used.
 
     Raises:
-        SourceError: It is not a capture, or has no packets of a known sensor.
-        OSError: It cannot be read.
+        SourceError: The file is not a capture, or has no packets of a known sensor.
+        OSError: The file cannot be read.
     """
 
     def __init__(self, uri: str, path: Path, options: SourceOptions) -> None:
@@ -186,8 +188,8 @@ class PcapSource(FileSource):
         the most packets are used; the others are counted in `losses`. The file stays open until `close`.
 
         Raises:
-            SourceError: It is not a capture, or has no packets of a known sensor.
-            OSError: It cannot be read.
+            SourceError: The file is not a capture, or has no packets of a known sensor.
+            OSError: The file cannot be read.
         """
         super().__init__()
         self._path = path
@@ -257,8 +259,8 @@ class PcapSource(FileSource):
         return [block[at : at + PACKET_BYTES] for at in (offsets - start).tolist()]
 
     def _one_sensor(self, packets: Packets, uri: str) -> Packets:
-        """Return the packets of the sensor that sent most, without those with impossible or decreasing times;
-        what is left out is counted.
+        """Return the packets of the sender, and of the product number, with most packets, without packets
+        with impossible or decreasing times. Packets that are left out are counted.
 
         Raises:
             SourceError: There are no packets.
@@ -292,12 +294,12 @@ class PcapSource(FileSource):
 
 
 def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
-    """Return the data packets of a capture, and the numbers of other packets to the LiDAR's port and of cut
-    bytes, by reason. Reading ends at a damaged length.
+    """Return the data packets of a capture, and a dict from reasons to the numbers of other packets to the
+    port of the LiDAR and of cut bytes. Reading ends at a damaged length.
 
     Raises:
         SourceError: The file is not a capture that can be read.
-        OSError: It cannot be read.
+        OSError: The file cannot be read.
     """
     losses: dict[str, int] = {}
     found: list[tuple[int, int, int, int, int]] = []
@@ -327,15 +329,15 @@ def find_packets(path: Path) -> tuple[Packets, dict[str, int]]:
 
 
 def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]) -> tuple[int, int]:
-    """Return the position of the 1206 bytes of a captured data packet, and the address of its sender and its
-    destination port as one number; (0, 0) for other packets.
+    """Return the position in `buffer` of the 1206 bytes of a captured data packet, and the IP address of its
+    sender and its destination port as one number (address * 2^16 + port); (0, 0) for other packets.
 
     Args:
         buffer: Bytes of the file.
-        at, end: Position of the captured bytes.
-        link: Bytes before the IP header.
-        losses: Counts other packets to the LiDAR's port, and data packets that the capture has cut; changed
-            in place.
+        at, end: First position of the captured bytes, and one past the last.
+        link: Number of bytes before the IP header.
+        losses: Dict from reasons to numbers of other packets to the port of the LiDAR, and of data packets
+            that the capture has cut; increased in place.
     """
     ip = at + link
     if link == _ETHERNET and buffer[at + 12 : at + 14] == b"\x81\x00":
@@ -361,10 +363,12 @@ def _data_of(buffer: bytes, at: int, end: int, link: int, losses: dict[str, int]
 
 
 def _file_header(header: bytes, path: Path) -> tuple[str, int, int]:
-    """Return the byte order, the nanoseconds per unit of fractions, and the bytes before the IP header.
+    """Return the byte order for `struct` (">" or "<"), the nanoseconds per unit of fractions of a second, and
+    the number of bytes before the IP header.
 
     Raises:
-        SourceError: This is no capture of Ethernet packets in the pcap format.
+        SourceError: The file is not a capture in the pcap format, is cut in its header, or has a link type
+            that cannot be read.
     """
     if header.startswith(b"\x0a\x0d\x0d\x0a"):
         raise SourceError(

@@ -34,7 +34,7 @@ from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, T
 
 @dataclass(frozen=True, slots=True)
 class Car:
-    """Dimensions of a car with steered front wheels [m].
+    """Dimensions of a car with steered front wheels, all in metres.
 
     Attributes:
         L: Wheelbase.
@@ -50,16 +50,17 @@ class Car:
 
 
 def dead_reckoning(time: Float, speed: Float, steering: Float, car: Car) -> Float:
-    """Return the pose of the laser at each encoder time, shape (N, 3): x, y [m], yaw [rad].
+    """Return the pose x, y [m], yaw [rad, not wrapped] of the laser at each encoder time, shape (N, 3).
 
     The first pose is (0, 0, 0). Speed and steering are constant between two readings, so the motion is an
     arc, which is integrated exactly. With v_c = v / (1 - tan(s) H / L) the laser moves in its own axes with
     v_c - b w ahead and a w to the left, and turns with w = v_c tan(s) / L.
 
     Args:
-        time: [s], ascending, shape (N,).
-        speed: Speed of the left rear wheel [m/s].
-        steering: [rad], positive to the left, well below a right angle.
+        time: Times of the readings, ascending, shape (N,) [s].
+        speed: Speed of the left rear wheel, shape (N,) [m/s].
+        steering: Steering angle, positive to the left, with a magnitude well below a right angle, shape (N,)
+            [rad].
         car: Dimensions of the car.
     """
     dt = np.diff(time)
@@ -89,12 +90,14 @@ class VictoriaParkSource(FileSource):
     """Source of planar scans (z = 0) and odometry from the Victoria Park zip.
 
     Args:
-        uri: As the user wrote it.
+        uri: Path as the user wrote it.
         path: The zip.
-        options: Extrinsics; dead reckoning gives the path of the laser, so the default is identity.
+        options: Choices of the user, of which the extrinsics are used; the default is the identity. The
+            odometry is the path of the laser for any extrinsics.
 
     Raises:
-        SourceError: It is a different zip, damaged, or too large when unpacked.
+        SourceError: The zip is another one, damaged, or too large when unpacked, or has no valid scan or
+            encoder reading.
         OSError: The file becomes unreadable after it was unpacked.
     """
 
@@ -102,7 +105,8 @@ class VictoriaParkSource(FileSource):
         """Read the whole zip; scans are made in `records`.
 
         Raises:
-            SourceError: It is a different zip, damaged, or too large when unpacked.
+            SourceError: The zip is another one, damaged, or too large when unpacked, or has no valid scan or
+                encoder reading.
             OSError: The file becomes unreadable after it was unpacked.
         """
         super().__init__()
@@ -182,8 +186,9 @@ class VictoriaParkSource(FileSource):
             return _nanoseconds(table[:, 0]), table[:, 1:].astype(np.float32)
 
     def _read_encoders(self, text: bytes, uri: str) -> tuple[Int, Float]:
-        """Return times [ns], shape (N,), and poses by dead reckoning, x, y [m], yaw [rad], shape (N, 3).
-        Scans before the first encoder reading get its pose; readings out of bounds are counted.
+        """Return times [ns], shape (N,), and poses by dead reckoning, x, y [m], yaw [rad], shape (N, 3). If
+        the first scan is before the first encoder reading, the first pose is added at the time of this scan;
+        readings out of bounds are counted.
 
         Raises:
             SourceError: There is no valid reading.
@@ -203,8 +208,8 @@ class VictoriaParkSource(FileSource):
         return stamp_ns, poses
 
     def _read_gps(self, text: bytes) -> TruthPath | None:
-        """Return the path by GPS, x east, y north [m], without yaw; None without valid rows. Other rows are
-        counted as damage."""
+        """Return the path by GPS, x east, y north [m], without yaw; None if there are no valid rows. Other
+        rows are counted as damage."""
         table = self._ascending(self._rows(text, "GPS.txt"), "GPS rows with impossible times")
         near = (np.abs(table[:, 1:]) < COORDINATE_LIMIT).all(axis=1)
         if not near.all():
@@ -242,8 +247,8 @@ class VictoriaParkSource(FileSource):
 
 
 def _unpack(path: Path, uri: str) -> dict[str, bytes]:
-    """Return the contents of laser.txt, drs.txt and, if it is there, gps.txt by lower-case name, from any
-    folder of the zip. Sizes are checked before unpacking.
+    """Return a dict from the names "laser.txt", "drs.txt" and, if it exists, "gps.txt" to the contents of
+    these files, from any folder of the zip and with names in any case. Sizes are checked before unpacking.
 
     Raises:
         SourceError: The zip cannot be read or is damaged, has no LASER.txt or no DRS.txt, or a file in it is

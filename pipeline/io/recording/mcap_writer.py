@@ -54,8 +54,8 @@ _FOREVER = "{sec: 9223372036, nsec: 854775807}"
 
 
 def offered_qos_profiles(latched: bool) -> str:
-    """Return the quality-of-service profile of a topic as YAML; `latched` keeps the last message for late
-    subscribers, otherwise the last ten are kept for present ones."""
+    """Return the quality-of-service profile of a topic as YAML; if `latched`, the last message is kept for
+    late subscribers, otherwise the last ten for present subscribers."""
     return (
         f"- history: {_KEEP_LAST}\n"
         f"  depth: {1 if latched else 10}\n"
@@ -82,7 +82,7 @@ class _RosWriter:
     Args:
         stream: Stream of a new file.
         chunk_size: Size of a chunk [bytes].
-        attachment, content: Name and JSON of its attachment.
+        attachment, content: Name and JSON of the attachment of the file.
     """
 
     def __init__(self, stream: Stream | BinaryIO, chunk_size: int, attachment: str, content: bytes) -> None:
@@ -100,7 +100,7 @@ class _RosWriter:
         """Write the last chunk and the index; the stream stays open.
 
         Raises:
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         self._writer.finish()
 
@@ -115,7 +115,7 @@ class _RosWriter:
         """Return the number of a new channel in the file.
 
         Args:
-            topic: Topic.
+            topic: Name of the topic.
             kind: Message type, e.g. "sensor_msgs/msg/Imu".
             latched: Whether late subscribers get the last message; topics of fixed transforms always are.
         """
@@ -126,7 +126,7 @@ class _RosWriter:
         """Append a message in CDR to a channel, with one time [ns] for log and publication.
 
         Raises:
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         self._writer.add_message(channel, stamp_ns, payload, stamp_ns, self._sequence[channel])
         self._sequence[channel] += 1
@@ -152,7 +152,7 @@ def write_recording(
         sensor: Sensor, stored with the ground truth.
         T_base_lidar: Extrinsics of the LiDAR.
         truth: Ground truth, attached as `stemmap_truth.json`.
-        camera: Camera of the pictures among the records; without it pictures are left out.
+        camera: Camera of the pictures among the records; None leaves pictures out.
 
     Returns:
         Number of messages: two for an odometry or a picture, one for a scan or an IMU reading, and the static
@@ -188,12 +188,12 @@ class _Run(_RosWriter):
         return self._sequence.total()
 
     def add(self, record: Record | Picture) -> None:
-        """Write a record as one or two messages; nothing for other kinds, and for a picture without a camera.
-        Extrinsics are written before the first record, with its time.
+        """Write a record as one or two messages; other kinds, and pictures if there is no camera, are
+        ignored. Extrinsics are written before the first record, with its time.
 
         Raises:
             StemmapError: ROS cannot represent the time.
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         stamp = record.stamp_ns
         if self._T_base_lidar is not None:
@@ -225,13 +225,13 @@ class _Run(_RosWriter):
 class LiveWriter(_RosWriter):
     """Writer of one recording of a live run, in the ROS 2 profile of MCAP.
 
-    The robot's messages are written in their order of arrival, with their times of arrival as log times. A
-    channel names those that the mapping did not use, so that a replay can repeat the live map.
+    The robot's messages are written in their order of arrival, with their times of arrival as log times. The
+    channel SKIPPED names the messages that the mapping did not use.
 
     Args:
         stream: Stream of a new file.
         channels: Channels of the robot; they keep their numbers.
-        header: Further values that determine the run, as JSON values: address, topics, seed.
+        header: Fields of `LiveRunHeader` except the version, as JSON values.
         robot: Namespace of the robot, "" for none.
     """
 
@@ -239,10 +239,10 @@ class LiveWriter(_RosWriter):
         self, stream: Stream, channels: Sequence[Channel], header: Mapping[str, Any], robot: str
     ) -> None:
         """Write the head of the file and define the channels of robot and outputs, whose topics begin with
-        /ROBOT/stemmap/, or /stemmap/ without a name.
+        /ROBOT/stemmap/, or with /stemmap/ if `robot` is "".
 
         Raises:
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         content = json.dumps({"version": VERSION, **header}).encode()
         super().__init__(stream, LIVE_CHUNK_SIZE, NAME, content)
@@ -260,19 +260,19 @@ class LiveWriter(_RosWriter):
         """Write a message of the robot at its time of arrival.
 
         Raises:
-            KeyError: Its channel is not one of `channels`.
-            OSError: The disk refuses.
+            KeyError: The channel of the message is not one of `channels`.
+            OSError: The stream cannot be written.
         """
         self._last_ns = message.log_ns
         self._write(self._numbers[message.channel], self._last_ns, message.payload)
 
     def add_outputs(self, messages_by_topic: Mapping[str, bytes]) -> None:
-        """Write results of the mapping (CDR by topic of `messages.TYPES`), at the time of the last message of
-        the robot, 0 before it.
+        """Write results of the mapping at the time of the last message of the robot, 0 if there is none.
+        `messages_by_topic` is a dict from topics of `messages.TYPES` to messages in CDR.
 
         Raises:
             KeyError: A topic is unknown.
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         for topic, payload in messages_by_topic.items():
             self._write(self._outputs[topic], self._last_ns, payload)
@@ -284,28 +284,28 @@ class LiveWriter(_RosWriter):
         Args:
             revision: Number of the change.
             from_scan: Index of the first scan with these parameters.
-            values: Value by name.
+            values: Dict from stages to dicts from names to values, as in `Revision`.
 
         Raises:
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         text = json.dumps({"revision": revision, "from_scan": from_scan, "values": values})
         self._write(self._parameters, self._last_ns, messages.text(text))
 
     def add_skipped(self, times_by_topic: Mapping[str, Sequence[int]]) -> None:
-        """Write which messages the mapping did not use: log times [ns] by topic. The log time of this note,
-        as of parameters and outputs, is that of the last message of the robot.
+        """Write the messages that the mapping did not use, as a dict from topics to their log times [ns]. The
+        log time of this note is that of the last message of the robot.
 
         Raises:
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         self._write(self._skipped, self._last_ns, messages.text(json.dumps(times_by_topic)))
 
     def flush(self) -> None:
-        """Write the present chunk to the stream, so that a crash of this process loses no message.
+        """Write the present chunk to the stream, so that the stream has all messages.
 
         Raises:
-            OSError: The disk refuses.
+            OSError: The stream cannot be written.
         """
         # The library ends a chunk when it is full or the file ends, and has no public method for it.
         self._writer._Writer__finalize_chunk()
@@ -317,7 +317,7 @@ class RepairResult:
 
     Attributes:
         messages: Number of messages in the new file.
-        losses: Parts that are lost, by reason.
+        losses: Dict from reasons to numbers of lost parts.
     """
 
     messages: int
@@ -334,7 +334,7 @@ def repair(path: Path, out: Path) -> RepairResult:
         out: The new file.
 
     Raises:
-        SourceError: It cannot be read, is not an MCAP file, or has no complete message.
+        SourceError: The recording cannot be read, is not an MCAP file, or has no complete message.
         StemmapError: The new file cannot be written.
     """
     with closing(McapFile(path)) as recording:

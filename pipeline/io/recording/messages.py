@@ -86,7 +86,7 @@ def odometry_of(head: Message, child: str, at: Message, covariance: NDArray[np.f
         head: Header with the parent frame.
         child: Name of the child frame.
         at: geometry_msgs/Pose of the child.
-        covariance: Covariance of the pose, 36 numbers.
+        covariance: Covariance of x, y, z [m], roll, pitch, yaw [rad], 36 numbers row by row.
     """
     twist = make("geometry_msgs/Twist", linear=vector(), angular=vector())
     return make(
@@ -150,8 +150,8 @@ def odometry(record: Odometry) -> Message:
 
 
 def imu(record: Imu) -> Message:
-    """Return a sensor_msgs/Imu in base_link; without an orientation its covariance begins with -1 and the
-    orientation is the identity. Other covariances are zero.
+    """Return a sensor_msgs/Imu in base_link; if the orientation is None, it is the identity and its
+    covariance begins with -1. Other covariances are zero.
 
     Raises:
         StemmapError: ROS cannot represent the time.
@@ -187,7 +187,7 @@ def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) 
 
     Args:
         stamp_ns: Time [ns].
-        width, height: Size of its pictures [pixels].
+        width, height: Size of the pictures of the camera [pixels].
         K: Camera matrix, shape (3, 3) [pixels].
 
     Raises:
@@ -210,7 +210,7 @@ def camera_info(stamp_ns: int, width: int, height: int, K: NDArray[np.float64]) 
 
 
 def text(content: str) -> bytes:
-    """Return a std_msgs/String with this content in CDR."""
+    """Return a std_msgs/String with the string `content` in CDR."""
     return encode(make("std_msgs/String", data=content))
 
 
@@ -261,22 +261,23 @@ _GREEN, _WHITE = (0.0, 0.62, 0.45, 0.9), (1.0, 1.0, 1.0, 1.0)
 
 
 def type_hash(topic: str) -> str:
-    """Return the hash of the type of a topic (REP 2016), by which ROS 2 nodes match topics; KeyError for one
-    that is not in TYPES."""
+    """Return the hash of the type of a topic (REP 2016), by which ROS 2 nodes match topics; KeyError for a
+    topic that is not in TYPES."""
     return str(standard_types("cdr").hash_rihs01(TYPES[topic]))
 
 
 def scan_messages(frame: Frame) -> dict[str, bytes]:
-    """Return the messages of a scan by topic, in CDR: those of `pose_messages` and `clearance_messages`."""
+    """Return a dict from topics to messages of a scan in CDR: those of `pose_messages` and
+    `clearance_messages`."""
     return pose_messages(frame) | clearance_messages(frame.clearance, frame.stamp_ns)
 
 
 def clearance_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, bytes]:
-    """Return the messages of a clearance by topic, in CDR: CLEARANCE (the distance ahead) and ZONE; empty for
-    None, when obstacles are not detected.
+    """Return a dict from topics to messages of a clearance in CDR: CLEARANCE (the distance ahead) and ZONE;
+    empty if `clearance` is None.
 
-    By REP 117 a range is infinite without an obstacle; it is NaN where the sensor has no view. A time [ns]
-    that ROS cannot represent is limited.
+    By REP 117 a range is infinite without an obstacle; it is NaN in the zone UNKNOWN. A time [ns] that ROS
+    cannot represent is clipped.
     """
     if clearance is None:
         return {}
@@ -295,8 +296,8 @@ def clearance_messages(clearance: Clearance | None, stamp_ns: int) -> dict[str, 
 
 
 def pose_messages(frame: Frame) -> dict[str, bytes]:
-    """Return the pose at a scan by topic, in CDR: POSE, and ODOMETRY with its covariance. A time [ns] that
-    ROS cannot represent is limited."""
+    """Return a dict from topics to messages of the pose at a scan in CDR: POSE, and ODOMETRY with the
+    covariance of the pose. A time [ns] that ROS cannot represent is clipped."""
     T, covariance = frame.estimate.T_map_base, np.zeros((6, 6))
     rows = np.array([0, 1, 5])  # x, y and yaw of x, y, z, roll, pitch, yaw
     covariance[np.ix_(rows, rows)] = frame.estimate.covariance
@@ -306,15 +307,15 @@ def pose_messages(frame: Frame) -> dict[str, bytes]:
 
 
 def map_messages(frame: Frame, path: Path) -> dict[str, bytes]:
-    """Return the map at a scan by topic, in CDR: PATH (at most MOST_POSES poses), and the confirmed trees as
-    TREES and DETECTIONS. A time that ROS cannot represent is limited."""
+    """Return a dict from topics to messages of the map at a scan in CDR: PATH (at most MOST_POSES poses), and
+    the confirmed trees as TREES and DETECTIONS. A time that ROS cannot represent is clipped."""
     head = _header(frame.stamp_ns)
     return {PATH: encode(_path(path, head)), **tree_messages(frame.trees, head)}
 
 
 def tree_messages(trees: Trees, head: Any) -> dict[str, bytes]:  # noqa: ANN401
-    """Return the confirmed trees by topic, in CDR: TREES, markers of which the first deletes all earlier
-    ones, and DETECTIONS.
+    """Return a dict from topics to messages of the confirmed trees in CDR: TREES, markers of which the first
+    deletes all earlier ones, and DETECTIONS.
 
     Args:
         trees: The map.
@@ -435,7 +436,7 @@ def _detection(trees: Trees, row: int, head: Any) -> Any:  # noqa: ANN401
 
 
 def _header(stamp_ns: int, frame_id: str = MAP) -> Any:  # noqa: ANN401
-    """Return a header with a time [ns], limited to what ROS can represent."""
+    """Return a header with a time [ns], clipped to the times that ROS can represent."""
     return header(min(max(stamp_ns, 0), _LATEST_NS), frame_id)
 
 

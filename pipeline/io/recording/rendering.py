@@ -34,13 +34,13 @@ _THIN, _SIDE, _NEAR = 0.06, 0.8, 0.4  # m
 def with_pictures(
     records: Iterator[Record], trees: TruthTrees, path: TruthPath
 ) -> Iterator[Record | Picture]:
-    """Yield the records of a simulated run, and a picture after the first scan and each EVERY-th one after
-    it.
+    """Yield the records of a simulated run, and a picture after the first scan and after each EVERY-th scan
+    that follows.
 
     Args:
         records: Records of the run.
         trees: Trees and other objects.
-        path: True path, at whose poses, interpolated, the pictures are taken.
+        path: True path, which is interpolated for the poses of the pictures.
     """
     count = 0
     yaw = np.unwrap(path.yaw)
@@ -56,13 +56,13 @@ def with_pictures(
 
 
 def rendered(trees: TruthTrees, pose: tuple[float, float, float]) -> bytes:
-    """Return a JPEG of WIDTH x HEIGHT pixels with the objects as rectangles before ground and sky, near ones
-    last. Objects less than 0.4 m in front of the camera or behind it are omitted; one without diameter gets a
-    default width.
+    """Return a JPEG of WIDTH x HEIGHT pixels with the objects as rectangles before ground and sky, nearest
+    ones last. Objects less than 0.4 m in front of the camera or behind it are omitted; one without diameter
+    gets a default width.
 
     Args:
         trees: Trees and other objects.
-        pose: x, y [m], yaw [rad] of the base in the map.
+        pose: Pose x, y [m], yaw [rad] of the base in the map.
     """
     from PIL import Image, ImageDraw
 
