@@ -63,7 +63,8 @@ def test_a_plot_is_drawn_has_figures_and_is_undone(person: Dashboard) -> None:
     expect(page.locator("#plots-detection")).to_have_text(
         re.compile("Use the figures above|Detection does not decrease")
     )
-    expect(page.locator("#plots-review")).to_have_text(re.compile(r"Review: 0 of \d+ found trees reviewed\.$"))
+    review = page.locator("#plots-review")
+    expect(review).to_have_text(re.compile(r"Review: 0 of \d+ found trees reviewed\.$"))
 
     # Typed values; a name is changed; all is undone and repeated.
     page.get_by_text("Type a plot").click()

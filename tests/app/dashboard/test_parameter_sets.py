@@ -52,7 +52,7 @@ async def test_a_set_that_has_the_name_makes_room(both: Running) -> None:
     assert dashboard.sets.name_of("forest", dashboard.parameters.parameters) == "mine"
     await client.post("/api/parameters/reset", json={})
     await client.post("/api/sets", json={"name": "as forest"})
-    assert dashboard.sets.name_of("forest", dashboard.parameters.parameters) == "", "the preset has these values"
+    assert dashboard.sets.name_of("forest", dashboard.parameters.parameters) == "", "that of the preset"
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", "-flag", "x" * 41, "a\nb", "a\x1b[2J", "forest"])

@@ -114,6 +114,7 @@ def test_the_observed_area_is_that_of_the_new_map(session):
         remapped(session)
         views = session.run.take_views()
         with mapped_from_start(wanted, LAST - 1) as other:
+            assert other.run is not None
             expected = other.run.take_views()
         assert [(stamp, free.tobytes()) for stamp, free in views] == [
             (stamp, free.tobytes()) for stamp, free in expected
