@@ -52,10 +52,10 @@ class _Blob:
         self._planes = planes
 
     def add(self, array: np.ndarray[Any, Any]) -> dict[str, Any]:
-        """Append the bytes of a little-endian array, padded to a multiple of 8 bytes. Return its description,
-        a dict of JSON values: "dtype", the NumPy type with "<"; "shape", a list; and "at", the offset of the
-        first byte in the block. The byte order of other arrays is not converted."""
-        data = np.ascontiguousarray(array)
+        """Append the bytes of an array in little-endian order, padded to a multiple of 8 bytes. Return its
+        description, a dict of JSON values: "dtype", the NumPy type with "<"; "shape", a list; and "at", the
+        offset of the first byte in the block."""
+        data = np.ascontiguousarray(array, array.dtype.newbyteorder("<"))
         at = self.length
         raw = (
             data.reshape(-1).view(np.uint8).reshape(-1, data.itemsize).T.tobytes()
@@ -64,7 +64,7 @@ class _Blob:
         )
         self.parts.append(raw + b"\0" * (-len(raw) % _ALIGN))
         self.length += len(self.parts[-1])
-        return {"dtype": data.dtype.newbyteorder("<").str, "shape": list(array.shape), "at": at}
+        return {"dtype": data.dtype.str, "shape": list(array.shape), "at": at}
 
 
 def encode(record: Any, *, planes: bool = False) -> tuple[Any, bytes]:  # noqa: ANN401 - any record

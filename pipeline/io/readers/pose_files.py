@@ -113,7 +113,9 @@ def read_times(path: Path) -> Int:
         times = np.rint(read_table(path, 1) * 1e9).astype(np.int64).ravel()
     except TextError:
         times = np.array([_date(line) for line in _text(path).split("\n") if line.strip()], dtype=np.int64)
-    if not len(times) or np.any(np.diff(times) < 0):
+    if not len(times):
+        raise TextError("it has no times")
+    if np.any(np.diff(times) < 0):
         raise TextError("its times go back")
     return times
 

@@ -286,3 +286,15 @@ def test_a_memory_comes_back_bit_by_bit(seed, scans):
             assert one[part].tobytes() == other[part].tobytes(), f.name
         else:
             assert one == other, f.name
+
+
+@dataclass(frozen=True)
+class _Column:
+    values: Int
+
+
+@pytest.mark.parametrize("planes", [False, True])
+def test_arrays_in_another_byte_order_are_converted(planes):
+    values = np.array([1, -2, 3], np.dtype(np.int64).newbyteorder(">"))
+    tree, blob = encode(_Column(values), planes=planes)
+    np.testing.assert_array_equal(decode(_Column, tree, blob, planes=planes).values, [1, -2, 3])
