@@ -190,7 +190,8 @@ def add_source_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_live_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --record and --publish."""
+    """Add `--record [FILE.mcap]` and `--publish`. The value `record` is None without the flag, "" for a
+    name in the data folder, else the file name; `publish` is a bool."""
     parser.add_argument(
         "--record",
         metavar="FILE.mcap",

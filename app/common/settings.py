@@ -111,12 +111,12 @@ def recordings_place(settings: Settings, now_s: float) -> Path:
 
 
 def data_folder(given: Mapping[str, str]) -> Path | None:
-    """Return the data folder: STEMMAP_FOLDER, else `stemmap` in XDG_DATA_HOME, LOCALAPPDATA or
-    ~/.local/share, whichever is known first; None if there is none. Empty variables count as unknown; the
-    folder need not exist.
+    """Return the data folder: STEMMAP_FOLDER (a leading ~ is the home folder of the process), else `stemmap`
+    in XDG_DATA_HOME, LOCALAPPDATA or ~/.local/share, whichever is known first; None if there is none. Empty
+    variables count as unknown; the folder need not exist.
 
     Args:
-        given: The environment variables, from which the home folder is taken too.
+        given: The environment variables; HOME, else USERPROFILE, is the home folder of ~/.local/share.
     """
     if named := given.get("STEMMAP_FOLDER"):
         return Path(named).expanduser()

@@ -24,7 +24,8 @@ _MOST_STEPS = 200
 
 
 def preset_alone(name: str) -> tuple[str, Parameters]:
-    """Return the name and the parameters of a preset; raises ParameterError for an unknown one."""
+    """Return `name` unchanged and the parameters of this preset, the default of `begin`. Raises
+    ParameterError for an unknown preset."""
     return name, preset(name)
 
 

@@ -154,7 +154,8 @@ def _of_role(
     rank: Callable[[Publisher], tuple[object, ...]],
     where: str,
 ) -> Publisher | None:
-    """Return the publisher of a role: that of the named topic, else the first by rank; None if there is none.
+    """Return the publisher of a role: that of the topic that the user named, else the first by `rank` of
+    those with one of `types`. None if there is no such publisher, also if the named topic is not published.
 
     Args:
         there: Publishers of the robot.

@@ -173,7 +173,8 @@ class ZenohLink(Link):
         ]
 
     def _watch(self) -> None:
-        """Update until `close` whether the router is connected; zenoh reconnects by itself."""
+        """Set `problem` every _WATCH_S until `close`: "" if the router is connected. zenoh reconnects by
+        itself."""
         while not self.closing.is_set():
             is_connected = bool(self.session.info.routers_zid())
             self.problem = "" if is_connected else f"no connection to {self._address.endpoint}"

@@ -369,14 +369,15 @@ class Follower:
     def look(
         self, client: viser.ClientHandle, pose: Pose2, z: float, *, from_above: bool, origin: bool = False
     ) -> None:
-        """Turn the camera of one browser to the robot, from the distance that `frame_plot` has set.
+        """Move the camera of one browser to a fixed offset from the robot, scaled by `frame_plot`, and point
+        it at the robot. The offset is along the axes of the viewer; the heading does not matter.
 
         Args:
             client: The browser.
-            pose: Pose of the robot in the map.
-            z: Height of the robot [m].
-            from_above: Whether the camera is above the robot; otherwise behind it.
-            origin: Whether it turns to the origin of the viewer instead.
+            pose: Pose of the robot in the map; only x, y are used.
+            z: Height of the robot in the map [m].
+            from_above: Whether the camera is above the robot (ABOVE); otherwise it is at BEHIND.
+            origin: Whether the target is the origin of the viewer instead of the robot.
         """
         target = np.zeros(3) if origin else np.array([pose.x, pose.y, z]) + self._world.position
         with client.atomic():

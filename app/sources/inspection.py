@@ -86,12 +86,12 @@ async def ask(
 
 
 async def check_source(request: SourceRequest) -> None:
-    """Check that a source can be opened. A child process reads the first scan of a file, within 300 s, or the
-    header and the first points of a whole cloud; of simulated runs and live robots only the address is
-    checked.
+    """Check that a source can be opened. Of a recording, a child process reads the first scan, within
+    OPENING_LIMIT_S. Of a whole cloud, it reads the header and the first points; on systems other than Linux,
+    only the existence of the file is checked. Of simulated runs and live robots, only the address is checked.
 
     Raises:
-        StemmapError: The source cannot be opened; the error gives the reason.
+        StemmapError: The source cannot be opened or takes too long; the error gives the reason.
     """
     if not check_address(request.uri):
         return

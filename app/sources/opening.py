@@ -198,10 +198,11 @@ def open_cloud(uri: str) -> WholeCloud:
 
 
 def check_cloud(uri: str) -> None:
-    """Open a whole cloud only in a child process with limits; nothing is checked on other systems than Linux.
+    """Check that a whole cloud can be opened, in a child process with limits of time and memory. Nothing is
+    checked on systems other than Linux, or if the path does not exist.
 
     Raises:
-        SourceError: As for `open_source`.
+        SourceError: The cloud cannot be read, or takes more time or memory than a file of its size should.
     """
     from pipeline.io.readers.clouds import open_cloud as _open_cloud
 

@@ -126,11 +126,11 @@ def validate(
 
 def groups_of(examples: Sequence[Examples]) -> tuple[str, Int]:
     """Return the kind of the groups, "run" or "place", and the group number of each of N examples, int64,
-    shape (N,). The groups are runs if there are at least LEAST_RUNS groups of runs, otherwise places
-    (clusters of objects).
+    shape (N,); the numbers need not be consecutive.
 
-    A place is a cluster of objects, of any run, each within SAME_PLACE of another one. Runs that share a
-    place form one group.
+    A place is a cluster of objects, of any run, each within SAME_PLACE of another one in x, y. A group of the
+    kind "run" has all runs that share places. If there are fewer than LEAST_RUNS of these groups, each place
+    is a group instead.
 
     Args:
         examples: Examples of each run; together at least one.

@@ -243,8 +243,10 @@ def other_runs(
     open_digest: str,
     may_be_opened: Callable[[str], str | None],
 ) -> list[OtherRun]:
-    """Return the runs of the list except the open one, one per source, in the order of their newest records.
-    Runs that cannot be scored are included, with the reason in `why_not`. Checks whether their files exist.
+    """Return one run per digest of a source except `open_digest`, in the order of their newest records.
+
+    A run that cannot be scored is included, with the reason in `why_not`: it may not be opened, it was live,
+    its file does not exist, or no true trees are known (no record has scores, and no tree is annotated).
 
     Args:
         rows: Records of the store as dicts, the newest first, see `RunRecords.listed`.

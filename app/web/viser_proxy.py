@@ -135,8 +135,8 @@ async def bridge(
     looks_only: bool,
 ) -> None:
     """Carry messages between a browser and viser until one of them leaves, then close the websocket. If viser
-    cannot be reached, the websocket is closed with 1013 before it is accepted, which is logged. Messages that
-    are not allowed are dropped.
+    cannot be reached, the websocket is closed with 1013 before it is accepted, which is logged. Text messages
+    of the browser and those that `is_allowed` rejects are dropped; all messages of viser pass.
 
     Args:
         browser: The websocket of the browser, not accepted yet.

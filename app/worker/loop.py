@@ -312,8 +312,8 @@ class WorkerLoop:
             self._send_opened(opened)
 
     def _play(self) -> None:
-        """Continue the run; a run that was opened again is announced as the next run. Raises SourceError if
-        it cannot be read."""
+        """Continue the run, see `Session.play`. A failed or closed run is opened again and announced with a
+        new number. Raises SourceError if it cannot be read."""
         self._held = False
         opened_again = self._session.play()
         if opened_again is not None:

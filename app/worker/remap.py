@@ -308,8 +308,8 @@ class RunMap:
         return np.array([known.get(number, np.nan) for number in trees.number.tolist()], dtype=np.float64)
 
     def ended(self, trees: Trees) -> dict[int, tuple[float, float]]:
-        """Return a dict from the number of each tree that was ever confirmed and is not among `trees` to its
-        last position (x, y) in the map [m]."""
+        """Return a dict from the number in this map of each tree that was ever confirmed and is not among
+        `trees`, which have numbers of this map too, to its last position (x, y) [m]."""
         last = self.history.last_places()
         return {n: last[n] for n in self.confirmed_s.keys() - set(trees.number.tolist()) if n in last}
 

@@ -255,12 +255,12 @@ class Session:
             self._run.stopwatch.disturb()
 
     def work(self) -> Frame | None:
-        """Map the next scan and return its frame, or the frame of the seek target once it is reached. A live
-        robot publishes and records the results.
+        """Map at most one scan and return its frame. In a seek, each call maps one scan on the way, whose
+        frame may have no points (`Run.is_bare`); the seek ends at its target or at the end of the run. The
+        results of a live robot are published and recorded.
 
-        None if no run is open, if nothing is to be mapped (`pace` is "idle"), while a whole cloud is not
-        mapped completely, before a live scan arrived, and at the end of another run, whose state then becomes
-        "finished".
+        None if no run is open, if `pace` is "idle", while a whole cloud is not mapped completely, before a
+        live scan arrived, and at the end of a run without a seek, whose state then becomes "finished".
 
         Raises:
             StemmapError: Nothing more can be read, or the scan cannot be mapped.

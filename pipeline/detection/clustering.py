@@ -79,9 +79,10 @@ def dbscan_grid(
 
 @cache
 def _row_offsets(dimensions: int) -> Int:
-    """Return the key differences between a cell and the middle cell of each row along the last axis that can
-    contain a neighbour, int64, shape (5,) in the plane and (25,) in space: the row of the cell itself (0)
-    first, then by distance. `dimensions` is 2 or 3."""
+    """Return the key offsets from a cell to the rows of cells along the last axis that can contain a
+    neighbour, int64, shape (5,) for 2 and (25,) for 3 `dimensions`: the key plus an offset is that of the
+    cell in this row with the same last coordinate. They are sorted by distance, the row of the cell itself
+    (0) first. The array is cached and must not be changed."""
     reach = np.arange(-_REACH, _REACH + 1)
     rows = np.stack(np.meshgrid(*([reach] * (dimensions - 1)), indexing="ij"), -1).reshape(-1, dimensions - 1)
     rows = rows[np.argsort((rows**2).sum(axis=1), kind="stable")]

@@ -138,20 +138,23 @@ def loop_to(
     run: RunHistory, numbers: Int, T_map_base: Pose2, R: Float, last_mapped: int, spread: Float | None = None
 ) -> Loop | None:
     """Return the loop from the scan at which known trees were left to the newest scan, at which they are
-    found again. The anchor of the loop is the scan whose pose is nearest to `T_map_base`, among the scans up
-    to the one at which the trees were left. The trees count as left at `placed` or `closed` of the run at the
-    earliest. Return None if the trees were left at `last_mapped` or later, if the error of the position is
-    below LEAST_GAP and the run is not `contradicted`, or if the error is larger than the drift of the path
-    can be.
+    found again; None if it is rejected. The trees count as left at `placed` or `closed` of the run at the
+    earliest. The anchor of the loop is the scan whose pose is nearest to `T_map_base`, among the scans up to
+    the one at which the trees were left.
+
+    The gap is `T_map_base` minus the newest pose of the path. A loop is rejected if the trees were left at
+    `last_mapped` or later; if the gap in x, y is below LEAST_GAP and the run is not `contradicted`; if the
+    gap exceeds DRIFT sigma of `spread` + R; or if the path since then has jumps, and the gap of the path
+    without them exceeds DRIFT sigma of the drift of the odometry + R.
 
     Args:
         run: Path and map; unchanged.
         numbers: Numbers of the trees that agree, int64, shape (K,); at least one exists in the map.
         T_map_base: Pose of the base in the map by these trees.
-        R: Covariance of this pose, shape (3, 3).
+        R: Covariance of T_map_base (x, y [m], yaw [rad]), shape (3, 3).
         last_mapped: Last scan that changed the map.
-        spread: Covariance of the pose, shape (3, 3); None uses the drift of the odometry since the trees were
-            left.
+        spread: Covariance of the newest pose of the path, shape (3, 3); None uses the drift of the odometry
+            since the trees were left.
 
     Raises:
         LinAlgError: The sum of the covariances is singular.

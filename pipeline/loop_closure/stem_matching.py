@@ -316,8 +316,8 @@ def partners(
 
 @compiled
 def crowding(pose: Float, local: Float, reference: Float, window: float) -> tuple[float, int]:
-    """Return the mean density of the map around the aligned local stems [1/m^2], and the number of local
-    stems with a stem of the map within the window.
+    """Return the density of map stems within `window` of an aligned local stem, mean over all local stems
+    [1/m^2], and the number of local stems with at least one map stem within `window`.
 
     Args:
         pose: x, y [m], yaw [rad] of the local frame in the map, shape (3,).
