@@ -2,11 +2,11 @@
 
 Each mutant changes one expression, in a scratch worktree of the committed state. It is killed if a test
 fails, or if a test does not end. Without --minutes, the mutants written by hand below are run, each with the
-tests named beside it. With --minutes, the operators, numbers and truth values of ROOMS are mutated in a
-random order for this time, each with the tests that execute its line, the quickest first. The tests of each
-line are recorded before, one file of tests at a time. Recorded lines and results are stored in the folder, so
-that a run that was ended goes on where it was; the table is printed at the end. Kernels run without numba, so
-that nothing is compiled.
+tests named beside it. With --minutes, operators, numbers and booleans in ROOMS are mutated in random order
+until the time is over. Each of these mutants is run with the tests that execute its line, the fastest first.
+The tests of each line are recorded before, one test file at a time. Recorded lines and results are stored in
+the folder, so that a run that was stopped can be resumed. A table is printed at the end. Kernels run without
+numba, so that nothing is compiled.
 """
 
 from __future__ import annotations

@@ -240,7 +240,7 @@ export async function review(kind) {
   if (!draft.error && state.selected === tree.number) await next();
 }
 
-// The DBH that a person typed [cm], null for an empty text, or undefined and an error for the person.
+// Returns a typed DBH [cm], null for an empty text, or undefined and shows an error.
 export function typedDbh(typed) {
   const text = typed.trim().replace(",", "."), value = text === "" ? null : Number(text);
   if (value === null || (value > 0 && value <= LARGEST_DBH)) return value;
@@ -249,7 +249,7 @@ export function typedDbh(typed) {
   return undefined;
 }
 
-// Stores the DBH of a found tree [cm]; who measures a tree confirms it, unless it was rejected.
+// Stores the DBH of a found tree [cm]. An open or skipped tree becomes confirmed; a rejected one stays rejected.
 export function measureDbh(tree, dbh) {
   const row = annotationOf(tree);
   if (row) return change(row, { dbh_cm: dbh, ...(row.kind === SKIPPED ? { kind: "tree" } : {}) });

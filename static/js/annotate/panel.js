@@ -131,7 +131,7 @@ function fill() {
 }
 
 function hint(tree) {
-  if (draft.adding) return "Click on the map where a tree is missing; the ring shows where it will be added. Scores count what is within their reach of the path. Esc ends.";
+  if (draft.adding) return "Click on the map where a tree is missing; the ring shows where it will be added. Scores count trees near the path only (Tune, Evaluation, Reach). Esc ends.";
   if (imported) return imported;
   if (tree) return `Tree ${tree.number}, ${seenText(tree)}, ${dbhText(tree)}${votesText(tree)}. Is this a tree?`;
   if (!rows().length) return "Press Next to review the trees one by one, or Add and click on the map where a tree was missed (Shift+click in the 3D scene).";

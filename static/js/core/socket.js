@@ -3,7 +3,8 @@
 const FIRST_WAIT = 500, LONGEST_WAIT = 5000, REFUSED_WAIT = 30_000; // [ms]
 const ANSWER_WAIT = 5000; // [ms]
 
-// Whether the server answers and refuses this page. The script is not told why a WebSocket was refused.
+// Returns whether the server refuses this page. The status of a refused WebSocket handshake is not available to JavaScript, so that
+// another request is sent.
 async function isRefused() {
   try {
     return [401, 403].includes((await fetch("/api/access", { cache: "no-store", signal: AbortSignal.timeout(ANSWER_WAIT) })).status);

@@ -169,13 +169,13 @@ function hint() {
   return `Trees of the map at the shown time.${trees} ± is the standard error. That of a count does not contain missed trees, and is about 0 where the whole plot was observed; for the mean it is the variation between plots.`;
 }
 
-const NO_ERROR = " The error of N/ha is small because all of the area was observed and few diameters are near the minimum; trees that the map lacks are not included.";
+const SMALL_ERROR_NOTE = " The error of N/ha is small because all of the area was observed and few diameters are near the minimum; trees that the map lacks are not included.";
 
 // Which of the figures with and without correction to use, as `stemmap stand` prints it, and what a small error means.
 function detectionText() {
   const { all, plots: own } = figures;
   const shownPlots = [all, own].flatMap((each) => Object.values(each?.plots ?? {}));
-  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: [stems, se], trees }) => trees > 0 && se !== null && se < SMALL_ERROR * stems) ? NO_ERROR : "");
+  return correctionText(own ?? all ?? {}) + (shownPlots.some(({ n_ha: [stems, se], trees }) => trees > 0 && se !== null && se < SMALL_ERROR * stems) ? SMALL_ERROR_NOTE : "");
 }
 
 function correctionText({ detection_sigma_m: sigma, plots: of, mean }) {

@@ -92,7 +92,7 @@ function more(run, map) {
       el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(fileName(title, "map.png"), map.canvas) }),
       reportMenu("run-report", run.key, () => title),
       el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(fileName(title, "trees.csv"), treeRows(run.map.trees)) })),
-    ...(run.scores ? [el("div", {}, el("h3", { text: run.annotated ? "Against ground truth and annotations" : "Against the ground truth" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
+    ...(run.scores ? [el("div", {}, el("h3", { text: "Scores" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
     el("div", {}, el("h3", { text: "Differences from the preset" }), Object.keys(run.differences).length
       ? table(["parameter", "value"], Object.entries(run.differences).map(([name, value]) => [name, String(value)]))
       : el("p", { class: "note", text: `None: all parameters are those of the preset ${run.preset}.` })),
