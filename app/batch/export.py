@@ -88,7 +88,7 @@ TREE_FIELDS = (
     Field("height_m", "height_m", "m", "height of the tree; empty where its top is not seen"),
     Field("sigma_height_m", "sh_m", "m", "standard deviation of the height"),
     Field("lean_deg", "lean_deg", "deg", "angle of the stem from the vertical"),
-    Field("review", "review", "", "state of the review: open, or confirmed by a person"),
+    Field("review", "review", "", "state of the review: open, or confirmed or skipped by a person"),
 )
 #: Beginnings of the names of the figures of a plot in a Shapefile, which may end in `_se`.
 _FIGURES_SHORT = {

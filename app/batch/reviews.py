@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from app.batch.run_folder import read_run
-from app.store.records import KINDS, Content
+from app.store.records import KINDS, SKIPPED, Content
 from pipeline.errors import StemmapError
 from pipeline.geometry.poses import Float
 from pipeline.io.atomic_files import write_texts
@@ -33,38 +33,40 @@ _FILES = ("path.csv", "terrain.csv", "seen.csv", "run.json", "georeference.json"
 
 
 def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> dict[int, str]:
-    """Return a dict from the number of each tree that a person reviewed to CONFIRMED or REJECTED.
+    """Return a dict from the number of each tree that a person reviewed to CONFIRMED, REJECTED or SKIPPED.
 
     An annotation belongs to the tree that is nearest to it, if it is nearer than SAME_THING. Of several
-    annotations of a tree the nearest one counts, of equally near ones the last. The page has the same rule
-    (`paired` in static/js/annotate/annotations.js).
+    annotations of a tree the nearest one that states a class counts, of equally near ones the last. The page
+    has the same rule (`paired` in static/js/annotate/annotations.js).
 
     Args:
         numbers, position: Numbers of the trees, and their positions in the map, shape (T, 2) [m].
-        contents: The annotations in the same frame; skipped trees and plots are ignored.
+        contents: The annotations in the same frame; plots are ignored.
     """
     from scipy.spatial import cKDTree
 
-    stating = [content for content in contents if content.kind in KINDS]
-    if not stating or not len(numbers):
+    states = {**dict.fromkeys(KINDS, REJECTED), "tree": CONFIRMED, SKIPPED: SKIPPED}
+    reviews = [content for content in contents if content.kind in states]
+    if not reviews or not len(numbers):
         return {}
-    distance, row = cKDTree(position).query([(content.x, content.y) for content in stating])
+    distance, row = cKDTree(position).query([(content.x, content.y) for content in reviews])
+    states_class = np.array([content.kind != SKIPPED for content in reviews])
     found: dict[int, str] = {}
-    for k in np.argsort(-distance, kind="stable"):  # the nearest comes last
+    for k in np.lexsort((-distance, states_class)):  # the one that counts comes last
         if distance[k] < SAME_THING:
-            found[numbers[row[k]]] = CONFIRMED if stating[k].kind == "tree" else REJECTED
+            found[numbers[row[k]]] = states[reviews[k].kind]
     return found
 
 
 def stored_reviews(store: Store, source: Mapping[str, Any]) -> list[Content]:
-    """Return the annotations of a recording that state what an object is, in the frame of the map.
+    """Return the annotations of a recording that review trees, in the frame of the map.
 
     Args:
         store: The store.
         source: Member `source` of run.json.
     """
     contents = store.contents(str(source.get("sha256") or source.get("uri")))
-    return [content for content in contents if content.kind in KINDS]
+    return [content for content in contents if content.kind in (*KINDS, SKIPPED)]
 
 
 @contextmanager
@@ -81,7 +83,7 @@ def reviewed_run(folder: FilePath, contents: Sequence[Content]) -> Iterator[File
         StemmapError: A file of the run is missing or damaged.
     """
     run = read_run(folder)  # checks the files
-    if not (contents or run.rejected or CONFIRMED in run.reviews.values()):
+    if not (contents or run.rejected or {*run.reviews.values()} - {OPEN}):
         yield folder
         return
     offset = run.record["source"].get("offset_m", (0.0, 0.0))

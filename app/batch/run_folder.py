@@ -61,7 +61,7 @@ class FinishedRun:
         record: run.json; only "source", "seed" and "parameters" are checked.
         uri: URI of the source.
         trees: The trees that no person rejected.
-        reviews: Dict from the number of each tree to the state of its review, "open" or "confirmed", see
+        reviews: Dict from the number of each tree to the state of its review, not "rejected", see
             `REVIEWS`.
         rejected: Number of rejected trees.
         of_cloud: Whether a whole cloud was mapped, which has an empty path.

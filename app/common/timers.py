@@ -125,6 +125,9 @@ async def cancel(task: asyncio.Task[Any] | None) -> None:
         _log.exception("%s had ended with a fault", task.get_name())
 
 
+TOTAL = "total"
+
+
 class Stopwatch:
     """Median times of the stages and of whole scans over the last scans; the `StageTimer` of a mapper.
 
@@ -142,6 +145,7 @@ class Stopwatch:
         self._totals: deque[float] = deque(maxlen=scans)
         self._aside = False
         self._disturbances = 0
+        self._scan: dict[str, float] = {}
 
     def disturb(self) -> None:
         """Discard the current measurement, for example because a kernel was compiled meanwhile."""
@@ -157,18 +161,25 @@ class Stopwatch:
         finally:
             times = self._stages.setdefault(stage, deque(maxlen=self._scans))
             if not self._aside and disturbances == self._disturbances:
-                times.append(self._clock() - start)
+                spent = self._clock() - start
+                times.append(spent)
+                self._scan[stage] = self._scan.get(stage, 0.0) + 1e3 * spent
 
     @contextmanager
-    def whole_scan(self) -> Iterator[None]:
+    def whole_scan(self) -> Iterator[dict[str, float]]:
         """Measure the mapping of one scan including the time between the stages; `aside` has no effect on
-        it."""
+        it. Yields a dict from the name of each stage, and TOTAL, to its time [ms], which is filled until the
+        end of the context; it stays without TOTAL if the scan is disturbed."""
         start, disturbances = self._clock(), self._disturbances
+        times: dict[str, float] = {}
+        self._scan = times
         try:
-            yield
+            yield times
         finally:
             if disturbances == self._disturbances:
-                self._totals.append(self._clock() - start)
+                spent = self._clock() - start
+                self._totals.append(spent)
+                times[TOTAL] = 1e3 * spent
 
     @contextmanager
     def aside(self) -> Iterator[None]:

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from app.explain.history import half_axes
-from app.worker.protocol import Shown
+from app.worker.course import QUANTITIES
+from app.worker.protocol import Course, Shown
 from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict
 
 Float = NDArray[np.float64]
@@ -47,6 +48,20 @@ def map_payload(shown: Shown) -> dict[str, Any]:
         "counts": dict(frame.counts),
         "layers": layer_counts(frame),
         "clearance": clearance_payload(frame.clearance),
+    }
+
+
+def course_payload(course: Course) -> dict[str, Any]:
+    """Return the course of a map as a dict of JSON values: `scans` and `time_s`, as in `Course`; `values` and
+    `stages`, dicts from names to lists with one number for each scan, None where unknown or infinite; and
+    `quantities`, a dict from the names of known quantities to dicts with `title` and `unit`."""
+    quantities = {name: QUANTITIES[name] for name in QUANTITIES if name in course.known}
+    return {
+        "scans": course.scans.tolist(),
+        "time_s": _rounded(course.time_s),
+        "values": {name: [*map(_known, values.tolist())] for name, values in course.values.items()},
+        "stages": {name: [*map(_known, values.tolist())] for name, values in course.stages.items()},
+        "quantities": {name: {"title": each.title, "unit": each.unit} for name, each in quantities.items()},
     }
 
 

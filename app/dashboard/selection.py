@@ -16,10 +16,12 @@ from app.worker.protocol import (
     AskCamera,
     AskCluster,
     AskCompare,
+    AskCourse,
     AskSection,
     AskTree,
     AskTreePicture,
     CameraPicture,
+    Course,
     Question,
     WorkerBusyError,
 )
@@ -108,6 +110,11 @@ class WorkerClient:
         """Return the accumulated points at breast height after the current scan; raises NoStoryError without
         a run, WorkerBusyError without an answer."""
         return _known((await self._ask(AskSection)).section)
+
+    async def course(self, names: list[str], most: int) -> Course:
+        """Return the course of the map with the named quantities of at most `most` scans; raises NoStoryError
+        without a run, WorkerBusyError without an answer."""
+        return _known((await self._ask(AskCourse, names, most)).course)
 
     async def _ask(
         self, kind: Callable[Concatenate[int, int, P], Question], *values: P.args, **named: P.kwargs

@@ -81,7 +81,7 @@ class ShownRun:
         """Return the present state of a dashboard; raises NothingMappedError before the first map."""
         if dashboard.shown is None or dashboard.path is None:
             raise NothingMappedError
-        state = dashboard.parameters
+        state, editor = dashboard.parameters, dashboard.annotation_editor
         return cls(
             dashboard.source,
             dashboard.digest,
@@ -93,8 +93,8 @@ class ShownRun:
             state.parameters,
             dashboard.file_truth,
             dashboard.seen,
-            (*dashboard.annotation_editor.rows, *dashboard.annotation_editor.plots),
-            dashboard.annotation_editor.frame,
+            (*editor.rows, *editor.skipped, *editor.plots),
+            editor.frame,
         )
 
     @property

@@ -16,7 +16,7 @@ from app.batch.run_folder import NO_PATH
 from app.batch.summary import FAR_FROM_PLOT
 from app.common.timers import Stopwatch
 from app.store.forests import kept_forests
-from app.worker.protocol import RunCounts
+from app.worker.protocol import Course, RunCounts
 from app.worker.tree_numbers import TreeNumbers
 from pipeline.classification.column_extraction import BREAST
 from pipeline.config import Parameters
@@ -152,6 +152,11 @@ class InventoryRun:
         if self.plot is None:
             return np.zeros((0, 3), np.float32)
         return self.plot.points[:, [0, 1, 3]].astype(np.float32)
+
+    def course(self, names: Sequence[str], most: int) -> Course:
+        """Return a course without scans: a whole cloud has none. The arguments are ignored."""
+        del names, most
+        return Course(np.zeros(0, np.int64), np.zeros(0), {}, {}, [])
 
     def take_views(self) -> list[tuple[int, Float]]:
         """Return nothing: the area that a whole cloud covers does not come from views."""

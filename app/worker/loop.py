@@ -493,6 +493,10 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
             return protocol.Answer(ticket, section=section(run.accumulated))
+        case protocol.AskCourse(names=names, most=most):
+            if run is None:
+                raise StemmapError("no run is open", remedy="Open one")
+            return protocol.Answer(ticket, course=run.course(names, most))
         case protocol.AskTree(tree=tree):
             return protocol.Answer(ticket, tree=tree_story(run, session.frame, tree))
         case protocol.AskCluster(scan=scan, cluster=cluster):

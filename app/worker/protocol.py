@@ -19,7 +19,7 @@ from app.explain.records import ClusterStory, MapSection, TreeStory
 from app.sources.request import SourceRequest
 from pipeline.errors import StemmapError
 from pipeline.io.readers.camera import Camera, Picture
-from pipeline.types.records import Float, Frame, Path, Trees, TruthTrees
+from pipeline.types.records import Float, Frame, Int, Path, Trees, TruthTrees
 
 # Beyond any run, and well inside of an int64 of nanoseconds.
 LONGEST_S = 1e9
@@ -341,6 +341,37 @@ class AskSection(_Question, frozen=True, tag="ask_section"):
     """Request the accumulated points at breast height."""
 
 
+class AskCourse(_Question, frozen=True, tag="ask_course"):
+    """Request the course of the map.
+
+    Attributes:
+        names: Names of quantities.
+        most: Maximum number of scans, which are evenly spaced.
+    """
+
+    names: list[str]
+    most: Annotated[int, Meta(ge=1, le=MOST_SCANS)]
+
+
+class Course(msgspec.Struct, frozen=True):
+    """Quantities of the mapped scans, in their order. Unknown values are NaN.
+
+    Attributes:
+        scans: Indices of the scans, shape (N,).
+        time_s: Times of the scans since the first one, shape (N,) [s].
+        values: Dict from the requested names to the values, shape (N,), in the units of QUANTITIES.
+        stages: Dict from stages, and "total", to the times of mapping the scans, shape (N,) [ms]; NaN where
+            they were not measured.
+        known: Names of QUANTITIES of which any value is known.
+    """
+
+    scans: Int
+    time_s: Float
+    values: dict[str, Float]
+    stages: dict[str, Float]
+    known: list[str]
+
+
 class CameraPicture(msgspec.Struct, frozen=True):
     """An encoded picture with the pose of its camera.
 
@@ -362,8 +393,8 @@ class Answer(msgspec.Struct, frozen=True, tag="answer"):
 
     Attributes:
         ticket: Identifier of the question.
-        cluster, tree, frames, camera, section: One of them is set unless `missing` is; `frames` has one frame
-            per parameter set, without raw points.
+        cluster, tree, frames, camera, section, course: One of them is set unless `missing` is; `frames` has
+            one frame per parameter set, without raw points.
         missing: Reason why there is no answer, and the remedy.
     """
 
@@ -373,6 +404,7 @@ class Answer(msgspec.Struct, frozen=True, tag="answer"):
     frames: list[Frame] | None = None
     camera: CameraPicture | None = None
     section: MapSection | None = None
+    course: Course | None = None
     missing: str = ""
 
 
@@ -458,7 +490,7 @@ class View(msgspec.Struct, frozen=True, tag="view"):
 
 
 FromWorker = Opened | Shown | Report | Answer | Remapped | Rough | View
-Question = AskCluster | AskTree | AskCompare | AskCamera | AskTreePicture | AskSection
+Question = AskCluster | AskTree | AskCompare | AskCamera | AskTreePicture | AskSection | AskCourse
 ToWorker = Command | Begin | Question
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from app.batch.summary import warning_texts
 from app.explain.history import TreeHistory
+from app.worker.course import ScanSeries, read_quantities
 from app.worker.protocol import (
     LENGTH_BYTES,
     MapChanges,
@@ -252,6 +253,7 @@ class RunMap:
             first scan].
         clusters: Clusters of all scans.
         counts: Counts of all scans.
+        course: Quantities of all scans, see `read_quantities`, with `time_s` [s since the first scan].
         views: Time [ns] and free range by direction [m], see `SegmentedScan.free`, of the scans that
             `ViewSelection` takes for the observed area, in the order of their times.
     """
@@ -270,6 +272,7 @@ class RunMap:
         self.before = mapper.snapshot()
         self.snapshots = Snapshots(self.before, 0 if is_live else _MOST_STATES)
         self.history, self.clusters, self.counts = TreeHistory(), ClusterTable(), ScanCounts()
+        self.course = ScanSeries()
         self.confirmed_s: dict[int, float] = {}
         self.views: list[tuple[int, Float]] = []
         self._view_selection, self._newest_ns = ViewSelection(), -1
@@ -289,6 +292,7 @@ class RunMap:
         self.clusters.record(frame)
         self.counts.record(frame)
         time_s = (frame.stamp_ns - start_ns) / NS
+        self.course.record(frame.index, {"time_s": time_s, **read_quantities(frame)})
         if time_s <= self._time_s:
             self.confirmed_s = {number: at for number, at in self.confirmed_s.items() if at < time_s}
         self._time_s = time_s
@@ -315,11 +319,12 @@ class RunMap:
 
     def use(self, parameters: Parameters, index: int) -> bool:
         """Use other parameters from the scan with an index onwards; no scan is mapped. Return whether any
-        value changes. If so, the states after that scan are dropped, and the frames of this scan and of later
-        ones."""
+        value changes. If so, the states after that scan are dropped, and the frames and the course of this
+        scan and of later ones."""
         changes = self.parameters.set_from(index, parameters)
         if changes:
             self.snapshots.forget_after(index)
+            self.course.forget_from(index)
             if self.frames is not None:
                 self.frames.forget_from(index)
         return changes

@@ -12,13 +12,15 @@ from contextlib import ExitStack
 from dataclasses import replace
 
 import msgspec
+import numpy as np
 
-from app.common.timers import Stopwatch
+from app.common.timers import TOTAL, Stopwatch
 from app.explain.records import History
 from app.robot.source import LiveSource
 from app.sources.request import with_odometry
+from app.worker.course import ScanSeries
 from app.worker.cursor import Cursor, StepStore, live_steps
-from app.worker.protocol import RunCounts, Shown
+from app.worker.protocol import Course, RunCounts, Shown
 from app.worker.remap import (
     NOT_OF_THE_MAP,
     Remapping,
@@ -31,6 +33,7 @@ from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.front_end import SegmentedScan, StageTimer
+from pipeline.geometry.columns import evenly_spaced
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
@@ -100,6 +103,7 @@ class Run:
         self._cache = caches.of(parameters)
         self._numbers = TreeNumbers()
         self._views_sent = 0
+        self._times = ScanSeries()  # of mapping each scan, by stage [ms]
         self._remapping: Remapping | None = None
         self._previous: RunMap | None = None  # the map before the last change of parameters, for undo
 
@@ -117,6 +121,21 @@ class Run:
         """Return the counts of the map up to a scan that was mapped."""
         losses = Counter(self._left_out) + Counter(self.source.losses)
         return self._map.counts.totals(index, self.warnings, losses)
+
+    def course(self, names: Sequence[str], most: int) -> Course:
+        """Return the course of the map with at most about `most` scans, see `Course`."""
+        series, path = self._map.course, self.path
+        scans = series.scans("time_s")
+        scans = np.append(scans[:-1][evenly_spaced(len(scans) - 1, most - 1)], scans[-1:])
+        values = {name: series.values(name, scans) for name in names}
+        stages = {stage: self._times.values(stage, scans) for stage in self._times.names}
+        if "mapping" in names and TOTAL in stages:
+            values["mapping"] = stages[TOTAL]
+        if "driven" in names:
+            driven = np.append(0.0, np.cumsum(np.hypot(np.diff(path.x), np.diff(path.y))))
+            values["driven"] = np.append(driven, np.nan)[np.minimum(scans, len(path.x))]
+        known = [*series.names, "driven", *(["mapping"] if TOTAL in stages else [])]
+        return Course(scans, series.values("time_s", scans), values, stages, known)
 
     @property
     def start_ns(self) -> int:
@@ -219,8 +238,10 @@ class Run:
         if mapper.parameters is not wanted:
             mapper.parameters, self._cache = wanted, self._caches.of(wanted)
         self._broken = True
-        with self.stopwatch.whole_scan():
+        with self.stopwatch.whole_scan() as times:
             frame, free = self._process(mapper, step, hurried=hurried)
+        if TOTAL in times and not self.is_bare:
+            self._times.record(step.index, times)
         self._broken = False
         if new_map:
             self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))

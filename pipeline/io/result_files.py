@@ -24,7 +24,7 @@ ROWS = "detections.csv"  # written during the run
 # Earlier versions did not write them.
 NEW_TREE_COLUMNS = ("height_m", "sigma_height_m", "lean_deg", "review")
 #: States of a tree in the review by a person.
-OPEN, CONFIRMED, REJECTED = REVIEWS = ("open", "confirmed", "rejected")
+OPEN, CONFIRMED, REJECTED, SKIPPED = REVIEWS = ("open", "confirmed", "rejected", "skipped")
 TERRAIN_COLUMNS = ("x_m", "y_m", "z_m", "sigma_m", "views")
 SEEN_COLUMNS = ("x_m", "y_m", "nearest_m", "views")
 

@@ -12,7 +12,14 @@ from fastapi import APIRouter, Depends, Path, Query
 from starlette.responses import FileResponse, Response
 
 from app.dashboard.dashboard import Dashboard
-from app.dashboard.payload import binary_payload, comparison_payload, doubts_of, stages_payload, trees_payload
+from app.dashboard.payload import (
+    binary_payload,
+    comparison_payload,
+    course_payload,
+    doubts_of,
+    stages_payload,
+    trees_payload,
+)
 from app.dashboard.scores import pairs_payload
 from app.dashboard.selection import NothingMappedError
 from app.dashboard.shown_run import ShownRun
@@ -29,6 +36,7 @@ from app.web.responses import (
     text_reply,
 )
 from app.web.routes.access import Bounds, Dash, FigureParameters, ViewerTurn, in_thread
+from app.worker.course import MOST_ROWS, QUANTITIES
 from app.worker.protocol import Shown
 from pipeline.config import Parameters
 from pipeline.config.stages import Stand
@@ -39,6 +47,8 @@ router = APIRouter(prefix="/api")
 # Reading a long recording again.
 _CLOUD_S = 600.0
 _Scan = Annotated[int | None, Query(ge=0, le=LARGEST_NUMBER)]
+_Names = Annotated[str, Query(max_length=1000)]
+_Most = Annotated[int, Query(ge=2, le=MOST_ROWS)]
 _Stamp = Annotated[int, Path(ge=-(2**63), le=2**63 - 1)]
 
 
@@ -160,6 +170,22 @@ async def pairs(dashboard: Dash) -> Response:
     return json_reply(
         await asyncio.to_thread(pairs_payload, shown.frame.trees, dashboard.truth, match_distance)
     )
+
+
+@router.get("/course", dependencies=[ViewerTurn])
+async def course(dashboard: Dash, names: _Names = "", most: _Most = 1200) -> Response:
+    """Return the course of the map, see `course_payload`; 404 before the first map, 422 for an unknown name,
+    503 if the worker is busy.
+
+    Args:
+        dashboard: The dashboard.
+        names: Names of QUANTITIES, separated by commas.
+        most: Maximum number of scans.
+    """
+    wanted = [name for name in names.split(",") if name]
+    if unknown := [name for name in wanted if name not in QUANTITIES]:
+        return error_reply(422, f"there is no quantity {unknown[0]!r}", remedy=f"Use {', '.join(QUANTITIES)}")
+    return json_reply(course_payload(await dashboard.worker_client.course(wanted, most)))
 
 
 @router.get("/doubts")

@@ -10,7 +10,6 @@ import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
 import { throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
-import { available, isOutdated, QUANTITIES, recorded, startHistory } from "./history.js";
 
 const EVERY = 2000; // [ms] between two updates
 const CURSOR_EVERY = 200; // [ms] between two moves of the cursor
@@ -19,7 +18,8 @@ const MOST_APART = 24; // trees whose cells have a gap; the gaps of more are dra
 const ROW = 120; // [px] of height that a curve of its own needs
 const HEAD = 0.2; // share of its height for its name
 const FIXED = { n_eff: ["n_eff"], sigma: ["sigma", "yaw"] }; // charts of certain quantities
-let chosen = (recall("quantities") ?? "trees,sigma").split(",").filter((name) => name in QUANTITIES);
+let chosen = (recall("quantities") ?? "trees,sigma").split(",").filter(Boolean);
+let quantities = {}; // name -> {title, unit} of those that the run has
 let plotly = null, busy = false;
 
 function load() {
@@ -59,37 +59,46 @@ async function matrix(kind) {
     hovertemplate: `tree %{y} to tree %{x}<br>%{z:.3~r} ${unit}<extra></extra>` }], figure];
 }
 
-// Times of the stages, one above the other.
-function stages() {
-  const scans = recorded(LONGEST);
-  if (scans.length < 2) return NOTHING;
-  const time = scans.map((scan) => scan.time), names = [...new Set(scans.flatMap((scan) => Object.keys(scan.stages)))];
-  const figure = layout({ showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, shapes: [cursor()] });
-  figure.margin.t = 74;
-  figure.xaxis.title = { text: timeTitle() };
-  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "ms per scan" } });
-  return [names.map((name) => ({ ...line(time, scans.map((scan) => scan.stages[name] ?? null), name), stackgroup: "one" })), figure];
+// The course of the run: {scans, time_s, values, stages, quantities}, by name one value for each of at most LONGEST scans.
+async function course(names) {
+  const answer = await get(`/api/course?most=${LONGEST}&names=${names.join(",")}`);
+  const added = Object.keys(answer.quantities).some((name) => !quantities[name]);
+  quantities = answer.quantities;
+  if (added) showChosen();
+  return answer;
 }
 
-const NOTHING = "Nothing to plot yet: the curves begin with the first scan that this page receives. Press play.";
-const timeTitle = () => `time in the run, s${isOutdated() ? "; partly mapped with earlier parameters: play the run again to renew the curves" : ""}`;
+// Times of the stages, one above the other.
+async function stages() {
+  const { time_s: time, stages: { total, ...times } } = await course([]);
+  if (!total || time.length < 2) return NOTHING;
+  const figure = layout({ showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, shapes: [cursor()] });
+  figure.margin.t = 74;
+  figure.xaxis.title = { text: TIME };
+  Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "ms per scan" } });
+  return [Object.entries(times).map(([name, values]) => ({ ...line(time, values, name), stackgroup: "one" })), figure];
+}
+
+const NOTHING = "Nothing to plot yet: curves need two mapped scans. Press play.";
+const TIME = "time in the run, s";
 
 // Curves of quantities below one another, with one axis of time.
-function curves(names) {
-  const scans = recorded(LONGEST);
-  if (scans.length < 2) return NOTHING;
+async function curves(wanted) {
+  const { time_s: time, values } = await course(wanted);
+  const names = wanted.filter((name) => quantities[name]);
+  if (time.length < 2) return NOTHING;
   if (!names.length) return "Add a quantity to see its curve.";
-  const time = scans.map((scan) => scan.time), figure = layout({ hovermode: "x", hoversubplots: "axis", showlegend: false, shapes: [cursor()] });
+  const figure = layout({ hovermode: "x", hoversubplots: "axis", showlegend: false, shapes: [cursor()] });
   const { yaxis } = figure, height = 1 / names.length;
   figure.annotations = [];
   names.forEach((name, place) => {
-    const [title, unit] = QUANTITIES[name];
+    const { title, unit } = quantities[name];
     const top = 1 - (place + HEAD) * height;
     figure[`yaxis${place ? place + 1 : ""}`] = { ...yaxis, domain: [1 - (place + 1) * height, top], nticks: 5, automargin: true };
     figure.annotations.push({ text: `${title}${unit && `, ${unit}`}`, showarrow: false, xref: "paper", x: 0, xanchor: "left", yref: "paper", y: top, yanchor: "bottom" });
   });
-  Object.assign(figure.xaxis, { title: { text: timeTitle() }, anchor: names.length > 1 ? `y${names.length}` : "y", showspikes: true, spikemode: "across", spikethickness: 1, spikedash: "dot", spikecolor: colour("dim") });
-  return [names.map((name, place) => ({ ...line(time, scans.map((scan) => scan.values[name]), QUANTITIES[name][0]), yaxis: place ? `y${place + 1}` : "y" })), figure];
+  Object.assign(figure.xaxis, { title: { text: TIME }, anchor: names.length > 1 ? `y${names.length}` : "y", showspikes: true, spikemode: "across", spikethickness: 1, spikedash: "dot", spikecolor: colour("dim") });
+  return [names.map((name, place) => ({ ...line(time, values[name], quantities[name].title), yaxis: place ? `y${place + 1}` : "y" })), figure];
 }
 
 // The current scan as a line over all curves.
@@ -117,8 +126,8 @@ function showChosen() {
   box.hidden = byId("chart-choice").value !== "quantities";
   const add = el("select", { id: "chart-add", "aria-label": "Add a quantity", onchange: () => { if (add.value) choose([...chosen, add.value]); } },
     el("option", { value: "", text: "Add a quantity …" }),
-    ...available().filter((name) => !chosen.includes(name)).map((name) => el("option", { value: name, text: QUANTITIES[name][0] })));
-  box.replaceChildren(...chosen.map((name) => el("button", { class: "small", text: `${QUANTITIES[name][0]} ✕`, "aria-label": `Remove ${QUANTITIES[name][0]}`, onclick: () => choose(chosen.filter((each) => each !== name)) })), add);
+    ...Object.keys(quantities).filter((name) => !chosen.includes(name)).map((name) => el("option", { value: name, text: quantities[name].title })));
+  box.replaceChildren(...chosen.filter((name) => quantities[name]).map((name) => el("button", { class: "small", text: `${quantities[name].title} ✕`, "aria-label": `Remove ${quantities[name].title}`, onclick: () => choose(chosen.filter((each) => each !== name)) })), add);
 }
 
 const drawingOf = (kind) => (kind in SCALES ? matrix(kind) : kind === "time" ? stages() : curves(FIXED[kind] ?? chosen));
@@ -178,7 +187,6 @@ function saveTable() {
 }
 
 export function startCharts() {
-  startHistory();
   byId("chart-png").addEventListener("click", savePng);
   byId("chart-csv").addEventListener("click", saveTable);
   const list = byId("chart-choice");
@@ -191,6 +199,6 @@ export function startCharts() {
   });
   on("tab", () => visible("charts") && showChosen());
   on("tab theme", draw);
-  on("history", moveCursor);
+  on("map", moveCursor);
   setInterval(() => state.status?.state !== "failed" && draw(), EVERY);
 }

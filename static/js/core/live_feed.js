@@ -32,9 +32,8 @@ const receivers = {
 function receiveMap({ path, ...map }) {
   state.path.length = Math.min(state.path.length, path.start);
   state.path.push(...path.points);
-  if (path.start === 0) state.odometry.length = 0; // another run
   state.map = map.index < 0 ? null : map; // -1: another run is opening and nothing of it is mapped yet
-  if (map.odom) state.odometry[map.index] = map.odom;
+  if (!state.map) state.odometry = [];
   if (!state.map && state.selectedTruth) {
     state.selectedTruth = null; // an object of the former run
     changed("selection");
@@ -59,7 +58,6 @@ export function connect() {
     onOpen() {
       chosen = null; // a message sent over the lost connection may not have arrived
       Object.assign(state, { connected: true, lostAt: 0, refused: false, heardAt: performance.now() });
-      state.odometry.length = 0;
       changed("connection");
     },
     onClose() {

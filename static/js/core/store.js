@@ -5,7 +5,7 @@ export const state = {
   source: null,      // source request of the open run: {uri, odometry, seed, topics, mount, preset, parameters}
   map: null,         // the newest map message, without its path
   path: [],          // [[x, y], ...], one per scan, in the frame of the map
-  odometry: [],      // [x, y] by scan index; holes where the page was not connected
+  odometry: [],      // [scan, x, y] of mapped scans, in their order, from the odometry alone
   truth: null,       // ground truth trees
   evaluation: null,  // the map scored against the ground truth
   annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}], skipped: likewise, plots, georeference}

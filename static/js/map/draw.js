@@ -92,7 +92,6 @@ export function drawLine(pen, view, points, colour, width) {
   pen.beginPath();
   let last = null;
   for (const point of points) {
-    if (!point) continue;
     const [px, py] = view.toScreen(point[0], point[1]);
     if (last === null) pen.moveTo(px, py);
     else if (Math.abs(px - last[0]) + Math.abs(py - last[1]) < 1.5) continue; // closer than a pixel and a half
@@ -102,20 +101,19 @@ export function drawLine(pen, view, points, colour, width) {
   pen.stroke();
 }
 
-// The odometry moved to the start of the path, so that its drift since then is visible.
+// The odometry moved and turned to the start of the path, so that its drift since then is visible.
 function alignedOdometry({ odometry, path, map }) {
-  const first = odometry.findIndex(Boolean);
-  if (first < 0 || !map || first >= path.length) return [];
-  const [ox, oy] = odometry[first];
-  const later = Math.min(first + 10, path.length - 1);
-  const there = odometry[later];
+  if (!map || !odometry.length) return [];
+  const known = [...odometry.filter(([scan]) => scan < map.index), [map.index, ...map.odom]];
+  const [first, ox, oy] = known[0];
+  const [later, lx, ly] = known.find(([scan]) => scan >= first + 10) ?? known.at(-1);
+  if (later >= path.length) return [];
   let turn = 0;
-  if (there && Math.hypot(there[0] - ox, there[1] - oy) > 0.2) {
-    turn = Math.atan2(path[later][1] - path[first][1], path[later][0] - path[first][0]) - Math.atan2(there[1] - oy, there[0] - ox);
+  if (Math.hypot(lx - ox, ly - oy) > 0.2) {
+    turn = Math.atan2(path[later][1] - path[first][1], path[later][0] - path[first][0]) - Math.atan2(ly - oy, lx - ox);
   }
   const [c, s] = [Math.cos(turn), Math.sin(turn)];
-  return odometry.slice(0, map.index + 1).map((p) =>
-    p && [path[first][0] + c * (p[0] - ox) - s * (p[1] - oy), path[first][1] + s * (p[0] - ox) + c * (p[1] - oy)]);
+  return known.map(([, x, y]) => [path[first][0] + c * (x - ox) - s * (y - oy), path[first][1] + s * (x - ox) + c * (y - oy)]);
 }
 
 export function drawTruth(pen, view, truth) {

@@ -7,7 +7,7 @@ import { clock, count, NONE } from "../core/format.js";
 import { reportMenu } from "../core/report.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";
-import { mapPicture, paintRun, treeText } from "./draw.js";
+import { isRejected, mapPicture, paintRun, treeText } from "./draw.js";
 import { FIGURES, SCORES, shortSource, when } from "./figures.js";
 
 let shown = null; // the picture on the screen
@@ -42,8 +42,8 @@ export async function showRun(key, actions) {
   }
   const { trees, path, truth } = run.map;
   const map = mapPicture({
-    label: `Map of ${run.name}: ${trees.length} trees`,
-    legend: [["tree", "tree, size by DBH"], ["path", "path"], ...(truth ? [["truth", "ground truth"]] : [])],
+    label: `Map of ${run.name}: ${count(run.trees, "tree")}`,
+    legend: [["tree", "tree, size by DBH"], ...(trees.some(isRejected) ? [["rejected", "rejected by a person"]] : []), ["path", "path"], ...(truth ? [["truth", "ground truth"]] : [])],
     paint: (pen, view) => paintRun(pen, view, run.map),
     bounds: () => boundsOf(trees, path),
     describe: (at, view) => { const tree = treeAt(trees, at, view); return tree ? treeText(tree) : ""; },
@@ -108,8 +108,8 @@ function changes({ revisions }) {
   return [table(["by", "when", "time in the run", "change"], rows)];
 }
 
-const COLUMNS = ["tree", "x_m", "y_m", "sigma_m", "dbh_cm", "sigma_dbh_cm", "eccentricity", "observations"];
+const COLUMNS = ["tree", "x_m", "y_m", "sigma_m", "dbh_cm", "sigma_dbh_cm", "eccentricity", "observations", "review"];
 
 function treeRows(trees) {
-  return [COLUMNS, ...trees.map((t) => [t.number, t.x.toFixed(4), t.y.toFixed(4), t.ellipse[0].toFixed(4), t.dbh_cm, t.sigma_dbh_cm, t.eccentricity, t.observations])];
+  return [COLUMNS, ...trees.map((t) => [t.number, t.x.toFixed(4), t.y.toFixed(4), t.ellipse[0].toFixed(4), t.dbh_cm, t.sigma_dbh_cm, t.eccentricity, t.observations, t.review ?? "open"])];
 }

@@ -20,9 +20,12 @@ export function mapPicture({ label, legend, paint, bounds, describe }) {
 export function paintRun(pen, view, { path, truth, trees }) {
   drawLine(pen, view, path, colours.path, 2);
   for (const each of truth ?? []) drawTruth(pen, view, each);
-  for (const tree of trees) drawTree(pen, view, tree, false);
+  for (const tree of trees) drawTree(pen, view, tree, false, isRejected(tree));
   drawNumbers(pen, view, trees, null);
 }
+
+// Whether a person rejected a tree of a finished map.
+export const isRejected = ({ review }) => review === "rejected";
 
 export function paintTwo(pen, view, { a, b_path: path, places_b: places, trees }) {
   drawLine(pen, view, a.map.path, colours.path, 2);
@@ -88,4 +91,4 @@ function drawArrow(pen, view, from, to) {
   pen.stroke();
 }
 
-export const treeText = (tree) => `Tree ${tree.number}, ${dbhText(tree)}\n${seenText(tree)}`;
+export const treeText = (tree) => `Tree ${tree.number}, ${dbhText(tree)}\n${seenText(tree)}${isRejected(tree) ? "\nrejected by a person" : ""}`;

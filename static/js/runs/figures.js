@@ -15,7 +15,7 @@ export const FIGURES = [
   ["scans", scans],
   ["driven", (run) => `${figure(run.distance_m)} m`],
   ["pose lost", (run) => percent(run.lost)],
-  ["trees", (run) => String(run.trees)],
+  ["trees", (run) => (run.rejected ? `${run.trees}, ${run.rejected} rejected` : String(run.trees))],
   ["F1", (run) => figure(run.scores?.f1)],
 ];
 

@@ -25,7 +25,8 @@ PLACES = np.array([[0.0, 0.0], [2.0, 0.0], [4.0, 0.0]])
         ([Content(0.1, 0.0)], {1: "confirmed"}),
         ([Content(2.0, 0.2, "pole")], {2: "rejected"}),
         ([Content(0.0, SAME_THING + 0.01)], {}),  # a missed tree that was added
-        ([Content(0.0, 0.0, SKIPPED), Content(2.0, 0.0, PLOT)], {}),
+        ([Content(0.0, 0.0, SKIPPED), Content(2.0, 0.0, PLOT)], {1: "skipped"}),
+        ([Content(0.0, 0.2, "pole"), Content(0.0, 0.0, SKIPPED)], {1: "rejected"}),
         ([Content(4.0, 0.1, "bush"), Content(4.0, 0.3), Content(0.0, 0.0)], {1: "confirmed", 3: "rejected"}),
         ([Content(4.0, 0.3), Content(4.0, 0.1, "bush")], {3: "rejected"}),
     ],

@@ -80,6 +80,7 @@ ROUTES = [
     ("POST", "/api/search/use"),
     ("POST", "/api/search/save"),
     ("GET", "/api/doubts"),
+    ("GET", "/api/course"),
     ("GET", "/api/learning"),
     ("POST", "/api/learning"),
     ("POST", "/api/learning/use"),

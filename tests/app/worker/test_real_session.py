@@ -80,6 +80,20 @@ def test_the_observed_area_is_that_of_the_command(session: Session, tmp_path: Fi
     assert seen_text(recorder.area(session.path)) == (tmp_path / "out" / "seen.csv").read_text()
 
 
+def test_a_rerun_gives_the_course_of_the_new_map(session: Session) -> None:
+    stand_at(session, 12)
+    run = session.run
+    assert run is not None
+    before = run.course(["clusters", "trees", "mapping"], 100)
+    session.set_parameters(Parameters().replace({"clustering.eps": 0.6}), 1, whole=True)
+    while session.is_remapping:
+        session.remap()
+    found = run.course(["clusters", "trees", "mapping"], 100)
+    assert found.scans.tolist() == before.scans.tolist() == [*range(13)]
+    assert (found.values["clusters"] != before.values["clusters"]).any()
+    assert np.isfinite(found.values["mapping"]).all(), "each scan was mapped once, and its time is kept"
+
+
 def test_a_slider_on_the_standing_scan_and_back_leaves_no_trace(session: Session) -> None:
     before = stand_at(session, 12)
     other = session.set_parameters(Parameters().replace({"clustering.eps": 0.6}), 1)
