@@ -117,6 +117,8 @@ def test_actions_are_found_and_executed(dashboard: Dashboard):
 @pytest.mark.parametrize(
     ("word", "found"),
     [
+        ("annotate", "Tab Annotate"),
+        ("plot", "Tab Plots"),
         ("help", "Settings and keyboard shortcuts"),
         ("zoom", "Zoom in on the map"),
         ("delete", "Annotate: delete the chosen annotation"),
@@ -130,4 +132,6 @@ def test_actions_and_settings_are_found_by_other_words(dashboard: Dashboard, wor
     page.locator("#palette-button").click()
     page.locator("#palette-find").fill(word)
     expect(page.locator("#palette-list [role=option]", has_text=found).first).to_be_visible()
+    if found.startswith("Tab "):
+        expect(page.locator("#palette-list [role=option]").first).to_have_text(found)
     page.keyboard.press("Escape")

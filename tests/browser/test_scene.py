@@ -494,3 +494,33 @@ def trees_of(dashboard: Dashboard) -> list[dict[str, float | None]]:
     """The trees of the map that the page shows."""
     read = "async () => (await import('/static/js/core/store.js')).trees()"
     return list(dashboard.page.evaluate(read))
+
+
+def test_the_notice_of_software_rendering_closes_by_itself(dashboard: Dashboard):
+    """It covers a part of the scene; a browser that showed it before closes it at once."""
+    scene = dashboard.scene
+    shown = "() => localStorage.getItem('stemmap.rendering-notice')"
+    if dashboard.page.evaluate(shown) is None:
+        pytest.skip("this browser renders in hardware")
+    scene.wait_for_function(
+        "() => ![...document.querySelectorAll('[class*=mantine-Notification-root]')]"
+        ".some(({ textContent }) => textContent.includes('Software WebGL'))"
+    )
+
+
+def test_the_panel_leaves_a_small_scene_free(dashboard: Dashboard):
+    page, scene = dashboard.page, dashboard.scene
+    dashboard.tab("Trees")
+    slider = scene.get_by_role("slider", name="Radius eps").first
+    expect(slider).to_be_visible()
+    width = page.viewport_size
+    assert width is not None
+    split = page.locator("#split-left")
+    split.focus()
+    for _ in range(60):
+        if page.locator("#scene").bounding_box()["width"] < 540:
+            break
+        split.press("ArrowRight")
+    expect(slider).to_be_hidden()
+    split.dblclick()
+    expect(slider).to_be_visible()

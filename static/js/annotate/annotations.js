@@ -259,6 +259,7 @@ export function measureDbh(tree, dbh) {
 // Marks the selected tree as skipped if it is open, then goes to the next one.
 export async function skip() {
   const tree = selectedTree();
+  draft.error = "";
   if (tree && reviewOf(tree) === "open") {
     await edit(() => call("POST", "", { x: tree.x, y: tree.y, kind: SKIPPED, dbh_cm: null }));
     if (draft.error || state.selected !== tree.number) return;

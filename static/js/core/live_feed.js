@@ -16,7 +16,7 @@ const receivers = {
   sets(message) { state.sets = message; },
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
-  annotations(message) { state.annotations = message; },
+  annotations(message) { receiveAnnotations(message); },
   learning(message) { state.learning = message; },
   selection(message) { receiveSelection(message.tree ?? null, message.cluster ?? null, message.place ?? null); },
   events(message) { state.events = message.events; },
@@ -38,6 +38,11 @@ function receiveMap({ path, ...map }) {
     state.selectedTruth = null; // an object of the former run
     changed("selection");
   }
+}
+
+function receiveAnnotations(message) {
+  state.annotations = message;
+  if (state.map) Object.assign(state.map, { right: null, wrong: null }); // counted with the references before
 }
 
 // An answer to an earlier click must not undo a later one.

@@ -65,7 +65,7 @@ function describe(at) {
   if (draft.adding || drawing() || !(tree ?? truth ?? cluster)) return "";
   const lines = [];
   if (tree) lines.push(`Tree ${tree.number}, ${dbhText(tree)}`, isCloud() ? `height ${heightText(tree)}` : seenText(tree));
-  else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
+  else if (cluster) lines.push(`${isCloud() ? "Candidate" : "Cluster"}: ${cluster.verdict === "tree" && !isCloud() ? "tree in this scan, none in the map" : cluster.verdict}, ${state.map.clusters.size[cluster.row]} points`);
   if (truth) lines.push(`${annotations().some((row) => distance(row, truth) < SAME) ? "Annotation" : "Ground truth"}: ${truth.kind}${truth.dbh_cm !== null ? `, ${dbhText(truth)}` : truth.kind === "tree" ? ", DBH unknown" : ""}`);
   return lines.join("\n") || NONE;
 }

@@ -18,8 +18,8 @@ export function openPalette() {
   sift();
 }
 
-// All words except FILLERS must occur in the title or the keywords of an entry. Order: titles that begin with the text, titles with
-// a word that begins with the first word, other titles, keywords.
+// All words except FILLERS must occur in the title or the keywords of an entry. Order: tabs whose name begins with the text, titles
+// that begin with it, titles with a word that begins with the first word, other titles, keywords.
 function search(text) {
   const words = text.toLowerCase().split(/\s+/).filter((word) => word && !FILLERS.has(word));
   const all = [...ACTIONS.map(([title, keys, , run, , more]) => [title, keys, run, more ?? ""]), ...presentActions()].filter(([, , run]) => mayDo(run));
@@ -31,6 +31,7 @@ function rankOf(title, words, text) {
   const low = title.toLowerCase();
   if (!words.every((word) => low.includes(word))) return 4;
   if (/^Tree \d/.test(title) && !/\d/.test(text)) return 3;
+  if (words.length && low.startsWith(`tab ${words.join(" ")}`)) return -1;
   if (low.startsWith(words.join(" "))) return 0;
   return low.split(/\W+/).some((word) => words.length && word.startsWith(words[0])) ? 1 : 2;
 }

@@ -63,6 +63,7 @@ function row(id, label, hint, value, ...more) {
   return el("div", {}, el("label", { for: id, text: label }), el("div", { class: "row" }, box, copy, ...more), el("p", { class: "dim", text: hint }));
 }
 
+const VIEWERS_EVERY = 3000; // [ms] between two counts of the pages of viewers
 const LOOPBACK = ["localhost", "127.0.0.1", "[::1]"];
 
 function reach() {
@@ -74,10 +75,15 @@ const viewers = () => (access.viewers ? `${count(access.viewers, "page")} ${acce
 
 function viewOnly() {
   const note = el("p", { id: "share-viewers", role: "status", text: viewers() });
+  const timer = setInterval(() => {
+    if (!byId("share-dialog").open || !note.isConnected) clearInterval(timer);
+    else refreshAccess().then(() => note.dataset.ended || setText(note, viewers()), () => {});
+  }, VIEWERS_EVERY);
   const end = el("button", { id: "share-end", type: "button", text: "End this link", title: "The link and all pages that were opened with it lose access at once. A new view-only link replaces it. Your access does not change.",
     onclick: () => attempted(async () => {
       await endViewerLink();
       byId("share-viewer").value = viewerLink();
+      note.dataset.ended = "true";
       setText(note, "The previous link has ended. The new view-only link is shown above.");
     }) });
   return [row("share-viewer", "View-only link", "It shows everything and changes nothing. In one browser the last opened link applies: try it in another browser or a private window.", viewerLink(), end), note];

@@ -227,6 +227,20 @@ async def test_learning_uses_topics_mounting_seed_and_odometry_of_the_mapped_run
     assert annotated_run(source).request == source.request
 
 
+async def test_rejected_trees_do_not_count_in_the_list_and_are_marked_in_the_map(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard)
+    run, author = dashboard.annotation_editor.run, Author("b" * 16, "Ann")
+    assert run is not None
+    reviews = [Content(0.0, 0.0), Content(2.0, 0.1, "pole"), Content(4.0, 0.0, "skipped")]
+    await dashboard.store.ask(lambda store: store.add(run, author, reviews))
+    (row,) = await runs(client)
+    assert row["trees"] == 2
+    whole = (await client.get(f"/api/runs/{row['key']}")).json()
+    assert (whole["trees"], whole["rejected"]) == (2, 1)
+    assert [tree["review"] for tree in whole["map"]["trees"]] == ["confirmed", "rejected", "skipped"]
+
+
 async def test_the_list_has_the_number_of_annotations_of_each_recording(both: Running) -> None:
     client, dashboard = both
     await play(dashboard)
