@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import ast
 import gc
+import hashlib
 import importlib
 import json
 import math
@@ -367,10 +368,10 @@ class Coverage:
 
 
 def recorded(folder: Path, tree: Path, minutes: float) -> Coverage:
-    """Return the lines that quick tests execute. A file of tests is recorded once for each state of the
-    sources and of itself. Files that mention ROOMS come first; what is left after so many minutes is not
-    used."""
-    folder /= "-".join(name[:12] for name in _git("rev-parse", "HEAD:app", "HEAD:pipeline").split())
+    """Return the lines that quick tests execute. A file of tests is recorded once for each state of ROOMS
+    and of itself. Files that mention ROOMS come first; what is left after so many minutes is not used."""
+    state = _git("rev-parse", *(f"HEAD:{room}" for room in ROOMS))
+    folder /= hashlib.sha256(state.encode()).hexdigest()[:12]
     folder.mkdir(parents=True, exist_ok=True)
     listed = _git("ls-tree", "-r", "HEAD", "tests/app", "tests/pipeline").splitlines()
     files = [(blob, path) for _, _, blob, path in map(str.split, listed) if "/test_" in path]
