@@ -3,6 +3,7 @@
 Code lines of `app` and `pipeline` are lines that are neither blank, nor comments, nor part of a docstring. An
 import chain counts the modules (or the folders) of `app` of which each imports the next when it is loaded.
 Imports inside of functions and for type checking do not count; members of a circle of imports count once.
+Named numbers are constants of a module, in capitals, outside of the declared parameters.
 """
 
 from __future__ import annotations
@@ -111,6 +112,27 @@ def _targets(tree: ast.Module) -> Iterator[str]:
             waiting += ast.iter_child_nodes(node)
 
 
+def named_numbers(text: str) -> int:
+    """Number of constants of a module in capitals whose value contains a number."""
+    found = 0
+    for node in ast.parse(text).body:
+        if not isinstance(node, ast.Assign | ast.AnnAssign) or node.value is None:
+            continue
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        names = [each for target in targets for each in ast.walk(target) if isinstance(each, ast.Name)]
+        values = [each.value for each in ast.walk(node.value) if isinstance(each, ast.Constant)]
+        if any(type(value) in (int, float) for value in values):
+            found += sum(name.id == name.id.upper() for name in names)
+    return found
+
+
+def rooms() -> Iterator[tuple[str, int, int]]:
+    """Code lines and named numbers of each folder of `pipeline`."""
+    for folder in sorted(path for path in (ROOT / "pipeline").iterdir() if (path / "__init__.py").exists()):
+        texts = [path.read_text(encoding="utf-8") for path in folder.rglob("*.py")]
+        yield folder.name, sum(map(code_lines, texts)), sum(map(named_numbers, texts))
+
+
 def main() -> None:
     """Print the table."""
     lines = {
@@ -133,6 +155,9 @@ def main() -> None:
         print(f"{name:38}{value:>8}")
     print("modules: " + " -> ".join(modules))
     print("folders: " + " -> ".join(folders))
+    print(f"{'folder of pipeline':38}{'lines':>8}{'numbers':>9}")
+    for folder, code, numbers in rooms():
+        print(f"{folder:38}{code:>8,}{numbers:>9}")
 
 
 if __name__ == "__main__":
