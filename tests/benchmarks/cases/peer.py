@@ -73,7 +73,8 @@ def compare(comparison: Comparison, budget_s: float) -> list[Table]:
     """Map the same scans with both sides in turns."""
     from pipeline.config import preset
 
-    parameters = preset(comparison.preset).replace(comparison.changes)
+    # The peer looks for no obstacles.
+    parameters = preset(comparison.preset).replace({**comparison.changes, "obstacles.method": "none"})
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         recorded.write(comparison.uri, folder, stride=comparison.stride, scans=comparison.scans)
