@@ -119,15 +119,16 @@ class DetectionResult(NamedTuple):
 def segment(
     step: Step, sensor: Sensor, T_base_lidar: Pose3, parameters: Parameters, timer: StageTimer = no_timer
 ) -> SegmentedScan:
-    """Return a scan filtered and segmented into ground and clusters. It may have no points; without ground in
-    view, heights are None and a warning is added. The step is unchanged.
+    """Return a scan filtered and segmented into ground and clusters. It may have no points. Without ground in
+    view, and always for detected stems, heights are None; a warning is added only if the ground was searched
+    for, i.e. for points within range and a `ground.method` other than "none". The step is unchanged.
 
     Its counts are "returns", "without a value", "out of range", "out of the box", "ground or too high",
     "averaged in voxels", "clustered" and "noise"; of detected stems, the first three and "clustered".
 
     Args:
         step: The scan: points of a LiDAR, or stems that another program has detected, each of which becomes a
-            cluster.
+            cluster of one point if it is within the range limits.
         sensor: The LiDAR.
         T_base_lidar: Pose of the LiDAR on the robot.
         parameters: Parameters of all stages.

@@ -98,7 +98,7 @@ def stem_corners(x: float, y: float, dbh: float) -> Float:
 
     Args:
         x, y: Position in the base frame [m], not the origin.
-        dbh: Diameter [m]; NaN if unknown, then THIN is used.
+        dbh: Diameter [m]; NaN or infinite if unknown, then the diameter THIN is used.
     """
     half = 0.5 * (dbh if np.isfinite(dbh) else THIN)
     across = np.array([-y, x, 0.0]) * half / np.hypot(x, y)

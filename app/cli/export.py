@@ -46,15 +46,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the files that --to names, and print them. Files other than those of Tree Manager replace
-    existing ones.
+    """Write the files that --to names, and print them. Existing files are replaced; the folder --out of Tree
+    Manager must be new or empty.
 
     Returns:
         Exit code: 3 if trees far from the path were left out of tree-manager files, else 0.
 
     Raises:
         StemmapError: A flag is wrong, the run cannot be read or lacks what the format shows, a package is not
-            installed, or a file cannot be written.
+            installed, or a file of Tree Manager, .las or .laz cannot be written.
+        OSError: A file of another format cannot be written, for example because its folder does not exist.
     """
     with reviewed(arguments.run) as folder:
         return _export(arguments, folder)

@@ -51,7 +51,7 @@ def python_module(name: str, *arguments: str) -> tuple[str, ...]:
 
 
 def exit_reason(returncode: int) -> str:
-    """Return how a process ended: "signal 9, SIGKILL" or "exit code 1".
+    """Return how a process ended: "signal 9, SIGKILL" or "exit code 1"; "signal 99" for an unknown signal.
 
     Args:
         returncode: Return code; that of a process that a signal ended is the negative number of the signal.

@@ -227,7 +227,8 @@ def _files(uri: str, endpoint: str, named: dict[str, str]) -> dict[str, str]:
     Args:
         uri: The address, for errors.
         endpoint: Endpoint of the router.
-        named: Dict from the roles "ca", "cert" and "key", as far as they are given, to paths.
+        named: Dict from the roles "ca", "cert" and "key", as far as they are given, to paths; "~" is the home
+            folder. An empty dict is valid for every endpoint.
 
     Raises:
         SourceError: A file is missing, "cert" or "key" is given without the other, or the endpoint is not

@@ -165,7 +165,8 @@ class DdsLink(Link):
         return f"no scans{wanted} are announced{there}{elsewhere}"
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these channels from now on, see `Link.subscribe`."""
+        """Receive the messages of these channels, in place of those of an earlier call, see
+        `Link.subscribe`."""
         self._channels = tuple(channels)
 
     def failure(self, error: Exception) -> str:

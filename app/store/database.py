@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -95,7 +96,6 @@ def _sqlite(database: str) -> sa.Engine:
     @sa.event.listens_for(engine, "connect")
     def _(connection: sqlite3.Connection, _record: Any) -> None:  # noqa: ANN401
         connection.execute(f"PRAGMA busy_timeout = {_PATIENCE_MS}")
-        connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = FULL")
         connection.execute("PRAGMA foreign_keys = ON")
 
@@ -125,6 +125,9 @@ def _checked(engine: sa.Engine, where: str) -> sa.Engine:
             if result != "ok":
                 raise StemmapError("the annotations are damaged", where=where, remedy=keep)
             _prepare_tables(connection)
+        # Stored in the file, so it is set only once the database is known to be ours.
+        with closing(engine.raw_connection()) as raw:
+            raw.execute("PRAGMA journal_mode = WAL")
     except StemmapError as error:
         engine.dispose()
         if error.where:

@@ -58,7 +58,8 @@ class Forests:
         self._provenance: dict[str, dict[str, Any]] = {}
 
     def __call__(self, name: str, all_around: bool) -> Forest:
-        """Return a forest by its name, for sensors that see all around or for sensors that look one way. A
+        """Return a forest by its name, for sensors that see all around or for sensors that look one way. The
+        name PACKAGE is the forest of the package, others are files of the data folder, which contain both. A
         file is read once; later changes of it have no effect.
 
         Raises:

@@ -61,7 +61,8 @@ class Content:
 
 
 def contents_of(truth: TruthTrees) -> list[Content]:
-    """Return the rows of a table of true trees as contents of annotations; a DBH of NaN becomes None."""
+    """Return the rows of a table of true trees and other objects as contents of annotations. The class is
+    kept, also HIDDEN, which no annotation of a person has; a DBH of NaN becomes None."""
     columns = zip(truth.x.tolist(), truth.y.tolist(), truth.kind, truth.dbh.tolist(), strict=True)
     return [Content(x, y, kind, dbh if dbh == dbh else None) for x, y, kind, dbh in columns]
 

@@ -197,8 +197,8 @@ class WorkerLoop:
         return self._commands.get(timeout=patience_s)
 
     def _patience(self) -> float | None:
-        """Return the time until work is due [s], the shorter one of that for a rerun and `_due_in`; None if
-        only a command can start work."""
+        """Return the time until work is due [s], 0 if it is overdue: `_due_in`, or during a rerun the shorter
+        one of `_due_in` and `_quiet_s`; None if only a command can start work."""
         due_s, quiet_s = self._due_in(), self._quiet_s()
         if not self._session.is_remapping:
             return due_s

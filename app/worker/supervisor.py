@@ -121,8 +121,9 @@ class WorkerProcess:
         opens the new source. The call waits at most 5 s for the worker to read.
 
         Raises:
-            WorkerBusyError: The worker does not run or accepts no commands, and this command is not sent
-                again later.
+            WorkerBusyError: The worker does not run or does not read in time, and the command is a step, a
+                seek or a question. Play, Pause and Begin are dropped without an error: the owner decides them
+                anew when the source is open again.
         """
         if isinstance(command, protocol.SetParameters | protocol.SetSpeed):
             self._settings[type(command)] = command

@@ -145,9 +145,11 @@ def _features(axis: Float, rows: Float, viewed: float, present: float, absent: f
 @compiled
 def _rays(rows: Float, met: Int32, passed: Int32, last: int, out: Float) -> None:
     """Write into `out` the features of rays: for each band the share of rays that ended at the column, UNSEEN
-    if there are no rays; the free height above the clean slices up to the next return, and above the highest
-    return; the height up to which there are rays; and the gap between the clean slices and the next return,
-    as far as there are rays [m].
+    if there are no rays; the height of the slices without returns that rays passed, from the clean slices up
+    to the next return, and above the highest return; the height up to which there are rays; and the gap
+    between the clean slices and the next return [m]. Without a next return, the first height has no upper
+    limit, and the gap is the height from the highest return up to the highest slice with rays. Slice 0 is
+    not read.
 
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE); a slice has a return if its first value, the

@@ -49,7 +49,11 @@ class Terrain:
 def shows_ground(terrain: Terrain) -> bool:
     """Return whether a scan shows the ground: LEAST_SEEN cells or more with ground returns, and a ground
     height below 0, i.e. below the sensor, at the sensor. A scan of a wall, a ceiling or scattered points does
-    not."""
+    not.
+
+    Args:
+        terrain: Ground of the scan in the level sensor frame; extrapolated cells do not count.
+    """
     seen = int(np.count_nonzero(terrain.seen))
     return seen >= LEAST_SEEN and ground_at(terrain.height, 0.0, 0.0) < 0.0
 

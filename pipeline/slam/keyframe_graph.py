@@ -556,8 +556,10 @@ class _Problem:
         return cost, (A.T @ A).tocsc(), A.T @ b
 
     def _step(self, H: Sparse, g: Float, damping: float) -> Float | None:
-        """Return the Levenberg-Marquardt step for the normal matrix H and the gradient g, shape (3K + 2L,);
-        None if the system is singular or the step is not finite. `damping` is relative to the diagonal of H.
+        """Return the Levenberg-Marquardt step that is added to the poses and stems, for the normal matrix H
+        and the gradient g, shape (3K + 2L,); None if the system is singular or the step is not finite.
+        `damping` is relative to the diagonal of H. The first pose is held, so that the free frame of the map
+        does not make the system singular.
         """
         solve = self._factorised(H, damping)
         if solve is None:

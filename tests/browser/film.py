@@ -25,6 +25,8 @@ FILM_WIDTH = 640
 FILM_COLOURS = 64
 SHADES = 64  # of each colour in a picture: the files stay small, and no colour is lost as in a palette
 STEP_MS = 700
+# The notice of software rendering then closes at once.
+NOTICE_WAS_SHOWN = "localStorage.setItem('stemmap.rendering-notice', 'shown')"
 _SHADE = 256 // SHADES
 _ROUNDS = 6
 
@@ -77,11 +79,10 @@ def main(folder: Path) -> None:
         browser = playwright.chromium.launch(executable_path="/usr/bin/chromium", headless=True, args=FLAGS)
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
         page.set_default_timeout(PATIENCE_MS)
+        page.add_init_script(NOTICE_WAS_SHOWN)
         dashboard = Dashboard(page, scene=True)
         page.goto(server.link)
         page.locator("#welcome-on").click()
-        dashboard.scene.get_by_text("Software WebGL").wait_for()
-        dashboard.scene.locator(".mantine-Notification-closeButton").first.click()
         camera = Camera(page, folder)
         try:
             monitor(dashboard, camera)

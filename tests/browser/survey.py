@@ -17,7 +17,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from tests.browser.conftest import PATIENCE_MS
 from tests.browser.dashboard import FEW_FRAMES, Dashboard
-from tests.browser.film import stand_at
+from tests.browser.film import NOTICE_WAS_SHOWN, stand_at
 from tests.browser.flags import FLAGS
 from tests.browser.serving import Server
 from tests.browser.test_accessibility import DIALOGS, OVERLAYS, TABS, THEMES
@@ -91,6 +91,7 @@ def survey_run(browser: Browser, link: str, folder: Path, size: str, wanted: lis
     context.set_default_timeout(PATIENCE_MS)
     page = context.new_page()
     page.add_init_script(FEW_FRAMES)
+    page.add_init_script(NOTICE_WAS_SHOWN)
     dashboard = Dashboard(page, scene=True)
     page.goto(f"{link}&fixedDpr=0.5")
     survey = Survey(page, folder, size, wanted)
@@ -101,8 +102,6 @@ def survey_run(browser: Browser, link: str, folder: Path, size: str, wanted: lis
     stand_at(dashboard, 30.05)
     if page.locator("#scene-show").is_visible():
         page.locator("#scene-show").click()
-    dashboard.scene.get_by_text("Software WebGL").wait_for()
-    dashboard.scene.locator(".mantine-Notification-closeButton").first.click()
     page.wait_for_timeout(CLICK_MS)
     survey.picture("page")
     page.locator("#map").press("Escape")  # the selection of the size before, which the server keeps

@@ -99,8 +99,8 @@ class Numbers:
         return text.replace("-", MINUS)
 
     def short(self, value: float) -> str:
-        """Return a number with at most six significant digits and no zeros at its end, without group
-        separators; from a million on in exponent form."""
+        """Return a finite number with at most six significant digits and no zeros at its end, without group
+        separators; in exponent form from a million on and, except for 0, below 0.0001."""
         return f"{value:.6g}".replace(".", self.point).replace("-", MINUS)
 
 

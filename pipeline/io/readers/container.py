@@ -239,8 +239,8 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
 
 
 def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
-    """Return the first `limit` + 1 unpacked bytes of a block, or all if there are fewer or the block is not
-    compressed; arguments as in `unpack`.
+    """Return the first `limit` + 1 unpacked bytes of a block; all if there are fewer, and the whole block if it
+    is not compressed. Of a truncated block the bytes before its end are returned. Arguments as in `unpack`.
 
     Raises:
         BrokenChunkError: The block is damaged, or the compression is unknown.
@@ -264,13 +264,14 @@ def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
 
 def plain(payload: bytes) -> bytes:
     """Return a payload without the compression of ROS 2 recorders by message (zstd): up to BLOCK_LIMIT bytes,
-    b"" if it is damaged. Other payloads are returned as they are."""
+    b"" if it is damaged or shorter than its header states. Other payloads are returned as they are."""
     if payload[:4] != _ZSTD_MAGIC:
         return payload
     try:
-        return _unpack_up_to(payload, "zstd", BLOCK_LIMIT)[:BLOCK_LIMIT]
-    except BrokenChunkError:
+        raw, size = _unpack_up_to(payload, "zstd", BLOCK_LIMIT), zstandard.frame_content_size(payload)
+    except (BrokenChunkError, zstandard.ZstdError):
         return b""
+    return raw[:BLOCK_LIMIT] if len(raw) >= min(size, BLOCK_LIMIT) else b""
 
 
 # --- files of chunks -------------------------------------------------------------------------------

@@ -264,14 +264,16 @@ class RecordDecoder:
         header, without leading slashes).
 
         If fixed transforms link the child frame of the message to the base, it is the pose of the base.
-        Otherwise, and without a child frame, the pose of the message is taken as that of the base.
+        Otherwise, and without a child frame, the pose of the message is taken as that of the base. Its
+        covariance is at least that of `OtherPose.of`.
 
         Args:
             message: nav_msgs/Odometry, or a type with the same header and pose.
             stamp_ns: Time of the pose [ns].
 
         Raises:
-            NoPoseError: The covariance in the plane is not finite, not symmetric or not positive definite.
+            NoPoseError: The covariance in the plane is not finite, not symmetric or not positive definite;
+                zeros, which mean that it is unknown, are not either.
             Exception: Of many kinds, when the message is damaged.
         """
         decoded: ros2.nav_msgs__msg__Odometry = self.message(message)  # the other type has the same fields

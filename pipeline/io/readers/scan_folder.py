@@ -115,10 +115,11 @@ class ScanFolder(FileSource):
                 count_loss(losses, "scans without points")
 
     def _first_scan(self, uri: str) -> Scan:
-        """Return the first scan with points among the first _TRIES files, at the time 0.
+        """Return the first scan with points among the first _TRIES files, at the time 0; files that cannot be
+        read are skipped.
 
         Raises:
-            SourceError: None of these files has points.
+            SourceError: None of these files can be read and has points.
         """
         reason = ""
         for file in self._files[:_TRIES]:
@@ -214,7 +215,7 @@ class ScanFolder(FileSource):
         Args:
             name: Name of the file.
             count: Number of rows of the file.
-            numbers: Number in the name of each scan file.
+            numbers: Number in the name of each scan file, ascending; 0 is the first row.
         """
         if count > int(numbers[-1]):
             return numbers

@@ -34,7 +34,7 @@ COLUMNS = (*AXIS, *PLACE, DBH, "dbh_approximation", "score", "reconstructed", "n
 
 
 def state_name(frame: int) -> str:
-    """Return the name of the file of the frame with the number `frame`."""
+    """Return the name of the file of a frame, "TreeManagerState_12.csv" for the number 12."""
     return f"TreeManagerState_{frame}.csv"
 
 

@@ -331,7 +331,7 @@ def repair(path: Path, out: Path) -> RepairResult:
 
     Args:
         path: The recording, which does not change.
-        out: The new file.
+        out: The new file; an existing one is replaced.
 
     Raises:
         SourceError: The recording cannot be read, is not an MCAP file, or has no complete message.
