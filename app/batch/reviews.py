@@ -33,8 +33,8 @@ _FILES = ("path.csv", "terrain.csv", "seen.csv", "run.json", "georeference.json"
 
 
 def reviews_of(numbers: Sequence[int], position: Float, contents: Iterable[Content]) -> dict[int, str]:
-    """Return a dict from the number of each tree that a person reviewed to its review: CONFIRMED for the class
-    "tree", REJECTED for another class, SKIPPED if no annotation of the tree states a class.
+    """Return a dict from the number of each reviewed tree to its review: CONFIRMED for the class "tree",
+    REJECTED for another class, SKIPPED if no annotation of the tree states a class.
 
     An annotation belongs to the tree that is nearest to it, if it is nearer than SAME_THING. Of several
     annotations of a tree the nearest one that states a class counts, of equally near ones the last. The page

@@ -54,7 +54,8 @@ class Broadcast:
 
         Args:
             payload: Message "map" without its path; not empty.
-            path_xy: Path, shape (N, 2) [m]; it must not be modified afterwards.
+            path_xy: Positions x, y of the path, and of the odometry if it is known, shape (N, 2) or (N, 4)
+                [m]; it must not be modified afterwards.
         """
         self._map = (self._next(), _encode(payload), path_xy)  # once for all listeners
         self._wake()
@@ -81,17 +82,17 @@ class Broadcast:
         return sorted(m for m in self._messages.values() if m[0] > count)
 
     def map_after(self, count: int) -> tuple[int, bytes, NDArray[np.float64]] | None:
-        """Return number, JSON and path, shape (N, 2) [m], of the map if its number is larger than `count`,
+        """Return number, JSON and path, as in `show`, of the map if its number is larger than `count`,
         else None. The path is not a copy."""
         return self._map if self._map is not None and self._map[0] > count else None
 
     def path_json(self, count: int, path_xy: NDArray[np.float64], start: int) -> bytes:
         """Return the rows of a path from `start` on as JSON: an object with `start` and `points`, a list of
-        [x, y] [m] rounded to 1 mm. The result of the last call is reused if `count` and `start` are the same.
+        rows [m] rounded to 1 mm. The result of the last call is reused if `count` and `start` are the same.
 
         Args:
             count: Number of the message with the map.
-            path_xy: Positions x, y of the path of this map, shape (N, 2) [m].
+            path_xy: Path of this map, as in `show`.
             start: First row of the result.
         """
         if self._path_json[:2] != (count, start):
@@ -162,7 +163,7 @@ class Listener:
         Args:
             count: Number of the message.
             payload: JSON of the map without its path.
-            path_xy: The path, shape (N, 2) [m].
+            path_xy: The path, as in `show`.
         """
         start = first_difference(self._path, path_xy)
         self._map_seen, self._map_at, self._path = count, time.monotonic(), path_xy

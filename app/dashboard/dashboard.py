@@ -23,6 +23,7 @@ from app.dashboard.camera_view import CameraView
 from app.dashboard.events import Events
 from app.dashboard.parameters import ParameterSets, ParameterState
 from app.dashboard.payload import BeforeAfter, counts_of, map_payload, truth_payload
+from app.dashboard.reviewed_runs import ReviewedRuns
 from app.dashboard.run_recorder import RunRecorder, RunState
 from app.dashboard.scores import Scores
 from app.dashboard.selection import Selector, WorkerClient
@@ -73,7 +74,7 @@ class Dashboard:
         self.parameters = parameters
         self.store = store or AsyncStore(None)
         self.results = self.store.folder and self.store.folder / RESULTS
-        self.run_recorder = RunRecorder(self.store)
+        self.run_recorder, self.reviewed_runs = RunRecorder(self.store), ReviewedRuns(self.store)
         self.annotation_editor = AnnotationEditor(self.store)
         self.annotation_editor.changed, self.annotation_editor.edited = self._use_truth, self._mark_edits
         self.live = live
@@ -457,16 +458,17 @@ class Dashboard:
         if self.shown is None:
             self.scene.suit(cloud=shown.frame.of_cloud)
             self.live.publish("view", self.scene.view)
-        new_xy = np.column_stack([shown.path.x, shown.path.y])
-        self._path_rows.write(shown.path_start, *columns_of(shown.path), new_xy)
-        *columns, self.path_xy = self._path_rows.shared()
-        self.path = Path(*columns)
+        odometry = np.full((len(shown.path.x), 2), np.nan)
+        odometry[: len(shown.odometry_xy)] = shown.odometry_xy
+        new_rows = np.column_stack([shown.path.x, shown.path.y, odometry])
+        self._path_rows.write(shown.path_start, *columns_of(shown.path), new_rows)
+        *columns, path_rows = self._path_rows.shared()
+        self.path, self.path_xy = Path(*columns), path_rows[:, :2]
         if shown.frame.ground is None and self.shown is not None:
             # The ground is sent only when it changes; the scene may not have drawn the earlier frame.
             frame = replace(shown.frame, ground=self.shown.frame.ground)
             shown = msgspec.structs.replace(shown, frame=frame)
         self.shown = shown
-        path_xy = self.path_xy
         distance = self.parameters.parameters.evaluation.match_distance
         payload = await asyncio.to_thread(map_payload, shown)
         counted = await asyncio.to_thread(counts_of, shown.frame, self.truth, distance)
@@ -474,7 +476,7 @@ class Dashboard:
             return
         counts = self._before_after.shown(shown.frame.index, counted)
         payload["layers"] |= self.scene.counts
-        self.live.show({**payload, **counts}, path_xy)
+        self.live.show({**payload, **counts}, path_rows)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
             self._broadcast_events()
         self.run_recorder.shown(self._run_state(shown))
@@ -517,9 +519,10 @@ class Dashboard:
 
 
 def _no_path() -> GrowingColumns:
-    """Return the columns of a path without scans, with the positions, shape (0, 2), as the last column."""
+    """Return the columns of a path without scans; the last column has the positions of path and odometry,
+    shape (0, 4)."""
     none = np.zeros(0)
-    return GrowingColumns(np.zeros(0, np.int64), none, none, none, none, np.zeros((0, 2)))
+    return GrowingColumns(np.zeros(0, np.int64), none, none, none, none, np.zeros((0, 4)))
 
 
 def _open_command(request: SourceRequest) -> protocol.Open:

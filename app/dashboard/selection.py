@@ -111,10 +111,10 @@ class WorkerClient:
         a run, WorkerBusyError without an answer."""
         return _known((await self._ask(AskSection)).section)
 
-    async def course(self, names: list[str], most: int) -> Course:
-        """Return the course of the map with the named quantities of at most `most` scans; raises NoStoryError
-        without a run, WorkerBusyError without an answer."""
-        return _known((await self._ask(AskCourse, names, most)).course)
+    async def course(self, names: list[str], most: int, stages: bool) -> Course:
+        """Return the course of the map, see `AskCourse` for the arguments; raises NoStoryError without a run,
+        WorkerBusyError without an answer."""
+        return _known((await self._ask(AskCourse, names, most, stages)).course)
 
     async def _ask(
         self, kind: Callable[Concatenate[int, int, P], Question], *values: P.args, **named: P.kwargs

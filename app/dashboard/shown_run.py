@@ -58,7 +58,7 @@ class ShownRun:
         preset, parameters: In force.
         truth: Ground truth in the coordinates of the files; None if there is none.
         seen: Views of the observed area; those of later scans may be added.
-        edits: The annotations of trees and the plots.
+        edits: The annotations of trees, also skipped ones, and the plots.
         frame: The reference system that a user gave the map on the dashboard, as annotation; None if there is
             none.
     """

@@ -83,7 +83,8 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     """Return the run in a folder that `stemmap map` wrote as a dict of JSON values. Long strings are cut.
 
     The keys are `uri`, `kind`, `source` (digest), `odometry`, `seed`, `chosen`, `scans` (number), `time_s`,
-    `distance_m`, `lost` (see `lost_share`), `trees` (number of trees that are not rejected) and `preset`;
+    `distance_m`, `lost` (see `lost_share`), `trees` (number of trees that are not rejected), `rejected` and
+    `preset`;
     `parameters`, a dict from dotted names to values; `scores` (see `score_payload`; None if unknown); and
     `map`, a dict with `trees` (see `trees_payload`), `path` (see `thinned`) and `truth` (None).
 
@@ -103,7 +104,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     run = read_run(Path(question["path"]))
     record = run.record
     path_xy = np.stack([run.path.x, run.path.y], axis=1)
-    trees = trees_payload(run.trees, 0)
+    trees = [{**tree, "review": run.reviews[tree["number"]]} for tree in trees_payload(run.trees, 0)]
     return {
         "uri": run.uri,
         "kind": str(record["source"].get("kind", ""))[:200],
@@ -116,6 +117,7 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "distance_m": float(np.hypot(*np.diff(path_xy, axis=0).T).sum()) if len(path_xy) else 0.0,
         "lost": lost_share(record.get("health", {}).get("scans", {})),
         "trees": len(trees),
+        "rejected": run.rejected,
         "preset": str(record.get("preset", ""))[:100],
         "parameters": run.parameters.flat(),
         "scores": _scores(record.get("evaluation")),

@@ -219,6 +219,13 @@ class RunRecords:
             changes = [_plain(each) for each in connection.execute(query).all()]
         return {**_plain(row), "map": stored, "revisions": changes}
 
+    def trees(self, record: int) -> list[dict[str, Any]]:
+        """Return the trees of the map of a run, see `RunFigures`; [] for an unknown run."""
+        with self._engine.begin() as connection:
+            stored = connection.execute(select(_maps.c.map).where(_maps.c.record == record)).scalar()
+        trees: list[dict[str, Any]] = (stored or {}).get("trees", [])
+        return trees
+
     def put_files(self, record: int, files: bytes) -> None:
         """Store the result files of a run, a zip archive; nothing happens if it does not exist."""
         with self._engine.begin() as connection:
@@ -451,6 +458,13 @@ class Store:
         query = select(a.run, func.count()).where(a.deleted.is_(False), a.kind.in_(KINDS)).group_by(a.run)
         with self._engine.begin() as connection:
             return {row.run: row[1] for row in connection.execute(query)}
+
+    def annotation_versions(self) -> dict[int, int]:
+        """Return a dict from the number of each source that ever had annotations to the sum of their
+        versions, which grows with each edit."""
+        query = select(_annotations.c.run, func.sum(_annotations.c.version)).group_by(_annotations.c.run)
+        with self._engine.begin() as connection:
+            return {row.run: int(row[1]) for row in connection.execute(query)}
 
     def annotated_sources(self) -> list[AnnotatedSource]:
         """Return all sources with annotations of KINDS, in the order of their first opening, and how each was

@@ -339,8 +339,8 @@ class Guard:
                     await send({"type": "websocket.close", "code": _POLICY_VIOLATION})
 
     def _renewing(self, scope: Scope, headers: Headers, send: Send) -> Send:
-        """Return `send` with the cookie of a new session of the same role in the response, if the path is "/",
-        the request has a session cookie, valid or not, and none has half of SESSION_S left; else `send`
+        """Return `send` with the cookie of a new session of the same role in the response, if the path is
+        "/", the request has a session cookie, valid or not, and none has half of SESSION_S left; else `send`
         itself. The request has passed the guard.
 
         Args:

@@ -110,6 +110,11 @@ class ScanSeries:
         for name, column in self._columns.items():
             column[index // self._stride] = values.get(name, math.nan)
 
+    @property
+    def stride(self) -> int:
+        """Difference between the indices of successive kept scans, a power of two."""
+        return self._stride
+
     def forget_from(self, index: int) -> None:
         """Remove the values of the scan with this index and of later ones."""
         for column in self._columns.values():

@@ -153,9 +153,14 @@ class InventoryRun:
             return np.zeros((0, 3), np.float32)
         return self.plot.points[:, [0, 1, 3]].astype(np.float32)
 
-    def course(self, names: Sequence[str], most: int) -> Course:
+    @property
+    def odometry_xy(self) -> Float:
+        """No positions, shape (0, 2)."""
+        return np.zeros((0, 2))
+
+    def course(self, names: Sequence[str], most: int, *, stages: bool) -> Course:
         """Return a course without scans: a whole cloud has none. The arguments are ignored."""
-        del names, most
+        del names, most, stages
         return Course(np.zeros(0, np.int64), np.zeros(0), {}, {}, [])
 
     def take_views(self) -> list[tuple[int, Float]]:

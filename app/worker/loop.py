@@ -390,8 +390,10 @@ class WorkerLoop:
         """Queue the frame of the session with the path and the confirmation times; nothing for None."""
         session, path = self._session, self._session.path
         if frame is not None and path is not None:
+            of_trees, counts = session.confirmed_s, session.counts
+            odometry_xy = session.odometry_xy[: len(path.x)]
             self._put(
-                protocol.Shown(self._run, session.time_s, frame, 0, path, session.confirmed_s, session.counts)
+                protocol.Shown(self._run, session.time_s, frame, 0, path, of_trees, counts, odometry_xy)
             )
 
     def _report(self) -> None:
@@ -493,10 +495,10 @@ def _answer(session: Session, recent: RecentScans, question: protocol.Question) 
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
             return protocol.Answer(ticket, section=section(run.accumulated))
-        case protocol.AskCourse(names=names, most=most):
+        case protocol.AskCourse(names=names, most=most, stages=stages):
             if run is None:
                 raise StemmapError("no run is open", remedy="Open one")
-            return protocol.Answer(ticket, course=run.course(names, most))
+            return protocol.Answer(ticket, course=run.course(names, most, stages=stages))
         case protocol.AskTree(tree=tree):
             return protocol.Answer(ticket, tree=tree_story(run, session.frame, tree))
         case protocol.AskCluster(scan=scan, cluster=cluster):

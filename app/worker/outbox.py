@@ -157,7 +157,11 @@ class Outbox:
             self._sent_ground = picture.ground
         self._sent_run = shown.run
         return structs.replace(
-            shown, frame=picture, path_start=start, path=rows_of(shown.path, slice(start, None))
+            shown,
+            frame=picture,
+            path_start=start,
+            path=rows_of(shown.path, slice(start, None)),
+            odometry_xy=shown.odometry_xy[start:],
         )
 
 

@@ -239,6 +239,8 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
         frame: Results of the scan.
         path_start: Number of rows sent before that remain valid.
         path: Rows of the path from there on.
+        odometry_xy: Positions x, y of the robot by odometry alone, for the same rows, shape (N, 2) [m]; no
+            rows if they are unknown.
         confirmed_s: Confirmation time of each tree [s], NaN if unknown; None if all are unknown. Since not
             every scan is displayed, it does not follow from the frames.
         counts: Counts up to this scan; None if they are unknown.
@@ -251,6 +253,7 @@ class Shown(msgspec.Struct, frozen=True, tag="shown"):
     path: Path
     confirmed_s: Float | None = None
     counts: RunCounts | None = None
+    odometry_xy: Float = msgspec.field(default_factory=lambda: np.zeros((0, 2)))
 
 
 class Report(msgspec.Struct, frozen=True, tag="report"):
@@ -346,11 +349,13 @@ class AskCourse(_Question, frozen=True, tag="ask_course"):
 
     Attributes:
         names: Names of quantities.
-        most: Maximum number of scans, which are evenly spaced.
+        most: Maximum number of scans; the last one is among them, the others are evenly spaced.
+        stages: Whether the times of the stages are wanted.
     """
 
     names: list[str]
-    most: Annotated[int, Meta(ge=1, le=MOST_SCANS)]
+    most: Annotated[int, Meta(ge=2, le=MOST_SCANS)]
+    stages: bool = False
 
 
 class Course(msgspec.Struct, frozen=True):
@@ -360,8 +365,8 @@ class Course(msgspec.Struct, frozen=True):
         scans: Indices of the scans, shape (N,).
         time_s: Times of the scans since the first one, shape (N,) [s].
         values: Dict from the requested names to the values, shape (N,), in the units of QUANTITIES.
-        stages: Dict from stages, and "total", to the times of mapping the scans, shape (N,) [ms]; NaN where
-            they were not measured.
+        stages: Dict from stages, and "total", to the times of mapping the scans, shape (N,) [ms]; NaN for
+            scans whose times were not measured, 0 for a stage that did not run. Empty unless they are wanted.
         known: Names of QUANTITIES of which any value is known.
     """
 

@@ -18,7 +18,7 @@ from app.common.timers import TOTAL, Stopwatch
 from app.explain.records import History
 from app.robot.source import LiveSource
 from app.sources.request import with_odometry
-from app.worker.course import ScanSeries
+from app.worker.course import QUANTITIES, ScanSeries
 from app.worker.cursor import Cursor, StepStore, live_steps
 from app.worker.protocol import Course, RunCounts, Shown
 from app.worker.remap import (
@@ -33,7 +33,7 @@ from pipeline.config import Parameters
 from pipeline.config.model import validated
 from pipeline.errors import ParameterError, SourceError, StemmapError
 from pipeline.front_end import SegmentedScan, StageTimer
-from pipeline.geometry.columns import evenly_spaced
+from pipeline.geometry.columns import GrowingColumns, evenly_spaced
 from pipeline.io.readers.base import Source, SourceDescription
 from pipeline.mapper import Mapper
 from pipeline.odometry.synchroniser import steps
@@ -104,6 +104,7 @@ class Run:
         self._numbers = TreeNumbers()
         self._views_sent = 0
         self._times = ScanSeries()  # of mapping each scan, by stage [ms]
+        self._odometry_xy = GrowingColumns(np.zeros((0, 2)))  # x, y of each scan
         self._remapping: Remapping | None = None
         self._previous: RunMap | None = None  # the map before the last change of parameters, for undo
 
@@ -122,20 +123,33 @@ class Run:
         losses = Counter(self._left_out) + Counter(self.source.losses)
         return self._map.counts.totals(index, self.warnings, losses)
 
-    def course(self, names: Sequence[str], most: int) -> Course:
-        """Return the course of the map with at most about `most` scans, see `Course`."""
-        series, path = self._map.course, self.path
+    @property
+    def odometry_xy(self) -> Float:
+        """Positions x, y of the robot by odometry alone, of all mapped scans, shape (N, 2) [m]. Not a
+        copy."""
+        return self._odometry_xy.shared()[0]
+
+    def course(self, names: Sequence[str], most: int, *, stages: bool) -> Course:
+        """Return the course of the map, see `AskCourse` for the arguments; quantities without a value in any
+        scan, and names that are not in QUANTITIES, are NaN."""
+        series, times, path = self._map.course, self._times, self.path
         scans = series.scans("time_s")
+        # Of a long run, each table keeps every 2nd, 4th, ... scan: these are in both.
+        scans = scans[scans % max(series.stride, times.stride) == 0]
         scans = np.append(scans[:-1][evenly_spaced(len(scans) - 1, most - 1)], scans[-1:])
         values = {name: series.values(name, scans) for name in names}
-        stages = {stage: self._times.values(stage, scans) for stage in self._times.names}
-        if "mapping" in names and TOTAL in stages:
-            values["mapping"] = stages[TOTAL]
-        if "driven" in names:
+        total = times.values(TOTAL, scans)
+        if "mapping" in values:
+            values["mapping"] = total
+        if "driven" in values:
             driven = np.append(0.0, np.cumsum(np.hypot(np.diff(path.x), np.diff(path.y))))
-            values["driven"] = np.append(driven, np.nan)[np.minimum(scans, len(path.x))]
-        known = [*series.names, "driven", *(["mapping"] if TOTAL in stages else [])]
-        return Course(scans, series.values("time_s", scans), values, stages, known)
+            values["driven"] = np.append(driven[: len(path.x)], np.nan)[np.minimum(scans, len(path.x))]
+        of_stages = {name: times.values(name, scans) for name in times.names} if stages else {}
+        for spent in of_stages.values():
+            spent[np.isnan(spent) & np.isfinite(total)] = 0.0
+        elsewhere = {"driven", *(["mapping"] if TOTAL in times.names else [])}
+        known = [name for name in QUANTITIES if name in elsewhere or name in series.names]
+        return Course(scans, series.values("time_s", scans), values, of_stages, known)
 
     @property
     def start_ns(self) -> int:
@@ -242,6 +256,9 @@ class Run:
             frame, free = self._process(mapper, step, hurried=hurried)
         if TOTAL in times and not self.is_bare:
             self._times.record(step.index, times)
+        if step.index == len(self._odometry_xy):
+            place = frame.T_odom_base.x, frame.T_odom_base.y
+            self._odometry_xy.write(step.index, np.array([place]))
         self._broken = False
         if new_map:
             self._numbers.begin_map(frame.trees, self._map.ended(frame.trees))
@@ -396,6 +413,7 @@ class Run:
             return None
         self._previous = self._map
         self._remapping, self._map, self._views_sent = None, remapping.finish(), 0
+        self._times = ScanSeries()  # those were of other parameters
         self._cache = self._caches.of(self._map.parameters.at(self.current))
         frame = self._map_step(self._step, new_map=True)
         confirmed_s = {self._numbers.known(n): at for n, at in self._map.confirmed_s.items()}

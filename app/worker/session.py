@@ -121,6 +121,12 @@ class Session:
         return shown.path if shown else None
 
     @property
+    def odometry_xy(self) -> Float:
+        """Positions x, y of the robot by odometry alone, of all mapped scans, shape (N, 2) [m]; no rows if
+        they are unknown."""
+        return np.zeros((0, 2)) if self._run is None else self._run.odometry_xy
+
+    @property
     def confirmed_s(self) -> Float | None:
         """Confirmation time of each tree of `frame`, shape (T,) [s since the first scan], NaN for trees that
         never were confirmed; None if there is no frame."""

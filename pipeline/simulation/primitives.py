@@ -213,6 +213,6 @@ class SolidsBuilder:
 
 
 def _surface(reflectivity: float, roughness: float = 0.0) -> list[float]:
-    """Return a row of `Solids.surface` of a shape that is not a STEM: reflectivity from 0 to 1, roughness [m],
-    and zeros in place of the parameters of a `Section`."""
+    """Return a row of `Solids.surface` of a shape that is not a STEM: reflectivity from 0 to 1, roughness
+    [m], and zeros in place of the parameters of a `Section`."""
     return [reflectivity, roughness, *[0.0] * (SURFACE - 2)]

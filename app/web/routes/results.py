@@ -173,19 +173,19 @@ async def pairs(dashboard: Dash) -> Response:
 
 
 @router.get("/course", dependencies=[ViewerTurn])
-async def course(dashboard: Dash, names: _Names = "", most: _Most = 1200) -> Response:
-    """Return the course of the map, see `course_payload`; 404 before the first map, 422 for an unknown name,
-    503 if the worker is busy.
+async def course(dashboard: Dash, names: _Names = "", most: _Most = 1200, stages: bool = False) -> Response:
+    """Return the course of the map, see `course_payload`; 404 before the first map, 503 if the worker is
+    busy.
 
     Args:
         dashboard: The dashboard.
-        names: Names of QUANTITIES, separated by commas.
+        names: Names of QUANTITIES, separated by commas; others are ignored.
         most: Maximum number of scans.
+        stages: Whether to return the times of the stages.
     """
-    wanted = [name for name in names.split(",") if name]
-    if unknown := [name for name in wanted if name not in QUANTITIES]:
-        return error_reply(422, f"there is no quantity {unknown[0]!r}", remedy=f"Use {', '.join(QUANTITIES)}")
-    return json_reply(course_payload(await dashboard.worker_client.course(wanted, most)))
+    wanted = [name for name in QUANTITIES if name in names.split(",")]
+    found = await dashboard.worker_client.course(wanted, most, stages)
+    return json_reply(await asyncio.to_thread(course_payload, found))
 
 
 @router.get("/doubts")

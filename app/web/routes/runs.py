@@ -21,7 +21,7 @@ from starlette.responses import Response
 
 from app.batch.georeference import write_map_frame
 from app.batch.plot_files import stored_frame, stored_plots
-from app.batch.reviews import reviewed_run, reviews_of, stored_reviews
+from app.batch.reviews import reviewed_run, stored_reviews
 from app.batch.run_folder import read_run_record
 from app.common.settings import Settings
 from app.dashboard.dashboard import Dashboard
@@ -29,7 +29,7 @@ from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.sources.request import request_of_kept
 from app.store.records import NoFilesError, UnknownError
-from app.store.store import RunRecords, Store
+from app.store.store import RunRecords
 from app.web.responses import (
     LARGEST_NUMBER,
     BadRequestError,
@@ -51,7 +51,7 @@ from app.web.routes.access import (
 from pipeline.config import PRESETS, preset
 from pipeline.geometry.poses import Pose2
 from pipeline.io.atomic_files import write_texts
-from pipeline.io.result_files import OPEN, REJECTED, csv_text
+from pipeline.io.result_files import REJECTED, csv_text
 from pipeline.stand.plots import SamplePlot
 
 router = APIRouter(prefix="/api/runs")
@@ -71,16 +71,17 @@ class _Name(Body):
 
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
-    """GET /api/runs: return an object with `runs`, at most 500, the last changed first, see `_listed`;
+    """GET /api/runs: return an object with `runs`, at most 500, the last changed first, see
+    `ReviewedRuns.listed`;
     `folders`, the finished folders,
     each with `key`, `name` and `changed_s`; and `open`, the number of the open run (null if it is not
     recorded)."""
     await dashboard.run_recorder.write_now()
-    rows = await dashboard.store.ask(_listed)
+    rows = await dashboard.reviewed_runs.listed()
     folders = await asyncio.to_thread(_folders, settings)
     return json_reply(
         {
-            "runs": rows,
+            "runs": [_row(row) for row in rows],
             "folders": [
                 {"key": f"{_FOLDER}{name}", "name": name, "changed_s": changed_s}
                 for name, changed_s in folders.items()
@@ -278,7 +279,8 @@ async def _visit_path(
     except NoFilesError:
         folder = FilePath(stack.enter_context(TemporaryDirectory(prefix="stemmap-run-")))
         names = ("number", "x", "y", "dbh_cm")
-        cells = [[str(tree[n]) if tree[n] is not None else "" for n in names] for tree in run["map"]["trees"]]
+        trees = [tree for tree in run["map"]["trees"] if tree.get("review") != REJECTED]
+        cells = [[str(tree[n]) if tree[n] is not None else "" for n in names] for tree in trees]
         write_texts(folder, {"trees.csv": csv_text(("tree", "x_m", "y_m", "dbh_cm"), cells)})
         return folder / "trees.csv"
 
@@ -315,11 +317,13 @@ async def _whole(key: str, settings: Settings, dashboard: Dashboard) -> dict[str
     if key.startswith(_FOLDER):
         name = key.removeprefix(_FOLDER)
         folder = await asyncio.to_thread(_finished_folder, name, settings)
-        found = await inspection.ask({"ask": "finished", "path": str(folder)})
+        async with _with_edits(folder, dashboard) as (reviewed, _):
+            found = await inspection.ask({"ask": "finished", "path": str(reviewed)})
         run = {"key": key, "name": name, "revisions": [], **found}
     else:
         number = _number(key)
-        run = await dashboard.store.ask(lambda store: _reviewed_record(store, number))
+        row = await dashboard.reviewed_runs.whole(number)
+        run = {**_row(row), "map": row["map"], "revisions": [_revision(each) for each in row["revisions"]]}
     return {**run, "differences": _differences(run["preset"], run["parameters"])}
 
 
@@ -361,39 +365,6 @@ def _row(row: dict[str, Any]) -> dict[str, Any]:
     }
     begun, changed = kept.pop("begun_ns"), kept.pop("changed_ns")
     return {**kept, "key": str(row["id"]), "begun_s": begun // 10**9, "changed_s": changed // 10**9}
-
-
-def _listed(store: Store) -> list[dict[str, Any]]:
-    """Return the runs of the store, see `_row`, each with `annotated`, the number of annotations of its
-    recording. `trees` does not count the trees that a person rejected."""
-    annotated = store.annotation_counts()
-    rows = [{**_row(row), "annotated": annotated.get(row["run"], 0)} for row in store.book.listed()]
-    return [
-        {**row, "trees": _reviewed_record(store, row["id"])["trees"]} if row["annotated"] else row
-        for row in rows
-    ]
-
-
-def _reviewed_record(store: Store, number: int) -> dict[str, Any]:
-    """Return a record as a dict, see `_row`, with `map` and `revisions`, see `_revision`. Each tree of the
-    map has its `review`; `trees` does not count those that a person rejected, and `rejected` is their number.
-    Raises UnknownError for an unknown record."""
-    row = store.book.whole(number)
-    trees = row["map"]["trees"]
-    position = np.array([(tree["x"], tree["y"]) for tree in trees], np.float64).reshape(-1, 2)
-    numbers = [tree["number"] for tree in trees]
-    reviews = reviews_of(numbers, position, store.contents(row["source"]))
-    rejected = sum(review == REJECTED for review in reviews.values())
-    return {
-        **_row(row),
-        "trees": len(trees) - rejected,
-        "rejected": rejected,
-        "map": {
-            **row["map"],
-            "trees": [{**tree, "review": reviews.get(tree["number"], OPEN)} for tree in trees],
-        },
-        "revisions": [_revision(each) for each in row["revisions"]],
-    }
 
 
 def _revision(row: dict[str, Any]) -> dict[str, Any]:

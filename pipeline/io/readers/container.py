@@ -239,8 +239,9 @@ def unpack(block: bytes, compression: str, size: int) -> bytes:
 
 
 def _unpack_up_to(block: bytes, compression: str, limit: int) -> bytes:
-    """Return the first `limit` + 1 unpacked bytes of a block; all if there are fewer, and the whole block if it
-    is not compressed. Of a truncated block the bytes before its end are returned. Arguments as in `unpack`.
+    """Return the first `limit` + 1 unpacked bytes of a block; all if there are fewer, and the whole block if
+    it is not compressed. Of a truncated block the bytes before its end are returned. Arguments as in
+    `unpack`.
 
     Raises:
         BrokenChunkError: The block is damaged, or the compression is unknown.

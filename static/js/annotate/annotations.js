@@ -176,7 +176,7 @@ function paired() {
     if (!tree) continue;
     pairs.treeOf.set(row.id, tree.number);
     const other = pairs.ofTree.get(tree.number);
-    if (!other || other.kind === SKIPPED || distance(row, tree) < distance(other, tree)) pairs.ofTree.set(tree.number, row);
+    if (!other || other.kind === SKIPPED || distance(row, tree) <= distance(other, tree)) pairs.ofTree.set(tree.number, row);
   }
   return pairs;
 }

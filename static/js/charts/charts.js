@@ -8,7 +8,7 @@ import { edits } from "../core/permissions.js";
 import { attempted } from "../core/problem.js";
 import { on, state } from "../core/store.js";
 import { colour } from "../core/theme.js";
-import { throttled } from "../core/timing.js";
+import { keepFresh, throttled } from "../core/timing.js";
 import { visible } from "../shell/tabs.js";
 
 const EVERY = 2000; // [ms] between two updates
@@ -60,18 +60,18 @@ async function matrix(kind) {
 }
 
 // The course of the run: {scans, time_s, values, stages, quantities}, by name one value for each of at most LONGEST scans.
-async function course(names) {
-  const answer = await get(`/api/course?most=${LONGEST}&names=${names.join(",")}`);
-  const added = Object.keys(answer.quantities).some((name) => !quantities[name]);
+async function course(names, times = false) {
+  const answer = await get(`/api/course?most=${LONGEST}&names=${names.join(",")}&stages=${times}`);
+  const isOther = Object.keys(answer.quantities).join() !== Object.keys(quantities).join();
   quantities = answer.quantities;
-  if (added) showChosen();
+  if (isOther) showChosen();
   return answer;
 }
 
 // Times of the stages, one above the other.
 async function stages() {
-  const { time_s: time, stages: { total, ...times } } = await course([]);
-  if (!total || time.length < 2) return NOTHING;
+  const { time_s: time, stages: { total, ...times } } = await course([], true);
+  if (!total || time.length < 2) return "No times: they are measured while the run plays, and a re-mapping removes those of other parameters. Press play.";
   const figure = layout({ showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, shapes: [cursor()] });
   figure.margin.t = 74;
   figure.xaxis.title = { text: TIME };
@@ -132,8 +132,8 @@ function showChosen() {
 
 const drawingOf = (kind) => (kind in SCALES ? matrix(kind) : kind === "time" ? stages() : curves(FIXED[kind] ?? chosen));
 
-async function draw() {
-  if (!visible("charts") || busy) return;
+const draw = keepFresh(async () => {
+  if (!visible("charts")) return;
   busy = true;
   try {
     const kind = byId("chart-choice").value;
@@ -143,11 +143,12 @@ async function draw() {
     showText(isText ? drawing : "");
     if (!isText) await show(Plotly, kind, ...drawing);
   } catch (error) {
-    showText(error.message);
+    const isShown = !byId("chart").hidden && byId("chart").dataset.kind === byId("chart-choice").value;
+    if (!isShown) showText(error.message); // else a busy server: the last chart stays until the next update
   } finally {
     busy = false;
   }
-}
+}, 0);
 
 // Shows a text in place of the chart; the chart without one.
 function showText(text) {

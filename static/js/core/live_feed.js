@@ -33,7 +33,6 @@ function receiveMap({ path, ...map }) {
   state.path.length = Math.min(state.path.length, path.start);
   state.path.push(...path.points);
   state.map = map.index < 0 ? null : map; // -1: another run is opening and nothing of it is mapped yet
-  if (!state.map) state.odometry = [];
   if (!state.map && state.selectedTruth) {
     state.selectedTruth = null; // an object of the former run
     changed("selection");
@@ -41,8 +40,10 @@ function receiveMap({ path, ...map }) {
 }
 
 function receiveAnnotations(message) {
+  const references = ({ trees, used, against } = {}) => JSON.stringify([trees, used, against]);
+  const isOther = references(message) !== references(state.annotations ?? {});
   state.annotations = message;
-  if (state.map) Object.assign(state.map, { right: null, wrong: null }); // counted with the references before
+  if (state.map && isOther) Object.assign(state.map, { right: null, wrong: null }); // counted with the references before
 }
 
 // An answer to an earlier click must not undo a later one.

@@ -4,8 +4,7 @@ export const state = {
   status: null,      // the newest status message
   source: null,      // source request of the open run: {uri, odometry, seed, topics, mount, preset, parameters}
   map: null,         // the newest map message, without its path
-  path: [],          // [[x, y], ...], one per scan, in the frame of the map
-  odometry: [],      // [scan, x, y] of mapped scans, in their order, from the odometry alone
+  path: [],          // [x, y, odometry x, odometry y] of each scan, the first two in the frame of the map
   truth: null,       // ground truth trees
   evaluation: null,  // the map scored against the ground truth
   annotations: null, // {run, serial, problem, used, same_thing_m, trees: [{id, x, y, kind, dbh_cm, who, at_s, version}], skipped: likewise, plots, georeference}

@@ -102,18 +102,12 @@ export function drawLine(pen, view, points, colour, width) {
 }
 
 // The odometry moved and turned to the start of the path, so that its drift since then is visible.
-function alignedOdometry({ odometry, path, map }) {
-  if (!map || !odometry.length) return [];
-  const known = [...odometry.filter(([scan]) => scan < map.index), [map.index, ...map.odom]];
-  const [first, ox, oy] = known[0];
-  const [later, lx, ly] = known.find(([scan]) => scan >= first + 10) ?? known.at(-1);
-  if (later >= path.length) return [];
-  let turn = 0;
-  if (Math.hypot(lx - ox, ly - oy) > 0.2) {
-    turn = Math.atan2(path[later][1] - path[first][1], path[later][0] - path[first][0]) - Math.atan2(ly - oy, lx - ox);
-  }
+function alignedOdometry({ path }) {
+  if (!path.length || path[0][2] === null) return [];
+  const [x0, y0, ox, oy] = path[0], [x1, y1, lx, ly] = path[Math.min(10, path.length - 1)];
+  const turn = Math.hypot(lx - ox, ly - oy) > 0.2 ? Math.atan2(y1 - y0, x1 - x0) - Math.atan2(ly - oy, lx - ox) : 0;
   const [c, s] = [Math.cos(turn), Math.sin(turn)];
-  return known.map(([, x, y]) => [path[first][0] + c * (x - ox) - s * (y - oy), path[first][1] + s * (x - ox) + c * (y - oy)]);
+  return path.map(([, , x, y]) => [x0 + c * (x - ox) - s * (y - oy), y0 + s * (x - ox) + c * (y - oy)]);
 }
 
 export function drawTruth(pen, view, truth) {

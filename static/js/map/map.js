@@ -16,7 +16,6 @@ import { clickOn, dragTo, drawing, hoverTo, plots, pressAt, release } from "../p
 import { drawMap, treeAt } from "./draw.js";
 import { boundsOf, MapCanvas } from "./map_canvas.js";
 import { measureAt, measuredText, measureTowards, measuring } from "./measure.js";
-import { startOdometry } from "./odometry.js";
 
 const BUTTONS_HEIGHT = 54; // [px] at the upper edge
 const LEGEND_EVERY = 500; // [ms] between two updates
@@ -90,7 +89,7 @@ const isRejected = (tree) => reviewOf(tree) === "rejected";
 function showLegend() {
   const kinds = (state.truth ?? []).map(({ kind }) => kind);
   const shown = { truth: kinds.includes("tree"), other: kinds.some((kind) => kind !== "tree"), plot: plots().length,
-    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: !isCloud() && state.odometry.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
+    hollow: trees().some((tree) => tree.dbh_cm === null), odometry: !isCloud() && state.path.length, ghost: Boolean(state.ghost?.ghost.length), rejected: trees().some(isRejected), annotation: annotating() && annotations().length };
   for (const [name, is] of Object.entries(shown)) byId(`legend-${name}`).hidden = !is;
   setText(byId("legend-ghost"), state.ghost && state.ghost === state.rough ? "preview" : "previous map");
 }
@@ -128,8 +127,7 @@ export function startMap() {
   byId("map-png").addEventListener("click", () => saveCanvas("map.png", canvas));
   byId("map-csv").addEventListener("click", () => saveCsv("map.csv", tableOfMap()));
   byId("map-fit").addEventListener("click", () => map.fit());
-  startOdometry();
   on("annotating", showNextToReview);
   on("map truth annotations tab ghost", throttled(showLegend, LEGEND_EVERY));
-  on("map truth filter selection measure tab annotations annotating sketch section compare ghost odometry theme", map.redraw);
+  on("map truth filter selection measure tab annotations annotating sketch section compare ghost theme", map.redraw);
 }

@@ -14,18 +14,21 @@ import { scans, shortSource, when } from "./figures.js";
 const HEADS = [["", ""], ["name", ""], ["when", "medium"], ["scans", "minor"], ["driven m", "minor extra"], ["pose lost", "minor", "Share of the scans in which the pose was lost"], ["trees", ""], ["F1", ""], ["annotated", "minor"]];
 const REFRESH_EVERY = 5000; // [ms]
 let known = { runs: [], folders: [], open: null }, listed = ""; // the answer of the server, and its text
-let requests = 0;
+let requests = 0, waiting = 0; // requests that were sent, and those without an answer
 const ticked = new Set();
 let deleted = null; // the run that Undo brings back
 
 async function load() {
   const request = requests += 1;
+  waiting += 1;
   try {
     const answer = await get("/api/runs"), text = JSON.stringify(answer);
     if (request !== requests || text === listed) return; // a later request knows more
     [known, listed] = [answer, text];
   } catch (error) {
     showError(error.message);
+  } finally {
+    waiting -= 1;
   }
   for (const key of ticked) if (![...known.runs, ...known.folders].some((run) => run.key === key)) ticked.delete(key);
   fill();
@@ -145,7 +148,7 @@ byId("toast-undo").addEventListener("click", undo);
 addEventListener("hashchange", follow);
 addEventListener("focus", load);
 // The open run gets more scans and trees. The rows are not replaced while the keyboard focus is in one of them.
-setInterval(() => { if (!document.hidden && !byId("runs").contains(document.activeElement)) load(); }, REFRESH_EVERY);
+setInterval(() => { if (!waiting && !document.hidden && !byId("runs").contains(document.activeElement)) load(); }, REFRESH_EVERY);
 on("theme", repaint);
 startUpload(async ({ uri }) => {
   await open({ uri });

@@ -47,7 +47,7 @@ function show() {
 
 function count() {
   if (byId("layer-list").hidden) return;
-  const known = { ...newest, labels: undefined, path: state.path.length, odometry: state.odometry.length, truth: state.truth?.length ?? 0 };
+  const known = { ...newest, labels: undefined, path: state.path.length, odometry: state.path.length, truth: state.truth?.length ?? 0 };
   for (const [name, cell] of Object.entries(counts)) setText(cell, known[name] === undefined ? "" : known[name].toLocaleString("en"));
 }
 

@@ -97,7 +97,7 @@ function show() {
   cells.points.cell.hidden = !isCloud();
   document.body.classList.toggle("cloud", isCloud());
   cells.health.cell.title = healthFigures();
-  cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has each scan of the run.";
+  cells.mapping.cell.title = "Median time of mapping a scan, over the last 50 scans that were mapped. Charts, “Time per stage”, has the times of the run.";
   cells.driven.cell.title = status.odometry ? `odometry: ${status.odometry}` : "";
   cells.f1.cell.title = state.evaluation?.warning || "F1 score of the map against the ground truth; this scan: how many of its stems are at trees of the ground truth";
   cells.f1.cell.hidden = !state.evaluation || NO_FIGURES.includes(status.state);

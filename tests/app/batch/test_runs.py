@@ -239,6 +239,34 @@ async def test_rejected_trees_do_not_count_in_the_list_and_are_marked_in_the_map
     whole = (await client.get(f"/api/runs/{row['key']}")).json()
     assert (whole["trees"], whole["rejected"]) == (2, 1)
     assert [tree["review"] for tree in whole["map"]["trees"]] == ["confirmed", "rejected", "skipped"]
+    await dashboard.store.ask(lambda store: store.undo(run, author))
+    assert [each["trees"] for each in await runs(client)] == [3]
+    await dashboard.store.ask(lambda store: store.redo(run, author))
+    assert [each["trees"] for each in await runs(client)] == [2]
+
+
+async def test_rejected_trees_are_counted_again_only_after_a_change(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard)
+    await play(dashboard, "other:", run=2)
+    run, author = dashboard.annotation_editor.run, Author("b" * 16, "Ann")
+    assert run is not None
+    await dashboard.store.ask(lambda store: store.add(run, author, [Content(2.0, 0.0, "pole")]))
+    assert {each["uri"]: each["trees"] for each in await runs(client)} == {"fake:": 3, "other:": 2}
+    read = []
+    await dashboard.store.ask(lambda store: setattr(store.book, "trees", read.append))
+    assert {each["uri"]: each["trees"] for each in await runs(client)} == {"fake:": 3, "other:": 2}
+    assert read == []
+
+
+async def test_a_run_whose_map_is_missing_is_listed(both: Running) -> None:
+    client, dashboard = both
+    await play(dashboard)
+    run, author = dashboard.annotation_editor.run, Author("b" * 16, "Ann")
+    assert run is not None
+    await dashboard.store.ask(lambda store: store.add(run, author, [Content(2.0, 0.0, "pole")]))
+    await dashboard.store.ask(lambda store: setattr(store.book, "trees", lambda _record: []))
+    assert [each["trees"] for each in await runs(client)] == [3]
 
 
 async def test_the_list_has_the_number_of_annotations_of_each_recording(both: Running) -> None:

@@ -302,6 +302,16 @@ def test_what_cannot_be_used_is_said_in_one_line_and_kept(tmp_path: Path, damage
     assert path.read_bytes() == before
 
 
+def test_a_database_of_another_program_stays_as_it_is(tmp_path: Path):
+    path = tmp_path / FILE_NAME
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("CREATE TABLE other (x)")
+    before = path.read_bytes()
+    with pytest.raises(StemmapError, match="another program"):
+        Store(tmp_path)
+    assert path.read_bytes() == before
+
+
 def test_a_folder_that_cannot_be_made_is_said(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StemmapError, match="STEMMAP_FOLDER"):

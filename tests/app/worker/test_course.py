@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from app.dashboard.payload import course_payload
 from app.worker.course import QUANTITIES, ScanSeries
+from app.worker.run import Run
 from app.worker.session import Session
 from pipeline.config import Parameters
 from tests.app.fakes import FakeSource, make_session
@@ -62,14 +63,16 @@ def test_the_course_has_all_mapped_scans_also_after_a_step_back() -> None:
     settle(session)
     run = session.run
     assert run is not None
-    found = run.course([*QUANTITIES], 100)
+    found = run.course([*QUANTITIES], 100, stages=True)
     assert found.scans.tolist() == [*range(30)]
     np.testing.assert_allclose(found.time_s, 0.1 * np.arange(30))
     assert np.isfinite(found.values["mapping"]).sum() == 30
     assert np.isnan(found.values["driven"][11:]).all(), "the path ends at the shown scan"
-    few = run.course(["x"], 7)
+    assert {"total"} <= set(found.stages)
+    few = run.course(["x"], 7, stages=False)
     assert len(few.scans) == 7
     assert few.scans[[0, -1]].tolist() == [0, 29]
+    assert few.stages == {}
     np.testing.assert_array_equal(few.values["x"], found.values["x"][few.scans])
     payload = course_payload(found)
     assert payload["scans"] == [*range(30)]
@@ -89,12 +92,31 @@ def test_other_parameters_from_a_scan_on_remove_the_course_from_there() -> None:
     session.set_parameters(Parameters().replace({"clustering.eps": 0.3}), 1)
     run = session.run
     assert run is not None
-    assert run.course(["x"], 100).scans.tolist() == [*range(11)], "the shown scan is mapped again"
+    assert run.course(["x"], 100, stages=False).scans.tolist() == [*range(11)], (
+        "the shown scan is mapped again"
+    )
 
 
 def test_a_run_before_its_first_scan_has_an_empty_course() -> None:
     run = opened(3).run
     assert run is not None
-    found = run.course([*QUANTITIES], 10)
+    found = run.course([*QUANTITIES], 10, stages=True)
     assert len(found.scans) == 0
     assert all(len(values) == 0 for values in found.values.values())
+
+
+def test_times_and_quantities_of_a_long_run_belong_to_the_same_scans() -> None:
+    """The map of a rerun keeps every scan while the times of the run keep every second one."""
+    session = opened(40)
+    session.play()
+    for _ in range(30):
+        session.work()
+    run = session.run
+    assert isinstance(run, Run)
+    run._times = ScanSeries(8)  # keeps every fourth scan of 30
+    for index in range(30):
+        run._times.record(index, {"total": 2.0, **({"sometimes": 1.0} if index % 8 == 0 else {})})
+    found = run.course(["x", "mapping"], 100, stages=True)
+    assert found.scans.tolist() == [0, 4, 8, 12, 16, 20, 24, 28]
+    assert found.values["mapping"].tolist() == [2.0] * 8
+    assert found.stages["sometimes"].tolist() == [1.0, 0.0] * 4, "a stage that did not run took no time"

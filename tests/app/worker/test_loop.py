@@ -11,6 +11,7 @@ import time
 from dataclasses import replace
 from typing import Any, cast
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -397,6 +398,26 @@ def test_a_picture_that_cannot_be_sent_is_told_and_ends_nothing(monkeypatch: pyt
     assert "larger than 100000" in told.status.warnings[-1]
     assert isinstance(shown_next, Shown)
     assert (shown_next.path_start, shown_next.path.x.tolist()) == (0, second.x.tolist())
+
+
+def test_rows_of_the_odometry_are_those_of_the_path() -> None:
+    stream = io.BytesIO()
+    mailbox = Outbox(stream)
+    odometry_xy = np.arange(6.0).reshape(3, 2)
+    for n in (2, 3):
+        shown = Shown(1, 0.1 * n, frame(n, n), 0, path([float(k) for k in range(n)]))
+        mailbox.put(msgspec.structs.replace(shown, odometry_xy=odometry_xy[:n]))
+        for _ in range(2000):
+            if mailbox._picture is None:
+                break
+            threading.Event().wait(0.01)
+    mailbox.close(20.0)
+    first, second = received(stream)
+    assert isinstance(first, Shown)
+    assert isinstance(second, Shown)
+    np.testing.assert_array_equal(first.odometry_xy, odometry_xy[:2])
+    assert second.path_start == 2
+    np.testing.assert_array_equal(second.odometry_xy, odometry_xy[2:])
 
 
 def test_a_reader_that_is_gone_does_not_stop_the_loop() -> None:

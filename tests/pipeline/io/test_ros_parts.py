@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.container import BrokenChunkError, unpack
+from pipeline.io.readers.container import BrokenChunkError, plain, unpack
 from pipeline.io.readers.mcap_file import MAGIC, MESSAGE_HEAD, RECORD, McapFile
 from pipeline.io.readers.message_time import WINDOW_NS, Stamped, in_order_of_stamps
 from pipeline.io.readers.topics import POINT_CLOUD
@@ -224,6 +224,14 @@ def test_blocks_are_unpacked_to_the_promised_size_only(name: str):
             unpack(packed, name, size)
     with pytest.raises(BrokenChunkError):
         unpack(packed[: len(packed) // 2], name, len(content))
+
+
+def test_a_truncated_payload_is_damaged():
+    content = bytes(range(256)) * 2000
+    packed = zstandard.ZstdCompressor().compress(content)
+    assert plain(packed) == content
+    assert plain(packed[: len(packed) // 2]) == b""
+    assert plain(content) == content
 
 
 @pytest.mark.parametrize("name", ["lz4", "zstd", "bz2"])
