@@ -165,6 +165,8 @@ class Listener:
             payload: JSON of the map without its path.
             path_xy: The path, as in `show`.
         """
-        start = first_difference(self._path, path_xy)
-        self._map_seen, self._map_at, self._path = count, time.monotonic(), path_xy
+        # The odometry of a scan, which may be NaN, never changes.
+        positions = path_xy[:, :2]
+        start = first_difference(self._path, positions)
+        self._map_seen, self._map_at, self._path = count, time.monotonic(), positions
         return b'%s,"path":%s}' % (payload[:-1], self._live.path_json(count, path_xy, start))

@@ -38,7 +38,7 @@ from pipeline.config import preset
 from pipeline.config.model import Value
 from pipeline.geometry.columns import GrowingColumns, columns_of
 from pipeline.stand.seen_area import SeenRecorder
-from pipeline.types.records import Path, TruthTrees
+from pipeline.types.records import Float, Path, TruthTrees
 
 if TYPE_CHECKING:
     from app.scene import Scene
@@ -85,6 +85,7 @@ class Dashboard:
         self.path: Path | None = None
         self.path_xy = np.zeros((0, 2))
         self._path_rows = _no_path()
+        self._broadcast_map: tuple[dict[str, Any], Float] | None = None
         self.truth: TruthTrees | None = None
         self.seen = SeenRecorder()
         self.sets = ParameterSets(self.store, self._show_parameters)
@@ -409,7 +410,7 @@ class Dashboard:
     async def _forget(self) -> None:
         """Remove map, path, observed area, selection, scores, events and the repetition of a part, and show
         the ground truth of the run that begins."""
-        self.shown = self.path = None
+        self.shown = self.path = self._broadcast_map = None
         self.seen = SeenRecorder()
         self.path_xy = np.zeros((0, 2))
         self._path_rows = _no_path()
@@ -435,7 +436,22 @@ class Dashboard:
         self.live.publish("annotations", self.annotation_editor.as_plain())
         if self.truth is None:
             self.scores.forget()
+        index = -1 if self.shown is None else self.shown.frame.index
+        if self.shown and self._broadcast_map and self._broadcast_map[0]["index"] == index:
+            distance = self.parameters.parameters.evaluation.match_distance
+            self._show_map(*self._broadcast_map, counts_of(self.shown.frame, self.truth, distance))
         self._score()
+
+    def _show_map(self, payload: dict[str, Any], path_rows: Float, counted: dict[str, Any]) -> None:
+        """Broadcast a map.
+
+        Args:
+            payload: Result of `map_payload`.
+            path_rows: Positions x, y of path and odometry, shape (N, 4) [m].
+            counted: Result of `counts_of`.
+        """
+        self._broadcast_map = payload, path_rows
+        self.live.show({**payload, **self._before_after.shown(payload["index"], counted)}, path_rows)
 
     def _mark_edits(self, who: str, number: int) -> None:
         """Add an event for edits of annotations and broadcast it; nothing before the first scan.
@@ -474,9 +490,8 @@ class Dashboard:
         counted = await asyncio.to_thread(counts_of, shown.frame, self.truth, distance)
         if number != self._opens:  # another source was requested meanwhile
             return
-        counts = self._before_after.shown(shown.frame.index, counted)
         payload["layers"] |= self.scene.counts
-        self.live.show({**payload, **counts}, path_rows)
+        self._show_map(payload, path_rows, counted)
         if self.events.shown(shown.frame, shown.time_s, shown.confirmed_s):
             self._broadcast_events()
         self.run_recorder.shown(self._run_state(shown))

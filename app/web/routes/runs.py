@@ -72,10 +72,8 @@ class _Name(Body):
 @router.get("")
 async def list_runs(dashboard: Dash, settings: Deployment) -> Response:
     """GET /api/runs: return an object with `runs`, at most 500, the last changed first, see
-    `ReviewedRuns.listed`;
-    `folders`, the finished folders,
-    each with `key`, `name` and `changed_s`; and `open`, the number of the open run (null if it is not
-    recorded)."""
+    `ReviewedRuns.listed`; `folders`, the finished folders, each with `key`, `name` and `changed_s`; and
+    `open`, the number of the open run (null if it is not recorded)."""
     await dashboard.run_recorder.write_now()
     rows = await dashboard.reviewed_runs.listed()
     folders = await asyncio.to_thread(_folders, settings)

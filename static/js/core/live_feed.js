@@ -16,7 +16,7 @@ const receivers = {
   sets(message) { state.sets = message; },
   truth(message) { state.truth = message.trees ?? null; },
   evaluation(message) { state.evaluation = message.TA ? message : null; },
-  annotations(message) { receiveAnnotations(message); },
+  annotations(message) { state.annotations = message; },
   learning(message) { state.learning = message; },
   selection(message) { receiveSelection(message.tree ?? null, message.cluster ?? null, message.place ?? null); },
   events(message) { state.events = message.events; },
@@ -37,13 +37,6 @@ function receiveMap({ path, ...map }) {
     state.selectedTruth = null; // an object of the former run
     changed("selection");
   }
-}
-
-function receiveAnnotations(message) {
-  const references = ({ trees, used, against } = {}) => JSON.stringify([trees, used, against]);
-  const isOther = references(message) !== references(state.annotations ?? {});
-  state.annotations = message;
-  if (state.map && isOther) Object.assign(state.map, { right: null, wrong: null }); // counted with the references before
 }
 
 // An answer to an earlier click must not undo a later one.

