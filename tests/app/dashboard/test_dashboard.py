@@ -211,6 +211,7 @@ async def test_a_picture_goes_to_scene_and_browsers_with_its_whole_path(dashboar
     assert shown is not None
     _, encoded, path_xy = shown
     payload = json.loads(encoded)
+    np.testing.assert_array_equal(path_xy[:, :2], [[0.0, 0.0], [1.0, 0.0]])
     assert payload["verdicts"] == {"too long": 1}
     assert len(payload["trees"]) == 2
 

@@ -45,6 +45,14 @@ def line(scans: int = 31, step: float = PLACE) -> Places:
     return places
 
 
+def test_only_landmarks_of_contradicted_places_are_not_usable() -> None:
+    births = np.array([-1, 0, 1, 2])  # the first one precedes all places
+    places = line(3)
+    assert places.is_usable(births).tolist() == [True, True, True, True]
+    assert places.with_contradiction(np.array([0])).is_usable(births).tolist() == [True, False, True, True]
+    assert Places().is_usable(births).all()
+
+
 def of_stand(trees: np.ndarray, shown: np.ndarray, pose: Pose = EXACT) -> tuple[float, np.ndarray]:
     """Log odds of the trees and which of them agree, for exact detections."""
     odds, agrees, _ = agreement(pose, shown, np.tile(R, (len(shown), 1)), trees, np.tile(R, (len(trees), 1)))
