@@ -513,12 +513,10 @@ def test_the_panel_leaves_a_small_scene_free(dashboard: Dashboard):
     dashboard.tab("Trees")
     slider = scene.get_by_role("slider", name="Radius eps").first
     expect(slider).to_be_visible()
-    width = page.viewport_size
-    assert width is not None
     split = page.locator("#split-left")
     split.focus()
     for _ in range(60):
-        if page.locator("#scene").bounding_box()["width"] < 540:
+        if page.locator("#scene").evaluate("node => node.clientWidth") < 540:
             break
         split.press("ArrowRight")
     expect(slider).to_be_hidden()

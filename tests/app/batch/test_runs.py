@@ -253,7 +253,7 @@ async def test_rejected_trees_are_counted_again_only_after_a_change(both: Runnin
     assert run is not None
     await dashboard.store.ask(lambda store: store.add(run, author, [Content(2.0, 0.0, "pole")]))
     assert {each["uri"]: each["trees"] for each in await runs(client)} == {"fake:": 3, "other:": 2}
-    read = []
+    read: list[int] = []
     await dashboard.store.ask(lambda store: setattr(store.book, "trees", read.append))
     assert {each["uri"]: each["trees"] for each in await runs(client)} == {"fake:": 3, "other:": 2}
     assert read == []
