@@ -4,7 +4,6 @@ reasons."""
 
 from __future__ import annotations
 
-import contextlib
 import math
 from bisect import bisect_right
 from collections import Counter, deque
@@ -109,10 +108,11 @@ class FrameStore:
         )
         shown = Shown(0, time_s, lean, 0, rows_of(path, slice(0, 0)), confirmed_s)
         scan = StoredScan(shown, columns_in, ground_in, replaced)
-        # A scan that is larger than a message may be is left out, but later ones are stored.
-        with contextlib.suppress(WireError):
+        try:
             if not self._blocks.put_block(frame.index, self._codec.encode(scan)[LENGTH_BYTES:]):
                 return
+        except WireError:  # larger than a message may be: left out, and the next one stores its own objects
+            objects, columns_in, ground_in = (None, None), -1, -1
         if replaced is not None:
             self._corrections.append((frame.index, start))
         self._scans += 1

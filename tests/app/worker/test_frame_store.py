@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tracemalloc
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from app.worker.remap import FrameStore
+from pipeline.ground.terrain_map import no_height_map
 from pipeline.io.block_file import BlockFile
 from tests.app import fakes
 
@@ -70,3 +72,19 @@ def test_what_the_file_refuses_ends_the_store_and_harms_nothing(monkeypatch: pyt
         store.forget_from(3)
         put(store, known[3])
         assert xs_of(store, 3) == known[3]
+
+
+def test_after_a_scan_that_is_too_large_the_others_have_their_ground(monkeypatch: pytest.MonkeyPatch) -> None:
+    ground = no_height_map()
+    with closing(FrameStore()) as store:
+        for index in range(3):
+            frame = replace(fakes.frame(index, fakes.START_NS + index), ground=ground)
+            with monkeypatch.context() as limited:
+                if index == 0:
+                    limited.setattr("app.worker.protocol.LARGEST_MESSAGE", 100)
+                store.put(frame, fakes.path([0.0] * (index + 1)), 0.1 * index, np.zeros(0))
+        assert store.read(0) is None
+        for index in (1, 2):
+            shown = store.read(index)
+            assert shown is not None
+            assert shown.frame.ground is not None
