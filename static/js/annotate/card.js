@@ -19,7 +19,7 @@ const evidence = () => byId("review-evidence");
 // The card around `hint`, which is visible without a selected tree, too.
 export const card = (hint) => el("article", { id: "review", class: "review", "aria-labelledby": "review-title" },
   el("h2", {}, el("span", { id: "review-title" }), " ", el("span", { id: "review-state", class: "review-state" })),
-  el("label", { class: "review-dbh", title: "A reference for the scores and for learning; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
+  el("label", { class: "review-dbh", title: "A reference for the scores and for learning, which confirms the tree; the diameter in the map does not change" }, "DBH by tape (cm) ", el("input", { id: "review-dbh", type: "text", inputmode: "decimal", autocomplete: "off", onchange: takeDbh })),
   el("div", { id: "review-evidence" }), hint,
   el("figure", { id: "review-camera", hidden: true }, el("figcaption", { text: "Camera" }), el("img", { alt: "" })),
   el("div", { id: "review-votes" }));

@@ -17,6 +17,8 @@ const LONGEST = 1200; // samples drawn of each curve
 const MOST_APART = 24; // trees whose cells have a gap; the gaps of more are drawn unevenly
 const ROW = 120; // [px] of height that a curve of its own needs
 const HEAD = 0.2; // share of its height for its name
+// A colour for each of up to 14 stages; Plotly repeats its own after ten.
+const STAGES = ["#4e79a7", "#f28e2b", "#e15759", "#76b7b2", "#59a14f", "#edc948", "#b07aa1", "#ff9da7", "#9c755f", "#7f7f7f", "#1b9e77", "#d95f02", "#66a61e", "#7570b3"];
 const FIXED = { n_eff: ["n_eff"], sigma: ["sigma", "yaw"] }; // charts of certain quantities
 let chosen = (recall("quantities") ?? "trees,sigma").split(",").filter(Boolean);
 let quantities = {}; // name -> {title, unit} of those that the run has
@@ -70,13 +72,15 @@ async function course(names, times = false) {
 
 // Times of the stages, one above the other.
 async function stages() {
-  const { time_s: time, stages: { total, ...times } } = await course([], true);
-  if (!total || time.length < 2) return "No times: they are measured while the run plays, and a re-mapping removes those of other parameters. Press play.";
+  const { time_s, stages: { total = [], ...times } } = await course([], true);
+  const isMeasured = (_, k) => total[k] !== null && total[k] !== undefined, time = time_s.filter(isMeasured);
+  if (time.length < 2) return "No times: they are measured while the run plays, and a re-mapping removes those of other parameters. Press play.";
   const figure = layout({ showlegend: true, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, shapes: [cursor()] });
   figure.margin.t = 74;
   figure.xaxis.title = { text: TIME };
   Object.assign(figure.yaxis, { rangemode: "tozero", title: { text: "ms per scan" } });
-  return [Object.entries(times).map(([name, values]) => ({ ...line(time, values, name), stackgroup: "one" })), figure];
+  figure.colorway = STAGES;
+  return [Object.entries(times).map(([name, values]) => ({ ...line(time, values.filter(isMeasured), name), stackgroup: "one" })), figure];
 }
 
 const NOTHING = "Nothing to plot yet: curves need two mapped scans. Press play.";

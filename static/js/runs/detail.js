@@ -3,7 +3,7 @@
 import { get } from "../core/api.js";
 import { byId, el, setText } from "../core/dom.js";
 import { fileName, saveCanvas, saveCsv } from "../core/download.js";
-import { clock, count, NONE } from "../core/format.js";
+import { clock, count, figure, NONE } from "../core/format.js";
 import { reportMenu } from "../core/report.js";
 import { treeAt } from "../map/draw.js";
 import { boundsOf } from "../map/map_canvas.js";
@@ -80,7 +80,8 @@ function edit(title, run, guarded, rename) {
 }
 
 function figures(run) {
-  const all = [...FIGURES, ["preset", (each) => each.preset || NONE]];
+  const changed = Object.keys(run.differences).length;
+  const all = [...FIGURES, ["preset", (each) => (each.preset || NONE) + (changed ? `, ${changed} changed` : "")]];
   return el("dl", { class: "run-figures" }, ...all.map(([name, text]) =>
     el("div", { "data-figure": name }, el("dt", { text: name }), el("dd", { text: text(run) }))));
 }
@@ -92,7 +93,7 @@ function more(run, map) {
       el("button", { class: "small", text: "Map as PNG", onclick: () => saveCanvas(fileName(title, "map.png"), map.canvas) }),
       reportMenu("run-report", run.key, () => title),
       el("button", { class: "small", text: "Trees as CSV", onclick: () => saveCsv(fileName(title, "trees.csv"), treeRows(run.map.trees)) })),
-    ...(run.scores ? [el("div", {}, el("h3", { text: "Scores" }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
+    ...(run.scores ? [el("div", {}, el("h3", { text: `Scores${typeof run.scores.reach_m === "number" ? ` (TA, FR, TR and FA within ${figure(run.scores.reach_m)} m of the path)` : ""}` }), table(["score", "value"], SCORES.map(([name, text]) => [name, text(run.scores)]), [1]))] : []),
     el("div", {}, el("h3", { text: "Differences from the preset" }), Object.keys(run.differences).length
       ? table(["parameter", "value"], Object.entries(run.differences).map(([name, value]) => [name, String(value)]))
       : el("p", { class: "note", text: `None: all parameters are those of the preset ${run.preset}.` })),
