@@ -70,7 +70,7 @@ const charts = () => [...byId("chart-choice").options].map(({ value, text }) => 
   toTab("charts")();
   byId("chart-choice").value = value;
   byId("chart-choice").dispatchEvent(new Event("change"));
-}]);
+}, "charts plots graphs curves"]);
 
 const views = () => Object.entries(CHOICES).flatMap(([name, words]) => (state.view?.[name]?.of ?? []).map((value) => [`${words} ${value}`, "", edits(() => chooseView(name, value))]));
 
