@@ -356,8 +356,9 @@ class Coverage:
         if name:
             word = re.compile(rf"\b{name}\b")
             for path, by_line in self.tests.items():
-                text = (_ROOT / path).read_text().splitlines()
-                found.update(*(tests for line, tests in by_line.items() if word.search(text[line - 1])))
+                # An empty module is recorded with a line 0.
+                text = dict(enumerate((_ROOT / path).read_text().splitlines(), 1))
+                found.update(*(tests for line, tests in by_line.items() if word.search(text.get(line, ""))))
         if name is not None and not found:
             found.update(*lines.values())
         chosen, left_s = [], _TESTS_S
