@@ -49,15 +49,15 @@ class Broadcast:
         self._messages[kind] = (self._next(), encoded)
         self._wake()
 
-    def show(self, payload: dict[str, Any], path_xy: NDArray[np.float64]) -> None:
+    def show(self, payload: dict[str, Any], path: NDArray[np.float64]) -> None:
         """Replace the map and wake the listeners, also if it is the same.
 
         Args:
             payload: Message "map" without its path; not empty.
-            path_xy: Positions x, y of the path, and of the odometry if it is known, shape (N, 2) or (N, 4)
+            path: Positions x, y of the path, and of the odometry if it is known, shape (N, 2) or (N, 4)
                 [m]; it must not be modified afterwards.
         """
-        self._map = (self._next(), _encode(payload), path_xy)  # once for all listeners
+        self._map = (self._next(), _encode(payload), path)  # once for all listeners
         self._wake()
 
     def forget_map(self) -> None:
@@ -86,17 +86,17 @@ class Broadcast:
         else None. The path is not a copy."""
         return self._map if self._map is not None and self._map[0] > count else None
 
-    def path_json(self, count: int, path_xy: NDArray[np.float64], start: int) -> bytes:
+    def path_json(self, count: int, path: NDArray[np.float64], start: int) -> bytes:
         """Return the rows of a path from `start` on as JSON: an object with `start` and `points`, a list of
         rows [m] rounded to 1 mm. The result of the last call is reused if `count` and `start` are the same.
 
         Args:
             count: Number of the message with the map.
-            path_xy: Path of this map, as in `show`.
+            path: Path of this map, as in `show`.
             start: First row of the result.
         """
         if self._path_json[:2] != (count, start):
-            rows = {"start": start, "points": np.round(path_xy[start:], 3).tolist()}
+            rows = {"start": start, "points": np.round(path[start:], 3).tolist()}
             self._path_json = (count, start, _encode(rows))
         return self._path_json[2]
 
@@ -156,17 +156,17 @@ class Listener:
         """Return the time until the next map may be sent [s]; negative if it may be sent now."""
         return self._map_at + MAP_PAUSE_S - time.monotonic()
 
-    def _map_message(self, count: int, payload: bytes, path_xy: NDArray[np.float64]) -> bytes:
+    def _map_message(self, count: int, payload: bytes, path: NDArray[np.float64]) -> bytes:
         """Return a map with the rows of its path that this browser does not have, as JSON, and count it as
         sent now.
 
         Args:
             count: Number of the message.
             payload: JSON of the map without its path.
-            path_xy: The path, as in `show`.
+            path: The path, as in `show`.
         """
         # The odometry of a scan, which may be NaN, never changes.
-        positions = path_xy[:, :2]
+        positions = path[:, :2]
         start = first_difference(self._path, positions)
         self._map_seen, self._map_at, self._path = count, time.monotonic(), positions
-        return b'%s,"path":%s}' % (payload[:-1], self._live.path_json(count, path_xy, start))
+        return b'%s,"path":%s}' % (payload[:-1], self._live.path_json(count, path, start))

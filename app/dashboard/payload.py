@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from app.explain.history import half_axes
 from app.worker.course import QUANTITIES
-from app.worker.protocol import Course, Shown
+from app.worker.protocol import RunCourse, Shown
 from pipeline.types.records import CLASSES, Clearance, Frame, Health, Trees, TruthTrees, Verdict
 
 Float = NDArray[np.float64]
@@ -51,9 +51,9 @@ def map_payload(shown: Shown) -> dict[str, Any]:
     }
 
 
-def course_payload(course: Course) -> dict[str, Any]:
-    """Return the course of a map as a dict of JSON values: `scans` and `time_s`, as in `Course`; `values` and
-    `stages`, dicts from names to lists with one number for each scan, None where unknown or infinite; and
+def course_payload(course: RunCourse) -> dict[str, Any]:
+    """Return the course of a map as a dict of JSON values: `scans` and `time_s`, as in `RunCourse`; `values`
+    and `stages`, dicts from names to lists with one number for each scan, None where unknown or infinite; and
     `quantities`, a dict from the names of known quantities to dicts with `title` and `unit`."""
     quantities = {name: QUANTITIES[name] for name in QUANTITIES if name in course.known}
     return {

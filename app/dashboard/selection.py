@@ -21,8 +21,8 @@ from app.worker.protocol import (
     AskTree,
     AskTreePicture,
     CameraPicture,
-    Course,
     Question,
+    RunCourse,
     WorkerBusyError,
 )
 from pipeline.config import Parameters
@@ -111,7 +111,7 @@ class WorkerClient:
         a run, WorkerBusyError without an answer."""
         return _known((await self._ask(AskSection)).section)
 
-    async def course(self, names: list[str], most: int, stages: bool) -> Course:
+    async def course(self, names: list[str], most: int, stages: bool) -> RunCourse:
         """Return the course of the map, see `AskCourse` for the arguments; raises NoStoryError without a run,
         WorkerBusyError without an answer."""
         return _known((await self._ask(AskCourse, names, most, stages)).course)

@@ -64,8 +64,6 @@ QUANTITIES: dict[str, Quantity] = {
     "x": Quantity("x of the robot", "m", lambda f: f.estimate.T_map_base.x),
     "y": Quantity("y of the robot", "m", lambda f: f.estimate.T_map_base.y),
     "heading": Quantity("heading of the robot", "°", lambda f: math.degrees(f.estimate.T_map_base.yaw)),
-    "odom_x": Quantity("x of the odometry", "m", lambda f: f.T_odom_base.x),
-    "odom_y": Quantity("y of the odometry", "m", lambda f: f.T_odom_base.y),
     "driven": Quantity("driven distance", "m"),
     "clearance": Quantity("distance to an obstacle ahead", "m", _ahead),
     "raw": Quantity("points of the scan", "", lambda f: float(f.counts.get("returns", math.nan))),

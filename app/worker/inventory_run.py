@@ -16,7 +16,7 @@ from app.batch.run_folder import NO_PATH
 from app.batch.summary import FAR_FROM_PLOT
 from app.common.timers import Stopwatch
 from app.store.forests import kept_forests
-from app.worker.protocol import Course, RunCounts
+from app.worker.protocol import RunCounts, RunCourse
 from app.worker.tree_numbers import TreeNumbers
 from pipeline.classification.column_extraction import BREAST
 from pipeline.config import Parameters
@@ -158,10 +158,10 @@ class InventoryRun:
         """No positions, shape (0, 2)."""
         return np.zeros((0, 2))
 
-    def course(self, names: Sequence[str], most: int, *, stages: bool) -> Course:
+    def course(self, names: Sequence[str], most: int, *, stages: bool) -> RunCourse:
         """Return a course without scans: a whole cloud has none. The arguments are ignored."""
         del names, most, stages
-        return Course(np.zeros(0, np.int64), np.zeros(0), {}, {}, [])
+        return RunCourse(np.zeros(0, np.int64), np.zeros(0), {}, {}, [])
 
     def take_views(self) -> list[tuple[int, Float]]:
         """Return nothing: the area that a whole cloud covers does not come from views."""

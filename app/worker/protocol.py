@@ -358,7 +358,7 @@ class AskCourse(_Question, frozen=True, tag="ask_course"):
     stages: bool = False
 
 
-class Course(msgspec.Struct, frozen=True):
+class RunCourse(msgspec.Struct, frozen=True):
     """Quantities of the mapped scans, in their order. Unknown values are NaN.
 
     Attributes:
@@ -409,7 +409,7 @@ class Answer(msgspec.Struct, frozen=True, tag="answer"):
     frames: list[Frame] | None = None
     camera: CameraPicture | None = None
     section: MapSection | None = None
-    course: Course | None = None
+    course: RunCourse | None = None
     missing: str = ""
 
 

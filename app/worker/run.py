@@ -20,7 +20,7 @@ from app.robot.source import LiveSource
 from app.sources.request import with_odometry
 from app.worker.course import QUANTITIES, ScanSeries
 from app.worker.cursor import Cursor, StepStore, live_steps
-from app.worker.protocol import Course, RunCounts, Shown
+from app.worker.protocol import RunCounts, RunCourse, Shown
 from app.worker.remap import (
     NOT_OF_THE_MAP,
     Remapping,
@@ -129,7 +129,7 @@ class Run:
         copy."""
         return self._odometry_xy.shared()[0]
 
-    def course(self, names: Sequence[str], most: int, *, stages: bool) -> Course:
+    def course(self, names: Sequence[str], most: int, *, stages: bool) -> RunCourse:
         """Return the course of the map, see `AskCourse` for the arguments; quantities without a value in any
         scan, and names that are not in QUANTITIES, are NaN."""
         series, times, path = self._map.course, self._times, self.path
@@ -149,7 +149,7 @@ class Run:
             spent[np.isnan(spent) & np.isfinite(total)] = 0.0
         elsewhere = {"driven", *(["mapping"] if TOTAL in times.names else [])}
         known = [name for name in QUANTITIES if name in elsewhere or name in series.names]
-        return Course(scans, series.values("time_s", scans), values, of_stages, known)
+        return RunCourse(scans, series.values("time_s", scans), values, of_stages, known)
 
     @property
     def start_ns(self) -> int:

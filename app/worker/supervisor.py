@@ -122,8 +122,8 @@ class WorkerProcess:
 
         Raises:
             WorkerBusyError: The worker does not run or does not read in time, and the command is a step, a
-                seek or a question. Play, Pause and Begin are dropped without an error: the owner decides them
-                anew when the source is open again.
+                seek or a question. Play, Pause and Begin are dropped without an error: after a restart, the
+                answer to the next `Opened` states whether the run plays.
         """
         if isinstance(command, protocol.SetParameters | protocol.SetSpeed):
             self._settings[type(command)] = command

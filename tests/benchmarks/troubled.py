@@ -249,9 +249,7 @@ TROUBLES = {
     "scans out of order": Trouble(arrival=_swapped, said=LEFT_OUT_SCANS, state="good", soon=3),
     "gap, driven on": Trouble(pause_ms=GAP_MS, said="no scan for 60 s"),
     "gap, pushed": Trouble(push=Pose2(2.0, 0.3, 0.1), pause_ms=GAP_MS, said="no scan for 60 s"),
-    "gap, odometry begins anew": Trouble(
-        _restarted, pause_ms=GAP_MS, said="no scan for 60 s", may_be_lost=True
-    ),
+    "gap, odometry restarts": Trouble(_restarted, pause_ms=GAP_MS, said="no scan for 60 s", may_be_lost=True),
     "kidnapped": Trouble(
         push=Pose2(3.0, 3.0, 2.0),
         said="the robot is lost",

@@ -21,7 +21,9 @@ from app.dashboard.run_recorder import MOST_PATH_POINTS, thinned
 from app.dashboard.shown_run import ShownRun
 from app.sources import inspection
 from app.sources.request import SourceRequest, request_of_kept
+from app.store.database import maps
 from app.store.records import Author, Content
+from app.store.store import Store
 from app.training.annotated_runs import annotated_run
 from app.worker.protocol import Begin, Open, Shown, View
 from pipeline.errors import SourceError, StemmapError
@@ -265,7 +267,12 @@ async def test_a_run_whose_map_is_missing_is_listed(both: Running) -> None:
     run, author = dashboard.annotation_editor.run, Author("b" * 16, "Ann")
     assert run is not None
     await dashboard.store.ask(lambda store: store.add(run, author, [Content(2.0, 0.0, "pole")]))
-    await dashboard.store.ask(lambda store: setattr(store.book, "trees", lambda _record: []))
+
+    def remove_maps(store: Store) -> None:
+        with store.book._engine.begin() as connection:
+            connection.execute(maps.delete())
+
+    await dashboard.store.ask(remove_maps)
     assert [each["trees"] for each in await runs(client)] == [3]
 
 

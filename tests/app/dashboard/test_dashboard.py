@@ -339,15 +339,15 @@ async def test_detections_are_counted_again_when_the_references_change(dashboard
     )
     await dashboard.receive(Shown(1, 0.1, replace(picture, detections=found), 0, path([0.0, 1.0])))
 
-    def told() -> dict[str, Any]:
+    def counted() -> dict[str, Any]:
         newest = dashboard.live.map_after(0)
         assert newest is not None
         shown: dict[str, Any] = json.loads(newest[1])
         return {name: shown[name] for name in ("index", "right", "wrong")}
 
-    assert told() == {"index": 1, "right": 0, "wrong": 1}
+    assert counted() == {"index": 1, "right": 0, "wrong": 1}
     editor, author = dashboard.annotation_editor, Author("b" * 16, "Ann")
     run = editor.run
     assert run is not None
     await editor.edit(run, lambda store: store.add(run, author, [Content(9.0, 0.0, "tree")]))
-    assert told() == {"index": 1, "right": 1, "wrong": 0}
+    assert counted() == {"index": 1, "right": 1, "wrong": 0}
