@@ -101,7 +101,8 @@ class Frames:
         """Try to align one more map; return whether an alignment was computed, successful or not. Maps that
         need no computation (the first with enough trees, the same recording) get their pose in passing.
 
-        A map is tried only with at least LEAST_TREES trees, and after a failure again with MORE_TREES more.
+        A map is tried only with at least LEAST_TREES trees, and after a failure again with MORE_TREES more. A
+        map with a pose is not tried again.
         Poses of runs that are not in `maps` any more are removed; without the run of the common frame, all
         are.
 
@@ -447,7 +448,8 @@ class Fleet:
         self.live.publish("fleet", {"members": cards, "notice": self.notice})
 
     def send_maps(self) -> None:
-        """Send the maps that exist to the pages, as the message "maps"."""
+        """Send the message "maps" to the pages: {"maps": dict from the name of each robot with a map to the
+        result of `drawn`}."""
         maps = {
             name: drawn(own, self._frames.pose(name), self._frames.how(name))
             for name, (_, own) in self._maps().items()
@@ -482,9 +484,9 @@ async def warm_kernels(command: Sequence[str] = WARMING) -> None:
 
 
 def named(sources: Sequence[Open]) -> dict[str, Open]:
-    """Return the sources by short names: for a file its stem, for a simulated run or an address with options
-    the whole address, with " (2)" and so on appended if two are equal. With several sources, the names of
-    their recordings get the name, see `recorded_apart`."""
+    """Return the sources by short names: the whole URI of a simulated run or of a URI with "?", for any other
+    file or address the stem of its last part, with " (2)" and so on appended if two are equal. With several
+    sources, the names of their recordings get the name, see `recorded_apart`."""
     found: dict[str, Open] = {}
     for source in sources:
         short = source.uri
@@ -587,8 +589,9 @@ class RobotWatch:
 
 
 def robots_at(address: ZenohAddress) -> list[str]:
-    """Return the namespaces of the robots at a router; [] if the router does not answer. It blocks for up to
-    3 s: until a short time after the connection, or after the second robot appeared."""
+    """Return the namespaces of the robots at a router; [] if the router does not answer. It blocks until
+    _SETTLED_S after the connection, or after the second robot appeared, and without a connection for
+    _DISCOVERY_S."""
     link = ZenohLink(address, Inbox())
     end = time.monotonic() + _DISCOVERY_S
     connected_s = None

@@ -156,7 +156,8 @@ def evaluate(trees: Trees, truth: TruthTrees, parameters: Evaluation, path: Floa
         truth: Trees and other objects of the ground truth, in the frame of the map. Objects of kind HIDDEN
             count neither way: a tree of the map at one of them is neither right nor wrong.
         parameters: Maximum distance of a match, and maximum distance of the ground truth from the path.
-        path: Positions of the robot, shape (N, 2) [m]; None scores the whole ground truth.
+        path: Positions of the robot, shape (N, 2) [m]; None scores the whole ground truth, an empty path
+            nothing.
     """
     confirmed = trees.confirmed
     found = trees.position[confirmed]

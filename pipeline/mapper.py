@@ -267,7 +267,8 @@ class Mapper:
 
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Set the pose of the base before scan `index`: all particles are drawn from it, with the map and the
-        path of the best one. The next scan has no motion by odometry, and loops do not begin before it.
+        path of the best one. The next scan has no motion by odometry, and loops do not begin before it. A
+        search for a lost robot is not ended, and the states stored for it are kept.
 
         Args:
             index: Number of the next scan.
@@ -430,7 +431,8 @@ class Mapper:
 
     def _check_loop(self, estimate: PoseEstimate) -> LoopClosure | Smoothing | None:
         """Return the loop that the robot has just closed, or `Smoothing` if the graph is to be solved; None
-        otherwise and during the search of a lost robot."""
+        otherwise, at a scan that is no keyframe, and during the search of a lost robot. Loops are not
+        searched for if the parameter `relocalisation.method` is "none"."""
         p = self._parameters.relocalisation
         if self._relocaliser.is_searching or not self._slam.is_keyframe:
             return None
@@ -564,6 +566,10 @@ class Mapper:
             estimate: Pose after all corrections.
             notices: Warnings of the motion.
             corrections: Corrections that were applied, whose messages become warnings; None for none.
+
+        Returns:
+            The frame. `columns` is None unless the classification method is "columns", `ground` is None if
+            the ground method is "none"; `T_odom_base` is the last known odometry, the identity before it.
         """
         terrain, p = self._terrain.state, self._parameters
         base_z = (terrain.sensor_z or 0.0) - float(scan.sensor_offset[2]) if terrain.scans else 0.0

@@ -224,8 +224,8 @@ def continue_map(
         continued: The saved run, and where the robot starts; the totals of the saved run are continued in
             place.
         source: Source of the new run.
-        mapper: A mapper before its first scan; it receives the map and, unless the start is "resume" or
-            "last", the pose of the start.
+        mapper: A mapper before its first scan; it receives the map, with "resume" also the state of its
+            odometry, and, unless the start is "resume" or "last", the pose of the start.
         odometry: Choice of the odometry.
         seed: Random seed.
         warnings: Messages for the user that are added to the totals, except with "resume".
@@ -277,7 +277,8 @@ def _in_another_run(
 ) -> RunStart:  # fmt: skip
     """Modify and return `begin` for another drive. The source is appended to the sources. If its first scan
     is not later than the map, its times are shifted so that this scan follows the map by PAUSE_NS. The truth
-    is that of the first source. If the source is part of the map already, a warning is added.
+    is that of the first source, see `_truth_of`. If the source is part of the map already, a warning is
+    added. Raises SourceError if the source cannot be read.
 
     Args:
         begin: The start so far.
@@ -342,8 +343,8 @@ def localise(
 
 
 def _truth_of(uri: str) -> Truth:
-    """Return the ground truth of the source with this URI, with only its trees; an empty `Truth` if the
-    source cannot be opened."""
+    """Return the ground truth of the source with this URI, with only its trees; an empty `Truth` if it has
+    none or the source cannot be opened. Nothing is raised."""
     try:
         with closing(open_source(uri, SourceOptions())) as source:
             known = source.truth()

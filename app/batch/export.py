@@ -148,7 +148,7 @@ class ExportedRun:
         frame: Reference system of the run.
         place: Positions of the trees: east, north, or x, y for a local map, shape (T, 2) [m].
         columns: Dict from each name of TREE_FIELDS to the rounded values of the trees, shape (T,); NaN for
-            unknown values.
+            unknown values. `review` has texts.
         path: The path in the coordinates of `place`, shape (N, 2) [m].
         plots: Tuples, one per plot, of name, shape in the coordinates of `place`, and a dict from the names
             of PLOT_FIELDS except "plot" to values.
@@ -276,8 +276,9 @@ def export_bytes(run: ExportedRun, suffix: str) -> tuple[bytes, str]:
 
 def _layers(run: ExportedRun) -> dict[str, Any]:
     """Return a dict from the name of each layer to its GeoDataFrame in the coordinates of the files: `trees`,
-    and, if they are not empty, `path`, `plots` and `contours`. The columns are LAYER_FIELDS and the geometry.
-    Raises StemmapError if a package is not installed or the terrain covers too large an area."""
+    also without trees; `path` if it has at least two positions; `plots` and `contours` if there are any. The
+    columns are LAYER_FIELDS and the geometry. Raises StemmapError if a package is not installed or the
+    terrain covers too large an area."""
     geopandas = gis_package("geopandas", "GIS files")
     layers = {
         "trees": geopandas.GeoDataFrame(
@@ -317,7 +318,7 @@ def _plot_table(run: ExportedRun) -> dict[str, Any]:
 
 
 def _write_layers(run: ExportedRun, file: FilePath) -> None:
-    """Write a GeoPackage with all layers and their styles."""
+    """Write a GeoPackage with the layers of `_layers`, which also raises, and their styles."""
     import pyogrio
 
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")})
@@ -406,7 +407,7 @@ _STYLES = {
 
 def _write_shapefiles(run: ExportedRun, file: FilePath) -> None:
     """Write a Shapefile per layer: the trees to `file`, the others to `file` with `_` and the name of the
-    layer. Columns have their short names; a local map has no .prj."""
+    layer. Columns have their short names; a local map has no .prj. Layers and errors as in `_layers`."""
     import pyogrio
 
     short = {field.name: field.short for fields in LAYER_FIELDS.values() for field in fields}
@@ -433,8 +434,8 @@ def _write_geojson(run: ExportedRun, file: FilePath) -> None:
 
 def _write_dxf(run: ExportedRun, file: FilePath) -> None:
     """Write a DXF drawing in metres with the layers TREES, LABELS, PATH, PLOTS and CONTOURS. A tree without a
-    diameter is a point without a circle, one without a height has z 0. StemmapError if ezdxf is not
-    installed."""
+    diameter is a point without a circle, one without a ground height has z 0. StemmapError if ezdxf or
+    contourpy is not installed, or the terrain covers too large an area."""
     ezdxf = gis_package("ezdxf", "DXF files")
     before = ezdxf.options.write_fixed_meta_data_for_testing
     ezdxf.options.write_fixed_meta_data_for_testing = True
@@ -602,8 +603,8 @@ def _write_geotiff(run: ExportedRun, file: FilePath) -> None:
     """Write the terrain as a GeoTIFF of float32 with NaN as no-data.
 
     Raises:
-        StemmapError: The run has no terrain, its reference system has no EPSG code up to 32766, or tifffile
-            is not installed.
+        StemmapError: The run has no terrain, or one that covers too large an area; its reference system has
+            no EPSG code up to 32766; or tifffile is not installed. A local map needs no code.
     """
     tifffile = gis_package("tifffile", "GeoTIFF files")
     found = terrain_raster(run)

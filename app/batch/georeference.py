@@ -92,7 +92,8 @@ class MapFrame:
 
     @property
     def method_words(self) -> str:
-        """How the frame was found, in English and to follow the word "by"."""
+        """How the frame was found, in English and to follow the word "by": the note if there is one; "the
+        source" if the method is unknown."""
         return self.note or _METHOD_WORDS[self.method].format(**self.numbers)
 
     def to_crs(self, points: Float) -> Float:
@@ -230,8 +231,8 @@ def check_area(crs: str, points: Float) -> None:
         points: East, north, shape (N, 2) [m].
 
     Raises:
-        StemmapError: A position is outside; the message gives its longitude and latitude. Or distances in
-            the system, such as Web Mercator, are not those on the ground.
+        StemmapError: A position is outside; the message gives its longitude and latitude if it has them. Or
+            distances in the system, such as Web Mercator, are not those on the ground.
     """
     import pyproj
 
@@ -367,16 +368,17 @@ NAME_MAX = 60  # characters of the name of a control point
 
 def read_control_points(file: FilePath, crs: str) -> list[ControlPoint]:
     """Return the control points of a table, in its order. A point with a tree has no x and y. A point without
-    a name gets the number of its tree or of its row as name.
+    a name gets the number of its tree or of its row as name. Whether the map has the trees is not checked.
 
     Args:
-        file: CSV with a header: easting and northing (or lon and lat), tree or x_m and y_m, optionally name
-            and elevation_m.
+        file: CSV with a header: lon and lat, or without a column lon easting and northing; tree, or x_m and
+            y_m for rows without a tree; optionally name and elevation_m.
         crs: Reference system, see `projected`, to which longitudes and latitudes are converted.
 
     Raises:
         SourceError: The file cannot be read, is larger than 1 MB, has an incomplete header or row, a cell
-            that is not a number, a name of more than NAME_MAX characters, no rows or more than POINTS_MAX.
+            that is not a number, a tree that is not a whole number, a name of more than NAME_MAX characters,
+            no rows or more than POINTS_MAX.
     """
     table = CsvTable.read(file, "table of control points", _LARGEST_FILE)
     if len(table.rows) > POINTS_MAX:

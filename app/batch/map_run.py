@@ -99,7 +99,7 @@ class MappingResult:
         summary: Lines to print.
         warnings: Each warning once, see `warning_texts`.
         losses: Dict from a reason to the number of messages or points that were left out for it.
-        scan_ms: Median time of a scan without compilation [ms].
+        scan_ms: Median time of a scan without compilation [ms]; 0 if none was measured.
         stage_ms: Dict from each stage to its median time without compilation [ms].
     """
 
@@ -124,7 +124,7 @@ def map_run(
 
     Raises:
         StemmapError: The source cannot be read or has no scan, the odometry is not available, or the start in
-            a continued map was not found.
+            a continued map was not found, or seen.csv of `earlier` is damaged.
         OSError: The folder cannot be written; it is unchanged then.
     """
     stopwatch = Stopwatch(scans=MEASURED_SCANS)
@@ -219,7 +219,7 @@ def _map_scans(
     """Map all scans and write their detections; return the last frame and the time of the first scan [ns].
 
     Args:
-        plan: The run.
+        plan: The run; its revisions are applied, and its `on_frame` is called after each scan.
         mapper: The mapper.
         begun: How the run begins; its tally is updated.
         to_map: Steps of the scans.
@@ -253,8 +253,8 @@ def _map_scans(
 
 
 def _observed(area: SeenArea, earlier: FilePath | None) -> SeenArea:
-    """Return the observed area with that of the run in `earlier`, if its files contain it; raises SourceError
-    if they are damaged."""
+    """Return the observed area joined with that of the run in `earlier`; `area` itself if `earlier` is None
+    or has no seen.csv. Raises SourceError if seen.csv is damaged."""
     before = None if earlier is None else read_seen_area(earlier)
     return area if before is None else before.joined(area)
 

@@ -104,7 +104,8 @@ def _parts_of_cloud(cloud: WholeCloud) -> Iterator[Float]:
 
 def _parts_of_drive(folder: FilePath) -> Iterator[Float]:
     """Yield the thinned points of a drive in the frame of the map, shape (N, 3) [m], in parts of at most
-    _CHUNK; z by the terrain of each scan and the nearest known terrain of the run.
+    _CHUNK; z by the terrain of each scan and the nearest known terrain of the run. Of the scans of the path,
+    every EVERY-th is used, except those that have only stems.
 
     Raises:
         StemmapError: The run is live or has several recordings, its source cannot be read, or no point

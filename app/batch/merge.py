@@ -104,8 +104,9 @@ def merge_runs(
 def _joined(
     a: SavedRun, b: SavedRun, merged: MergedMap, match: Match, shift: int, parameters: Parameters
 ) -> SavedRun:
-    """Return the saved state of the merged run; scan numbers, times and poses of the sources of b are those
-    in run a.
+    """Return the saved state of the merged run, with preset, seed and start time of run a. Scan numbers,
+    times and poses of the sources of b are those in run a; their start "origin" becomes "merged", and where
+    none of their stems agreed, `stems` is the number of stems of the match.
 
     Args:
         a, b: The runs.

@@ -42,8 +42,9 @@ def read_plots(file: FilePath, run: FilePath, *, crs: str | None) -> list[Sample
             other files with a reference system.
 
     Raises:
-        StemmapError: geopandas is not installed; the file cannot be read or has no plots; a shape is not a
-            valid area; or its reference system does not fit the run.
+        StemmapError: geopandas is not installed; the file cannot be read, has another suffix or no plots; a
+            shape is not a valid area, as a point without a radius; or its reference system does not fit the
+            run.
     """
     geopandas = gis_package("geopandas", "plots from files")
     if file.suffix.lower() not in SUFFIXES:
@@ -133,15 +134,17 @@ def _layer_of(file: FilePath) -> str:
 
 
 def _crs_of(file: FilePath, table: Any, given: str | None) -> Any:  # noqa: ANN401 - a pyproj.CRS
-    """Return the reference system of a file; None for the frame of the map.
+    """Return the reference system of a file; None for the frame of the map. A GeoJSON with the member
+    `coordinateFrame` is in the frame of the map unless `given`.
 
     Args:
         file: The file, for messages and for the members of a GeoJSON.
         table: GeoDataFrame of the file.
-        given: The system that the user gives, or None.
+        given: The system that the user gives, or None; LOCAL for the frame of the map. It is used if the file
+            states none, or is a GeoJSON without the member `crs`.
 
     Raises:
-        StemmapError: The reference system is unknown, or there is none.
+        StemmapError: `given` is unknown, there is no reference system, or a GeoJSON is not JSON in UTF-8.
     """
     import pyproj
 

@@ -315,7 +315,8 @@ def _unit_warnings(a: Visit, b: Visit, found: VisitComparison) -> list[str]:
 
 
 def comparison_lines(record: dict[str, Any]) -> list[str]:
-    """Return the results of `comparison_record` as lines for people."""
+    """Return the results of `comparison_record` as lines for people, without its warnings; unknown values are
+    left out."""
     pose, counts = record["alignment"], record["counts"]
     east, north = pose["shift_of_centre_m"]
     how = f"aligned by {count(pose['stems'], 'stem')}" if pose["stems"] else "coordinates taken as equal"

@@ -64,7 +64,7 @@ class StandResult:
 
 def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = ()) -> StandResult:
     """Return the stand parameters of a finished run; rejected trees do not count. Nothing is written.
-    Diameters that look like those of another unit, and few trees, are warnings.
+    Diameters that look like those of another unit, few trees, and overlapping plots are warnings.
 
     Args:
         folder: Folder of the run.
@@ -72,8 +72,9 @@ def stand_of(folder: FilePath, parameters: Stand, plots: Sequence[SamplePlot] = 
         plots: Plots in the frame of the map; without any, the whole observed area is one plot.
 
     Raises:
-        StemmapError: The folder is not that of a run, a file is damaged, nothing was observed, two plots have
-            the same name, no plot touches the observed area, or the volume formula is not valid.
+        StemmapError: The folder is not that of a run, a file is damaged, the run has no seen.csv or observed
+            nothing within reach, two plots have the same name, no plot touches the observed area, or the
+            volume formula is not valid.
     """
     run, frame = read_run(folder), read_map_frame(folder)
     warnings = []
@@ -137,7 +138,8 @@ def _left_out(
     trees: PlotTrees, plots: Sequence[SamplePlot], seen: SeenArea, dbh_min: float
 ) -> dict[str, int]:
     """Return a dict from each reason of `StandResult.left_out` except `rejected` to the number of trees that
-    no plot counts for it; without `outside_of_plots` if there are no plots."""
+    no plot counts for it, each tree for the first reason only; without `outside_of_plots` if there are no
+    plots."""
     reasons = {
         "outside_of_observed_area": seen.rows(trees.position) < 0,
         "below_minimum_dbh": trees.dbh < dbh_min,

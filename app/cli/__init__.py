@@ -98,7 +98,8 @@ def main(arguments: list[str] | None = None) -> int:
         arguments: Words after the program's name; None takes those of this process.
 
     Returns:
-        0 done, 1 failed with a message, 2 wrong usage, 3 done with losses (see stderr).
+        0 done, 1 failed with a message (also after Ctrl-C; without one if standard output was closed), 2
+        wrong usage, 3 done with losses (see stderr).
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or (words[0] not in COMMANDS and words[0] not in ("-h", "--help", "--version")):

@@ -51,6 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     Raises:
         StemmapError: A visit cannot be read or has no trees, the stems do not agree with certainty, or the
             files cannot be written.
+        OSError: The folder --out cannot be created.
     """
     from app.batch.revisit import compare, comparison_lines, comparison_record, read_visit, write_comparison
 

@@ -260,8 +260,8 @@ def run_grid(arguments: argparse.Namespace) -> int:
 
 
 def _ready(arguments: argparse.Namespace) -> tuple[list[PreparedRun], int]:
-    """Return the runs that can be scored, and the number of the others, which are reported on standard
-    error."""
+    """Return the runs that can be scored, in the order of the arguments, and the number of the others, whose
+    errors are printed to standard error and not raised."""
     from app.tuning.scoring import prepare_run
 
     runs, refused = [], 0

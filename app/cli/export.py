@@ -63,8 +63,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _export(arguments: argparse.Namespace, folder: Path) -> int:
     """Write what --to names for the run in `folder`: the files of the tree manager, its cloud (.las, .laz),
-    or its trees with the figures of the chosen plots. --out is only for the tree manager. Returns and raises
-    as `run`."""
+    or its trees with the figures of the chosen plots, if there are any. --out is only for the tree manager
+    (UsageError). Returns and raises as `run`."""
     if arguments.to == TREE_MANAGER:
         return _tree_manager(arguments, folder)
     from app.batch.export import export_run, read_for_export

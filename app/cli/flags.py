@@ -39,8 +39,8 @@ def program() -> str:
 
 
 def plain(text: str) -> str:
-    """Return text in which "?" replaces each character that is not printable, such as those that control a
-    terminal."""
+    """Return text in which "?" replaces each character that is not printable, such as a line break, a tab or
+    those that control a terminal."""
     return "".join(letter if letter.isprintable() else "?" for letter in text)
 
 

@@ -87,6 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises:
         StemmapError: The arguments contradict each other, or the run cannot be mapped.
+        OSError: The folder --out cannot be written.
     """
     if arguments.start is not None and arguments.continued is None:
         raise ParameterError("--start needs a continued map", remedy="Add --continue DIR")
@@ -105,8 +106,9 @@ def _run_plot(arguments: argparse.Namespace) -> int:
     """Map a whole cloud of a plot; return the exit code.
 
     Raises:
-        StemmapError: The arguments contradict each other, or the cloud cannot be read or the map not be
-            written.
+        StemmapError: The arguments contradict each other, the cloud or --truth cannot be read, or the folder
+            has the map of another source.
+        OSError: The folder cannot be written.
     """
     if arguments.continued is not None or arguments.stop_after is not None:
         raise ParameterError("a whole cloud has no scans", remedy="Remove --continue and --stop-after")
@@ -130,8 +132,9 @@ def _run_scans(arguments: argparse.Namespace) -> int:
     for parameters, a recorded live run is mapped with the parameters of its recording.
 
     Raises:
-        StemmapError: The source cannot be read, the start in the map was not found or, of a live source, is
-            not given, or the folder has the map of another source or cannot be written.
+        StemmapError: The source cannot be read, a flag is wrong or does not fit the source, the start in the
+            map was not found or, of a live source, is not given, or the folder has the map of another source.
+        OSError: The folder cannot be written.
     """
     from app.batch.continue_map import ContinuedMap, read_saved_run
     from app.batch.map_run import OfflineRun, map_run

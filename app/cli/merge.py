@@ -32,7 +32,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     Raises:
         StemmapError: A run cannot be read, the maps do not match with confidence, or the folder has the map
-            of another source or cannot be written.
+            of another source.
+        OSError: The folder cannot be written; it is unchanged then.
     """
     import numpy as np
 

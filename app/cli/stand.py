@@ -234,7 +234,9 @@ def run(arguments: argparse.Namespace) -> int:
         Exit code: 3 with warnings, else 0.
 
     Raises:
-        StemmapError: A flag or plot is not valid, the run cannot be read, or a file cannot be written.
+        StemmapError: A flag or plot is not valid, the run cannot be read, `stand_of` refuses it, or a file
+            cannot be written.
+        OSError: The folder --out cannot be created.
     """
     from app.batch.stand import stand_files, stand_of, stand_summary
     from pipeline.io.atomic_files import write_texts

@@ -155,8 +155,8 @@ def _planned(arguments: argparse.Namespace) -> tuple[PlannedRun, ...]:
 
 
 def _search(search: Search) -> bool:
-    """Make the trials and show progress; return whether the search stopped before the last one, by the time
-    limit or Ctrl-C.
+    """Score the start, make the trials and show progress; return whether the search stopped before the last
+    trial, by the time limit, which counts from the score of the start, or Ctrl-C.
 
     Raises:
         KeyboardInterrupt: Ctrl-C before the first trial.

@@ -153,8 +153,9 @@ class Stopwatch:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Measure one stage inside the context, also one that raises; the time is discarded if measurements
-        are disabled by `aside` or the stage is disturbed."""
+        """Measure one stage inside the context, also one that raises, and add its time to the dict of the
+        last `whole_scan`; the time is discarded if measurements are disabled by `aside` or the stage is
+        disturbed."""
         start, disturbances = self._clock(), self._disturbances
         try:
             yield

@@ -169,7 +169,8 @@ class Dashboard:
         being restarted.
 
         Raises:
-            WorkerBusyError: The worker cannot receive it now.
+            WorkerBusyError: The worker cannot receive it now, and it is a step or a seek. Pause is dropped
+            without an error then.
         """
         self._notice = ""
         # A worker that is down comes back with the source closed; then this is still to be done.
@@ -201,7 +202,7 @@ class Dashboard:
         when the command is sent; `receive` learns whether the source could be opened.
 
         While a run is open, the source is checked before that run is closed. Of several requests, only the
-        newest is opened.
+        newest is opened; the calls of the others return without an error.
 
         Raises:
             StemmapError: The source cannot be opened, or the parameters are not valid in this version; the

@@ -362,10 +362,11 @@ class ParameterSets:
 
     def name_of(self, preset_name: str, parameters: Parameters) -> str:
         """Return the name of the saved set with these values and preset, the first by name of equal ones;
-        empty if there is none, or if the values are those of the preset.
+        empty if there is none, or if the values are those of the preset. Sets that are not valid in this
+        version are not compared.
 
         Args:
-            preset_name: Name of the preset.
+            preset_name: Name of an existing preset.
             parameters: The values.
         """
         wanted = (preset_name, parameters)

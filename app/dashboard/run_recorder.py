@@ -130,8 +130,8 @@ class RunRecorder:
             self._soon(page)
 
     def shown(self, state: RunState) -> None:
-        """Record a shown scan. The scan with the largest index counts, so that stepping back keeps the map.
-        Nothing without a record."""
+        """Record a shown scan. The scan with the largest index counts, so that stepping back keeps the map;
+        of results of the same scan, the last. Nothing without a record."""
         page = self._page
         if page is None:
             return

@@ -226,11 +226,11 @@ class Selector:
         self._select(Selection(number))
 
     async def cluster(self, scan: int, cluster: int) -> None:
-        """Select a cluster of a recently displayed scan, with its tree. Nothing is selected if another run
-        was opened meanwhile.
+        """Select a cluster of a recently displayed scan, with its tree, in place of the selection. The
+        selection does not change if another run was opened meanwhile, or after an error.
 
         Raises:
-            NoStoryError: The cluster is no longer available.
+            NoStoryError: The cluster is no longer available, or no run is shown.
             WorkerBusyError: The worker did not answer in time.
         """
         run = self._run()

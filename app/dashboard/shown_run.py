@@ -108,7 +108,8 @@ class ShownRun:
         return placed([row.content for row in self.edits], offset)
 
     def reviews(self) -> dict[int, str]:
-        """Return a dict from the number of each confirmed tree to its review, see `reviews_of`."""
+        """Return a dict from the number of each confirmed tree that has a review to this review, see
+        `reviews_of`."""
         trees = self.shown.frame.trees
         place = trees.position[trees.confirmed]
         return reviews_of(trees.number[trees.confirmed].tolist(), place, [row.content for row in self.edits])
@@ -131,7 +132,7 @@ class ShownRun:
 
     def texts(self) -> dict[str, str]:
         """Return a dict from the names trees.csv, path.csv, seen.csv, terrain.csv and run.json to the texts
-        of these files."""
+        of these files. terrain.csv has only its header if the newest results have no ground."""
         ground, offset = self.shown.frame.ground, self.cloud.offset if self.cloud else (0.0, 0.0, 0.0)
         cells = [] if ground is None else list(terrain_rows(ground))
         if self.cloud is not None:
@@ -157,9 +158,13 @@ class ShownRun:
         return covered_area(covered + self.cloud.offset[:2])
 
     def _record(self) -> dict[str, Any]:
-        """Return the content of run.json as a dict, without what only `stemmap map` knows, and with
-        `rejected`, the number of rejected trees, which `trees` does not count. Reviews do not change the
-        scores `evaluation`, which are None if there is no ground truth."""
+        """Return the content of run.json as a dict.
+
+        The keys are `stemmap` (version); `source`, a dict with `uri`, `kind`, `sha256` ("" if the recording
+        has no digest) and, for a whole cloud, `offset_m` and `crs` (None if unknown); `recorded` and `chosen`
+        where known; `seed`, `odometry`, `preset`, `changed` and `parameters`; `scans` (0 for a whole cloud),
+        `duration_s` and `distance_m`; `trees`, without the rejected ones, and `rejected`, their number;
+        `evaluation`, which reviews do not change, None without ground truth; and those of `_counts`."""
         status, truth = self.status, self.truth
         trees = in_file(self.shown.frame.trees, self.cloud)
         rejected = sum(review == REJECTED for review in self.reviews().values())
@@ -191,8 +196,8 @@ class ShownRun:
 
     def _counts(self, scores: dict[str, Any] | None) -> dict[str, Any]:
         """Return a dict with `health` (not for a whole cloud), `verdicts`, `losses` and `warnings` of
-        run.json, as `stemmap map` writes them; only `warnings`, those of the status, if the counts are
-        unknown.
+        run.json, as `stemmap map` writes them, but `health` has no spans and of the worst values at most
+        `sigma_xy_m`; only `warnings`, those of the status, if the counts are unknown.
 
         Args:
             scores: Scores of the map as a dict, see `MapScores`; None if there is no ground truth.

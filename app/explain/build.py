@@ -425,7 +425,8 @@ def cloud_tree_story(run: InventoryRun, number: int) -> TreeStory:
 
 
 def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
-    """Return the explanation of a candidate of a whole cloud; `checks` is empty if no stem was fitted.
+    """Return the explanation of a candidate of a whole cloud; `checks` is empty if no stem was fitted, and
+    `tree` is the number of the tree of this candidate, or None. Fields of a scan keep their defaults.
 
     Args:
         run: The cloud.
@@ -454,7 +455,8 @@ def cloud_cluster_story(run: InventoryRun, row: int) -> ClusterStory:
 
 
 def check_results(checks: Sequence[Check], row: int) -> list[CheckResult]:
-    """Return the checks of the cluster or candidate in `row`, in the order in which they decide."""
+    """Return the checks of the cluster or candidate in `row`, in the order in which they decide. The title is
+    "" for a check whose limit is not a parameter."""
     titles = {spec.name: spec.title for spec in field_specs()}
     return [
         CheckResult(
@@ -510,7 +512,8 @@ def cross_sections(plot: PlotMap, row: int) -> list[CrossSection]:
 
 def _points_around(plot: PlotMap, height: float, centre: Float, radius: float) -> list[tuple[float, float]]:
     """Return at most _MOST_SECTION_POINTS points of a slice around a circle as (x, y) relative to the centre
-    of the circle [m], rounded to 1 mm.
+    of the circle [m], rounded to 1 mm. The points are less than _REACH radii, or less than the radius plus
+    _MARGIN if that is more, from the centre.
 
     Args:
         plot: The map.

@@ -133,7 +133,8 @@ class RecentScans:
         self._lock = threading.Lock()
 
     def keep(self, run: int, frame: Frame) -> None:
-        """Store a scan that is being sent to the browsers, in place of an earlier result of the same scan.
+        """Store a scan without its raw points, in place of an earlier result of the same scan. Beyond
+        _MOST_SCANS, the scans that were stored first are removed.
 
         Args:
             run: Number of the run.
@@ -152,7 +153,7 @@ class RecentScans:
             self._frames.clear()
 
     def find(self, run: int, scan: int) -> Frame | None:
-        """Return a scan as it was sent last; None if it is not stored any more.
+        """Return a scan as it was sent last, but with an empty `raw`; None if it is not stored.
 
         Args:
             run: Number of the run.

@@ -80,7 +80,7 @@ class ColumnStory(msgspec.Struct, frozen=True):
         present, absent: Number of accumulated scans with a clear view of the position that show it occupied,
             and that show it empty.
         viewed: Maximum height above ground that any scan observed there [m].
-        effects: The most influential features, the strongest first.
+        effects: The most influential features, at most six, the strongest first; none without an effect.
     """
 
     verdict: str
@@ -124,18 +124,21 @@ class ClusterStory(msgspec.Struct, frozen=True):
         scan, cluster: Number of the scan, and of the cluster in it.
         time_s: Time of the scan since the first scan of the run [s].
         verdict: Label of the verdict.
-        checks: All checks, in the order in which they decide.
+        checks: All checks, in the order in which they decide; empty for an external stem, and for a candidate
+            of a whole cloud without a fitted stem.
         size: Number of points of the cluster.
         eccentricity: lambda1 / lambda2.
         position: Position in the frame of the map [m].
         distance: Distance from the sensor [m].
         sensor_sigma: Standard deviation of a range [m].
-        points: Points (right, up) in the picture relative to the axis at their height [m]; at most 400.
+        points: Points (right, up) in the picture relative to the axis at their height, or without a circle to
+            the centre of the cluster [m]; at most 400.
         residual: Residuals of the same points, positive outside of the circle [m]; empty if there is no
             circle.
         circle: Circle of the cluster; None if the preset fits no circle or the points are too few.
         axes: One standard deviation along the principal axes in the picture: (right, up) of each [m].
-        tree: The nearest confirmed tree; None if none is near.
+        tree: The nearest confirmed tree within `slam.distance_max`, of a whole cloud the tree of the
+            candidate; None if there is none.
         column: Classification of the accumulated scans at the position; None if there is none.
         sections: Cross-sections of a candidate of a whole cloud; None for a cluster of a scan.
     """
@@ -179,8 +182,8 @@ class MapSection(msgspec.Struct, frozen=True):
 
     Attributes:
         side: Side of a cell [m].
-        origin: Lower left corner of cell (0, 0) in the frame of the map [m].
-        cells: Occupied cells along x and y, int32, shape (N, 2).
+        origin: Lower left corner (smallest x and y) of cell (0, 0) in the frame of the map [m].
+        cells: Occupied cells along x and y, int32, shape (N, 2); numbers may be negative.
     """
 
     side: float
@@ -205,7 +208,8 @@ class TreeStory(msgspec.Struct, frozen=True):
         eccentricity: Mean over the observations.
         observations: Number of scans that detected the tree.
         first_seen_s, last_seen_s: Times of the first and the last detection [s since the first scan].
-        cluster: Row of the cluster of the tree in the current scan; None if there is none.
+        cluster: Row of the cluster of the tree in the current scan, see `app.explain.build._cluster_of`, or
+            of its candidate in a whole cloud; None if there is none.
         column: Classification of the accumulated scans at the position; None if there is none.
         points: Accumulated points around the tree: x, y relative to the position of the tree along the axes
             of the map, and height above the ground [m], see `app.explain.build.points_around`; may be empty.

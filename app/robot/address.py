@@ -116,7 +116,8 @@ def parse_address(uri: str) -> Address:
 
 
 def _dds(uri: str) -> DdsAddress:
-    """Parse an address of plain DDS; errors as in `parse_address`. The robot "/" becomes "": all topics."""
+    """Parse an address of plain DDS; errors as in `parse_address`. The robot "/" becomes "": all topics.
+    `peer` is a list of hosts separated by commas."""
     place, _, query = uri[len(DDS) :].partition("?")
     if place:
         raise SourceError("plain DDS has no address, only options after ?", where=uri, remedy=_DDS_REMEDY)
@@ -139,10 +140,12 @@ def _dds(uri: str) -> DdsAddress:
 
 
 def _velodyne(uri: str) -> VelodyneAddress:
-    """Parse an address of a Velodyne sensor. Without a sender, only a loopback address is accepted.
+    """Parse an address of a Velodyne sensor. Without a sender (option `from`), only a loopback address is
+    accepted.
 
     Raises:
-        SourceError: The address is invalid.
+        SourceError: Host or sender is not an IPv4 address, the port is not from 1 to 65535, there is another
+            option than `from`, or the sender is missing.
     """
     place, _, query = uri[len(VELODYNE) :].partition("?")
     host, _, port = place.rpartition(":")

@@ -114,7 +114,8 @@ class Recorder:
         self._put(size, lambda writer: writer.add_outputs(messages_by_topic))
 
     def add_parameters(self, revision: int, from_scan: int, values: Mapping[str, Any]) -> None:
-        """Record parameters that apply from a mapped scan onwards.
+        """Record parameters that apply from a mapped scan onwards; nothing happens after the end of the
+        recording.
 
         Args:
             revision: Number of the revision.

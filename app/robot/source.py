@@ -183,7 +183,7 @@ class LiveSource:
 
     @property
     def description(self) -> SourceDescription:
-        """Description of the source; see `ready`.
+        """Description of the source; see `ready`. Its digest differs for every run.
 
         Raises:
             SourceError: No scan has arrived yet.
@@ -211,7 +211,7 @@ class LiveSource:
         that the reader still holds are yielded, but not messages that are still queued.
 
         Raises:
-            SourceError: A message cannot be read.
+            SourceError: A message cannot be read, or the topics of the robot cannot be used.
         """
         while not self._ending.is_set():
             records = self.take()
@@ -350,7 +350,7 @@ class LiveSource:
         are held back for `take`. If scans were skipped before, a notice gives their number. Does not wait.
 
         Raises:
-            SourceError: A message cannot be read.
+            SourceError: A message cannot be read, or the topics of the robot cannot be used.
         """
         if not self.ready:
             self._early = self.take()
@@ -365,7 +365,7 @@ class LiveSource:
         """Process messages until the description is known or `stop` is called; return whether it is known.
 
         Raises:
-            SourceError: A message cannot be read.
+            SourceError: A message cannot be read, or the topics of the robot cannot be used.
         """
         while not self.listen() and not self._ending.is_set():
             self._ending.wait(_POLL_S)

@@ -60,7 +60,7 @@ class Choice:
 
     Attributes:
         robot: Namespace of the robot, "" for none.
-        channels: Channels of the topics, numbered from 1.
+        channels: Channels of the topics, numbered from 1; the scan is the first.
         warnings: Other topics and robots that could have been chosen.
         camera: Channels of the pictures and of their CameraInfo if there are any, numbered after the others.
     """
@@ -73,8 +73,8 @@ class Choice:
 
 def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], where: str) -> Choice | None:
     """Return the topics of one robot that are read; None while no such robot publishes scans. A role without
-    a topic has no channel, and "pose" only has one if the user named it. Topics without a namespace belong to
-    every robot; those below a namespace `stemmap` are ignored.
+    a topic has no channel, and "pose" only has one if the user named it; its topic is not used as odometry.
+    Topics without a namespace belong to every robot; those below a namespace `stemmap` are ignored.
 
     Args:
         publishers: Present publishers.
@@ -111,7 +111,7 @@ def choose(publishers: Iterable[Publisher], robot: str, topics: dict[str, str], 
 
 
 def _pose(there: list[Publisher], topics: dict[str, str], where: str) -> Publisher | None:
-    """Return the topic of the poses of another SLAM if the user named it, else None.
+    """Return the topic of the poses of another SLAM if the user named it and it is published, else None.
 
     Args:
         there: Publishers of the robot.

@@ -122,8 +122,9 @@ class ZenohLink(Link):
         return f"no scans of {wanted} are announced in ROS domain {self._address.domain}{there}"
 
     def subscribe(self, channels: Sequence[Channel]) -> None:
-        """Receive the messages of these channels, as soon as there is a connection. Of fixed transforms
-        (tf_static), the last messages before the subscription are received too."""
+        """Receive the messages of these channels in addition to those of earlier calls, as soon as there is a
+        connection. Of fixed transforms (tf_static), the last messages before the subscription are received
+        too."""
         self._channels = (*self._channels, *channels)
         if self.session is not None:
             self._subscriptions += [self._subscribe_to(channel) for channel in channels]

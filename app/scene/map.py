@@ -54,7 +54,8 @@ class MapNodes:
 
     def show(self, frame: Frame, selected: int | None, ring: Ring, view: ViewSettings) -> None:
         """Show the map after a scan. Trees that move by less than a centimetre are not sent again;
-        unconfirmed trees are not shown. Trees have labels if the layers of trees and labels are on.
+        unconfirmed trees are not shown. Trees have labels if the layers of trees and labels are on;
+        `labelled` has their positions afterwards.
 
         Args:
             frame: Results of the scan.

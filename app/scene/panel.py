@@ -170,11 +170,12 @@ class SceneCommands(Protocol):
         """
 
     async def use_preset(self, name: str) -> None:
-        """Use all values of a preset; raises ParameterError if there is none of this name."""
+        """Use all values of a preset. Raises ParameterError if there is none of this name, and StemmapError
+        if its forest cannot be read; nothing changes then."""
 
     async def reset_parameters(self, names: list[str]) -> None:
-        """Reset parameters to the preset; an empty list means all. Raises ParameterError for an unknown
-        name."""
+        """Reset parameters to the preset; an empty list means all. Raises ParameterError for an unknown name,
+        and StemmapError if the values are refused; nothing changes then."""
 
     async def choose_view(self, name: str, value: str | bool) -> None:
         """Set one choice of the view.
@@ -184,7 +185,7 @@ class SceneCommands(Protocol):
             value: Visibility or following as bool; for CHOICES one of their values.
 
         Raises:
-            ParameterError: There is no such choice.
+            ParameterError: There is no such choice, or the value is not one of it.
         """
 
     async def select_tree(self, number: int | None) -> None:
@@ -198,7 +199,8 @@ class SceneCommands(Protocol):
             cluster: Row of the cluster in it.
 
         Raises:
-            StemmapError: The scan is not stored any more.
+            StemmapError: The scan is not stored any more or has no such cluster, or the worker does not
+                answer in time.
         """
 
 

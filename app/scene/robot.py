@@ -167,7 +167,8 @@ class WayNode(Segments):
         super().__init__(scene, f"{ROBOT}/way", 3.0)
 
     def show_ahead(self, on: bool, frame: Frame, parameters: Obstacles) -> None:
-        """Show the path ahead of the robot; nothing where the frame has no clearance.
+        """Show the path ahead of the robot in the colour of the zone, see OF_ZONE; nothing if the frame has
+        no clearance. The obstacle has a ring only in the zones SLOW and STOP.
 
         Args:
             on: Whether the layer is on.

@@ -131,7 +131,8 @@ class ScanNodes:
     def _show_markers(self, frame: Frame, on: bool) -> None:
         """Show a cylinder around each cluster that receives clicks, because point clouds do not.
 
-        Its radius is limited, so that a wide cluster does not cover its neighbours.
+        Its radius is limited, so that a wide cluster does not cover its neighbours. A candidate of a whole
+        cloud without a circle has a cylinder of size 0.
         """
         c = frame.clusters
         height = shown_height(c.extent[:, 2]) + 0.06
@@ -190,8 +191,8 @@ def cluster_colours(frame: Frame, numbers: NDArray[np.int64], colour_by: str) ->
     """Return the colours of the filtered points, uint8, shape (M, 3).
 
     By "height", each point is coloured by its height. Otherwise it has the colour of its cluster, or FILTERED
-    without a cluster: by its number ("cluster"), the logarithm of its eccentricity from 1 to 100
-    ("eccentricity"), whether it is a detection ("stage"), or else its verdict.
+    without a cluster: by its number ("cluster"), the logarithm of its eccentricity, clipped to 1 to 100, with
+    NaN as 1 ("eccentricity"), whether it is a detection ("stage"), or else its verdict.
 
     Args:
         frame: Results of the scan.

@@ -83,10 +83,10 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     """Return the run in a folder that `stemmap map` wrote as a dict of JSON values. Long strings are cut.
 
     The keys are `uri`, `kind`, `source` (digest), `odometry`, `seed`, `chosen`, `scans` (number), `time_s`,
-    `distance_m`, `lost` (see `lost_share`), `trees` (number of trees that are not rejected), `rejected` and
-    `preset`;
-    `parameters`, a dict from dotted names to values; `scores` (see `score_payload`; None if unknown); and
-    `map`, a dict with `trees` (see `trees_payload`), `path` (see `thinned`) and `truth` (None).
+    `distance_m`, `lost` (see `lost_share`), `trees` (number of trees that are not rejected), `rejected`
+    (number) and `preset`; `parameters`, a dict from dotted names to values; `scores` (see `score_payload`;
+    None if unknown); and `map`, a dict with `trees` (see `trees_payload`, each also with `review`, the state
+    of its review), `path` (see `thinned`) and `truth` (None). Rejected trees are left out.
 
     Args:
         question: The key "path" has the folder.
@@ -240,7 +240,7 @@ def visits(question: dict[str, Any]) -> dict[str, Any]:
         the earlier one; and `record`, see `comparison_record`.
 
     Raises:
-        StemmapError: The files of a visit cannot be read.
+        StemmapError: The files of a visit cannot be read; the error names the visit by its name.
     """
     from app.batch.revisit import compare, comparison_csv, comparison_record, read_visit, rows_of
 
@@ -385,7 +385,8 @@ def recorded(uri: str) -> dict[str, Any]:
 def heard(uri: str) -> dict[str, Any]:
     """Return the topics of a live robot, at most MOST_TOPICS, in the form of `recorded`: see `_counted`; the
     kind is "live" and `mount` None. It waits for topics, up to LISTEN_S or 1.5 s after the last new one, then
-    counts messages of the usable topics for COUNT_S. Without topics the list is empty and there is a warning.
+    counts messages of the usable topics for COUNT_S. Without topics, also because there is no connection, the
+    list is empty and there is a warning.
 
     Raises:
         SourceError: The address is invalid.

@@ -190,7 +190,7 @@ def mapper_of(
         timer: Measures the stages, see `Mapper`; None for no measurement.
 
     Raises:
-        StemmapError: The forest that the parameters name does not exist.
+        StemmapError: The forest that the parameters name does not exist, or its file is damaged.
     """
     from pipeline.front_end import no_timer
     from pipeline.mapper import Mapper

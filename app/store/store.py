@@ -173,7 +173,7 @@ class RunRecords:
             return record
 
     def update(self, record: int, figures: RunFigures) -> None:
-        """Update results and map of a record; nothing happens if it does not exist.
+        """Update results and map of a record, also of a deleted one; nothing happens if it does not exist.
 
         Args:
             record: Number of the record.
@@ -220,7 +220,8 @@ class RunRecords:
         return {**_plain(row), "map": stored, "revisions": changes}
 
     def trees(self, record: int) -> list[dict[str, Any]]:
-        """Return the trees of the map of a run, see `RunFigures`; [] for an unknown run."""
+        """Return the trees of the map of a run, see `RunFigures`, also of a deleted one; [] for an unknown
+        run."""
         with self._engine.begin() as connection:
             stored = connection.execute(select(_maps.c.map).where(_maps.c.record == record)).scalar()
         trees: list[dict[str, Any]] = (stored or {}).get("trees", [])

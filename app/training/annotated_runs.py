@@ -160,7 +160,7 @@ def examples_of(run: AnnotatedRun, kept: Path | None, progress: Progress) -> Exa
         progress: Called with a progress message every 50 scans while the run is mapped.
 
     Raises:
-        SourceError: The run cannot be read, is live, or is another recording.
+        SourceError: The run cannot be read, is live or a whole cloud, or is another recording.
         StemmapError: The stored examples are damaged, or the examples cannot be written.
         OSError: The folder cannot be created.
     """
@@ -193,7 +193,7 @@ def _map_again(run: AnnotatedRun, progress: Progress) -> list[Examples]:
         progress: Called with a progress message every 50 scans.
 
     Raises:
-        SourceError: The run cannot be read, is live, or is another recording.
+        SourceError: The run cannot be read, is live or a whole cloud, or is another recording.
     """
     request = run.request
     if is_cloud(request.uri):

@@ -74,7 +74,8 @@ class TuneSearch:
         return self.plan is not None and not self.is_under_way and len(self._trials) < self.plan.trials
 
     async def start(self, plan: Plan, request: SearchRequest | None = None) -> None:
-        """Start a search in a child process, and send its state. A stopped search is removed.
+        """Start a search in a child process, and send its state. The search before is removed, also if no
+        process can be started; then no state is sent.
 
         Args:
             plan: The search.

@@ -364,7 +364,8 @@ class PlannedRun(msgspec.Struct, frozen=True):
         truth: True trees; None for those of the source.
         truth_name: Name of the file of the true trees, for the provenance.
         held_out: Whether the run is only scored, and does not guide the search.
-        annotations: Annotations from the list of runs, which replace and extend the true trees of the source.
+        annotations: Annotations from the list of runs, which replace and extend the true trees of the source;
+            ignored if `truth` is given.
         digest: Digest of the recording to which the annotations belong; empty for any.
     """
 

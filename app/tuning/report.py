@@ -159,7 +159,7 @@ class Row:
         set_number: Number of the set, from 1 on.
         run: Number of the run, from 1 on; 0 for the mean.
         figures: Dict from the names of COLUMNS to scores; empty for a failure.
-        seconds: Computing time [s]; for a mean the sum.
+        seconds: Computing time [s]; 0 for a failure, and for a mean the sum.
         looked: Whether the front end (segmentation of scans) ran in this time.
         error: Reason of the failure.
     """
@@ -179,8 +179,8 @@ class Comparison:
     Attributes:
         rows: By set and run.
         means: A row per set.
-        best: Dict from each name in CRITERIA to the number of the best set, from 1; 0 if all sets are equal
-            or unknown.
+        best: Dict from each name in CRITERIA to the number of the best set, from 1; 0 if there is none, see
+            `best_of`.
     """
 
     plan: SweepPlan

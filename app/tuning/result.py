@@ -111,8 +111,8 @@ def provenance(plan: Plan, result: Result, date: str) -> dict[str, Any]:
     `tuned` is a dict with `stemmap` (version), `date`, `goal` (and `false_max` for "ta"), the numbers
     `trials` and `refused`, `seed`, `odometry`, `better_than_start`, `over`, a list of the axes as text, and
     `importance`, a dict from parameter names to shares. `run` is a list of a dict for each run with `uri`,
-    `sha256`, `held_out`, `truth` (name of a file, only if known) and the scores `start` and `best`, see
-    `_file_scores`.
+    `sha256`, `held_out`, `truth` (name of a file, only if known) and the scores `start` and `best` of this
+    run, see `_file_scores`.
 
     Args:
         plan: The search.

@@ -47,8 +47,9 @@ class MappedRun:
     Attributes:
         trees: The confirmed trees.
         path: One row per scan; empty for a whole cloud.
-        scans: Number of scans.
-        front_end_ran: Whether the front end ran; False where its cached results were used.
+        scans: Number of scans; 0 for a whole cloud.
+        front_end_ran: Whether the front end ran; False where its cached results were used. True for a whole
+            cloud.
     """
 
     trees: Trees

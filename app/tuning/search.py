@@ -164,8 +164,10 @@ class Search:
 
     def _next_job(self, _worker: int) -> tuple[_Tag, Job] | None:
         """Return the next run to be mapped with a set, and take it from the queue; a new set is suggested if
-        no known one waits. None if there is nothing to do now: before the start is scored, while there is a
-        set for each process, and when all trials are made or in progress."""
+        no known one waits. A suggested set whose values contradict one another needs no job: it becomes a
+        trial without a loss in its turn, and another set is suggested. None if there is nothing to do now:
+        while the last runs of the start are scored, while there is a set for each process, and when all
+        trials are made or in progress."""
         attempt = next((each for each in self._attempts if each.begun < len(each.runs)), None)
         while attempt is None and self._may_suggest():
             suggested = self._suggested()
@@ -287,7 +289,8 @@ class Search:
 
 
 def search_processes(plan: Plan, number: int = 1) -> ScoringProcesses[_Tag]:
-    """Return processes that score the sets of a search; each keeps all runs open. The caller closes them.
+    """Return processes that score the sets of a search; each keeps all runs open. Results are stored in the
+    folder `plan.kept`, without one in memory. The caller closes the processes.
 
     Args:
         plan: The search.
@@ -315,9 +318,10 @@ def search_for_page(parent: ParentConnection) -> None:
 
 
 def _search_for_page(search: Search, parent: ParentConnection) -> None:
-    """Advance a search and send its progress, at most every 0.25 s, and its result. If a message arrives
-    before the start is scored, an empty `SearchMessage` is sent and there is no result. The time limit counts
-    from the scored start on.
+    """Advance a search until it is complete, a message arrives or its time is over. Send first the scored
+    start, then the new trials, at most every `_MESSAGE_INTERVAL_S`, and last the result. If a message arrives
+    before the start is scored, only an empty `SearchMessage` is sent. The time limit, 0 for none, counts from
+    the scored start on. Errors of `Search.advance` pass through.
 
     Args:
         search: The search.

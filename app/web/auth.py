@@ -120,7 +120,9 @@ class AccessTokens:
 
     @classmethod
     def of(cls, settings: Settings) -> Self:
-        """Return the tokens of a deployment; without a token in the settings, that of the owner is new."""
+        """Return the tokens of a deployment. Without a token in the settings, that of the owner is new, and
+        the end of a view-only link is not saved, as without a data folder. Raises StemmapError as the
+        class."""
         if not settings.token:
             return cls(new_token())
         return cls(settings.token, settings.folder and settings.folder / "view-only-link")
@@ -410,8 +412,9 @@ class Guard:
 
     def _login(self, scope: Scope, headers: Headers) -> Response | None:
         """Return the response to a link with a valid token or ticket (see `_welcome`), 401 for a request
-        without a session, except one about the health of the server, else None. A ticket is used up. A client
-        that accepts HTML gets the 401 as a page."""
+        without a session or a valid header Authorization, except one about the health of the server, else
+        None. A token in the query counts only for GET and HEAD of "/", a ticket only for GET of "/"; a ticket
+        is used up. A client that accepts HTML gets the 401 as a page."""
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] in _SAFE_METHODS:
             query = parse_qsl(scope["query_string"].decode("latin-1"), keep_blank_values=True)
             given = dict(query)
@@ -493,7 +496,8 @@ class Guard:
         return "owner" if "owner" in roles else "viewer" if "viewer" in roles else None
 
     def _cookies(self, headers: Headers) -> list[str]:
-        """Return all session cookies of the request, because a cookie of another path could hide ours."""
+        """Return the values of all session cookies of the request, valid or not, because a cookie of another
+        path could hide ours."""
         return [
             value
             for line in headers.getlist("cookie")

@@ -60,7 +60,7 @@ def as_bad_request(where: str | None = None) -> Iterator[None]:
 
 
 def json_reply(content: object, status: int = 200) -> Response:
-    """Return records, dicts and lists as JSON that is not cached; NaN becomes null.
+    """Return records, dicts and lists as JSON that is not cached; NaN and infinity become null.
 
     Args:
         content: What `msgspec` can encode.

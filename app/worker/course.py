@@ -73,7 +73,8 @@ QUANTITIES: dict[str, Quantity] = {
 
 
 def read_quantities(frame: Frame) -> dict[str, float]:
-    """Return a dict from the names of the quantities that come from the results of a scan to their values."""
+    """Return a dict from the names of the quantities that come from the results of a scan (all except
+    "driven" and "mapping") to their values in the units of QUANTITIES; NaN if unknown."""
     return {name: quantity.read(frame) for name, quantity in QUANTITIES.items() if quantity.read is not None}
 
 
@@ -94,7 +95,9 @@ class ScanSeries:
         self._stride = 1
 
     def record(self, index: int, values: Mapping[str, float]) -> None:
-        """Store the values of the scan with an index, in place of earlier ones of this scan."""
+        """Store the values of the scan with an index (0 or more), in place of earlier ones of this scan;
+        names that are missing in `values` become NaN. If the index is beyond the rows, `stride` doubles until
+        it fits. A scan whose index is no multiple of `stride` is ignored."""
         while index // self._stride >= self._rows:
             self._stride *= 2
             for column in self._columns.values():

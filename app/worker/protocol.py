@@ -541,6 +541,7 @@ class MessageCodec(Generic[M]):
             WireError: The message is longer than LARGEST_MESSAGE, or has an array of a dtype or number of
                 dimensions that cannot be sent.
             NotImplementedError: The message has a value of a type that cannot be sent.
+            ValueError, OverflowError: A text is not valid Unicode, or an integer has more than 64 bits.
         """
         packed = bytearray(LENGTH_BYTES)
         self._encoder.encode_into(message, packed, LENGTH_BYTES)

@@ -77,8 +77,9 @@ class FrameStore:
         self._objects_in = (-1, -1)
 
     def put(self, frame: Frame, path: Path, time_s: float, confirmed_s: Float) -> None:
-        """Store the results of a scan, unless they are stored. All scans are given, in their order. A scan
-        that is larger than LARGEST_MESSAGE is left out; once the file is full, no later scan is stored.
+        """Store the results of the scan after the last stored one; any other scan is ignored, also one that
+        is stored. A scan that is larger than LARGEST_MESSAGE counts as stored, but cannot be read. Once a
+        scan cannot be written, because the file or the disk is full, no later one is stored.
 
         Args:
             frame: Results of the scan; its points are not stored.
@@ -280,8 +281,8 @@ class RunMap:
 
     def add(self, frame: Frame, free: Float) -> None:
         """Add the results of the scan that was mapped last. If the run went back, the entries of this scan
-        and of later ones are replaced, except views. A tree keeps the time of its first confirmation, unless
-        the run went back to or before it.
+        replace earlier ones, and `history` and `clusters` lose those of later scans; stored frames and views
+        stay. A tree keeps the time of its first confirmation, unless the run went back to or before it.
 
         Args:
             frame: The results.
@@ -583,7 +584,8 @@ def changes_between(
     to one within SAME, see `match`; a pair has moved if its positions differ by more than MOVED.
 
     `changes` has the trees that appeared, then those that vanished, then those that moved. `ghost` has the
-    confirmed trees of the old map. Positions and diameters are rounded to 1 mm.
+    confirmed trees of the old map. `confirmed` is sorted by time, then by number. Positions and diameters are
+    rounded to 1 mm.
 
     Args:
         before: Frame of the scan in the old map.

@@ -119,7 +119,8 @@ class Run:
         return self._map.history.of(-1 if in_map is None else in_map, scan)
 
     def counts(self, index: int) -> RunCounts:
-        """Return the counts of the map up to a scan that was mapped."""
+        """Return the counts of the map up to a scan that was mapped. Only `losses` is not limited to that
+        scan: it has all that was left out so far while the source was read."""
         losses = Counter(self._left_out) + Counter(self.source.losses)
         return self._map.counts.totals(index, self.warnings, losses)
 
@@ -271,7 +272,8 @@ class Run:
     def kept(self, index: int) -> Shown | None:
         """Return the results of a scan that was mapped, without mapping it again; its points are segmented
         again. Trees that were never numbered are left out, see `TreeNumbers.stored`. None if the results or
-        the step are not stored. The run does not change."""
+        the step are not stored. The run does not change. Raises StemmapError if the random forest of the
+        scan does not exist any more."""
         shown = None if self._map.frames is None else self._map.frames.read(index)
         step = None if shown is None else self._cursor.stored(index)
         if shown is None or step is None:
@@ -552,8 +554,9 @@ def recorded_parameters(description: SourceDescription) -> tuple[tuple[int, Para
     """Return the parameter sets with which a recorded live run was mapped, each with the index of its first
     scan, ascending.
 
-    A set with which the whole run was mapped again replaces those before it. The result is empty if no
-    parameters were recorded, or if they are of another version of stemmap.
+    A set replaces those recorded before it that begin at its first scan or later; one with which the whole
+    run was mapped again replaces all. The result is empty if no parameters were recorded, or if any of them
+    is not valid in this version of stemmap.
     """
     sets: list[tuple[int, Parameters]] = []
     try:

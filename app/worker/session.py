@@ -182,8 +182,9 @@ class Session:
             The opened run; None for a robot that has not sent scans yet, see `listen`.
 
         Raises:
-            SourceError: The source cannot be read.
-            StemmapError: The random forest of the parameters does not exist.
+            SourceError: The source cannot be read, or the odometry is not available for it.
+            StemmapError: The random forest of the parameters does not exist; or, for a robot, a process that
+                compiles cannot be started.
         """
         self.close()
         self._requested = uri, odometry, seed
@@ -266,7 +267,8 @@ class Session:
         results of a live robot are published and recorded.
 
         None if no run is open, if `pace` is "idle", while a whole cloud is not mapped completely, before a
-        live scan arrived, and at the end of a run without a seek, whose state then becomes "finished".
+        live scan arrived, and at the end of a run without a seek. The state becomes "finished" when no scan
+        is left, unless the run is live; also in a seek, which then returns the last scan.
 
         Raises:
             StemmapError: Nothing more can be read, or the scan cannot be mapped.
@@ -318,9 +320,9 @@ class Session:
             self._state = "paused"
 
     def advance(self, scans: int) -> Frame | None:
-        """Pause and seek a number of scans forward, or back if it is negative, from the sought scan if there
-        is one, else from the current one; at most back to the first scan. A live run only gets a message that
-        it cannot seek; nothing happens without a run.
+        """Pause and seek a number of scans forward, or back if it is negative, from the sought scan if its
+        index is known, else from the current one; at most back to the first scan. A live run only gets a
+        message that it cannot seek; nothing happens without a run.
 
         Returns:
             The sought scan if it was mapped, see `is_shown`; else None.
@@ -732,8 +734,8 @@ def tree_picture(run: Run | InventoryRun | None, number: int) -> CameraPicture:
         number: Number of the tree.
 
     Raises:
-        StemmapError: Nothing is mapped, the source has no camera or an unknown one, or no picture shows the
-            tree.
+        StemmapError: Nothing is mapped, the source has no camera or an unknown one, or no picture shows a
+            confirmed tree with this number.
     """
     frame = None if run is None else run.frame
     if run is None or frame is None:

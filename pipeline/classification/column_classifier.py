@@ -236,8 +236,9 @@ class ColumnClassifier:
 
     @property
     def all_around(self) -> bool:
-        """Whether the random forest for sensors that see all around is used, see `is_seen_all_around`. After
-        a change, the next scan classifies all columns again."""
+        """Whether the random forest for sensors that see all around is used, see `is_seen_all_around`. A
+        change loads the other forest (StemmapError if it cannot be read); the next scan classifies all
+        columns again."""
         return self._all_around
 
     @all_around.setter
@@ -248,8 +249,8 @@ class ColumnClassifier:
 
     @property
     def parameters(self) -> Classification:
-        """Parameters. Setting them loads the forest (StemmapError if there is none of that name); the next
-        scan classifies all columns again with it."""
+        """Parameters. Setting them loads the forest (StemmapError if there is none of that name; the
+        parameters then stay); the next scan classifies all columns again with it."""
         return self._parameters
 
     @parameters.setter
@@ -269,7 +270,8 @@ class ColumnClassifier:
 
     def add(self, points: Float32, height: Float32, scan: int, view: ScanView) -> None:
         """Integrate a scan and classify the columns of the tiles that are due; afterwards `columns` is a new
-        table. Existing columns in view update their visibility, and all columns get their verdict again.
+        table. The visibility and the rays of all columns in range, also new ones, are updated, and all
+        columns get their verdict again.
 
         Args:
             points: Points in the level sensor frame, float32, shape (N, 3) [m].

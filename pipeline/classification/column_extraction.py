@@ -168,8 +168,8 @@ def examine(mean: Float32, returns: Int32, low: Float, side: float) -> tuple[Flo
         mean, returns, low, side: See `find_columns`.
 
     Returns:
-        Columns whose axis at 1.3 m is in the tile, shape (K, 5), and their profiles, shape (K, SLICES,
-        PROFILE).
+        Columns whose axis at 1.3 m is in the tile, shape (K, 5), with the columns of `find_columns`, and
+        their profiles, shape (K, SLICES, PROFILE), see `profile`.
     """
     found = find_columns(mean, returns, low, side)
     order, bounds = in_buckets(mean, low, side)

@@ -206,7 +206,8 @@ def _nearer(rows: Float, first: int, end: int, out: Float) -> None:
 @compiled
 def _widths(rows: Float, first: int, end: int) -> tuple[float, float, float]:
     """Return the mean standard deviations of the inside of slices across and along its long side [m], and the
-    relative variation of the width; the standard deviations are UNSEEN if no slice has two voxels.
+    relative variation of the width. Only slices with two voxels or more count; without any, the standard
+    deviations are UNSEEN and the variation is 0.
 
     Args:
         rows: Profile of the column, shape (SLICES, PROFILE).

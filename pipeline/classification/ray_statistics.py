@@ -84,7 +84,8 @@ def update_visibility(
     place.
 
     A column is present if the free range ends within NEAR of it, absent if it ends more than BEHIND beyond
-    it; neither is counted if something nearer hides it. The observed height counts in each case.
+    it. Otherwise, as when something nearer hides it, neither is counted. The observed height counts in each
+    case.
 
     Args:
         axis: Axes of the columns, shape (K, 5).

@@ -222,7 +222,8 @@ class VoxelMap:
             setattr(self, f.name, getattr(fresh, f.name))
 
     def _with_room(self, rows: Int, room: int, tile_room: int) -> VoxelMap:
-        """Return a new map of some voxels.
+        """Return a new map of some voxels. Tiles without voxels are left out; the others keep the number of
+        returns at their last classification.
 
         Args:
             rows: Rows of the voxels to copy, in the new order, shape (N,).

@@ -21,7 +21,8 @@ class Stage(BaseModel):
 
     @classmethod
     def title(cls) -> str:
-        """Return the title of the stage: its docstring up to the first colon, without spaces at its ends."""
+        """Return the title of the stage: its docstring up to the first colon, without spaces at its ends; the
+        whole docstring if it has no colon, the name of the class if there is no docstring."""
         return (cls.__doc__ or cls.__name__).partition(":")[0].strip()
 
     @model_validator(mode="after")

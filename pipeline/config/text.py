@@ -17,7 +17,7 @@ _DEEP_NAME = re.compile(r"(?:\.[^.,=\n]{0,100}){20}")
 def assign(parameters: Parameters, assignments: list[str]) -> Parameters:
     """Return parameters changed by `stage.name=value` texts of the command line. Spaces around name and value
     are ignored; of two texts with one name the later one counts. Names of earlier versions give a
-    RenamedParameterWarning.
+    RenamedParameterWarning, and removed parameters are ignored with such a warning, see `current_names`.
 
     Raises:
         ParameterError: A text has no "=", a name is unknown, or a value is not valid.
@@ -46,8 +46,8 @@ def value_text(value: Value) -> str:
 
 
 def parsed(spec: FieldSpec, text: str) -> Value:
-    """Return the value of a parameter from its text; bounds and choices are not checked. The text of a bool
-    other than "true" and "false" is returned unchanged.
+    """Return the value of a parameter from its text; bounds and choices are not checked, and "nan" and "inf"
+    are numbers of type float. The text of a bool other than "true" and "false" is returned unchanged.
 
     Raises:
         ParameterError: The text of a numeric parameter is not a number.
@@ -75,7 +75,8 @@ def to_toml(parameters: Parameters) -> str:
 
 def from_toml(text: str, base: Parameters, where: str) -> Parameters:
     """Return the base set with the values of a TOML text; the text may omit stages and values. Names of
-    earlier versions give a RenamedParameterWarning.
+    earlier versions give a RenamedParameterWarning, and removed parameters are ignored with such a warning,
+    see `current_names`.
 
     Args:
         text: Content of the file.
@@ -151,5 +152,6 @@ def _bounds(spec: FieldSpec) -> str:
 
 
 def _shown(value: Value) -> str:
-    """Return a value as text; floating-point numbers in their shortest form with up to six digits."""
+    """Return a value as text; floating-point numbers in their shortest form with up to six digits, a bool as
+    "True" or "False"."""
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -164,7 +164,7 @@ def _find_runs(
     level: Int,
 ) -> int:
     """Find the runs of a cluster that follow the front of a circle, and return their number, at most
-    MOST_RUNS (further ones are ignored).
+    MOST_RUNS (further ones are ignored). Runs of fewer than LEAST returns are left out.
 
     Fills the table of runs, ordered by slice, the run of each return (unchanged, -1, for none) and its slice.
     The result is 0 for a cluster that is partly behind the sensor as seen along the direction to its

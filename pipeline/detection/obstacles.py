@@ -41,8 +41,9 @@ def find_clearance(
     """Return the clearance of the path of the robot, or None if obstacle detection is off (`method` is
     "none"). If the robot drives backwards, it is the path behind the robot.
 
-    An obstacle within the path width beside the robot has the distance 0. If `terrain` is None and the sensor
-    is below the minimum obstacle height, each zone except STOP becomes UNKNOWN.
+    An obstacle within the path width beside the robot has the distance 0. The zone CLEAR becomes UNKNOWN with
+    fewer than `min_points` returns within 30 degrees of the direction of driving. If `terrain` is None and
+    the sensor is below the minimum obstacle height, each zone except STOP becomes UNKNOWN.
 
     Args:
         points: The whole scan beyond `acquisition.range_min`, float32, shape (N, 3) [m], level sensor frame;
@@ -53,7 +54,8 @@ def find_clearance(
         sensor_offset: Position of the sensor in the level base frame, shape (3,) [m].
         twist: Velocity of the base: forward, left [m/s], yaw rate [rad/s]; the velocity to the left is not
             used.
-        parameters: Path width, zones and thresholds.
+        parameters: Path width, zones and thresholds. Fewer than `min_points` returns within DEPTH are no
+            obstacle.
     """
     if parameters.method == "none":
         return None

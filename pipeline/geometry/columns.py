@@ -131,7 +131,7 @@ def first_difference(old: NDArray[Any] | None, new: NDArray[Any]) -> int:
 
 
 def _has_same_memory(a: NDArray[Any], b: NDArray[Any]) -> bool:
-    """Return whether two arrays have their rows at the same addresses."""
+    """Return whether two arrays have their rows at the same addresses; their lengths may differ."""
     layouts = [(x.__array_interface__["data"], x.strides, x.dtype) for x in (a, b)]
     return layouts[0] == layouts[1]
 

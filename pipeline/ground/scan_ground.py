@@ -73,8 +73,9 @@ def heights_of_places(places: Float, height: Float) -> Float:
 
 
 def height_above(points: Float32, terrain: Terrain) -> Float32:
-    """Return the height of each point above the terrain, float32, shape (N,) [m]; NaN for a point that is not
-    finite. Beyond the last ring, the height of the last ring counts as ground.
+    """Return the height of each point above the terrain, float32, shape (N,) [m]; NaN where a coordinate is
+    NaN or x or y is infinite, and infinite where only z is. Beyond the last ring, the height of the last ring
+    counts as ground.
 
     Args:
         points: Points in the level sensor frame, float32, shape (N, 3) [m].
@@ -152,8 +153,8 @@ def on_the_grid(points: Float32) -> tuple[Float32, Float32]:
 @compiled
 def _height_above(points: Float32, height: Float) -> Float32:
     """Return the height of each point (float32, shape (N, 3) [m], level sensor frame) above the ground,
-    float32, shape (N,) [m], by bilinear interpolation of the nodes `Terrain.height`; NaN for a point that is
-    not finite."""
+    float32, shape (N,) [m], by bilinear interpolation of the nodes `Terrain.height`; NaN where a coordinate
+    is NaN or x or y is infinite, and infinite where only z is."""
     rings = height.shape[1]
     corners = _corners(height)
     node, f, g = _nodes(*on_the_grid(points), height.shape[0], rings)
@@ -610,8 +611,8 @@ def find_terrain(points: Float32, parameters: Ground) -> Terrain:
     it (Huber weights).
 
     Args:
-        points: The whole scan, float32, shape (N, 3) [m], level sensor frame; points that are not finite are
-            ignored.
+        points: The whole scan, float32, shape (N, 3) [m], level sensor frame; points that are not finite or
+            have |z| >= FARTHEST are ignored.
         parameters: `slope_max` is used.
     """
     slope = float(np.tan(np.radians(parameters.slope_max)))

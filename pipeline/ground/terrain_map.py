@@ -289,7 +289,7 @@ class HeightMapper:
         of the sensor and the number of scans remain.
 
         Args:
-            correction: Path before and after; each cell moves with the nearest scan of the path before.
+            correction: Path before and after, with at least one scan; see `corrected_tiles`.
         """
         tiles = corrected_tiles(self.state.tiles, correction)
         self.state = replace(self.state, tiles=tiles, record=_record(tiles))

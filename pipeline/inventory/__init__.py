@@ -121,6 +121,7 @@ def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = pack
     Raises:
         SourceError: The cloud cannot be read, has no points, or is larger than a plot.
         StemmapError: There is no such forest.
+        OSError: The file of the cloud cannot be read.
     """
     with closing(Inventory(cloud, forests)) as inventory:
         return finish(inventory.steps(parameters))
@@ -153,6 +154,7 @@ class Inventory:
         Raises:
             SourceError: The cloud cannot be read, has no points, or is larger than a plot.
             StemmapError: There is no such forest.
+            OSError: The file of the cloud cannot be read.
         """
         r_min, r_max = max(parameters.detection.radius_min, LEAST_RADIUS), parameters.detection.radius_max
         slope = parameters.ground.slope_max
@@ -209,6 +211,7 @@ class Inventory:
         Raises:
             SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER
                 bytes.
+            OSError: The file of the cloud cannot be read.
         """
         whole = Thinned(SHOWN, SHOWN_SIDE)
         ground, near, counts = yield from ground_steps(self._cloud, slope_max, whole=whole)
@@ -250,7 +253,7 @@ def ground_steps(
         slope_max: Largest slope of the terrain against the plane of the plot [degrees].
         band: Lowest and highest height above the ground that is kept, both exclusive [m].
         most: Maximum number of points after thinning, a power of two.
-        whole: Table to which the points of all heights are added; None for none.
+        whole: Table to which the points of all heights in the plot are added; None for none.
 
     Returns:
         Ground; points, of which there may be none; and a dict from "read", "apart from the plot" (left out)
@@ -258,6 +261,7 @@ def ground_steps(
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER bytes.
+        OSError: The file of the cloud cannot be read.
     """
     finder, of = ExtentFinder(), max(cloud.description.points, 1)
     read = 0

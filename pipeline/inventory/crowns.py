@@ -52,7 +52,8 @@ class Voxels:
         side: Side of the cubes of the thinning [m].
         upper: Rows of the points higher than CELL, shape (U,): lower points connect all trees.
         voxel: Voxel of each upper point, shape (U,).
-        graph: Squared lengths of the steps between voxels in units of CELL, sparse, shape (K, K).
+        graph: Squared lengths of the steps between voxels in units of CELL, sparse, shape (K, K); each pair
+            of voxels is stored once.
     """
 
     points: Float32
@@ -85,7 +86,8 @@ def voxels_of(points: Float32, side: float) -> Voxels:
 
 
 def find_crowns(voxels: Voxels, stems: Stems, ground: TerrainRaster) -> Crowns:
-    """Return the points of each tree and its height.
+    """Return the points of each tree and its height. Points up to CELL above the ground, and those without a
+    chain of voxels to a stem, belong to no tree. Without any points, no height is known.
 
     The height is that of the highest point of the tree. It is not seen (NaN, with the reason) if the ground
     at the stem is not seen, the tree has fewer than TIP points, the stem ends abruptly, the top may be cut by

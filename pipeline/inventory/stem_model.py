@@ -124,7 +124,8 @@ def _describe(stem: Any, rows: Float, h: Float) -> None:  # noqa: ANN401 - a row
 
 def classify_stems(stems: Stems, share: Float, r_min: float, r_max: float) -> Int32:
     """Return the verdict of each stem, int32, shape (K,): that of the first of its checks that fails, else
-    TREE. A column without a circle has the class of most votes, NO_ARC in place of TREE.
+    TREE. A stem without a model (circles in fewer than two slices) has the class of most votes instead,
+    NO_ARC in place of TREE.
 
     Args:
         stems: Result of `describe_stems`.
@@ -207,8 +208,8 @@ def is_repeated(stems: Stems, axes: Float, verdict: Int32) -> Bool:
     before others, then the one with more slices, then the earlier one.
 
     Two stems are at the same position if the axis of one is inside of the other at the middle of the heights
-    that both have, or half-way between them. A column without a circle is at its own axis. A stem that is not
-    a tree is also a duplicate up to BESIDE outside of a kept stem.
+    that both have, or half-way between them. A stem without a model (circles in fewer than two slices) is at
+    the axis of its column. A stem that is not a tree is also a duplicate up to BESIDE outside of a kept stem.
 
     Args:
         stems: Result of `describe_stems`, shape (K,).

@@ -44,8 +44,8 @@ def find_columns(points: Float32) -> Iterator[tuple[Float, Float]]:
         points: Points x, y, z and height above the ground, shape (N, 4) [m]; may be empty.
 
     Yields:
-        Axes: x, y at 1.3 m above the ground [m], shift per metre of height, strength, shape (K, 5); and
-        features, shape (K, COUNT).
+        Axes: x, y at 1.3 m above the ground [m], shift in x and y per metre of height, strength, shape (K,
+            5); and features, shape (K, COUNT). A tile without a column gives no rows.
     """
     memory = VoxelMap.empty()
     room = 1 << max(len(points) - 1, 0).bit_length()  # a full map would forget voxels; there is one per point
@@ -72,7 +72,8 @@ def strongest_first(tiles: Sequence[tuple[Float, Float]]) -> tuple[Float, Float]
 
 def trace(slices: Slices, axes: Float, r_min: float, r_max: float) -> Float:
     """Return the circles along the axes of K columns in each of S slices, with the values of `fit_circle`,
-    shape (K, S, FIGURES); NaN in slices without a circle.
+    shape (K, S, FIGURES); NaN in slices without a circle. After more than LOST slices in a row without a
+    circle none follows; a column without a first circle has none.
 
     The first circle is that of all points up to the height in which columns are found, moved along the axis
     to breast height. From there the circle of each slice is fitted, upwards and downwards; it begins with the
@@ -155,7 +156,7 @@ def _trace_column(
 @compiled
 def _fits(slices: Slices, k: int, row: Float, r_min: float, r_max: float) -> bool:
     """Fit the circle of a slice; return whether it can belong to the stem. If not, the position and the
-    radius are unchanged.
+    radius are unchanged, and the other values are undefined.
 
     Args:
         slices: Slices of the plot.

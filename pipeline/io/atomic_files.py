@@ -53,7 +53,7 @@ def write_texts(folder: Path, texts: Mapping[str, str]) -> list[Path]:
 
     Raises:
         OSError: The folder cannot be created.
-        StemmapError: A file cannot be written.
+        StemmapError: A file cannot be written; those before it stay written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():

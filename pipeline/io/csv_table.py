@@ -43,7 +43,7 @@ class CsvTable:
 
     Attributes:
         lines: List of the line numbers, from 1, of the rows in the file.
-        rows: List of the rows that are not empty, each a list of its cells, without the header.
+        rows: List of the rows with a cell that is not empty, each a list of its cells, without the header.
         column: Dict from names of columns in lower case to their indices; of several columns with the same
             name, the first one.
 

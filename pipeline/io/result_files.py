@@ -296,7 +296,8 @@ class RunFiles:
 
         Raises:
             OSError: A file cannot be written or moved.
-            ValueError: A number of `run` is not finite.
+            ValueError: A number of `run`, or a position of a confirmed tree, is not finite. No file is moved
+                or removed then.
         """
         self._detections.close()
         texts = {

@@ -91,17 +91,18 @@ def is_uncertain(sigma_xy: Float) -> bool:
 def find_loop(run: RunHistory, parameters: Relocalisation) -> Loop | None:
     """Search for a loop that ends at the newest scan.
 
-    Landmarks that were begun in the last LATELY metres and are within REACH of the robot are matched with
-    trees of at least LEAST_HITS observations that were first seen before and are within the possible drift,
-    at most FARTHEST.
+    Landmarks that were begun in the last LATELY metres, but not before `placed` of the run, and are within
+    REACH of the robot are matched with trees of at least LEAST_HITS observations that were first seen before
+    and are within the possible drift, at most FARTHEST.
 
     Args:
         run: Path and map with at least one scan; unchanged.
         parameters: Parameters of the stage.
 
     Returns:
-        The loop. None if the path is too short, either side has fewer than `stems_min` stems, the
-        constellation is not found (see `find_constellation`), or `loop_to` rejects the match.
+        The loop. None if the path is shorter than LATELY and the pose was not set from outside, either side
+        has fewer than `stems_min` stems, the constellation is not found (see `find_constellation`), or
+        `loop_to` rejects the match.
     """
     way = _way(run.path)
     lately = max(int(np.searchsorted(way, way[-1] - LATELY)), run.placed)

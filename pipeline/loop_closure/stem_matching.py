@@ -239,8 +239,9 @@ def search(
 def _keep(
     pose: Float, agree: Int, kept: int, x: float, y: float, yaw: float, found: int, reach: float
 ) -> int:
-    """Store a hypothesis, unless a stored one with at least as many stems has the same pose, or KEPT better
-    ones are stored; return the number of stored ones.
+    """Store a hypothesis; return the number of stored ones. A stored one with the same pose is replaced only
+    if it has fewer stems. A new pose is appended; if KEPT are stored, it replaces the one with the fewest
+    stems only if that has fewer.
 
     Args:
         pose, agree: Stored poses, shape (KEPT, 3), and their numbers of stems, shape (KEPT,); changed in
@@ -483,7 +484,8 @@ class Match:
         reason: Reason of the refusal, or None.
         local, reference: Rows of the stems that agree in the best pose, int64, shape (K,).
         second: Number of stems that agree in the second best pose; 0 if there is none.
-        false_alarms: Decimal logarithm of the expected number of equally good agreements by chance.
+        false_alarms: Decimal logarithm of the expected number of equally good agreements by chance; 0 if no
+            pose was found.
     """
 
     pose: Pose2 | None

@@ -49,8 +49,8 @@ class LidarOdometry:
         T_base_lidar: Extrinsics of the LiDAR.
 
     Attributes:
-        losses: Dict from reasons to numbers of scans: those without a pose, and those whose pose is only the
-            initial guess.
+        losses: Dict from reasons to numbers of scans: those with too few points for a pose, and those whose
+            pose is only the initial guess. Late scans, which have no pose either, are not counted.
     """
 
     def __init__(self, T_base_lidar: Pose3) -> None:
@@ -127,8 +127,9 @@ class LidarOdometry:
         return points[keep], offset
 
     def _expected(self, velocity: Float, span_ns: int) -> Float:
-        """Return the predicted step since the last scan in the sensor frame, shape (4, 4): by the wheels,
-        else the last step, or no motion after a pause (PAUSE_NS).
+        """Return the predicted step since the last scan in the sensor frame, shape (4, 4): by the wheels if
+        their readings at the two scans are less than 2 `span_ns` + STALE_NS apart, else the last step, or no
+        motion after a pause (PAUSE_NS).
 
         Args:
             velocity: Last step in the sensor frame, shape (4, 4).

@@ -64,8 +64,8 @@ class _PackedScan:
 
 
 def pack(step: Step, scan: SegmentedScan) -> bytes:
-    """Return a step and its segmented scan as a block. Of the points only those of the column input are kept;
-    clearance is omitted."""
+    """Return a step and its segmented scan as a block. Of the points only those of the column input are kept,
+    in steps of POINT and with heights in (0, HIGHEST); labels and clearance are omitted."""
     no_points: Float32 = np.zeros((0, 3), np.float32)
     lean = replace(
         scan, raw=no_points, filtered=no_points, labels=scan.labels[:0], column_input=None, clearance=None
@@ -80,8 +80,8 @@ def pack(step: Step, scan: SegmentedScan) -> bytes:
 
 
 def unpack(block: bytes) -> tuple[Step, SegmentedScan]:
-    """Return the step and the segmented scan that `pack` was given, without what it omits; z of the column
-    points is 0. Errors as `record_of`."""
+    """Return the step and the segmented scan that `pack` was given, without what it omits (points and labels
+    are empty, clearance is None); z of the column points is 0. Errors as `record_of`."""
     packed = record_of(_PackedScan, block)
     given = packed.column_input
     return packed.step, replace(packed.scan, column_input=None if given is None else given.unpacked())

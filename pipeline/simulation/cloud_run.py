@@ -56,8 +56,8 @@ class Surfels(NamedTuple):
 
     Attributes:
         points: Positions, shape (N, 3) [m].
-    normals: Unit normals of discs, zero for balls, shape (N, 3).
-    radius: Radius of the discs and balls, shape (N,) [m].
+        normals: Unit normals of discs, zero for balls, shape (N, 3).
+        radius: Radius of the discs and balls, shape (N,) [m].
         blocks: Radius in which a point hides surfels behind it, 0 in foliage, shape (N,) [m].
     """
 
@@ -128,8 +128,9 @@ def first_surfels(surfels: Surfels, R: Float, o: Float, beams: Float, optics: Op
     `optics.range_max`, or only surfels hidden behind another point.
 
     Each surfel is seen from the pose of the sensor when the beam passes it, and only the beams within its
-    angle are tested. Surfels very close to the sensor are ignored. The range is the mean of the nearest hit
-    and of those within MELT behind it, weighted towards the middle of the discs.
+    angle are tested. Surfels nearer to the axis of the sensor than twice `radius` or twice `blocks` are
+    ignored. The range is the mean of the nearest hit and of those within MELT behind it, weighted towards the
+    middle of the discs.
 
     Args:
         surfels: The surfels.
@@ -298,7 +299,8 @@ def open_cloud_run(
         T_base_lidar: Extrinsics of the LiDAR; None uses those of simulated robots.
 
     Raises:
-        SourceError: The cloud cannot be read, is too large for a plot, or has no path for a robot.
+        SourceError: The cloud cannot be read, has no points, is too large for a plot, or has no path for a
+            robot.
     """
     ground, near, _ = finish(ground_steps(cloud, SLOPE, band=BAND, most=MOST))
     points = near.points
@@ -446,8 +448,9 @@ def _obstacles(points: Float32, ground: TerrainRaster) -> Int:
 
 
 def _clearance(free: Bool, ground: TerrainRaster) -> Float:
-    """Return the distance of each cell of side SIDE to obstacles [m], 0 in obstacles; cells far from visible
-    ground and outside of the raster are obstacles. The shape is half of that of `free`, rounded down.
+    """Return the smallest distance of each cell of side SIDE to obstacles [m], 0 in obstacles; cells more
+    than one cell of `ground` from seen ground, and outside of the raster, are obstacles. The shape is half of
+    that of `free`, rounded down.
 
     Args:
         free: Whether each cell of side CELL is free, shape (R, C).

@@ -96,9 +96,9 @@ def bark_radius(surface: Float, radius: float, depth: float, angle: float, heigh
 
 @compiled
 def meet_stem(shape: Float, surface: Float, o: Float, d: Float) -> float:
-    """Return the range [m] at which a ray enters the bark of a stem from outside, MISS if it does not. From
-    the mantle that encloses the stem the ray advances by a share of the gap, which is small enough for
-    furrows with a slope of 2.
+    """Return the range [m] at which a ray enters the bark of a stem from outside; MISS if it does not, or if
+    the origin is inside the mantle that encloses the stem. From this mantle the ray advances by
+    a share of the gap, which is small enough for furrows with a slope of 2.
 
     Args:
         shape, surface: Rows of the stem, see `Solids`.

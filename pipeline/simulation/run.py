@@ -84,8 +84,8 @@ class SimulatedRun:
 
     def odometry_record(self, n: int) -> Odometry:
         """Return reading n of the odometry (50 Hz, from 0): the planar pose by the wheels, or, with the
-        quality "exact", the true pose with height and tilt. IndexError for a reading after the motion by
-        wheels."""
+        quality "exact", the true pose with height and tilt. A reading after the end of the motion raises an
+        IndexError, with "exact" a ValueError."""
         t_ns = n * (1_000_000_000 // ODOMETRY_HZ)
         if self.request.odometry == EXACT:
             R, p = self.motion.at(np.array([t_ns / 1e9]))
@@ -206,7 +206,8 @@ def obstacle_aware_drive(
     course: Course, speed: float, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, duration_s: float
 ) -> Drive:
     """Drive a course one sweep at a time from rest; the clearance after a sweep, by the default parameters,
-    decides the speed of the next one. Each sweep is simulated with a coarse LiDAR.
+    decides the share SPEED of the speed in the next one. The robot stands during the first sweep. Each sweep
+    is simulated with a coarse LiDAR.
 
     Args:
         course: The course, which is open; the robot stops at its end.
@@ -248,7 +249,8 @@ def _drive(course: Course, along: list[float], speeds: list[float], first: int) 
 
 
 def _zone(drive: Drive, scene: SimulatedScene, T_base_lidar: Pose3, seed: int, k: int) -> Zone:
-    """Return the zone of obstacle detection after sweep k; CLEAR if there is no clearance.
+    """Return the zone of obstacle detection, by the default parameters, after sweep k; CLEAR if there is no
+    clearance.
 
     Args:
         drive: Motion during the sweep.

@@ -18,7 +18,8 @@ Waypoints = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """An object at a given position: its kind, x, y [m] and diameter [m]."""
+    """An object at a given position: its kind ("tree", "pole", "bush" or "person"), x, y [m] and diameter
+    [m]."""
 
     kind: str
     x: float
@@ -285,8 +286,8 @@ class RunRequest:
         seed: Random seed of the run.
         sigma: Standard deviation of a range [m].
         odometry: Quality of the wheels, or "exact".
-        duration_s: Duration [s].
-        trees: Number of trees.
+        duration_s: Duration [s]; 0 for one loop of a run through a cloud.
+        trees: Number of trees; 0 for a run through a cloud.
         drive: Number of the drive; other drives through the same scene have other noise.
         file, truth: Cloud of a run through a real plot and table of its trees, or empty.
     """
@@ -303,7 +304,8 @@ class RunRequest:
 
     @property
     def scenario(self) -> Scenario:
-        """The scenario with the requested objects. KeyError for a run through a cloud, which has none."""
+        """The scenario with the requested number of trees. KeyError for a run through a cloud, which has
+        none."""
         return replace(SCENARIOS[self.name], trees=self.trees)
 
 
@@ -312,7 +314,8 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
     the defaults of the scenario.
 
     The duration of a run through a cloud is 0 in the request, for one loop, if the URI has none; a duration
-    in the URI is 1 s to 3600 s. Files are not opened.
+    in the URI is 1 s to 3600 s. A scenario with placed objects has at most its default number of trees, the
+    others have at most 2000. Files are not opened.
 
     Args:
         uri: As the user wrote it; the part after "?" is percent-encoded.
@@ -355,7 +358,8 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
 
 
 def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
-    """Return a dict from the keys to the values of the options of a URI; empty for an empty query.
+    """Return a dict from the keys to the decoded values of the options of a URI; empty for an empty query. A
+    value may be empty.
 
     Args:
         uri: The URI, for errors.
@@ -423,7 +427,7 @@ def _real(uri: str, key: str, text: str, low: float, high: float) -> float:
     Args:
         uri: The URI, for the error.
         key: Name of the option.
-        text: Value of the option; ASCII digits only, an exponent is allowed.
+        text: Value of the option, less than 40 characters; ASCII digits only, an exponent is allowed.
         low, high: Bounds.
 
     Raises:

@@ -265,8 +265,9 @@ class _Planter:
             self._add_tree(x, y, float(dbh))
 
     def add_others(self) -> None:
-        """Add the objects that are not trees, near enough to the course to be seen. SourceError if the plot
-        is full; undergrowth is left out on the course."""
+        """Add the objects that are not trees, near enough to the course to be seen. Persons who walk and
+        undergrowth are not in the ground truth. Undergrowth is left out on the course, and may be at occupied
+        positions. SourceError if the plot is full."""
         scenario, scene, rng, find = self._scenario, self._scene, self._rng, self._plot.find
         for _ in range(scenario.boxes):
             add_box(scene, *find(0.9, 0.5, 1.2, 9.0, rng, "box"))
@@ -317,8 +318,8 @@ class _Planter:
         self._persons.append(Person(owner, at, at, float(heading), 0.0, float(phase)))
 
     def _add_walker(self) -> None:
-        """Add a person who walks back and forth on a free line near the course; not to the ground truth.
-        SourceError if 2,000 random lines are not free."""
+        """Add a person who walks back and forth on a free line near the course; not to the ground truth. The
+        line is not marked as occupied. SourceError if 2,000 random lines are not free."""
         rng, plot = self._rng, self._plot
         for _ in range(2000):
             start = plot.centre + plot.half_side * rng.uniform(-0.8, 0.8, 2)

@@ -50,7 +50,7 @@ class SceneBuilder:
         return len(self.kinds) - 1
 
     def true_object(self, kind: str, x: float, y: float, dbh: float = np.nan) -> int:
-        """Add an object to the ground truth and return its number, the owner of its shapes.
+        """Add an object to the ground truth and to `kinds`, and return its number, the owner of its shapes.
 
         Args:
             kind: Kind of the object.
@@ -109,7 +109,7 @@ def add_tree(
         top: Height of the tree above the ground [m].
         crown_base: Height of the lower end of the foliage above the ground [m]; a tree with a crown base at
             or above `top` has no foliage.
-        branches: Number of branches below the crown.
+        branches: Number of branches below the crown and below 3.5 m.
     """
     rng, owner = scene.rng, scene.true_object("tree", x, y, dbh)
     ground = float(scene.foot(x, y)[2])
@@ -313,7 +313,7 @@ def add_hedge(scene: SceneBuilder, start: Float, end: Float) -> None:
 
 def stations(start: Float, end: Float, spacing: float) -> Float:
     """Return positions on the line from `start`, inclusive, to `end`, exclusive, both of shape (2,) [m], at
-    multiples of a spacing [m] from `start`; shape (N, 2)."""
+    multiples of a spacing [m] from `start`; shape (N, 2). N is 0 if both ends are equal."""
     length = float(np.hypot(*(end - start)))
     along = np.arange(0.0, length, spacing)
     return start + along[:, None] * (end - start) / max(length, 0.1)

@@ -97,7 +97,8 @@ class SimulatedTerrain:
     def with_ditches(
         self, depth: float, width: float, spacing: float, direction: float, phase: float
     ) -> SimulatedTerrain:
-        """Return a copy of this terrain with parallel drainage ditches; the origin keeps the height 0.
+        """Return a copy of this terrain with parallel drainage ditches, approximated by waves with amplitudes
+        above 1 cm. The whole terrain is shifted so that the origin has the height 0.
 
         Args:
             depth: Depth of a ditch [m].
@@ -134,7 +135,8 @@ WHEELBASE = 0.8  # m; distance between the axles of a small forestry robot
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WheelContact:
-    """The ground as wheels average it: height and slope over a square with the side of the wheelbase."""
+    """The ground as wheels average it. The height is the mean of the four points that are half a WHEELBASE
+    away along the axes x and y of the map, and the slopes are those between opposite points."""
 
     terrain: SimulatedTerrain
 

@@ -112,7 +112,8 @@ SENSORS = (
 def build_wild_scene(
     scenario: Scenario, course: Course, range_sigma: float, rng: np.random.Generator
 ) -> tuple[SpinningLidar, SimulatedScene]:
-    """Return a random sensor of SENSORS, and the scene.
+    """Return a random sensor of SENSORS, and the scene. A spinning sensor reports two echoes with the
+    probability DUAL. In `owners`, an object other than a tree has the number of its last part.
 
     Args:
         scenario: Number of trees and size of the plot.

@@ -67,8 +67,9 @@ class _Pairs(NamedTuple):
 def associate(
     centre: Float, R: Float, mean: Float, covariance: Float, gate: float, distance_max: float
 ) -> tuple[Int, Float]:
-    """Associate detections with landmarks one to one, pairs with the highest likelihood first. Without
-    detections or landmarks, no pair exists.
+    """Associate detections with landmarks one to one, pairs with the highest likelihood first. Of equal
+    pairs, that of the first landmark, then that of the first detection is taken. Without detections or
+    landmarks, no pair exists.
 
     Args:
         centre: Detections, shape (D, 2) [m].

@@ -83,8 +83,9 @@ class FastSlam:
     def process(
         self, index: int, motion: Pose2 | Motion, detections: Detections, clear_range: Float
     ) -> PoseEstimate:
-        """Predict the particles by the odometry, weigh them by the detections, and resample when it is due;
-        replaces `state`, and changes the arrays of the former state in place.
+        """Predict the particles by the odometry, weigh them by the detections, and resample if the effective
+        number of particles is below the share `resample_below` of the particles; replaces `state`, and
+        changes the arrays of the former state in place.
 
         Detections are used in the first scan, and in views and scans with a measured pose: after
         `update_distance`, when the motion is due, and when trees contradict the odometry or the last used
@@ -100,9 +101,10 @@ class FastSlam:
                 `detection.free_space`.
 
         Returns:
-            Pose after the scan with its health. `landmarks` contains only those of the best particle with at
-            least `hits_to_weigh` hits. `landmark_of` is the birth number of the landmark of each detection,
-            -1 for none; after a used scan each detection has one.
+            Pose after the scan with its health. Particles and weights are those before the resampling.
+            `landmarks` contains only those of the best particle with at least `hits_to_weigh` hits.
+            `landmark_of` is the birth number of the landmark of each detection, -1 for none; after a used
+            scan each detection has one.
         """
         p = self.parameters
         noise, offset = draws(self.seed, index, p.particles)
@@ -182,8 +184,9 @@ class FastSlam:
         particle. Weights, health statistics, shared errors and the motions since the last used scan and since
         the last keyframe are reset.
 
-        If the graph has keyframes, it gets one more without odometry to the one before, and a loop from its
-        first keyframe with this pose.
+        If the graph has keyframes, it gets a keyframe at the newest scan, without detections and without
+        odometry to the one before; a keyframe that this scan already has is replaced. If this is not the only
+        keyframe, the graph also gets a loop from its first keyframe with this pose. `path` is unchanged.
 
         Args:
             index: Number of the scan, which seeds the random numbers.
@@ -254,8 +257,8 @@ class FastSlam:
                 see `is_smoothing_due`.
 
         Returns:
-            The correction. None where the graph has no solution; the particles are unchanged then, and the
-            next smoothing waits for another revisit.
+            The correction. None where the graph has no solution (`KeyframeGraph.solve`); the particles are
+            unchanged then, and the next smoothing waits for another revisit.
         """
         graph, solution = self.state.graph, self.state.graph.solve()
         if solution is None:
@@ -265,8 +268,8 @@ class FastSlam:
 
     def close(self, index: int, loop: Loop) -> PathCorrection | None:
         """Close a loop that ends at the newest scan: solve the graph with it, and correct path and landmarks.
-        All particles continue from the corrected pose with the map of the best one, in which landmarks at the
-        same place from before and after the loop are joined.
+        The newest scan becomes a keyframe. All particles continue from the corrected pose with the map of the
+        best one, in which landmarks at the same place from before and after the loop are joined.
 
         Associations with old landmarks in the present revisit (`KeyframeGraph.revisit`) were made at the
         drifted pose. In the solution with the loop they are left out, and landmarks that the loop brings to
@@ -401,7 +404,7 @@ class FastSlam:
 
     def landmarks(self) -> Landmarks:
         """Return all landmarks of the best particle, those with few hits and in inactive places as well, with
-        the gate and the maximum distance of the parameters."""
+        the gate and the maximum distance of the parameters. Their scores are those of `hits_less_misses`."""
         known, p = self.state.map_of(self.state.best), self.parameters
         score = hits_less_misses(known.hits, known.score, p.misses_per_hit)
         return Landmarks(known.birth, known.mean, known.covariance, score, p.gate, p.distance_max)
@@ -565,8 +568,8 @@ class FastSlam:
         """Return the state with the detections of this scan, and with a keyframe if none exists or the last
         one is at least `keyframe_distance` of driven path behind.
 
-        The detections of a scan are kept only if it is `keyframe_distance` / SCANS_MAX after the last kept
-        one.
+        The detections of a scan, if there are any, are kept only if it is the first one since the last
+        keyframe or at least `keyframe_distance` / SCANS_MAX after the last kept one.
 
         Args:
             state: State after the scan.

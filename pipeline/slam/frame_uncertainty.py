@@ -202,7 +202,7 @@ class FrameUncertainty:
 
     def smoothed_by(self, correction: PathCorrection, covariance: Float) -> FrameUncertainty:
         """Return the state after a solution of the graph, from which all particles continue: reference poses
-        move, and all of them are smoothed.
+        move, and all of them are smoothed. `hidden` and `at` are unchanged; see `with_total`.
 
         Args:
             correction: Path before and after.

@@ -115,8 +115,8 @@ def choose_jointly(
     search: JointSearch,
 ) -> float:
     """Find the assignment with the highest likelihood of the detections of n levels, and write it to
-    `search.best` (-1 for a detection without landmark); return its -2 log likelihood. After MOST_STEPS steps
-    the best assignment so far is the result; n = 0 gives 0.
+    `search.best` (-1 for a detection without landmark, which counts like a pair at the gate); return its -2
+    log likelihood. After MOST_STEPS steps the best assignment so far is the result; n = 0 gives 0.
 
     Args:
         pose: Pose by the odometry and the pairs that were accepted before.

@@ -223,7 +223,7 @@ def correct_by_measured(mu: Float, P: Float, measured: MeasuredPose, p: int) -> 
     The shared error of the particle is subtracted from the measurement, and its covariance is added.
 
     Args:
-        mu: x, y [m], yaw [rad], shape (3,); is corrected.
+        mu: x, y [m], yaw [rad], shape (3,); is corrected, and its yaw is not wrapped.
         P: Covariance of `mu`, shape (3, 3); is corrected.
         measured: The measured pose, with `z` of shape (3,); unchanged.
         p: Row of the particle.

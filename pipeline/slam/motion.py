@@ -284,14 +284,14 @@ def correct_by_pose(mu: Float, P: Float, z: Float, R: Float) -> float:
     """Correct a pose by a measured pose (Kalman update with H = I), in place.
 
     Args:
-        mu: x, y [m], yaw [rad], shape (3,); is replaced by the corrected pose.
+        mu: x, y [m], yaw [rad], shape (3,); is replaced by the corrected pose, whose yaw is not wrapped.
         P: Covariance of `mu`, shape (3, 3); is replaced likewise.
         z: Measured pose, shape (3,).
         R: Covariance of `z`, shape (3, 3), positive definite.
 
     Returns:
         Log likelihood of the measurement without its constant: -(y^T S^-1 y + ln det S) / 2 with the
-        innovation y = z - mu and S = P + R.
+        innovation y = z - mu (yaw wrapped) and S = P + R.
     """
     S, y, before = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(3):

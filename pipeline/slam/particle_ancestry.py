@@ -295,7 +295,7 @@ class Genealogy:
         A single particle would add the noise of its random numbers (Rao-Blackwell).
 
         Args:
-            scans: Numbers of the scans, int64, shape (S,).
+            scans: Numbers of the scans, int64, shape (S,), without duplicates.
             weights: Weights of the particles after the newest scan, shape (P,).
         """
         settled = BLOCK * len(self.settled)
@@ -352,7 +352,7 @@ _STAMP, _SIGMA, _MOTION = 0, 4, 5  # columns; 1 to 3 are x, y, yaw
 
 
 class TrajectoryBuffer:
-    """Time, pose, sigma and odometry of each scan.
+    """Time, pose, sigma and odometry of each scan. Poses come from the argument of `path`.
 
     Args:
         stamp_ns: Times of the scans so far [ns], int64, shape (N,); None for none.
@@ -408,9 +408,9 @@ class TrajectoryBuffer:
         self._with_pose = min(self._with_pose, length)
 
     def path(self, poses: EstimatedPath) -> Path:
-        """Return the path with the poses of all N scans. It never changes, and shares its memory with later
-        ones, so that a call takes a time that depends only on the rows that differ from those of the last
-        call."""
+        """Return the path with `poses`, which must have all N scans of the buffer. The result never changes,
+        and shares its memory with later ones, so that a call takes a time that depends only on the rows that
+        differ from those of the last call. `sigma_xy` is NaN for scans without a sigma."""
         start = min(self._poses.rows_in_common(poses), self._with_pose)
         if start < len(self):
             stamp, *_, sigma, motion = (self._rows.column(k)[start:] for k in range(_MOTION + 1))

@@ -424,8 +424,8 @@ def merge_duplicates(
     cells: Cells,
     scale: float,
 ) -> None:
-    """Merge each landmark that was seen with those within the gate that were not seen and are not
-    frozen, in place.
+    """Merge each landmark that was seen with those within the gate that were not seen, are not frozen, and
+    have a score above 0, in place.
 
     The merged position is the Kalman update of both, the hits are added, and the better score and the lower
     birth number remain; the other row gets the score 0 and is removed later. Landmarks that are both seen in

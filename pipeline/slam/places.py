@@ -90,7 +90,8 @@ class Places:
 
     def with_contradiction(self, birth: Int) -> Places:
         """Return the places after the detections contradicted landmarks of the given birth numbers, int64,
-        shape (L,): their places are inactive, and `contradicted` is True."""
+        shape (L,): their places are inactive, and `contradicted` is True. Landmarks that precede all places
+        make no place inactive."""
         inactive = self.inactive.copy()
         row = self._row(birth)
         inactive[row[row >= 0]] = True

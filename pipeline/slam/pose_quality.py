@@ -389,8 +389,18 @@ def pose_health(
 
 def _state_and_reason(recent: RunningStatistics, sigma_xy: float, doubt: str) -> tuple[HealthState, str]:
     """Return the state and the message of its reason, which is empty for a good pose. The first rule that
-    applies decides; `sigma_xy` is in metres. NaN counts as uncertain and gives "lost". `doubt` is the reason
-    to doubt the odometry, "" for none; it gives "weak" unless the trees determine the motion reliably."""
+    applies decides.
+
+    "lost": `sigma_xy` is above SIGMA_WEAK or NaN; `is_lost`. "weak": a doubt, unless the trees determine the
+    motion reliably; `strange` above 0; `sigma_xy` above SIGMA_GOOD; `found` below FOUND_WEAK; `odometry`
+    above ODOMETRY_WEAK; `innovation` above INNOVATION_WEAK; `ambiguous` above AMBIGUOUS_WEAK; `alone` above
+    ALONE_WEAK. The rules for `found` and `alone` apply only once a well-known landmark was detected.
+
+    Args:
+        recent: Running statistics after the scan.
+        sigma_xy: Standard deviation of the position [m].
+        doubt: Reason to doubt the odometry, "" for none.
+    """
     if not sigma_xy <= SIGMA_WEAK:
         return "lost", f"the position is uncertain by {sigma_xy:.1f} m, more than the distance between trees"
     if is_lost(recent):

@@ -91,8 +91,8 @@ def likely_pairs(
     distance_max: float,
     room: Room,
 ) -> int:
-    """Collect the pairs within the gate in `room`, sorted by cost, and set `landmark_of` of all detections to
-    -1; return the number of pairs.
+    """Collect the pairs within the gate in `room`, with their `order` by cost, and return their number. Also
+    fill `best` and `second`, and set `landmark_of` of all detections to -1.
 
     Args:
         pose: Pose before the scan.
@@ -267,7 +267,7 @@ def recognise(
 
     Args:
         mu, P: Predicted pose x, y [m], yaw [rad] of the base in the map, shape (3,), and its covariance,
-            shape (3, 3); corrected in place.
+            shape (3, 3); corrected in place. The corrected yaw is not wrapped.
         centre: Detections in the base frame, shape (D, 2) [m].
         R: Covariances xx, xy, yy of the detections, shape (D, 3) [m^2].
         mean, covariance, hits: Landmarks of this particle, see Maps; rows that are not in `cells` are

@@ -108,7 +108,7 @@ def fit_control_points(
 
 def _residual_words(residuals: Float, names: Sequence[str]) -> str:
     """Return a text with the lengths [m] of the six largest residuals, shape (N, 2) [m], and the names of
-    their points."""
+    their points, the largest first."""
     shown = 6  # points in a message
     lengths = np.hypot(*residuals.T)
     largest = np.argsort(-lengths, kind="stable")[:shown]

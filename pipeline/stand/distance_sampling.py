@@ -65,8 +65,8 @@ def fit_half_normal(distance: Float, available: Float) -> DetectionFunction | No
     sum r^2 / (2 n); with constant A(r) (a straight path) it is sum r^2 / n.
 
     Args:
-        distance: Distance of each tree found [m], shape (N,).
-        available: Distance of each cell of the area [m], shape (K,).
+        distance: Distance of each tree found [m], shape (N,); finite.
+        available: Distance of each cell of the area [m], shape (K,); finite.
 
     Returns:
         The function; sigma is inf if constant detection explains the distances as well, else from 1/20 to 20

@@ -73,7 +73,8 @@ class StandFigures:
         values: Dict from the names in FIGURES, which has their units, to estimates. Names that end in
             `_plain` refer to the whole area, without any correction; `_corrected` are corrected for the
             probability of detection; the others refer to the observed area.
-        classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area.
+        classes: Diameter classes, from the minimum diameter upwards; per hectare of observed area. Empty, and
+            `trees` and `without_dbh` 0, if nothing was observed.
         warnings: Messages for the user.
     """
 
@@ -135,9 +136,12 @@ def stand_figures(
         parameters: Limits of diameters and classes.
 
     Returns:
-        The stand parameters. Unknown ones are NaN: all but the `_plain` ones if no area was observed, the
-        corrected ones if the probability is not above 0, those of diameters and volumes if no tree has one.
-        `_plain` figures have no standard error. In `v_ha`, trees without a volume count as 0.
+        The stand parameters. Trees thinner than the minimum diameter do not count; those without a diameter
+        do. Unknown parameters are NaN: all but the `_plain` ones if no area was observed; the corrected ones
+        if the probability is NaN or not above 0; basal areas and volumes if there are trees, but none has a
+        diameter or a volume; volumes without a formula; figures of diameters if no tree has a diameter; and
+        those of the pattern for fewer than two trees. `_plain` figures have no standard error. In `v_ha`,
+        trees without a volume count as 0.
 
     Raises:
         ValueError: The plot has no area.

@@ -88,7 +88,8 @@ def plot_of(name: str, shape: Mapping[str, Any]) -> SamplePlot:
     Args:
         name: Name of the plot.
         shape: Dict with the key `kind`: "circle" with x, y, radius [m]; "rectangle" with x, y, length, width
-            [m] and turn_deg; or "polygon" with `polygons`, the coordinates of a GeoJSON MultiPolygon [m].
+            [m] and turn_deg; or "polygon" (as any other kind) with `polygons`, the coordinates of a GeoJSON
+            MultiPolygon [m].
 
     Raises:
         StemmapError: The plot cannot be used, see `checked`.

@@ -55,7 +55,8 @@ class VisitComparison:
         growth, growth_sigma: Diameter in b minus that in a, and its standard deviation, shape (P,) [m]; NaN
             if unknown.
         significant: Whether the growth of a pair is significant: at most the share FALSE_DISCOVERIES of these
-            pairs is expected to be false (Benjamini and Hochberg 1995), shape (P,).
+            pairs is expected to be false (Benjamini and Hochberg 1995), shape (P,). False where growth or
+            sigma is unknown, or sigma is 0.
         moved: Whether the positions of a pair differ by more than MOVED_SIGMAS standard deviations and
             MOVED_MIN, shape (P,).
     """
@@ -102,7 +103,8 @@ def align_visits(a: VisitTrees, b: VisitTrees, parameters: Relocalisation) -> tu
 def compare_visits(
     a: VisitTrees, b: VisitTrees, T_a_b: Pose2, *, reach: float, refine: bool, stems: int = 0
 ) -> VisitComparison:
-    """Pair the trees of two visits and compare them.
+    """Pair the trees of two visits one to one (`match`) and compare them. Trees without a finite position
+    have no partner.
 
     Args:
         a, b: The visits.

@@ -62,7 +62,8 @@ class SeenArea:
 
     def joined(self, other: SeenArea, T_map_other: Pose2 | None = None) -> SeenArea:
         """Return the union with the area of another drive, which has cells of the same size (not checked). A
-        cell in both areas has the smaller distance and the sum of the views.
+        cell in both areas has the smaller distance, or the known one if the other is NaN, and the sum of the
+        views.
 
         Args:
             other: The other area.

@@ -135,7 +135,8 @@ def table_figures(tracks: Rows, limits: FigureLimits) -> tuple[Float, Float, Flo
 
     Returns:
         Observed arc [rad]; DBH [m]; its standard deviation [m]; mean eccentricity; and which tracks are
-        trees. DBH, its standard deviation and eccentricity are NaN where they are unknown.
+        trees, see `is_confirmed`. DBH and its standard deviation are NaN where `diameter` has none, the
+        eccentricity is NaN without a finite one.
     """
     T = tracks.sides.shape[0]
     coverage, dbh, dbh_sigma, mean = np.empty(T), np.empty(T), np.empty(T), np.full(T, np.nan)

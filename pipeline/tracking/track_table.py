@@ -189,10 +189,11 @@ def join(rows: Rows, old: int, young: int) -> None:
     """Join the track of row `young` to that of row `old`, in place.
 
     The track whose landmark has the larger score (`old` for equal scores) gives landmark, state, covariance
-    and time of the last observation. The larger score and the earlier first observation are kept. Counts and
-    sums are added (a last scan that observed both counts once). The class is tree if one is a tree; a track
-    without class gets that of the other one. The row `old` keeps its number. The row `young` stays unchanged;
-    the caller removes it.
+    and time of the last observation. A track without a landmark gives them only if neither has one and it is
+    `old`. The larger score and the earlier first observation are kept. Counts and sums are added; in `hits`,
+    a last scan that observed both counts once. The class is tree if one is a tree, else that of `old`, or
+    that of `young` if `old` has none. The row `old` keeps its number. The row `young` stays unchanged; the
+    caller removes it.
     """
     x, P, shared, stamp_ns, first_ns = rows.x, rows.P, rows.shared, rows.stamp_ns, rows.first_ns
     hits, sides, verdict = rows.hits, rows.sides, rows.verdict

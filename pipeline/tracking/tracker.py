@@ -183,8 +183,8 @@ class Tracker:
 
     def trees(self) -> Trees:
         """Return the attributes of all trees, confirmed or not (Table 2), in ascending order of number; the
-        columns are copies. SHARED_COVARIANCE is added to the covariances. Diameters are NaN where they are
-        unknown."""
+        columns are copies. SHARED_COVARIANCE is added to the covariances. Diameters and eccentricities are
+        NaN where they are unknown; heights and leans are None."""
         t, p = self.tracks, self.parameters
         limits = FigureLimits(p.hits_to_confirm, np.radians(p.dbh_arc_min), p.out_of_round, p.taper_sigma)
         coverage, dbh, dbh_sigma, eccentricity, confirmed = table_figures(t.as_rows(), limits)
@@ -294,9 +294,11 @@ def follow(
 ) -> Bool:
     """Assign the tracks to the landmarks of the present map, in place.
 
-    A track keeps its landmark if that exists. Otherwise it gets a free landmark at its position
-    (`associate`); if the landmark there has a track, both are joined. A track without any of these gets the
-    landmark NO_LANDMARK.
+    A track keeps its landmark if that exists; of several tracks with the same landmark, only the lowest row
+    does. Any other track gets a free landmark at its position (`associate`). If only a landmark with a track
+    is there, both tracks are joined into the lower row, unless the track had the landmark NO_LANDMARK before.
+    A track without any of these gets the landmark NO_LANDMARK. The score of a track becomes that of its
+    landmark.
 
     Args:
         rows: Tracks; landmark, score and, for joined tracks, all columns are changed.

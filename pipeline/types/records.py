@@ -289,7 +289,8 @@ class Step:
 
         Args:
             interval: Length of the intervals [s]; 0 makes each scan due.
-            delay: Time of the run at which the first interval begins [s].
+            delay: Shift of all intervals [s]: they begin at `delay` plus or minus multiples of `interval`
+                after the first scan.
         """
         if self.elapsed_ns < FIRST_NS or interval == 0.0:
             return True
@@ -569,7 +570,7 @@ class PoseEstimate:
         particles: shape (P, 3): x, y [m], yaw [rad] in the frame of the map.
         weights: shape (P,), sum 1.
         n_eff: Effective number of particles, 1 / sum of squared weights.
-        landmarks: shape (L, 2) [m], the landmarks of the best particle.
+        landmarks: shape (L, 2) [m], the landmarks of the best particle with at least `hits_to_weigh` hits.
         health: Quality of the pose.
         relative: Covariance with respect to the nearby landmarks, shape (3, 3); None if it is `covariance`.
         landmark_of: Birth number of the landmark of each detection, int64, shape (D,); -1 without one.
@@ -668,7 +669,8 @@ class Frame:
         sensor_offset: shape (3,) [m]: position of the sensor in the base frame; `raw` plus this offset is in
             the level base frame.
         trees: The map.
-        counts: Number of points that each stage passed and rejected, by name.
+        counts: Dict from names such as "out of range", "clustered" and "noise" to numbers of points that a
+            stage passed or rejected; the names differ for stems and whole clouds.
         warnings: Messages for the user.
         columns: Voxel columns; None without this classifier.
         ground: Terrain map, updated every few scans; None without ground segmentation, or if it is unchanged.
@@ -715,7 +717,8 @@ class CloudDescription:
         crs: Coordinate reference system as WKT or "EPSG:32632"; empty when unknown.
         digest: SHA-256 (hex) of the file.
         warnings: Messages for the user.
-        low, high: Corners by the header in the coordinates of the file, shape (3,) [m]; not checked.
+        low, high: Corners by the header in the coordinates of the file, shape (3,) [m]; not checked. None if
+            unknown.
         attributes: Names of the columns besides the coordinates.
         cut_above: Whether the field of view of a sensor cuts the trees, as in the cloud of a drive.
     """
@@ -742,7 +745,7 @@ class WholeCloud(Protocol):
 
     @property
     def losses(self) -> dict[str, int]:
-        """Points left out in the latest reading, by reason."""
+        """Dict from reasons to numbers of points left out in the latest reading; empty if there are none."""
 
     def parts(self) -> Iterator[Float32]:
         """Yield all points in parts: x, y, z minus the offset [m], finite, float32, shape (N, 3). Each call

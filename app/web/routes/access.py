@@ -118,11 +118,12 @@ def _figure_parameters(
     dbh_min: Annotated[float, Query(ge=0.0, le=1.0)] = 0.07,
     volume: Annotated[str, Query(max_length=LONGEST)] = "",
 ) -> Stand:
-    """Return the parameters of stand figures that a request gives; BadRequestError for another formula.
+    """Return the parameters of stand figures that a request gives; BadRequestError if the formula is not
+    valid.
 
     Args:
         dbh_min: Minimum diameter [m].
-        volume: Volume formula; empty for none.
+        volume: Volume formula, see `Stand`; empty for none.
     """
     try:
         return Stand(dbh_min=dbh_min, volume=volume.strip())

@@ -297,6 +297,7 @@ async def telling(browser: WebSocket, live: Broadcast) -> AsyncIterator[None]:
 
 
 async def _send(browser: WebSocket, listener: Listener) -> None:
-    """Send the messages of a listener to a browser without end."""
+    """Send the messages of a listener to a browser until the task is cancelled; the errors of a browser that
+    has disconnected pass through."""
     async for message in listener.messages():
         await browser.send_text(message.decode())

@@ -198,7 +198,8 @@ async def change(body: _PlotChange, number: Number, dashboard: Dash) -> Response
 async def _added(dashboard: Dashboard, body: Edit, plots: Sequence[tuple[str, dict[str, Any]]]) -> Response:
     """Add plots in one edit, and return the response 201 with their `ids`, see `edited`. `plots` has the name
     ("" for the next free number) and the shape (dict, see `plot_of`) of each plot. Raises BadRequestError if
-    a shape or name is not valid, a name is taken or there would be too many plots or corners."""
+    a shape or name is not valid, a name is taken or there would be too many plots or corners; errors of
+    `apply_edit` and `edited` pass through."""
     taken, contents = _names(dashboard), []
     for name, shape in plots:
         name = _checked_name(name, taken) if name else _free("", taken)

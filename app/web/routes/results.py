@@ -142,7 +142,8 @@ async def export(
 
 
 def _exported(run: ShownRun, suffix: str, parameters: Stand) -> tuple[bytes, str]:
-    """Return the bytes and the name of the exported file; StemmapError where `export` answers 422."""
+    """Return the bytes and the name of the exported file for a suffix with its dot, for example ".gpkg";
+    StemmapError where `export` answers 422."""
     from app.batch.export import export_bytes, read_for_export
     from app.batch.stand import stand_of
 

@@ -264,8 +264,8 @@ async def _with_edits(
 async def _visit_path(
     key: str, run: dict[str, Any], stack: AsyncExitStack, settings: Settings, dashboard: Dashboard
 ) -> FilePath:
-    """Return the folder of a run, or a table of its trees if it has no result files; errors as in
-    `_run_folder`.
+    """Return the folder of a run; if it has no result files, a table (trees.csv) of its trees without those
+    that were rejected in the review. Errors as in `_run_folder`, except NoFilesError.
 
     Args:
         key, settings, dashboard: See `_run_folder`.

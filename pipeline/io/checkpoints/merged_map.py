@@ -50,8 +50,9 @@ def merge_maps(
 ) -> MergedMap:
     """Merge map b into map a; both are unchanged. Trees that `associate` pairs within GATE sigma (with
     `relocalisation.slack` added) and `slam.distance_max` become one with the number in a; other trees of b
-    get new numbers. The run continues at the end of b, in the frame of a, without graph and places. The
-    terrain of b is left out if the runs have too little ground in common, see `merged_terrain`.
+    get new numbers. The run continues at the end of b, in the frame of a, without graph, places, odometry
+    and a search for a lost robot. The terrain of b is left out if the runs have too little ground in common,
+    see `merged_terrain`.
 
     Args:
         a, b: The maps.
@@ -60,6 +61,9 @@ def merge_maps(
         stamp_shift_ns: Added to the times of b [ns], which must then be after those of a; this is not
             checked.
         parameters: Parameters of all stages.
+
+    Raises:
+        ValueError: The terrain of a map contradicts itself, see `PackedHeightMap.unpacked`.
     """
     moved = _moved_tracks(b.tracks, T_a_b, covariance, stamp_shift_ns)
     moved.landmark[moved.landmark != NO_LANDMARK] += a.slam.detections

@@ -181,7 +181,8 @@ class PictureSource(Protocol):
         """Return the camera, or None and the reason why it is unknown, "" when there is no camera."""
 
     def picture_near(self, stamp_ns: int, within_ns: int = SAME_TIME_NS) -> Picture | None:
-        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it."""
+        """Return the picture nearest to a time [ns], None if none is within `within_ns` of it or it cannot be
+        decoded."""
 
     def picture_stamps(self) -> list[int]:
         """Return the times of the pictures that are available, ascending [ns]."""

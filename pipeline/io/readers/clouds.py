@@ -68,7 +68,7 @@ def offset_for(middle: Float) -> Float:
 
 
 class CloudFile:
-    """A file of points as a cloud (see `pipeline.inventory.cloud.WholeCloud`).
+    """A file of points as a cloud (see `pipeline.types.records.WholeCloud`).
 
     A subclass opens the file (`_open`), calls `_describe`, and yields the points (`_read`).
 

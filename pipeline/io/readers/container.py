@@ -101,6 +101,9 @@ class Container:
             numbers: Numbers of the channels that are read.
             start_ns: Earlier times of recording [ns] are left out; None for none.
             losses: Dict from reasons to numbers of messages that cannot be read; increased in place.
+
+        Raises:
+            SourceError: The file cannot be read.
         """
         raise NotImplementedError
 

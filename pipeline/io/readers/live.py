@@ -123,8 +123,9 @@ class ArrivalReader:
     def add(self, message: Message) -> list[Record]:
         """Process the next message; return the records that it completes, after notices of the source. Until
         the source is described by its first OPENING_SCANS scans, or for OPENING_NS after the first one,
-        messages are stored and [] is returned; then the stored ones follow at once. What cannot be used is
-        counted in `losses`.
+        messages are stored and [] is returned; then the stored ones follow at once. Of more than
+        OPENING_LIMIT stored messages, the older half is dropped and not counted, except scans and fixed
+        transforms, see `_forget_oldest`. What else cannot be used is counted in `losses`.
 
         Raises:
             SourceError: There are scans, and none could be read in five attempts of OPENING_NS.
@@ -330,7 +331,8 @@ def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
         where: Name of the file in errors.
 
     Raises:
-        SourceError: The settings are of another version, or name no topic or more than _MOST_TOPICS.
+        SourceError: The settings are of another version, or name no topic or more than _MOST_TOPICS, with
+            those of the camera.
     """
     try:
         content = container.attachment(NAME, _LIMIT)

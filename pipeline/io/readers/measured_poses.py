@@ -113,9 +113,10 @@ def fit_rigid(
         what, unknown: For messages: name of the positions, and what a short path does not determine.
 
     Returns:
-        The fit and "", or None and the reason why there is none: fewer than FEWEST positions within the time
-        of the odometry, a path shorter than `shortest` or than three sigmas, or an RMS residual above WORST
-        times the larger of the median sigma and 2 % of the path. Positions that are not finite are ignored.
+        The fit and "", or None and the reason why there is none: fewer than two times of the odometry, fewer
+        than FEWEST positions within its time, a path shorter than `shortest` or than three sigmas, or an RMS
+        residual above WORST times the larger of the median sigma and 2 % of the path. Positions that are not
+        finite are ignored.
     """
     if len(positions) < FEWEST or len(stamp_ns) < 2:
         return None, f"{len(positions)} {what} are too few"
@@ -351,7 +352,8 @@ class OtherPose:
             T_child_base: Pose of the base in the child frame; None if the child frame is the base.
 
         Raises:
-            NoPoseError: The covariance in the plane is not finite, not symmetric or not positive definite.
+            NoPoseError: The covariance in the plane is not finite, has a magnitude of 1e12 or more, or is not
+                symmetric or not positive definite.
         """
         planar = np.array(covariance, dtype=np.float64).reshape(6, 6)[np.ix_(_ROWS, _ROWS)]
         if not (np.abs(planar) < 1e12).all():
@@ -575,7 +577,8 @@ class FrameAlignment:
     def _add_reading(self, message: Message, stamp_ns: int) -> Any:  # noqa: ANN401
         """Decode and store a reading; return the frame if it is known now, else None. Damaged readings, those
         without a position and those less than _APART_NS after the last one are left out. `refused` is set
-        after _HOPELESS damaged readings without a usable one, and with more than _MOST_READINGS."""
+        after _HOPELESS damaged readings without a usable one, and with more than _MOST_READINGS readings and
+        poses of the odometry together."""
         try:
             with np.errstate(all="ignore"):
                 reading, self._frame = self.kind.read(message, stamp_ns)

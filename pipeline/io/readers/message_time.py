@@ -60,7 +60,7 @@ class Clock:
 
     def __init__(self, offsets_ns: list[int | None]) -> None:
         """Choose the clock: stamps are used if there are topics, all have a stamp, and their offsets differ
-        by 10 s at most; `offset_ns` is that of the first topic, 0 if stamps are not used."""
+        by _SAME_CLOCK_NS at most; `offset_ns` is that of the first topic, 0 if stamps are not used."""
         known = [offset for offset in offsets_ns if offset is not None]
         self.by_stamp = (
             bool(known) and len(known) == len(offsets_ns) and max(known) - min(known) <= _SAME_CLOCK_NS
@@ -115,8 +115,9 @@ class ClockStepFilter(Clock):
     def time_of(self, stamp_ns: int | None, message: Message) -> int | None:
         """Return the time of a message [ns], with the steps of the clock removed; call it in the order of
         arrival. If stamps are not used it is the time of arrival. A stamp that is missing or zero is replaced
-        by the time of arrival plus the known offset. None if such a message is the first of its channel, or
-        if the first stamp of the channel is of another clock. A step adds a notice."""
+        by the time of arrival plus the known offset. None as long as a channel has had no usable stamp: a
+        first stamp is usable if its offset is within _LIVE_LIMIT_NS of that of another channel, or if it is
+        the first of all. The result may be negative. A step adds a notice."""
         if not self.by_stamp:
             return message.log_ns
         known = self._channels.get(message.channel)
@@ -138,7 +139,7 @@ class ClockStepFilter(Clock):
 
     def _first_of(self, offset_ns: int, stamp_ns: int) -> _ChannelClock | None:
         """Return the state of a channel that is seen for the first time, with the correction of the channel
-        that has the same clock; None if its stamp is impossible.
+        with the nearest offset; None if this differs by more than _LIVE_LIMIT_NS. The state is not stored.
 
         Args:
             offset_ns: Stamp minus arrival of its first message [ns].
@@ -179,7 +180,7 @@ class Stamped(Generic[T_co]):
 def in_order_of_stamps(arrivals: Iterable[Stamped[T]], losses: dict[str, int]) -> Iterator[Stamped[T]]:
     """Yield contents sorted by time, then by rank, then in the order of arrival. A content waits until one
     that is more than WINDOW_NS later arrives, or more than _HELD_LIMIT contents wait. Contents that arrive
-    with a time before that of the last one yielded are left out.
+    with a time before that of the last one yielded are left out and counted.
 
     Args:
         arrivals: Contents in the order of arrival.

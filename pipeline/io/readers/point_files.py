@@ -97,7 +97,8 @@ def read_columns(path: Path, losses: dict[str, int]) -> Columns:
             is added in place.
 
     Raises:
-        ScanFileError: No point can be read, or the header has more than POINT_LIMIT points.
+        ScanFileError: As `open_table`; the header has more than POINT_LIMIT points, or none of its points can
+            be read. A header with 0 points gives empty columns.
         OSError: The file cannot be read.
     """
     table = open_table(path)
@@ -114,8 +115,8 @@ def read_columns(path: Path, losses: dict[str, int]) -> Columns:
 
 
 def _column_names(fields: list[str]) -> list[str]:
-    """Return the names of columns in lower case without the prefix of CloudCompare. Empty and repeated names,
-    and "_", become "*" and the index of the column; such columns are not used."""
+    """Return the names of columns in lower case without the prefix "scalar_" of CloudCompare. Empty and
+    repeated names, and "_", become "*" and the index of the column; such columns are not used."""
     names: list[str] = []
     for k, field in enumerate(fields):
         name = field.lower().removeprefix("scalar_")
@@ -171,6 +172,10 @@ class _Stream:
             path: The file.
             points: Number of points by the header. If the file has fewer, only whole records are yielded.
             stack: Stack on which the file is opened; the caller closes it.
+
+        Raises:
+            OSError: The file cannot be read.
+            _DAMAGE: The zip or its packed data is damaged.
         """
         file: IO[bytes]
         if self.member is None:
@@ -280,7 +285,8 @@ def _text_table(
 
 def _as_type(numbers: NDArray[np.float64], dtype: np.dtype[Any]) -> NDArray[np.generic]:
     """Return numbers of a text file, shape (N,), as the type of the header: floating numbers unchanged as
-    float64; integers truncated and clipped to the range of the type, NaN as 0."""
+    float64; integers truncated and clipped to the range of the type (for 8 bytes, to half of its largest
+    number), NaN as 0."""
     if dtype.kind == "f":
         return numbers
     bounds = np.iinfo(dtype)
@@ -470,8 +476,9 @@ def _open_ply(path: Path, head: bytes) -> PointTable:
         head: The first bytes of the file, with the whole header.
 
     Raises:
-        ScanFileError: The header is damaged, there is no such element, it has no x, y or z, or it has list
-            properties. In a binary file, also if an element before it has list properties.
+        ScanFileError: The header is damaged or promises too many points, there is no such element, it has no
+            x, y or z, or it has list properties, or the file ends before its first point. In a binary file,
+            also if an element before it has list properties.
         OSError: The size of a binary file cannot be read.
     """
     order, elements, start = _ply_header(head)
@@ -493,10 +500,11 @@ def _open_ply(path: Path, head: bytes) -> PointTable:
 
 
 def _ply_header(head: bytes) -> tuple[str, list[_PlyElement], int]:
-    """Return the byte order ("" for text), the elements, and the length of the header [bytes].
+    """Return the byte order ("<", ">", or "" for text), the elements with names in lower case, and the length
+    of the header [bytes]. Comments and unknown lines are ignored.
 
     Raises:
-        ScanFileError: The bytes are not a header of a PLY file.
+        ScanFileError: The bytes are not a complete header of a PLY file.
     """
     order: str | None = None
     elements: list[_PlyElement] = []
@@ -555,10 +563,12 @@ class _NumpyArray:
     def streams(self) -> list[_Stream]:
         """Return the records of a table, or its columns if they are stored one after the other. The fields of
         a structured array keep their names; the columns of a plain table are x, y, z, with four or five
-        columns also intensity, and the others are not used.
+        columns also intensity, and the others are not used. Fields of text are not used either. Whether
+        there are x, y and z is not checked.
 
         Raises:
-            ScanFileError: The array is not a table of numbers.
+            ScanFileError: The array has neither the shape (N, 3 to _MOST_FIELDS) and numbers, nor the shape
+                (N,) and fields of numbers or text.
         """
         form = f"an array of shape {self.shape} and type {self.dtype}"[:120]
         if len(self.shape) == 1 and self.dtype.names:
@@ -592,7 +602,8 @@ class _NumpyArray:
 
 def _open_npz(path: Path) -> PointTable:
     """Return the table of the array with a usual name (_BEST_NAMES, the first of them), else of the first
-    that is a table of points, else of arrays x, y, z and, if there is one, intensity of equal length.
+    that is a table of points, else of arrays x, y, z and, if there is one, intensity of equal length. An
+    array that cannot be used is skipped; only the first _MOST_MEMBERS members are searched.
 
     Raises:
         ScanFileError: The file is damaged or has no such array.
@@ -637,7 +648,8 @@ def _npy_header(file: IO[bytes], member: str | None, size: int) -> _NumpyArray:
         size: Size of the file or of the unpacked member [bytes].
 
     Raises:
-        ScanFileError: The header is damaged, or the array holds Python objects (pickles) or is too large.
+        ScanFileError: The header is damaged or of a newer version than 2.0, or the array has no dimension,
+            has more than MOST_POINTS entries along one, or holds Python objects (pickles).
     """
     head = io.BytesIO(file.read(_NPY_HEADER_LIMIT))  # no header decides how much is read
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

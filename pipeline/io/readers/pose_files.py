@@ -37,7 +37,8 @@ def read_poses(path: Path) -> list[Pose3]:
     of a LiDAR.
 
     Raises:
-        TextError: The file has another format, matrices that are not rotations, or positions beyond 1e8 m.
+        TextError: The file has another format, matrices that are not orthogonal, or positions of
+            COORDINATE_LIMIT or more.
         OSError: The file cannot be read.
     """
     rows = read_table(path, 12).reshape(-1, 3, 4)
@@ -60,8 +61,8 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
     shape (N,), or KITTI rows (times None, see `read_poses`).
 
     Raises:
-        TextError: The file has neither format, times that do not ascend, a quaternion of length 0, or
-            positions beyond 1e8 m.
+        TextError: The file has neither format, times that do not strictly ascend or cannot be read, a
+            quaternion of length 0, or positions of COORDINATE_LIMIT or more.
         OSError: The file cannot be read.
     """
     lines = _lines(path)
@@ -103,7 +104,7 @@ def seconds_ns(text: str) -> int:
 
 def read_times(path: Path) -> Int:
     """Return the times of a file [ns], int64, shape (N,), one per row, in seconds or as dates with times of
-    day (UTC).
+    day (UTC). Empty lines are skipped; lines that begin with # only in a file of seconds.
 
     Raises:
         TextError: The file has another format, no rows, or times that decrease; equal times are accepted.
@@ -160,8 +161,8 @@ def read_table(path: Path, columns: int) -> Float:
     one row; empty lines and lines that begin with # are skipped.
 
     Raises:
-        TextError: The file has no rows, a row with another number of words, or a word that is not such a
-            number.
+        TextError: The file is larger than TEXT_LIMIT or is not UTF-8, or it has no rows, a row with another
+            number of words, or a word that is not such a number.
         OSError: The file cannot be read.
     """
     return _table(_lines(path), columns)
@@ -235,7 +236,7 @@ _FAR_NS = 1_000_000_000
 
 def pose_at(times: Int, poses: list[Pose3], stamp_ns: int) -> Pose3 | None:
     """Return the pose interpolated at a time. Outside of the times it is the nearest pose; None if the time
-    is more than _FAR_NS from the rows before and after it.
+    is more than _FAR_NS from both neighbouring rows. One near row is enough, however long the gap is.
 
     Args:
         times: Times of the poses, ascending, shape (N,), N >= 1 [ns].
@@ -281,8 +282,8 @@ _LINE_LIMIT = 1 << 16  # bytes; a longer line is cut, and its parts are damaged 
 
 
 def parse_numbers(text: bytes) -> Float:
-    """Return the numbers between blanks or line ends, up to the first word that is not a number, shape
-    (N,)."""
+    """Return the numbers between blanks or line ends, up to the first word that is not a number, shape (N,);
+    "nan" and "inf" are numbers. The text after that word is ignored."""
     parts, at = [np.zeros(0)], 0
     while at < len(text):
         gap = _GAP.search(text, at + _BLOCK)
@@ -327,7 +328,8 @@ def parse_table(text: bytes, columns: int) -> tuple[Float, int]:
 def read_rows(file: IO[bytes], columns: int, lines: int) -> Iterator[Float]:
     """Yield the numbers of the next lines of a file part by part, each of shape (N, columns), N >= 1.
 
-    Empty lines are skipped, and damaged lines are left out.
+    Empty lines are skipped, and damaged lines are left out; see `parse_table`. A line of more than
+    _LINE_LIMIT bytes counts as several lines.
 
     Args:
         file: Open at the beginning of the first line.

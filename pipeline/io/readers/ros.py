@@ -96,7 +96,8 @@ class RosSource(MessageSource):
 
     def records(self) -> Iterator[Record]:
         """Yield records in the order of time, scans after other records of the same time. Messages that
-        cannot be used, or come too late, are counted in `losses`."""
+        cannot be used, or come too late, are counted in `losses`. SourceError if the recording cannot be
+        read on."""
         losses: dict[str, int] = {}
         self._losses = losses
         for stamped in in_order_of_stamps(self._arrivals(losses), losses):
@@ -121,8 +122,8 @@ class RosSource(MessageSource):
 
     def fixes(self) -> list[Fix]:
         """Return all GNSS fixes of the recording with their times by the clock of the source, in the order of
-        recording. Messages that are damaged, have no fix or an impossible time are left out; [] if there is
-        no GNSS topic."""
+        recording. Messages that are damaged, have no fix or an impossible time are left out, not counted; []
+        if there is no GNSS topic. SourceError if the recording cannot be read."""
         found = []
         for message in self._container.messages(self._topics.numbers("gnss"), None, {}):
             for stamped in self._stamped(message, {}):
@@ -141,7 +142,8 @@ class RosSource(MessageSource):
     # --- reading ---------------------------------------------------------------------------------
 
     def _time_of(self, stamp_ns: int | None, message: Message) -> int | None:
-        """Return the time of a message [ns] by the clock of the source, None if its stamp is impossible."""
+        """Return the time of a message [ns] by the clock of the source, None if it has no possible time; see
+        `time_of` of `Clock` and, for a live run, of `ClockStepFilter`."""
         return self._clock.time_of(stamp_ns, message)
 
     def _arrivals(self, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
@@ -154,7 +156,7 @@ class RosSource(MessageSource):
     def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Yield the message itself with its time, or, for a channel of moving transforms, each odometry that
         the message contains with its time; see `_stamped` and `_transforms`. Entries with an impossible time
-        are omitted and counted in `losses`. Errors of decoding transforms are raised."""
+        are omitted and counted in `losses`; a damaged message of transforms is omitted, not counted."""
         if message.channel in self._moving:
             return self._transforms(message, losses)
         return self._stamped(message, losses)
@@ -182,7 +184,7 @@ class RosSource(MessageSource):
 
     def _transforms(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Yield the odometry in a message of moving transforms, with its time; transforms between other
-        frames are ignored, impossible times are counted in `losses`."""
+        frames and damaged messages are ignored, impossible times are counted in `losses`."""
         for stamp_ns, parent, child, pose in self._extrinsics.decode(message):
             if (parent, child) == self._extrinsics.odometry_link:
                 time_ns = self._clock.time_of(stamp_ns, message)
@@ -210,10 +212,10 @@ class RosSource(MessageSource):
         return None
 
     def _first_scan(self) -> tuple[Scan, str, int]:
-        """Return the first scan that can be read, its frame and the product number of the sensor.
+        """Return the first scan with points, its frame and the product number of the sensor (0 if unknown).
 
         Raises:
-            SourceError: None of the first messages has points that can be read.
+            SourceError: None of the first _TRIES messages has points that can be read.
         """
         reason = "the topic has no messages that can be read"
         for arrival in islice(self._scan_arrivals(None), _TRIES):
@@ -279,7 +281,7 @@ class RosSource(MessageSource):
         self, first: Scan, frame: str, sensor: Sensor, digest: str, options: SourceOptions
     ) -> SourceDescription:
         """Return the description of the source with all warnings, to which some about frames, times and
-        damage are added, and set the base frame.
+        damage are added, and set the base frame of the source and of its decoder.
 
         Args:
             first: First scan.

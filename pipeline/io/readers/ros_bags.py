@@ -132,10 +132,10 @@ class Db3File(IndexedContainer):
 
 def bag_files(folder: Path) -> list[Path]:
     """Return the .mcap and .db3 files (suffix in any case) of a folder in the order of the numbers at the
-    end of their names; may be empty.
+    end of their names; may be empty. Compressed files (.zstd) are ignored where others are not compressed.
 
     Raises:
-        SourceError: The files themselves are compressed, or there are several without metadata.yaml.
+        SourceError: All files are compressed, or there are several without metadata.yaml.
         OSError: The folder cannot be read.
     """
     bags = (path for path in folder.iterdir() if path.suffix.lower() in (".mcap", ".db3"))
@@ -158,7 +158,7 @@ def bag_files(folder: Path) -> list[Path]:
 
 def _natural(path: Path) -> tuple[int, str]:
     """Return the sort key of a part of a recording: the number after the last "_" of the name, and the name.
-    A name without a number comes first."""
+    A name without a number, or with one of more than nine digits, has the number 0."""
     tail = path.stem.rpartition("_")[2]
     return (int(tail), path.name) if tail.isdecimal() and len(tail) < 10 else (0, path.name)
 
@@ -219,7 +219,7 @@ class BagFolder(IndexedContainer):
 
     def _message(self, number: int, log_ns: int, place: int) -> Message | None:
         """Return the message at the location `place` in the file to which the channel belongs; None if it
-        cannot be read."""
+        cannot be read. SourceError if that file cannot be read."""
         part, own = divmod(number, _STRIDE)
         message = self._parts[part]._message(own, log_ns, place)
         return None if message is None else replace(message, channel=number)
@@ -360,7 +360,7 @@ def _fields(header: bytes) -> Header:
 
 
 def open_bag(path: Path) -> IndexedContainer:
-    """Open a file of recorded messages by its contents.
+    """Open a file of recorded messages by its contents: SQLite, else a ROS 1 bag, else MCAP.
 
     Raises:
         SourceError: The file has another format, or cannot be read.

@@ -55,7 +55,8 @@ def decode_cloud(cloud: ros2.sensor_msgs__msg__PointCloud2, stamp_ns: int) -> Sc
     that are not valid returns are left out, see `clean_scan`.
 
     Raises:
-        LayoutError: Width, height, steps, fields and length of the data do not fit together.
+        LayoutError: Width, height, steps, fields and length of the data do not fit together, x, y or z is
+            missing or not a floating number, or there are more than POINT_LIMIT points.
     """
     table = _table(cloud)
     return scan_of(stamp_ns, {name: table[name] for name in table.dtype.names or ()})
@@ -182,8 +183,9 @@ class RecordDecoder:
         Args:
             message: The message.
             stamp_ns: Time of the message [ns].
-            losses: Dict from reasons to numbers of messages that cannot be used; increased in place. A
-                measured pose whose frame is not known yet is not counted.
+            losses: Dict from reasons to numbers of messages that cannot be used, and of packets that are not
+                data packets; increased in place. Not counted are measured poses whose frame is unknown, and
+                those up to `OtherFrame.from_ns`.
         """
         channel = self._channels[message.channel]
         try:
@@ -210,7 +212,8 @@ class RecordDecoder:
         return None
 
     def scan(self, message: Message, stamp_ns: int, losses: dict[str, int]) -> tuple[Scan, str, int]:
-        """Return a scan, the name of its frame, and the product number of the sensor (0 if unknown).
+        """Return a scan, which may have no points, the name of its frame, and the product number of the
+        sensor (0 if unknown).
 
         Args:
             message: PointCloud2, LaserScan or VelodyneScan.
@@ -219,7 +222,7 @@ class RecordDecoder:
                 place.
 
         Raises:
-            Exception: Of many kinds, when the message is damaged.
+            Exception: Of many kinds, when the message is damaged, or a VelodyneScan has no data packet.
         """
         msgtype = self._channels[message.channel].msgtype
         if msgtype == LASER_SCAN:
@@ -249,6 +252,7 @@ class RecordDecoder:
         """Return a GNSS fix, None if the receiver had no fix, and the name of the frame of its antenna.
 
         Raises:
+            ValueError: Position or variances are invalid, see `Fix.of`.
             Exception: Of many kinds, when the message is damaged.
         """
         decoded: ros2.sensor_msgs__msg__NavSatFix = self.message(message)

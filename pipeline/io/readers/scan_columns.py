@@ -28,7 +28,8 @@ def clean_scan(
 ) -> Scan:
     """Return a scan without invalid returns: points that are not finite, have a coordinate with a magnitude
     of RANGE_LIMIT or more, or are at the origin (all magnitudes up to NEAR_LIMIT). If no point is left out,
-    arrays that already have the type of `Scan` are shared with the result.
+    arrays that already have the type of `Scan` are shared with the result; reflectances that are not finite
+    are then replaced in the argument.
 
     Args:
         stamp_ns: Time of the scan [ns].
@@ -137,7 +138,8 @@ def point_offsets(time: NDArray[np.generic], stamp_ns: int) -> NDArray[np.int64]
 
 
 def _unit(largest: float) -> float | None:
-    """Return the unit [s] of times since 1970 by the largest time, None if times are relative (up to 1e8)."""
+    """Return the unit [s] of times since 1970 by the largest magnitude, None if times are relative (up to
+    1e8)."""
     for limit, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest > limit:
             return unit
@@ -145,8 +147,9 @@ def _unit(largest: float) -> float | None:
 
 
 def scan_of(stamp_ns: int, columns: Mapping[str, NDArray[np.generic]]) -> Scan:
-    """Return a scan of the columns of a table, which are found by their usual names, without invalid returns
-    (`clean_scan`). Ring numbers and times that are impossible are left out as a whole.
+    """Return a scan of the columns of a table, which are found by their usual names (REFLECTANCE, RING, TIME;
+    the first one that exists), without invalid returns (`clean_scan`). Ring numbers and times that are
+    impossible are left out as a whole.
 
     Args:
         stamp_ns: Time of the scan [ns].
@@ -171,8 +174,8 @@ VLP_16 = Sensor("VLP-16", 16, float(np.radians(2.0)), float(np.radians(0.2)), 0.
 
 
 def sensor_of(scan: Scan) -> Sensor:
-    """Infer the sensor from a scan: number of rings, their step in elevation, and the step in azimuth; the
-    range sigma is 0.03 m.
+    """Infer the sensor from a scan: number of rings (the highest ring number + 1), their step in elevation,
+    and the step in azimuth; the range sigma is 0.03 m.
 
     If the scan has no ring numbers, it is a VLP-16 if the elevations are those of this sensor, else `rings`
     is 0. For fewer than 100 points `rings` is 0 too. An unknown azimuth step is that of `Sensor`, an unknown

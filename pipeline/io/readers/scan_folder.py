@@ -97,7 +97,7 @@ class ScanFolder(FileSource):
 
     def records(self) -> Iterator[Record]:
         """Yield the scans, each after its odometry if it has a pose. Files that cannot be read, and scans
-        without points, are counted in `losses`."""
+        without points, are left out and counted in `losses`; their odometry is yielded."""
         self._losses = losses = dict[str, int]()
         for index in range(len(self._files)):
             stamp_ns = int(self._stamp[index])
@@ -173,8 +173,8 @@ class ScanFolder(FileSource):
 
     def _read_poses(self, places: list[Path], numbers: Int) -> list[Pose3 | None] | None:
         """Return the pose of each scan (None for scans without one) by the first file of poses that fits;
-        None if there is none. Times of its rows replace those of scans without times. Arguments as in
-        `_read_stamps`."""
+        None if there is none. Times of its rows replace those of scans without times, and the file is added
+        to the files of the digest. Arguments as in `_read_stamps`."""
         for path, (times, poses) in self._read_texts(places, POSES, read_any_poses):
             found = self._fitting(path.name, times, poses, numbers)
             if found is not None:
@@ -245,7 +245,7 @@ def _scan_files(path: Path) -> tuple[str, list[Path]]:
 
 def _in_order(files: list[Path]) -> list[Path]:
     """Return files sorted by the times in their names if all names are times, else by the numbers at the ends
-    of their names."""
+    of their names (those without a number first); equal ones by name."""
     by_time = all(_TIME_NAME.fullmatch(file.stem) for file in files)
     return sorted(files, key=lambda f: (_name_ns(f.stem) if by_time else _number(f), f.name))
 
@@ -283,7 +283,8 @@ HDL_64 = Sensor("HDL-64", 64, float(np.radians(0.4)), float(np.radians(0.17)), 0
 
 
 def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a KITTI .bin file as a scan; an incomplete last row is left out and counted.
+    """Read a KITTI .bin file as a scan, which may have no points. Invalid returns are left out
+    (`clean_scan`); an incomplete last row is left out and counted in `losses`.
 
     Args:
         path: The file.
@@ -309,8 +310,9 @@ def load_bin(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
 
 
 def load_table(path: Path, stamp_ns: int, losses: dict[str, int]) -> Scan:
-    """Read a PCD, PLY or NumPy file as a scan at a time [ns]. Points of NaN are left out; points of the
-    header that the file does not have are counted in `losses`, in place.
+    """Read a PCD, PLY or NumPy file as a scan at a time [ns], which may have no points. Invalid returns are
+    left out (`clean_scan`); points of the header that the file does not have are counted in `losses`, in
+    place.
 
     Raises:
         ScanFileError: The file is damaged, has no x, y and z, or its header has more than POINT_LIMIT points.

@@ -140,7 +140,8 @@ class Topics:
 
     def recorded(self) -> tuple[RecordedTopic, ...]:
         """Return all topics with the role in which each is read, the role that it could have, and the reason
-        why it is not read."""
+        why it is not read; each is "" if there is none. Topics of transforms are always read; those of
+        CameraInfo are read as "camera" if a camera is chosen."""
         reading = {topic: "transforms" for topic in self.every if topic.msgtype in TRANSFORM_TYPES}
         if "camera" in self.chosen:
             reading |= {topic: "camera" for topic in self.every if topic.msgtype == CAMERA_INFO}
@@ -166,8 +167,8 @@ def choose_topics(channels: Iterable[Channel], wanted: Mapping[str, str], where:
         channels: Channels of the recording.
         wanted: Dict from roles ("scan", "odometry", "imu", "gnss", "pose", "camera") to topics chosen by the
             user. Other roles get the topic of their type with most messages. Exceptions: "pose" is read only
-            if it is chosen; its topic is not used as odometry; LaserScan is used only if there is no other
-            topic of scans.
+            if it is chosen; its topic is not used as odometry; LaserScan is used only if no other topic of
+            scans has messages. A role without messages gets no topic, unless the user chooses one.
         where: Name of the recording in errors.
 
     Raises:
@@ -234,7 +235,7 @@ def _group(channels: Iterable[Channel]) -> list[Topic]:
 def _choose(topics: list[Topic], role: str, wanted: Mapping[str, str], where: str) -> Topic | None:
     """Return the topic of a role with the most messages, of equal ones that of the type named first in
     TYPES_BY_ROLE, then the first by name; None if there is none with messages. LaserScan is chosen only if
-    there is no other topic of scans, and the topic of the role "pose" is not chosen as odometry.
+    no other topic of scans has messages, and the topic of the role "pose" is not chosen as odometry.
 
     Args:
         topics: Topics of the recording.

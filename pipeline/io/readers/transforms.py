@@ -118,7 +118,7 @@ class Extrinsics:
 
     def base_frame(self, by_odometry: str) -> str:
         """Return the base frame: `by_odometry` if it is not "", else the child of the moving transform of the
-        odometry, else a frame with a usual name, else ""."""
+        odometry, else the first of "base_link", "base_footprint" and "base" that `tree` knows, else ""."""
         if by_odometry:
             return by_odometry
         if self.odometry_link is not None:

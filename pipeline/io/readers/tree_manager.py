@@ -124,7 +124,8 @@ def _write(folder: Path, path: MapPath, trees: Trees, reach: float) -> int:
 
 def _row(trees: Trees, k: int, place: Float) -> list[float | bool]:
     """Return the row of tree k in a frame, in the order of COLUMNS; `place` is its position in the frame,
-    shape (2,) [m]. The stem is vertical at height 0."""
+    shape (2,) [m]. The stem is vertical at height 0. "dbh_approximation" is the dbh, "score" is 1,
+    "reconstructed" is whether the dbh is known, and "number_clusters" is the number of observations."""
     dbh, upright = float(trees.dbh[k]), np.eye(3).ravel().tolist()
     fit = [dbh, dbh, 1.0, math.isfinite(dbh), int(trees.observations[k])]
     return [*upright, float(place[0]), float(place[1]), 0.0, *fit]
@@ -200,8 +201,9 @@ class TreeManagerSource(FileSource):
         )
 
     def records(self) -> Iterator[Record]:
-        """Yield odometry for each row of the trajectory, then the scan of the same time. Files and rows
-        that cannot be read are counted in `losses`."""
+        """Yield odometry for each row of the trajectory, then the scan of the same time, if the row has a
+        file that can be read; a scan without stems is yielded. Files and rows that cannot be read are counted
+        in `losses`."""
         self._losses = losses = dict[str, int]()
         file_of = dict(zip(self._row.tolist(), self._files, strict=True))
         for row in range(len(self._stamp)):
@@ -306,10 +308,11 @@ def _numbers(body: bytes, columns: int) -> tuple[Float, int]:
 
 
 def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
-    """Return the times [ns], int64, shape (N,), ascending, and the poses of the sensor in a file.
+    """Return the times [ns], int64, shape (N,), strictly ascending, and the poses of the sensor in a file.
 
     Raises:
-        SourceError: The file is missing, damaged, or its times do not ascend.
+        SourceError: The file is missing, damaged, or its times do not strictly ascend or are _TIME_LIMIT or
+            more.
         OSError: The file cannot be read.
     """
     remedy = "It needs a row `time x y z qx qy qz qw` for each TreeManagerState file."

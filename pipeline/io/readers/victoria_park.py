@@ -166,8 +166,9 @@ class VictoriaParkSource(FileSource):
         return clean_scan(int(self._scan_ns[index]), points, dropped=int(BEAMS - np.count_nonzero(seen)))
 
     def _read_laser(self, text: bytes, uri: str) -> tuple[Int, NDArray[np.float32]]:
-        """Return times [ns], int64, shape (N,), and ranges [m], shape (N, BEAMS). Scans with impossible
-        times, and an incomplete one at the end, are counted as damage.
+        """Return times [ns], int64, shape (N,), and ranges [m], shape (N, BEAMS). Scans with impossible times
+        or numbers that are not finite, and an incomplete one at the end, are left out and counted as damage.
+        Text after the first word that is not a number is ignored and not counted.
 
         Raises:
             SourceError: There is no valid scan.
@@ -187,8 +188,8 @@ class VictoriaParkSource(FileSource):
 
     def _read_encoders(self, text: bytes, uri: str) -> tuple[Int, Float]:
         """Return times [ns], shape (N,), and poses by dead reckoning, x, y [m], yaw [rad], shape (N, 3). If
-        the first scan is before the first encoder reading, the first pose is added at the time of this scan;
-        readings out of bounds are counted.
+        the first scan is before the first encoder reading, the first pose is added at the time of this scan.
+        Readings with impossible times, or of _FASTEST or _STEEPEST and more, are left out and counted.
 
         Raises:
             SourceError: There is no valid reading.
@@ -208,8 +209,8 @@ class VictoriaParkSource(FileSource):
         return stamp_ns, poses
 
     def _read_gps(self, text: bytes) -> TruthPath | None:
-        """Return the path by GPS, x east, y north [m], without yaw; None if there are no valid rows. Other
-        rows are counted as damage."""
+        """Return the path by GPS, x east, y north [m], with NaN as yaw; None if there are no valid rows.
+        Other rows are left out and counted as damage."""
         table = self._ascending(self._rows(text, "GPS.txt"), "GPS rows with impossible times")
         near = (np.abs(table[:, 1:]) < COORDINATE_LIMIT).all(axis=1)
         if not near.all():

@@ -141,7 +141,7 @@ def write_recording(
     truth: Truth | None = None,
     camera: Camera | None = None,
 ) -> int:
-    """Write a run; the file appears when it is complete.
+    """Write a run; the file appears when it is complete, and replaces an existing one.
 
     The frames are odom -> base_link -> velodyne. Every message is logged at the time of its record. The same
     records give the same bytes.
@@ -156,7 +156,7 @@ def write_recording(
 
     Returns:
         Number of messages: two for an odometry or a picture, one for a scan or an IMU reading, and the static
-        transforms. Other records are left out.
+        transforms (one for the LiDAR, one for a camera; none without records). Other records are left out.
 
     Raises:
         StemmapError: ROS cannot represent a time, or writing fails.

@@ -25,6 +25,7 @@ def make(name: str, /, **fields: Any) -> Message:  # noqa: ANN401
     """Return a message of a type, e.g. "std_msgs/Header", with all its fields.
 
     Raises:
+        ValueError: The name does not have exactly one slash.
         KeyError: The type is unknown.
         TypeError: A field is missing or unknown.
     """
@@ -268,7 +269,7 @@ def type_hash(topic: str) -> str:
 
 def scan_messages(frame: Frame) -> dict[str, bytes]:
     """Return a dict from topics to messages of a scan in CDR: those of `pose_messages` and
-    `clearance_messages`."""
+    `clearance_messages`, i.e. POSE and ODOMETRY, and with a clearance CLEARANCE and ZONE."""
     return pose_messages(frame) | clearance_messages(frame.clearance, frame.stamp_ns)
 
 
@@ -333,7 +334,7 @@ def tree_messages(trees: Trees, head: Any) -> dict[str, bytes]:  # noqa: ANN401
 
 def _path(path: Path, head: Any) -> Any:  # noqa: ANN401
     """Return a nav_msgs/Path with at most MOST_POSES poses, evenly thinned, the last one included; empty for
-    an empty path."""
+    an empty path. Each pose has its own time, clipped to ROS times, and the frame MAP."""
     step = max(1, -(-len(path.x) // MOST_POSES))
     # Counted from the end, so that the pose of the robot is always included.
     rows = range((len(path.x) - 1) % step, len(path.x), step) if len(path.x) else range(0)

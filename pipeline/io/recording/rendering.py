@@ -57,8 +57,8 @@ def with_pictures(
 
 def rendered(trees: TruthTrees, pose: tuple[float, float, float]) -> bytes:
     """Return a JPEG of WIDTH x HEIGHT pixels with the objects as rectangles before ground and sky, nearest
-    ones last. Objects less than 0.4 m in front of the camera or behind it are omitted; one without diameter
-    gets a default width.
+    ones last. Objects less than _NEAR in front of the camera or behind it are omitted; one without diameter
+    has the width _THIN (a pole) or _SIDE.
 
     Args:
         trees: Trees and other objects.
