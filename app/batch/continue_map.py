@@ -218,7 +218,8 @@ def continue_map(
     seed: int,
     warnings: list[str],
 ) -> RunStart:
-    """Load the saved map into a new mapper, and return how the run begins in it.
+    """Load the saved map into a new mapper, and return how the run begins in it. With another start than
+    "resume", times of the new run are shifted to follow those of the saved one.
 
     Args:
         continued: The saved run, and where the robot starts; the totals of the saved run are continued in

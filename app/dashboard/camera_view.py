@@ -52,8 +52,8 @@ class CameraView:
 
     async def look(self, frame: Frame, path: Path | None) -> dict[str, Any]:
         """Return the description of the camera picture nearest to a scan as a dict of JSON values; `jpeg`
-        returns the picture itself. Calls wait for one another, so that there are at most about three pictures
-        per second.
+        returns the picture of this `stamp_ns`. Calls wait for one another, so that there are at most about
+        three pictures per second.
 
         The keys are `index` of the scan; `of`, a number of the run; `stamp_ns`, the time of the picture as a
         string; `later_ms`, this time minus that of the scan; `marks`, the result of `marks_of`, empty if the
@@ -84,8 +84,9 @@ class CameraView:
                     )
                 self._check(of)
                 self._kept[picture.stamp_ns] = content
-                while len(self._kept) > _MOST_KEPT:
-                    self._kept.popitem(last=False)
+            self._kept.move_to_end(picture.stamp_ns)  # the page asks for it next
+            while len(self._kept) > _MOST_KEPT:
+                self._kept.popitem(last=False)
         camera, moved = found.camera, motion(path, frame.stamp_ns, picture.stamp_ns)
         return {
             "index": frame.index,

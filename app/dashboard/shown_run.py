@@ -123,7 +123,8 @@ class ShownRun:
     @contextmanager
     def folder(self) -> Iterator[FilePath]:
         """Write the run to a temporary folder, as `stemmap map` and `stemmap georeference` do, and yield it;
-        it is removed afterwards. Raises StemmapError if a file cannot be written."""
+        it is removed afterwards. Raises StemmapError if a file cannot be written, and OSError without a place
+        for the folder."""
         with TemporaryDirectory(prefix="stemmap-run-") as name:
             write_texts(FilePath(name), self.texts())
             if self.frame is not None and self.frame.content.plot is not None:

@@ -357,9 +357,9 @@ class Link(ABC):
         self.thread.join(timeout=_CLOSE_S)
 
     def take(self, channel: Channel, payload: Any, size: int) -> None:  # noqa: ANN401 - bytes of a library
-        """Put a message into the inbox with its time of arrival; bytes are copied only if the inbox accepts
-        them. A message larger than MESSAGE_LIMIT is dropped and counted in `losses`. Scans, also dropped
-        ones, are counted in `scans`.
+        """Put a message into the inbox with its time of arrival; a full inbox skips its oldest scan, and
+        pictures are copied only if it accepts them. A message larger than MESSAGE_LIMIT is dropped and
+        counted in `losses`. Scans, also dropped ones, are counted in `scans`.
 
         Args:
             channel: Channel of the message.

@@ -313,14 +313,10 @@ _HALF = 1 << 20  # largest cell coordinate of a key
 
 
 class Accumulated:
-    """Filtered points of all scans in the frame of the map, one per cell, placed by the pose of their scan.
-
-    Attributes:
-        left_out: Number of cells left out because of the limit MOST_POINTS.
-    """
+    """Filtered points of all scans in the frame of the map, one per cell and at most MOST_POINTS, placed by
+    the pose of their scan."""
 
     def __init__(self) -> None:
-        self.left_out = 0
         self._recent: list[_PlacedScan] = []
         self._rows = GrowingColumns(np.zeros((0, 3), np.float32), np.zeros(0, np.int64))  # points, cells
         # Columns, not objects: each scan of a long drive adds a row. Scan, points before it, pose.
@@ -337,8 +333,8 @@ class Accumulated:
         first.
 
         Nothing is added to `points` if the robot moved less than STEP and turned less than TURN since the
-        last added scan. Only the first point of each cell is kept; above MOST_POINTS points are counted in
-        `left_out`. The time windows of `points_of` do not depend on the motion.
+        last added scan. Only the first point of each cell is kept, and none beyond MOST_POINTS. The time
+        windows of `points_of` do not depend on the motion.
 
         Returns:
             Whether `points` changed.
@@ -354,11 +350,8 @@ class Accumulated:
             if np.hypot(*moved[:2]) < STEP and turned < TURN:
                 return went_back
         keys, first = np.unique(_keys(placed), return_index=True)
-        new = np.sort(first[~np.isin(keys, self._rows.column(1))])
         count = len(self._rows)
-        room = MOST_POINTS - count
-        self.left_out += max(0, len(new) - room)
-        new = new[:room]
+        new = np.sort(first[~np.isin(keys, self._rows.column(1))])[: MOST_POINTS - count]
         row = len(scans)
         if row and before[-1] == count:
             row -= 1  # it added no point, and only the last such scan is needed, for its pose
@@ -394,15 +387,13 @@ class Accumulated:
             del self._recent[0]
 
     def _go_back(self, index: int) -> bool:
-        """Remove the points of the scan with this index and of later ones, and reset `left_out` if there were
-        any; return whether there were."""
+        """Remove the points of the scan with this index and of later ones; return whether there were any."""
         scans = self._scans.column(0)
         row = int(np.searchsorted(scans, index))
         if row == len(scans):
             return False
         self._rows.return_to(int(self._scans.column(1)[row]))
         self._scans.return_to(row)
-        self.left_out = 0
         return True
 
 

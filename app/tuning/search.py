@@ -235,7 +235,8 @@ class Search:
     def _complete_in_order(self) -> None:
         """Make trials of the sets whose runs are all scored, in the order of suggestion, up to the first set
         with a run that is not scored. The first set becomes `start`. If a set is the best so far and its
-        held-out runs are not scored, they are queued and the set is not a trial yet."""
+        held-out runs are not scored, they are queued and the set is not a trial yet. A set without runs,
+        because its values contradict one another, becomes a trial without a loss."""
         while self._attempts and len(self._attempts[0].scores) == len(self._attempts[0].runs):
             attempt, loss = self._attempts[0], None
             training, held_out = attempt.scores_of(self._training), attempt.scores_of(self._held_out)

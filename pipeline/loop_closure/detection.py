@@ -243,8 +243,8 @@ def _way(path: Float) -> Float:
 
 
 def _stems(place: Float, covariance: Float) -> MapStems:
-    """Return stems without diameters, which are unknown for distant trees. Their sigma is limited to SIGMA,
-    since the error that all positions share is what the match finds. `place` has the shape (N, 2) [m],
-    `covariance` xx, xy, yy, shape (N, 3) [m^2]."""
+    """Return stems without diameters, which are unknown for distant trees. Their sigma, that of the
+    most uncertain direction, is limited to SIGMA, since the error that all positions share is what the match
+    finds. `place` has the shape (N, 2) [m], `covariance` xx, xy, yy, shape (N, 3) [m^2]."""
     unknown = np.full(len(place), np.nan)
     return MapStems(place, np.minimum(worst_sigma(covariance), SIGMA), unknown, unknown)

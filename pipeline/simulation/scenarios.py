@@ -358,8 +358,8 @@ def parse_uri(uri: str, seed: int = 0) -> RunRequest:
 
 
 def _pairs(uri: str, query: str, keys: dict[str, str]) -> dict[str, str]:
-    """Return a dict from the keys to the decoded values of the options of a URI; empty for an empty query. A
-    value may be empty.
+    """Return a dict from the keys to the decoded values ("+" is a space) of the options of a URI; empty for
+    an empty query. A value may be empty.
 
     Args:
         uri: The URI, for errors.

@@ -246,7 +246,7 @@ async def _receive(browser: WebSocket, dashboard: Dashboard, *, may_select: bool
     Args:
         browser: Websocket of the browser.
         dashboard: The dashboard, whose selection changes.
-        may_select: Whether selections are processed; otherwise they are ignored.
+        may_select: Whether valid selections are processed; otherwise they are ignored.
     """
     while (event := await browser.receive())["type"] != "websocket.disconnect":
         try:

@@ -142,7 +142,7 @@ async def add(body: _AddPlot, dashboard: Dash) -> Response:
 @router.post("/plots/along")
 async def add_along(body: _Along, dashboard: Dash) -> Response:
     """Add circles along the path in one edit; responses as in `add`, and 409 before the first scan, 422 if
-    there would be too many."""
+    there would be too many or, as the path is shorter than half of `every`, none."""
     if dashboard.path is None:
         raise NothingMappedError
     with as_bad_request():

@@ -50,8 +50,9 @@ async def start_search(
     body: SearchRequest, dashboard: Dash, settings: Deployment, any_file: AnyFile
 ) -> Response:
     """POST /api/search: start a search over the open run, from its first scan to its last, and over other
-    recorded runs. Return the state of the search, with 202; 409 while another search runs, or if the run
-    cannot be searched over; 422 for invalid parameters or bounds. A stopped search is removed."""
+    recorded runs. Return the state of the search, with 202; 409 while another search runs, if the open run or
+    one of the others cannot be searched over, is unknown or named twice, if there are too many, or if the
+    store cannot be read; 422 for invalid parameters or bounds. A stopped search is removed."""
     await dashboard.search.start(await _plan(dashboard, settings, any_file, body), body)
     return json_reply(dashboard.search.as_plain(), 202)
 

@@ -429,8 +429,9 @@ def align_poses(
         path: Poses of the base by odometry in the map frame: x, y [m], yaw [rad], shape (N, 3).
 
     Returns:
-        The frame and "", or None and the reason why there is none, see `fit_rigid`. Headings that differ from
-        those of the odometry by more than SCATTER (RMS) are not used.
+        The frame and "", or None and the reason why there is none, see `fit_rigid`. The yaw of the frame is
+        from the positions alone. If the differences between the headings and those of the odometry scatter
+        about their mean by more than SCATTER (RMS), the headings are not used: `turn` is None.
     """
     at_ns = np.array([pose.stamp_ns for pose in poses], dtype=np.int64)
     other = np.array([pose.T_other_base.as_array() for pose in poses]).reshape(-1, 3)
@@ -443,12 +444,13 @@ def align_poses(
         return None, why
     ours = interpolated(at_ns, stamp_ns, np.column_stack([np.cos(path[:, 2]), np.sin(path[:, 2])]))
     off = wrap_angle(np.arctan2(ours[:, 1], ours[:, 0]) - other[:, 2])
+    off = off[(at_ns >= stamp_ns[0]) & (at_ns <= stamp_ns[-1])]
     turn = math.atan2(float(np.sin(off).mean()), float(np.cos(off).mean()))
     scatter = float(np.sqrt(np.square(wrap_angle(off - turn)).mean()))
     # In the middle of the stretch a third of the variance of the drift has accumulated.
     drift, turn_drift = DRIFT**2 * fit.length / 3.0, TURN_DRIFT**2 * fit.length / 3.0
     own = math.sqrt(float(np.median([pose.covariance[2, 2] for pose in poses])))
-    heading = max(own, scatter) / math.sqrt(max(len(poses) / 10.0, 1.0))
+    heading = max(own, scatter) / math.sqrt(max(len(off) / 10.0, 1.0))
     return OtherFrame(
         fit,
         math.sqrt(fit.sigma**2 + drift),

@@ -224,7 +224,8 @@ class VictoriaParkSource(FileSource):
         )
 
     def _rows(self, text: bytes, name: str) -> Float:
-        """Return the rows of three numbers of a text file, shape (N, 3), and count its damaged lines."""
+        """Return the rows of three numbers of a text file, shape (N, 3), and count its damaged lines as
+        losses. Numbers may be NaN or infinite; `_ascending` leaves such rows out."""
         table, damaged = parse_table(text, 3)
         if damaged:
             count_loss(self._damage, f"damaged rows of {name}", damaged)
