@@ -61,7 +61,7 @@ def row(particles: int, landmarks: int, steps: int, peer_steps: int) -> tuple[Ce
         "ours": Driven(_ours(particles, landmarks), landmarks, known=True)
     }
     if peer_steps:
-        sides["peer"] = Driven(_peer(particles), landmarks)
+        sides["peer"] = Driven(plain_python(particles), landmarks)
     side_by_side = in_turns(sides, peer_steps) if peer_steps else {"peer": []}
     ours = in_turns({"ours": sides["ours"]}, steps)["ours"]
     peer = middle(side_by_side["peer"]) if peer_steps else None
@@ -168,7 +168,8 @@ def detections_of(seen: Float, sigma: float) -> Detections:
     return Detections(np.arange(len(seen)), seen, covariance, unknown, unknown, np.zeros(len(seen)), unknown)
 
 
-def _peer(particles: int) -> Feed:
+def plain_python(particles: int) -> Feed:
+    """Return the filter of the peer, which gets the map by observations."""
     import numpy as np
 
     from pipeline.config import Parameters
