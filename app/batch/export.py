@@ -319,8 +319,7 @@ def _plot_table(run: ExportedRun) -> dict[str, Any]:
 
 def _write_layers(run: ExportedRun, file: FilePath) -> None:
     """Write a GeoPackage with the layers of `_layers`, which also raises, and their styles."""
-    import pyogrio
-
+    pyogrio = gis_package("pyogrio", "GIS files")
     pyogrio.set_gdal_config_options({"OGR_CURRENT_DATE": _DATE.strftime("%Y-%m-%dT%H:%M:%S.000Z")})
     try:
         for name, layer in _layers(run).items():
@@ -408,8 +407,7 @@ _STYLES = {
 def _write_shapefiles(run: ExportedRun, file: FilePath) -> None:
     """Write a Shapefile per layer: the trees to `file`, the others to `file` with `_` and the name of the
     layer. Columns have their short names; a local map has no .prj. Layers and errors as in `_layers`."""
-    import pyogrio
-
+    pyogrio = gis_package("pyogrio", "GIS files")
     short = {field.name: field.short for fields in LAYER_FIELDS.values() for field in fields}
     for name, layer in _layers(run).items():
         part = file if name == "trees" else file.with_name(f"{file.stem}_{name}{file.suffix}")

@@ -6,6 +6,7 @@ import csv
 import json
 import math
 import sqlite3
+import sys
 import xml.etree.ElementTree as ElementTree
 import zipfile
 from pathlib import Path
@@ -219,19 +220,13 @@ def test_what_cannot_be_written_is_refused(runs, capsys, tmp_path, monkeypatch, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_missing_package_is_named_with_its_extra(runs, capsys, tmp_path, monkeypatch):
-    import importlib
-
-    real = importlib.import_module
-
-    def without(name, package=None):
-        if name == "xlsxwriter":
-            raise ImportError(name)
-        return real(name, package)
-
-    monkeypatch.setattr(importlib, "import_module", without)
-    result = stemmap(capsys, "export", runs["local"], "--to", tmp_path / "x.xlsx")
-    result.refused(1, "xlsxwriter", "stemmap[gis]")
+@pytest.mark.parametrize(
+    ("suffix", "package"), [("xlsx", "xlsxwriter"), ("gpkg", "pyogrio"), ("shp", "pyogrio")]
+)
+def test_a_missing_package_is_named_with_its_extra(runs, capsys, tmp_path, monkeypatch, suffix, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    result = stemmap(capsys, "export", runs["local"], "--to", tmp_path / f"x.{suffix}")
+    result.refused(1, package, "stemmap[gis]")
 
 
 def test_a_cloud_with_a_reference_system_keeps_it(tmp_path, capsys):
