@@ -297,16 +297,21 @@ def place_words(crs: str, point: Float) -> str:
 
 def read_map_frame(folder: FilePath) -> MapFrame:
     """Return the frame of the map of a run: that of georeference.json, else that of a whole cloud with a
-    reference system, else the local one. The reference system is not checked.
+    known reference system, else the local one.
 
     Raises:
-        SourceError: run.json is missing, or a file is damaged.
+        SourceError: run.json is missing, or a file is damaged, as by an unknown reference system.
     """
+    import pyproj
+
     record = read_run_record(folder)
     file = folder / FILE
     if not file.is_file():
         crs = str(record["source"].get("crs") or "") if is_of_cloud(record) else ""
-        return MapFrame(crs, method="cloud" if crs else "")
+        try:
+            return MapFrame(_known(crs), method="cloud" if crs else "")
+        except pyproj.exceptions.ProjError:  # `stemmap map` warned of it
+            return MapFrame()
     try:
         if file.stat().st_size > _LARGEST_FILE:
             raise ValueError("too large")
@@ -317,12 +322,23 @@ def read_map_frame(folder: FilePath) -> MapFrame:
         if not all(abs(v) < COORDINATE_LIMIT for v in (x, y, yaw, z)):
             raise ValueError("out of range")
         method, numbers, note = _method_of(given)
-        crs, place = str(given["crs"]), str(given.get("place", ""))
+        crs, place = _known(str(given["crs"])), str(given.get("place", ""))
         return MapFrame(crs, Pose2(x, y, yaw), z, method, numbers, note, sigma, residuals, place)
-    except (ValueError, KeyError, TypeError, RecursionError, OSError):
+    except (ValueError, KeyError, TypeError, RecursionError, OSError, pyproj.exceptions.ProjError):
         raise SourceError(
             f"{FILE} is damaged", where=str(folder), remedy="Run stemmap georeference again"
         ) from None
+
+
+def _known(crs: str) -> str:
+    """Return a reference system as it is; "" for none.
+
+    Raises:
+        pyproj.exceptions.ProjError: It is unknown or has no transformation to WGS84.
+    """
+    if crs:
+        reproject(np.zeros((0, 2)), crs, WGS84)
+    return crs
 
 
 def _method_of(given: dict[str, Any]) -> tuple[str, dict[str, float], str]:

@@ -18,7 +18,8 @@ import pyproj
 import pytest
 import rasterio
 
-from app.batch.export import LAYER_FIELDS
+from app.batch.export import LAYER_FIELDS, LOCAL_WKT
+from app.batch.georeference import read_map_frame
 from app.batch.run_folder import read_run
 from pipeline.geometry.poses import Pose2
 from tests.app.batch.finished_runs import grid_run, write_run
@@ -239,3 +240,13 @@ def test_a_cloud_with_a_reference_system_keeps_it(tmp_path, capsys):
     assert Path(run / "trees.csv").is_file()
     with (run / "trees.csv").open(newline="") as text:
         assert len(list(csv.reader(text))) == 101
+
+
+@pytest.mark.parametrize("crs", ["no system", LOCAL_WKT])
+def test_a_cloud_whose_reference_system_is_unknown_is_local(tmp_path, capsys, crs):
+    run = grid_run(tmp_path / "cloud", cloud_crs=crs)
+    assert read_map_frame(run).crs == ""
+    for suffix in ("gpkg", "geojson"):
+        result = stemmap(capsys, "export", run, "--to", tmp_path / f"x.{suffix}")
+        assert result.code == 0, result.err
+        assert "100 trees in local coordinates" in result.out
