@@ -249,7 +249,7 @@ def _moved_rows(
             [str(int(row[0]) + scans), f"{float(row[1]) + seconds:.3f}", f"{x:.3f}", f"{y:.3f}", *row[4:]]
             for row, (x, y) in zip(rows, at.tolist(), strict=True)
         ]
-    except (OSError, ValueError, IndexError):
+    except (OSError, ValueError, IndexError, csv.Error):
         raise StemmapError(
             "its detections cannot be read", where=str(file), remedy="Map the run again"
         ) from None

@@ -257,7 +257,11 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
         SourceError: The file cannot be read or is larger than 256 MB, has another header or a damaged row, or
             a cell of `_NEVER_EMPTY` is empty.
     """
-    rows = list(csv.reader(_text(file).splitlines()))
+    damaged = SourceError("a row is damaged", where=str(file), remedy="Map the run again")
+    try:
+        rows = list(csv.reader(_text(file).splitlines()))
+    except csv.Error:
+        raise damaged from None
     missing = tuple(name for name in NEW_TREE_COLUMNS if name in names and rows and name not in rows[0])
     known = tuple(name for name in names if name not in missing)
     if not rows or tuple(rows[0]) != known:
@@ -265,7 +269,7 @@ def _columns(file: FilePath, names: tuple[str, ...]) -> dict[str, Float]:
     try:
         columns = _table(rows[1:], known)
     except ValueError:
-        raise SourceError("a row is damaged", where=str(file), remedy="Map the run again") from None
+        raise damaged from None
     columns.update({name: np.full(len(rows) - 1, math.nan) for name in missing})
     for name in _NEVER_EMPTY.intersection(names):
         if not np.all(np.isfinite(columns[name])):

@@ -1,4 +1,4 @@
-"""Partial outputs that killed runs left."""
+"""Partial outputs that killed runs left, and damaged files of runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from app.batch.run_folder import read_run
 from app.cli import main
+from pipeline.errors import SourceError
+from tests.app.batch.finished_runs import grid_run
 
 
 def test_a_map_says_at_its_start_what_lies_in_its_folder(
@@ -18,3 +21,11 @@ def test_a_map_says_at_its_start_what_lies_in_its_folder(
     first, second, *_ = capsys.readouterr().err.splitlines()
     assert ".unfinished-abc is the partial output of a run that was killed" in first
     assert "unfinished" not in second
+
+
+def test_a_cell_that_is_too_long_is_a_damaged_row(tmp_path: Path) -> None:
+    folder = grid_run(tmp_path / "run")
+    with (folder / "trees.csv").open("a") as file:
+        file.write("1" * 140_000)
+    with pytest.raises(SourceError, match="a row is damaged"):
+        read_run(folder)

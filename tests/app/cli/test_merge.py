@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -139,3 +140,12 @@ def test_another_stand_is_refused(runs, tmp_path, capsys):
 def test_a_run_without_a_state_is_refused(runs, tmp_path, capsys):
     assert main(["merge", str(runs / "a"), str(tmp_path), "--out", str(tmp_path / "out")]) == 1
     assert "no saved state" in capsys.readouterr().err
+
+
+def test_damaged_detections_are_refused(runs, tmp_path, capsys):
+    shutil.copytree(runs / "b", tmp_path / "b")
+    with (tmp_path / "b" / "detections.csv").open("a", encoding="utf-8") as file:
+        file.write("1" * 140_000)
+    assert main(["merge", str(runs / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "out")]) == 1
+    assert "its detections cannot be read" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
