@@ -90,8 +90,8 @@ def read_run(folder: FilePath) -> FinishedRun:
     try:
         parameters = validated(dict(record["parameters"]))
         uri, seed = str(record["source"]["uri"]), int(record["seed"])
-    except (ValueError, KeyError, TypeError, ParameterError):
-        raise _damaged(folder) from None
+    except (ValueError, KeyError, TypeError, OverflowError, ParameterError):
+        raise damaged_record(folder) from None
     columns = _columns(folder / "trees.csv", TREE_COLUMNS)
     states = [REVIEWS[k] for k in np.nan_to_num(columns["review"]).astype(np.int64)]
     trees = rows_of(_trees(columns), kept := np.array([state != REJECTED for state in states], np.bool_))
@@ -182,10 +182,10 @@ def read_run_record(folder: FilePath) -> dict[str, Any]:
             return dict(record)
     except (ValueError, KeyError, TypeError, RecursionError):
         pass
-    raise _damaged(folder)
+    raise damaged_record(folder)
 
 
-def _damaged(folder: FilePath) -> SourceError:
+def damaged_record(folder: FilePath) -> SourceError:
     """Return the error of a folder with a damaged run.json."""
     return SourceError("run.json is damaged", where=str(folder), remedy="Map the run again")
 

@@ -96,13 +96,18 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
     """
     import numpy as np
 
-    from app.batch.run_folder import read_run
+    from app.batch.run_folder import damaged_record, read_run
     from app.batch.summary import lost_share
     from app.dashboard.payload import trees_payload
     from app.dashboard.run_recorder import thinned
 
     run = read_run(Path(question["path"]))
     record = run.record
+    try:
+        scans, time_s = int(record.get("scans") or 0), float(record.get("duration_s") or 0.0)
+        lost = lost_share(record.get("health", {}).get("scans", {}))
+    except (ValueError, TypeError, AttributeError, OverflowError):
+        raise damaged_record(Path(question["path"])) from None
     path_xy = np.stack([run.path.x, run.path.y], axis=1)
     trees = [{**tree, "review": run.reviews[tree["number"]]} for tree in trees_payload(run.trees, 0)]
     return {
@@ -112,10 +117,10 @@ def finished(question: dict[str, Any]) -> dict[str, Any]:
         "odometry": str(record.get("odometry") or "auto")[:LONGEST_URI],
         "seed": run.seed,
         "chosen": record.get("chosen"),
-        "scans": int(record.get("scans") or 0),
-        "time_s": float(record.get("duration_s") or 0.0),
+        "scans": scans,
+        "time_s": time_s,
         "distance_m": float(np.hypot(*np.diff(path_xy, axis=0).T).sum()) if len(path_xy) else 0.0,
-        "lost": lost_share(record.get("health", {}).get("scans", {})),
+        "lost": lost,
         "trees": len(trees),
         "rejected": run.rejected,
         "preset": str(record.get("preset", ""))[:100],

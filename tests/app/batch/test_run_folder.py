@@ -29,3 +29,11 @@ def test_a_cell_that_is_too_long_is_a_damaged_row(tmp_path: Path) -> None:
         file.write("1" * 140_000)
     with pytest.raises(SourceError, match="a row is damaged"):
         read_run(folder)
+
+
+def test_a_seed_that_is_no_number_is_a_damaged_record(tmp_path: Path) -> None:
+    folder = grid_run(tmp_path / "run")
+    file = folder / "run.json"
+    file.write_text(file.read_text().replace('"seed": 0', '"seed": Infinity'))
+    with pytest.raises(SourceError, match=r"run\.json is damaged"):
+        read_run(folder)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Sequence
 from math import radians
 from pathlib import Path
@@ -28,6 +30,7 @@ from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.topics import IMAGE, NAV_SAT_FIX, POINT_CLOUD
 from pipeline.io.recording import write_recording
 from pipeline.types.records import Sensor
+from tests.app.batch.finished_runs import grid_run
 from tests.app.fakes import FakeSource, FakeWorker, make_mapper
 from tests.app.robot.conftest import clouds
 from tests.app.server_for_tests import BEARER, Running, running
@@ -218,3 +221,15 @@ async def test_a_whole_cloud_is_checked_without_a_drive_through_it(tmp_path: Pat
     damaged.write_bytes(file.read_bytes()[:300])
     with pytest.raises(SourceError):
         await check_source(SourceRequest(str(damaged)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"scans": "many"}, {"scans": math.inf}, {"duration_s": [1]}, {"health": []}, {"health": {"scans": 3}}],
+)
+def test_a_damaged_record_of_a_run_is_named(tmp_path: Path, changes: dict[str, Any]) -> None:
+    folder = grid_run(tmp_path / "run")
+    file = folder / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    with pytest.raises(SourceError, match=r"run\.json is damaged"):
+        inspection_process.finished({"path": str(folder)})
