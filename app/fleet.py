@@ -29,7 +29,7 @@ from app.dashboard.broadcast import Broadcast
 from app.dashboard.dashboard import Dashboard
 from app.dashboard.parameters import ParameterState
 from app.dashboard.payload import clearance_payload, trees_payload
-from app.robot.address import ROOT, ZenohAddress
+from app.robot.address import ROOT, ZenohAddress, is_live
 from app.robot.link import Inbox
 from app.robot.zenoh import ZenohLink
 from app.sources import inspection
@@ -484,14 +484,14 @@ async def warm_kernels(command: Sequence[str] = WARMING) -> None:
 
 
 def named(sources: Sequence[Open]) -> dict[str, Open]:
-    """Return the sources by short names: the whole URI of a simulated run or of a URI with "?", for any other
-    file or address the stem of its last part, with " (2)" and so on appended if two are equal. With several
-    sources, the names of their recordings get the name, see `recorded_apart`."""
+    """Return the sources by short names: the whole URI of a simulated run or of a URI with "?", the last part
+    of any other address, the stem of any other file, with " (2)" and so on appended if two are equal. With
+    several sources, the names of their recordings get the name, see `recorded_apart`."""
     found: dict[str, Open] = {}
     for source in sources:
         short = source.uri
         if "?" not in short and not short.startswith("sim:"):
-            short = Path(short).stem or short
+            short = (Path(short).name if is_live(short) else Path(short).stem) or short
         name, k = short, 1
         while name in found:
             k += 1

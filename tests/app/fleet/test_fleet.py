@@ -181,6 +181,15 @@ def test_runs_are_named_by_their_files_and_record_apart():
     assert next(iter(named(runs[:1]).values())).record == "/data/live.mcap"
 
 
+def test_robots_are_named_by_their_whole_address():
+    uris = ("zenoh:tcp/192.168.1.5:7447", "zenoh:tcp/192.168.1.6:7447", "velodyne:192.168.1.201")
+    assert list(named([Open(uri) for uri in uris])) == [
+        "192.168.1.5:7447",
+        "192.168.1.6:7447",
+        "velodyne:192.168.1.201",
+    ]
+
+
 async def begun(fleet: Fleet, name: str) -> None:
     async with asyncio.timeout(60):
         while not fleet.members[name].started:
