@@ -565,11 +565,15 @@ class RobotWatch:
         await asyncio.to_thread(self._link.close)
 
     async def _watch(self) -> None:
-        """Add the robots of the router every 0.5 s until the task is cancelled. While the fleet is empty,
-        `notice` has the problem or that no robot is announced; with the first robot it is cleared."""
+        """Add the robots of the router every 0.5 s until the task is cancelled; errors are only logged. While
+        the fleet is empty, `notice` has the problem or that no robot is announced; with the first robot it is
+        cleared."""
         while True:
             for robot in self._link.robots():
-                self.take(robot)
+                try:
+                    self.take(robot)
+                except Exception:  # the other robots are still to be added
+                    _log.exception("the robot %r could not be added", robot)
             if not self._fleet.members:
                 problem = self._link.problem
                 self._fleet.notice = problem or f"Waiting: no robot is announced at {self._address.endpoint}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from app.fleet import NAMELESS, RobotWatch, address_of, recorded_apart
@@ -52,6 +54,30 @@ async def test_robots_that_are_called_alike_are_all_shown_and_recorded_apart():
     records = [member.source.record for member in fleet.members.values()]
     assert len({record.casefold() for record in records}) == len(robots)
     assert records[1:4] == [f"/nowhere/live-{end}.mcap" for end in ("robot", "a_b", "a_b-2")]
+    await watching.close()
+    await fleet.close()
+
+
+async def test_a_robot_that_cannot_be_added_does_not_keep_others_out(monkeypatch: pytest.MonkeyPatch):
+    assert isinstance(ROUTER, ZenohAddress)
+    fleet = make(free_port())
+    add = fleet.add
+
+    def fails_for_red(name: str, source: Open) -> bool:
+        if name == "red":
+            raise RuntimeError("no memory")
+        return add(name, source)
+
+    monkeypatch.setattr(fleet, "add", fails_for_red)
+    watching = RobotWatch(fleet, ROUTER, Open(""))
+    monkeypatch.setattr(watching._link, "robots", lambda: ["red", "blue"])
+    watching.start()
+    async with asyncio.timeout(20):
+        while not fleet.members:
+            await asyncio.sleep(0.01)
+    assert list(fleet.members) == ["blue"]
+    assert watching._task is not None
+    assert not watching._task.done()
     await watching.close()
     await fleet.close()
 
