@@ -74,8 +74,8 @@ class TuneSearch:
         return self.plan is not None and not self.is_under_way and len(self._trials) < self.plan.trials
 
     async def start(self, plan: Plan, request: SearchRequest | None = None) -> None:
-        """Start a search in a child process, and send its state. The search before is removed, also if no
-        process can be started; then no state is sent.
+        """Start a search in a child process, and send its state. The search before is removed; if no process
+        can be started, it stays, and no state is sent.
 
         Args:
             plan: The search.
@@ -87,8 +87,8 @@ class TuneSearch:
         if self.is_under_way or self._turn.locked():
             raise StemmapError("a search is under way", remedy="Stop it first")
         async with self._turn:
-            self._forget()
             process = self._process = await ChildProcess.start(self._command)
+            self._forget()
             self.plan, self.request, self._state = plan, request, "looking"
             self._task = asyncio.create_task(self._listen(process), name="search")
             self._task.add_done_callback(lambda _: self.show())  # from now on it can continue

@@ -107,6 +107,18 @@ async def test_a_search_that_fails_says_why_and_another_can_begin(command, words
         assert words in told[-1]["error"]
 
 
+async def test_the_search_before_stays_if_no_process_can_be_started():
+    told: list[dict[str, Any]] = []
+    search = TuneSearch(told.append, says(*SAID))
+    await search.start(PLAN)
+    await until(lambda: not search.is_under_way)
+    search._command = ["/no/such/program"]
+    with pytest.raises(StemmapError):
+        await search.start(PLAN)
+    assert search.as_plain() == told[-1]
+    assert search.result == RESULT
+
+
 async def test_one_search_at_a_time_and_leaving_the_run_ends_its_process():
     search = TuneSearch(lambda _told: None, says(SAID[0], then="time.sleep(600)"))
     await search.start(PLAN)
