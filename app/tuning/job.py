@@ -364,7 +364,7 @@ def _why_gone(uri: str) -> str:
     if is_live(uri):
         return "it is a live run, which cannot be mapped again"
     try:
-        check_existence(uri.removeprefix("file://"))
+        check_existence(uri.removeprefix("file:").removeprefix("//"))
     except SourceError:
         return "its recording does not exist any more"
     return ""

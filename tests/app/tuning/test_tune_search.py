@@ -14,7 +14,7 @@ import pytest
 import pytest_asyncio
 
 from app.sources.request import SourceRequest
-from app.tuning.job import TuneSearch
+from app.tuning.job import TuneSearch, _why_gone
 from app.tuning.plan import Plan, PlannedRun, Trial, axes_of
 from app.tuning.result import Result, SearchMessage
 from app.worker.protocol import Open
@@ -117,6 +117,12 @@ async def test_the_search_before_stays_if_no_process_can_be_started():
         await search.start(PLAN)
     assert search.as_plain() == told[-1]
     assert search.result == RESULT
+
+
+@pytest.mark.parametrize("scheme", ["", "file:", "file://"])
+def test_a_recording_that_is_gone_cannot_be_opened_again(tmp_path: Path, scheme: str):
+    assert _why_gone(f"{scheme}{tmp_path}") == ""
+    assert "does not exist any more" in _why_gone(f"{scheme}{tmp_path}/gone.mcap")
 
 
 async def test_one_search_at_a_time_and_leaving_the_run_ends_its_process():
