@@ -237,15 +237,15 @@ class ColumnClassifier:
     @property
     def all_around(self) -> bool:
         """Whether the random forest for sensors that see all around is used, see `is_seen_all_around`. A
-        change loads the other forest (StemmapError if it cannot be read); the next scan classifies all
-        columns again."""
+        change loads the other forest (StemmapError if it cannot be read; the value then stays); the next scan
+        classifies all columns again."""
         return self._all_around
 
     @all_around.setter
     def all_around(self, all_around: bool) -> None:
         if all_around != self._all_around:
-            self._all_around = all_around
-            self.parameters = self._parameters
+            self._forest = self._forests(self.parameters.forest, all_around)
+            self._all_around, self._vote_again = all_around, True
 
     @property
     def parameters(self) -> Classification:

@@ -16,10 +16,11 @@ from pipeline.classification.column_classifier import (
     seen_higher,
 )
 from pipeline.classification.features import NAMES
-from pipeline.classification.forest import CLASSES, DecisionTrees
+from pipeline.classification.forest import CLASSES, DecisionTrees, package_alone
 from pipeline.classification.voxel_map import TILE, VoxelMap, corrected_voxels, keys_of, tiles_of
 from pipeline.config import preset
 from pipeline.detection.free_space import BINS
+from pipeline.errors import StemmapError
 from pipeline.geometry.pose_arrays import PathCorrection
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.ground.scan_ground import SECTORS
@@ -122,6 +123,19 @@ def test_the_forest_of_a_sensor_that_has_moved_votes_on_all_columns_from_the_nex
     gathering.all_around = True
     gathering.add(np.zeros((0, 3), np.float32), np.zeros(0, np.float32), 1, view())
     assert gathering.columns.share[:, 0].tolist() == [1.0] * len(standing.verdict)
+
+
+def test_a_forest_that_cannot_be_read_leaves_the_kind_of_the_sensor_as_it_was():
+    def one_kind(name: str, all_around: bool) -> Forest:
+        if all_around:
+            raise StemmapError("the forest cannot be read")
+        return package_alone(name, all_around)
+
+    gathering = ColumnClassifier(FOREST.classification, all_around=False, forests=one_kind)
+    for _ in range(2):
+        with pytest.raises(StemmapError):
+            gathering.all_around = True
+        assert not gathering.all_around
 
 
 def test_going_back_gives_the_same_again():
