@@ -169,7 +169,7 @@ async def import_file(body: _ImportPlots, dashboard: Dash) -> Response:
     ]
     taken, named = _names(dashboard), []
     for plot, polygons in zip(read["plots"], moved, strict=True):
-        name = _free(" ".join(plot["name"].split())[: _LONGEST_NAME - 6], taken)
+        name = _free(" ".join(plot["name"].split())[: _LONGEST_NAME - 6].rstrip(), taken)
         taken.add(name)
         named.append((name, {"kind": "polygon", "polygons": polygons}))
     return await _added(dashboard, body, named)

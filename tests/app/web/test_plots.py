@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import base64
+import json
 import math
 from typing import Any
 
@@ -180,6 +181,23 @@ async def test_the_layer_of_an_export_is_imported_again(both, tmp_path) -> None:
     assert names == ["1", "b", "1 (2)", "b (2)"]
     (ring,) = (await plots(client))[3]["shape"]["polygons"][0]
     assert shapely.Polygon(ring).area == pytest.approx(12.0, abs=0.01)
+
+
+async def test_a_long_name_of_a_file_that_is_taken_gets_a_number(both) -> None:
+    client, _ = both
+    name = "x" * 53
+    await act(client, "POST", plots=[{**CIRCLE, "name": name}])
+    square = [[[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]]]
+    feature = {
+        "type": "Feature",
+        "properties": {"name": f"{name} north"},
+        "geometry": {"type": "Polygon", "coordinates": square},
+    }
+    layer = json.dumps({"type": "FeatureCollection", "coordinateFrame": {}, "features": [feature]})
+    files = {"layer.geojson": base64.b64encode(layer.encode()).decode()}
+    added = await act(client, "POST", "/import", files=files)
+    assert added.status_code == 201, added.text
+    assert [plot["name"] for plot in await plots(client)] == [name, f"{name} (2)"]
 
 
 async def test_a_file_that_is_no_plots_is_refused_in_one_sentence(both) -> None:
