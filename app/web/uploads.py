@@ -214,8 +214,8 @@ def _file_list(line: bytes) -> list[tuple[PurePosixPath, int]]:
         line: JSON, a list of [path, size].
 
     Raises:
-        UploadError: The value is not such a list, has no or too many files, two of one path, or a path that
-            leaves the folder, is hidden, too deep or too long.
+        UploadError: The value is not such a list, has no or too many files, two of one path, one in the path
+            of another, or a path that leaves the folder, is hidden, too deep or too long.
     """
     try:
         listed = msgspec.json.decode(line, type=list[tuple[str, Annotated[int, msgspec.Meta(ge=0)]]])
@@ -230,8 +230,8 @@ def _file_list(line: bytes) -> list[tuple[PurePosixPath, int]]:
         if len(parts) > _DEEPEST or not all(map(_is_file_name, parts)):
             raise UploadError(422, "a file has a name that cannot be used", where=_shown(name))
     files = {PurePosixPath(name): size for name, size in listed}
-    if len(files) != len(listed):
-        raise UploadError(422, "two files have the same name")
+    if len(files) != len(listed) or any(folder in files for path in files for folder in path.parents):
+        raise UploadError(422, "two files, or a file and a folder, have the same name")
     return list(files.items())
 
 
