@@ -148,13 +148,14 @@ class Uploads:
             self._awaited -= awaited
 
     def clear(self) -> None:
-        """Remove incomplete uploads that were not written for an hour: those of servers that were
+        """Remove incomplete uploads of which nothing was written for an hour: those of servers that were
         terminated."""
         if self._folder is None or not self._folder.is_dir():
             return
         for part in self._folder.glob(f"{_PART}*"):
             with contextlib.suppress(OSError):
-                if part.stat().st_mtime < time.time() - _ABANDONED_S:
+                written = max(path.stat().st_mtime for path in (part, *part.rglob("*")))
+                if written < time.time() - _ABANDONED_S:
                     _remove(part)
 
     def _place(self) -> Path:

@@ -307,6 +307,20 @@ def test_what_a_killed_server_left_is_removed_when_nobody_writes_to_it(recording
     assert kept(recordings) == [new.name]
 
 
+def test_a_folder_of_which_a_file_is_being_written_is_not_removed(recordings: Path) -> None:
+    import os
+
+    old, active = recordings / ".upload-a", recordings / ".upload-b"
+    for part in (old, active):
+        (part / "velodyne").mkdir(parents=True)
+        (part / "velodyne" / "0.bin").write_bytes(b"x")
+        for path in (part / "velodyne" / "0.bin", part / "velodyne", part):
+            os.utime(path, (time.time() - 7200, time.time() - 7200))
+    os.utime(active / "velodyne" / "0.bin")
+    Uploads(recordings, 1, AsyncStore(None)).clear()
+    assert kept(recordings) == [active.name]
+
+
 async def test_a_real_file_is_recognised_by_its_contents(tmp_path: Path) -> None:
     from app.cli import main
 
