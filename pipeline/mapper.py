@@ -268,7 +268,7 @@ class Mapper:
     def place(self, index: int, T_map_base: Pose2, covariance: Float) -> None:
         """Set the pose of the base before scan `index`: all particles are drawn from it, with the map and the
         path of the best one. The next scan has no motion by odometry, and loops do not begin before it. A
-        search for a lost robot is not ended, and the states stored for it are kept.
+        search for a lost robot ends, and the states stored for it are discarded.
 
         Args:
             index: Number of the next scan.
@@ -278,6 +278,7 @@ class Mapper:
         self._slam.place(index, T_map_base, covariance)
         self._placed, self._last = index, (T_map_base, covariance)
         self._odometry = None
+        self._relocaliser.reset()
 
     # --- stages ---------------------------------------------------------------------------------------
 

@@ -177,6 +177,21 @@ def test_a_map_saved_while_lost_goes_on_to_the_same_bytes():
         replace(saved, search=replace(saved.search, since=10**6)).state()
 
 
+def test_a_map_saved_while_lost_goes_on_where_the_robot_is_put():
+    m, (_, after) = at_the_jump(), kidnapped()
+    for step in after[:5]:
+        m.process(step)
+    saved = SavedMap.of(m)
+    other = mapper()
+    other.load(saved.state(), saved.stamp_ns, saved.sigma_xy, saved.motion)
+    _, truth, _ = drive()
+    k = int(np.searchsorted(truth.stamp_ns, drive()[0][BACK + 5].scan.stamp_ns))
+    pose = Pose2(truth.x[k], truth.y[k], truth.yaw[k])
+    other.place(len(saved.stamp_ns), pose, np.diag([0.1, 0.1, 0.02]) ** 2)
+    assert other.snapshot().recovery.local is None
+    assert {other.process(step).health.state for step in after[5:15]} <= {"good", "weak"}
+
+
 def test_measured_poses_are_of_the_map_and_not_of_the_small_one_of_a_search():
     recovery: Relocaliser[Any] = Relocaliser(0)
     recovery.state = RelocaliserState(local=SlamState.at_origin(20))
