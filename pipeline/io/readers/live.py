@@ -331,8 +331,8 @@ def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
         where: Name of the file in errors.
 
     Raises:
-        SourceError: The settings are of another version, or name no topic or more than _MOST_TOPICS, with
-            those of the camera.
+        SourceError: The settings are of another version, name no topic besides those of the camera, or more
+            than _MOST_TOPICS with them.
     """
     try:
         content = container.attachment(NAME, _LIMIT)
@@ -342,7 +342,7 @@ def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
     except (SourceError, msgspec.DecodeError, RecursionError):
         count_loss(container.damage, "settings of the live run that cannot be read")
         return None
-    if run.version != VERSION or not 0 < len(run.topics) + len(run.camera) <= _MOST_TOPICS:
+    if run.version != VERSION or not run.topics or len(run.topics) + len(run.camera) > _MOST_TOPICS:
         raise SourceError("the recording is of a newer version of stemmap", where=where)
     return run
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -30,7 +30,7 @@ from pipeline.io.readers.container import Channel, Message
 from pipeline.io.readers.mcap_file import McapFile
 from pipeline.io.readers.topics import POINT_CLOUD
 from pipeline.io.recording import write_recording
-from pipeline.io.recording.mcap_writer import repair
+from pipeline.io.recording.mcap_writer import LiveWriter, repair
 from pipeline.types.records import Scan
 from tests.app.robot.conftest import Child, until
 from tests.app.robot.test_live_session import FakeLink, announce
@@ -219,6 +219,24 @@ def test_a_mapper_five_times_slower_than_the_robot_loses_nothing_in_the_recordin
     main(["map", str(recording.path), "--out", str(tmp_path / "d")])
     assert "of the 20 recorded scans" in capfd.readouterr().err
     assert (tmp_path / "d" / "path.csv").read_text().count("\n") == 21
+
+
+def write_live(path: Path, run: Path, topics: list[str], spoil: Callable[[LiveWriter], None]) -> None:
+    """A recording of the messages of a file, with settings that name some topics, and with what `spoil` adds
+    at its end."""
+    with closing(McapFile(run)) as container, path.open("wb") as stream:
+        header = {"uri": "zenoh:tcp/robot:7447", "topics": topics, "camera": ["/camera"]}
+        writer = LiveWriter(stream, container.channels, header, "")
+        for message in container.messages([c.number for c in container.channels], None, {}):
+            writer.add(message)
+        spoil(writer)
+        writer.finish()
+
+
+def test_settings_without_a_topic_of_scans_are_refused(stand: Path, tmp_path: Path):
+    write_live(tmp_path / "live.mcap", stand, [], lambda writer: None)
+    with pytest.raises(SourceError, match="newer version"):
+        open_source(str(tmp_path / "live.mcap"))
 
 
 def test_a_queue_that_is_full_is_counted_and_reported(stand: Path, tmp_path: Path, monkeypatch):
