@@ -439,10 +439,9 @@ class LiveRecording(MessageSource):
         first_ns = next((m.log_ns for m in self._messages(list(scans), {})), 0)
         tail_ns = self._container.tail_ns(scans)
         last_ns = max((m.log_ns for m in self._container.messages(scans, tail_ns, {})), default=first_ns)
-        warnings = list(known.warnings)
+        revisions, warnings = tuple(self._notes(PARAMETERS, Revision)), list(known.warnings)
         if self._container.damage:
             warnings.append("the recording is cut or damaged: only whole messages are read")
-        revisions = tuple(self._notes(PARAMETERS, Revision))
         if skipped and not self._options.as_live:
             # Scans are counted among those that were mapped live, so the numbers do not fit here.
             revisions = tuple(replace(last, from_scan=0) for last in revisions[-1:])
@@ -485,18 +484,18 @@ class LiveRecording(MessageSource):
         return {number: times for number, times in skipped.items() if times}
 
     def _notes(self, topic: str, kind: type[T]) -> Iterator[T]:
-        """Yield the JSON values of a topic of the recorder as `kind`; damaged ones are counted in the losses.
+        """Yield the JSON values of a topic of the recorder as `kind`; damaged ones are counted as damage.
         Reading ends after _MOST_NOTES and at a note longer than _LIMIT."""
         numbers = [c.number for c in self._container.channels if c.topic == topic]
         types: Any = standard_types("cdr")
-        for count, message in enumerate(self._container.messages(numbers, None, {})):
+        for count, message in enumerate(self._container.messages(numbers, None, self._damage)):
             if count >= _MOST_NOTES or len(message.payload) > _LIMIT:
                 break
             try:
                 text = types.deserialize_cdr(message.payload, "std_msgs/msg/String").data
                 note = msgspec.json.decode(text, type=kind)
             except Exception:  # the generated decoders of rosbags raise many kinds
-                count_loss(self._losses, "notes of the recorder that cannot be read")
+                count_loss(self._damage, "notes of the recorder that cannot be read")
             else:
                 yield note
 

@@ -239,6 +239,20 @@ def test_settings_without_a_topic_of_scans_are_refused(stand: Path, tmp_path: Pa
         open_source(str(tmp_path / "live.mcap"))
 
 
+def test_damaged_notes_are_counted_in_every_reading(stand: Path, tmp_path: Path):
+    def spoil(writer: LiveWriter) -> None:
+        writer.add_parameters(0, -1, {"clustering": []})
+        writer.add_skipped({"/velodyne_points": ["late"]})
+
+    write_live(tmp_path / "live.mcap", stand, ["/velodyne_points"], spoil)
+    with closing(open_source(str(tmp_path / "live.mcap"))) as source:
+        assert source.description.revisions == ()
+        assert any("cut or damaged" in warning for warning in source.description.warnings)
+        for _ in range(2):
+            assert sum(isinstance(record, Scan) for record in source.records()) == 20
+            assert source.losses == {"notes of the recorder that cannot be read": 2}
+
+
 def test_a_queue_that_is_full_is_counted_and_reported(stand: Path, tmp_path: Path, monkeypatch):
     monkeypatch.setattr(recorder_module, "QUEUE_BYTES", 100)
     recording = Recorder(tmp_path / "live.mcap")
