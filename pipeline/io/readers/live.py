@@ -124,8 +124,8 @@ class ArrivalReader:
         """Process the next message; return the records that it completes, after notices of the source. Until
         the source is described by its first OPENING_SCANS scans, or for OPENING_NS after the first one,
         messages are stored and [] is returned; then the stored ones follow at once. Of more than
-        OPENING_LIMIT stored messages, the older half is dropped and not counted, except scans and fixed
-        transforms, see `_forget_oldest`. What else cannot be used is counted in `losses`.
+        OPENING_LIMIT stored messages, the older half is dropped, except scans and fixed transforms, see
+        `_forget_oldest`. Dropped messages, and what cannot be used, are counted in `losses`.
 
         Raises:
             SourceError: There are scans, and none could be read in five attempts of OPENING_NS.
@@ -158,11 +158,12 @@ class ArrivalReader:
         return self._open(self._first_ns)
 
     def _forget_oldest(self) -> None:
-        """Remove the older half of the waiting messages, except scans and fixed transforms, of which the
-        newest remain in at most half of that space."""
+        """Remove and count the older half of the waiting messages, except scans and fixed transforms, of
+        which the newest remain in at most half of that space."""
         half, kept = len(self._opening) // 2, self._fixed | self._scans
-        old = [message for message in self._opening[:half] if message.channel in kept]
-        self._opening[:half] = old[-half // 2 :]
+        old = [message for message in self._opening[:half] if message.channel in kept][-half // 2 :]
+        self._opening[:half] = old
+        count_loss(self.losses, "messages that waited too long for scans", half - len(old))
 
     def _open(self, now_ns: int) -> list[Record]:
         """Describe the source by the waiting messages; return their records. If no scan can be read, wait for

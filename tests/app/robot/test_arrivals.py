@@ -82,7 +82,9 @@ def test_nothing_is_known_before_a_scan_and_memory_is_bounded(drive: Path):
         for k in range(2 * OPENING_LIMIT):
             assert reader.add(replace(first, log_ns=k)) == []
         assert reader.description is None
-        assert len(reader._opening) <= OPENING_LIMIT
+        waiting = len(reader._opening)
+        assert waiting <= OPENING_LIMIT
+        assert reader.losses == {"messages that waited too long for scans": 2 * OPENING_LIMIT - waiting}
 
 
 def test_scans_that_nobody_can_read_are_an_error_in_the_end():
