@@ -121,7 +121,7 @@ def map_plot(cloud: WholeCloud, parameters: Parameters, forests: ForestOf = pack
     Raises:
         SourceError: The cloud cannot be read, has no points, or is larger than a plot.
         StemmapError: There is no such forest.
-        OSError: The file of the cloud cannot be read.
+        OSError: The temporary file of the points cannot be read.
     """
     with closing(Inventory(cloud, forests)) as inventory:
         return finish(inventory.steps(parameters))
@@ -154,7 +154,7 @@ class Inventory:
         Raises:
             SourceError: The cloud cannot be read, has no points, or is larger than a plot.
             StemmapError: There is no such forest.
-            OSError: The file of the cloud cannot be read.
+            OSError: The temporary file of the points cannot be read.
         """
         r_min, r_max = max(parameters.detection.radius_min, LEAST_RADIUS), parameters.detection.radius_max
         slope = parameters.ground.slope_max
@@ -211,7 +211,7 @@ class Inventory:
         Raises:
             SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER
                 bytes.
-            OSError: The file of the cloud cannot be read.
+            OSError: The temporary file of the points cannot be read.
         """
         whole = Thinned(SHOWN, SHOWN_SIDE)
         ground, near, counts = yield from ground_steps(self._cloud, slope_max, whole=whole)
@@ -261,7 +261,7 @@ def ground_steps(
 
     Raises:
         SourceError: The cloud cannot be read, has no points, or its raster needs more than MOST_RASTER bytes.
-        OSError: The file of the cloud cannot be read.
+        OSError: The temporary file of the points cannot be read.
     """
     finder, of = ExtentFinder(), max(cloud.description.points, 1)
     read = 0

@@ -47,7 +47,7 @@ class SpooledCloud:
 
         Raises:
             SourceError: The source cannot be read.
-            OSError: The file of the source, or the temporary file, cannot be read.
+            OSError: The temporary file cannot be read.
         """
         if self._file is not None:
             yield from _read_points(self._file)

@@ -77,8 +77,7 @@ class CloudFile:
         path: The file.
 
     Raises:
-        SourceError: The file has another format, is damaged, or has no valid point.
-        OSError: The file cannot be read.
+        SourceError: The file cannot be read, has another format, is damaged, or has no valid point.
     """
 
     name: str  # of the format, in errors
@@ -88,8 +87,7 @@ class CloudFile:
         """Open the file and read its description and its first points.
 
         Raises:
-            SourceError: The file has another format, is damaged, or has no valid point.
-            OSError: The file cannot be read.
+            SourceError: The file cannot be read, has another format, is damaged, or has no valid point.
         """
         self._uri, self._path = uri, path
         self.losses: dict[str, int] = {}
@@ -102,8 +100,7 @@ class CloudFile:
         counted in it.
 
         Raises:
-            SourceError: The file is damaged before its first point.
-            OSError: The file cannot be read.
+            SourceError: The file cannot be read, or is damaged, before its first point.
         """
         self.losses = {}
         read = 0
@@ -152,11 +149,15 @@ class CloudFile:
 
     @contextmanager
     def _one_error(self) -> Iterator[None]:
-        """Raise any exception of a library as a SourceError; SourceError and OSError pass unchanged."""
+        """Raise any exception of a library or of the system as a SourceError; SourceError passes
+        unchanged."""
         try:
             yield
-        except (SourceError, OSError):
+        except SourceError:
             raise
+        except OSError as error:
+            what = f"cannot read: {error.strerror or error}"
+            raise SourceError(what, where=self._uri, remedy=_REMEDY) from None
         except ScanFileError as error:
             raise SourceError(str(error), where=self._uri, remedy=_REMEDY) from None
         except BaseException as error:

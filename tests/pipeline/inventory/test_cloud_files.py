@@ -17,7 +17,7 @@ from pipeline.errors import SourceError
 from pipeline.io.readers import is_cloud, open_source
 from pipeline.io.readers.clouds import open_cloud
 from pipeline.io.readers.point_files import ScanFileError, open_table, read_columns
-from tests.pipeline.inventory.plots import plot
+from tests.pipeline.inventory.plots import plot, write_las
 
 UTM = np.array([470600.0, 3810200.0, 2278.0])
 TEXT = (
@@ -69,6 +69,18 @@ def test_the_points_that_another_library_wrote(tmp_path, points, name, how, kind
         assert read.dtype == np.float32
         np.testing.assert_allclose(read, points, atol=1e-4)  # texts have six digits
     assert not cloud.losses
+
+
+@pytest.mark.parametrize("name", ["c.ply", "c.pcd", "c.npy", "c.npz", "c.las"])
+def test_a_cloud_that_cannot_be_read_any_more_is_an_error_of_the_cloud(tmp_path, points, name):
+    """The commands attribute an OSError to the folder of the results."""
+    file = tmp_path / name
+    write_las(file, points[:100]) if name == "c.las" else write(file, points[:100])
+    cloud = open_cloud(str(file))
+    file.unlink()
+    with pytest.raises(SourceError, match="cannot read: No such file") as refusal:
+        list(cloud.parts())
+    assert refusal.value.where == str(file)
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
