@@ -28,8 +28,8 @@ def clean_scan(
 ) -> Scan:
     """Return a scan without invalid returns: points that are not finite, have a coordinate with a magnitude
     of RANGE_LIMIT or more, or are at the origin (all magnitudes up to NEAR_LIMIT). If no point is left out,
-    arrays that already have the type of `Scan` are shared with the result; reflectances that are not finite
-    are then replaced in the argument.
+    arrays that already have the type of `Scan` are shared with the result, except reflectances of which some
+    are not finite.
 
     Args:
         stamp_ns: Time of the scan [ns].
@@ -66,12 +66,12 @@ def clean_scan(
 
 def _as_float(values: NDArray[np.generic] | None) -> Float32 | None:
     """Return a column as float32, with NaN as 0 and infinite numbers as the largest float32 of their sign;
-    None for None. A contiguous float32 column is not copied but changed in place."""
+    None for None. A contiguous float32 column of finite numbers is not copied."""
     if values is None:
         return None
     with np.errstate(over="ignore", invalid="ignore"):
         column = np.ascontiguousarray(values, dtype=np.float32)
-    return np.nan_to_num(column, copy=False) if not np.isfinite(column).all() else column
+    return np.nan_to_num(column) if not np.isfinite(column).all() else column
 
 
 def _as_int(values: NDArray[np.generic] | None) -> Int32 | None:

@@ -150,3 +150,13 @@ def test_times_far_from_the_stamp_are_not_used():
     assert decode_cloud(encode(table), STAMP_NS).offset_ns is None
     table["timestamp"] = [5.0, 6.0, 7.0]
     assert decode_cloud(encode(table), STAMP_NS).offset_ns is None
+
+
+def test_a_reflectance_that_is_not_finite_is_replaced_in_the_scan_alone():
+    table = np.ones(1, np.dtype([*XYZ.descr, ("intensity", "<f4")]))
+    table["intensity"] = np.nan
+    message = encode(table)
+    message.data.setflags(write=False)
+    reflectance = decode_cloud(message, STAMP_NS).reflectance
+    assert reflectance is not None
+    np.testing.assert_array_equal(reflectance, [0.0])
