@@ -155,8 +155,8 @@ class RosSource(MessageSource):
 
     def _times_of(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Yield the message itself with its time, or, for a channel of moving transforms, each odometry that
-        the message contains with its time; see `_stamped` and `_transforms`. Entries with an impossible time
-        are omitted and counted in `losses`; a damaged message of transforms is omitted, not counted."""
+        the message contains with its time; see `_stamped` and `_transforms`. Entries with an impossible time,
+        and transforms that cannot be read, are omitted and counted in `losses`."""
         if message.channel in self._moving:
             return self._transforms(message, losses)
         return self._stamped(message, losses)
@@ -184,8 +184,8 @@ class RosSource(MessageSource):
 
     def _transforms(self, message: Message, losses: dict[str, int]) -> Iterator[Stamped[Message | Odometry]]:
         """Yield the odometry in a message of moving transforms, with its time; transforms between other
-        frames and damaged messages are ignored, impossible times are counted in `losses`."""
-        for stamp_ns, parent, child, pose in self._extrinsics.decode(message):
+        frames are ignored; impossible times, and what cannot be read, are counted in `losses`."""
+        for stamp_ns, parent, child, pose in self._extrinsics.decode(message, losses):
             if (parent, child) == self._extrinsics.odometry_link:
                 time_ns = self._clock.time_of(stamp_ns, message)
                 if time_ns is None:

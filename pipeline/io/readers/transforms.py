@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import count_loss
 from pipeline.io.readers.container import Channel, Container, Message
+from pipeline.io.readers.message_time import SECOND_NS
 from pipeline.io.readers.topics import decode
 
 if TYPE_CHECKING:
@@ -83,6 +85,8 @@ FIXED_MESSAGES = 1000
 MOVING_MESSAGES = 300
 _WORLD = ("map", "world", "earth", "odom", "utm")
 
+_UNREADABLE = "transforms that cannot be read"
+
 #: Time of the transform, parent frame, child frame, T_parent_child.
 Link = tuple[int, str, str, Pose3]
 
@@ -139,7 +143,7 @@ class Extrinsics:
         seen: dict[tuple[str, str], Pose3] = {}
         moved: set[tuple[str, str]] = set()
         for message in islice(self._container.messages(numbers, None, {}), limit if numbers else 0):
-            for _stamp, parent, child, pose in self.decode(message):
+            for _stamp, parent, child, pose in self.decode(message, {}):
                 before = seen.setdefault((parent, child), pose)
                 if not (
                     np.allclose(before.R, pose.R, atol=1e-9) and np.allclose(before.t, pose.t, atol=1e-9)
@@ -153,22 +157,30 @@ class Extrinsics:
             if not steady or (link not in moved and link[0].split("/")[-1] not in _WORLD)
         }
 
-    def decode(self, message: Message) -> list[Link]:
-        """Return the finite transforms of a message, in its order; [] if it is damaged."""
+    def decode(self, message: Message, losses: dict[str, int]) -> list[Link]:
+        """Return the finite transforms of a message, in its order; [] if it is damaged.
+
+        Args:
+            message: The message.
+            losses: Dict from reasons to numbers; damaged messages, and transforms of the odometry that are
+                not finite, are added in place.
+        """
         try:
             channel = self._channels[message.channel]
             decoded: ros2.tf2_msgs__msg__TFMessage = decode(channel, message.payload)
         except Exception:  # the generated decoders of rosbags raise many kinds
+            count_loss(losses, _UNREADABLE)
             return []
-        with np.errstate(all="ignore"):
-            return [link for link in map(_link, decoded.transforms) if link is not None]
-
-
-def _link(stamped: ros2.geometry_msgs__msg__TransformStamped) -> Link | None:
-    """Return a transform with its time and frames; None if it is not finite."""
-    try:
-        pose = pose_of(stamped.transform.translation, stamped.transform.rotation)
-    except ValueError:
-        return None
-    stamp_ns = int(stamped.header.stamp.sec) * 1_000_000_000 + int(stamped.header.stamp.nanosec)
-    return stamp_ns, frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id), pose
+        links = []
+        for stamped in decoded.transforms:
+            parent, child = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
+            try:
+                with np.errstate(all="ignore"):
+                    pose = pose_of(stamped.transform.translation, stamped.transform.rotation)
+            except ValueError:
+                if (parent, child) == self.odometry_link:
+                    count_loss(losses, _UNREADABLE)
+                continue
+            stamp_ns = int(stamped.header.stamp.sec) * SECOND_NS + int(stamped.header.stamp.nanosec)
+            links.append((stamp_ns, parent, child, pose))
+        return links

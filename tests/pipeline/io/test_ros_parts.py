@@ -25,7 +25,7 @@ from pipeline.io.readers.mcap_file import MAGIC, MESSAGE_HEAD, RECORD, McapFile
 from pipeline.io.readers.message_time import WINDOW_NS, Stamped, in_order_of_stamps
 from pipeline.io.readers.topics import POINT_CLOUD
 from pipeline.io.readers.transforms import TransformTree
-from pipeline.types.records import Scan
+from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.recordings import START_NS, STEP_NS, Author, drive, points_of, write_recording
 
@@ -164,6 +164,30 @@ def test_without_a_transform_the_mounting_is_taken_as_none_and_said(tmp_path: Pa
     assert known.warnings == (
         "no fixed transform from velodyne to base_link: the LiDAR is assumed to be at the base",
     )
+
+
+def test_transforms_of_the_odometry_that_cannot_be_read_are_counted(tmp_path: Path, opened: Opened):
+    path, kind = tmp_path / "run.mcap", "tf2_msgs/msg/TFMessage"
+    author = Author("mcap")
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "")
+        points, moving = (
+            writer.register_channel(topic, "cdr", writer.register_schema(name, "ros2msg", b""))
+            for topic, name in (("/points", POINT_CLOUD), ("/tf", kind))
+        )
+        for k, cloud in enumerate(cloud_payloads(5)):
+            stamp_ns = START_NS + k * STEP_NS
+            reach = np.nan if k == 3 else 0.1 * k
+            links = ("odom", "base_link", (reach, 0.0, 0.0, 0.0)), ("base_link", "wheel", (np.nan,) * 4)
+            payload = bytes(author.store.serialize_cdr(author.transforms(stamp_ns, *links), kind))
+            writer.add_message(moving, stamp_ns, payload[:20] if k == 2 else payload, stamp_ns)
+            writer.add_message(points, stamp_ns, cloud, stamp_ns)
+        writer.finish()
+    source = opened(path)
+    poses = [record for record in source.records() if isinstance(record, Odometry)]
+    np.testing.assert_allclose([pose.T_odom_base.t[0] for pose in poses], [0.0, 0.1, 0.4])
+    assert source.losses == {"transforms that cannot be read": 2}
 
 
 def test_rings_numbered_from_above_are_turned_round(tmp_path: Path, opened: Opened):
