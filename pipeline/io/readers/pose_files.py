@@ -281,22 +281,23 @@ _LINES = 1 << 18  # read at once
 _LINE_LIMIT = 1 << 16  # bytes; a longer line is cut, and its parts are damaged lines
 
 
-def parse_numbers(text: bytes) -> Float:
-    """Return the numbers between blanks or line ends, up to the first word that is not a number, shape (N,);
-    "nan" and "inf" are numbers. The text after that word is ignored."""
-    parts, at = [np.zeros(0)], 0
+def parse_numbers(text: bytes) -> tuple[Float, int]:
+    """Return the numbers between blanks or line ends, up to the first word that is not a number, shape (N,),
+    and the number of words from that one on, which are left out; "nan" and "inf" are numbers."""
+    parts, at, left = [np.zeros(0)], 0, 0
     while at < len(text):
         gap = _GAP.search(text, at + _BLOCK)
         end = len(text) if gap is None else gap.end()
         words = text[at:end].split()
         try:
-            parts.append(np.array(words, np.float64))
+            numbers = np.array([] if left else words, np.float64)
         except ValueError:
-            whole = list(takewhile(lambda numbers: numbers is not None, (_numbers([word]) for word in words)))
-            parts.append(np.array(whole, np.float64).ravel())
-            break
+            whole = takewhile(lambda numbers: numbers is not None, (_numbers([word]) for word in words))
+            numbers = np.array(list(whole), np.float64).ravel()
+        parts.append(numbers)
+        left += len(words) - len(numbers)
         at = end
-    return np.concatenate(parts)
+    return np.concatenate(parts), left
 
 
 def parse_table(text: bytes, columns: int) -> tuple[Float, int]:

@@ -167,13 +167,15 @@ class VictoriaParkSource(FileSource):
 
     def _read_laser(self, text: bytes, uri: str) -> tuple[Int, NDArray[np.float32]]:
         """Return times [ns], int64, shape (N,), and ranges [m], shape (N, BEAMS). Scans with impossible times
-        or numbers that are not finite, and an incomplete one at the end, are left out and counted as damage.
-        Text after the first word that is not a number is ignored and not counted.
+        or numbers that are not finite, an incomplete one at the end, and words from the first one on that is
+        not a number, are left out and counted as damage.
 
         Raises:
             SourceError: There is no valid scan.
         """
-        numbers = parse_numbers(text)  # the real file has all scans in one line
+        numbers, left = parse_numbers(text)  # the real file has all scans in one line
+        if left:
+            count_loss(self._damage, "words of LASER.txt from the first one that is not a number on", left)
         whole = len(numbers) // (BEAMS + 1) * (BEAMS + 1)
         if whole < len(numbers):
             count_loss(

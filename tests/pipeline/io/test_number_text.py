@@ -57,12 +57,19 @@ def test_a_line_without_end_is_read_in_bounded_parts() -> None:
 
 @pytest.mark.parametrize("word", ["x", "1.2.3", "-", "4e", "."])
 def test_a_sequence_ends_at_the_first_word_that_is_not_a_number(word: str) -> None:
-    np.testing.assert_array_equal(parse_numbers(f"1 2\t{word} 3".encode()), [1.0, 2.0])
+    numbers, left = parse_numbers(f"1 2\t{word} 3".encode())
+    np.testing.assert_array_equal(numbers, [1.0, 2.0])
+    assert left == 2
 
 
 def test_a_long_sequence_is_split_between_words() -> None:
-    numbers = np.random.default_rng(1).uniform(-1e3, 1e3, 600_000)
-    text = b"\t".join(b"%.9f" % number for number in numbers)
+    expected = np.random.default_rng(1).uniform(-1e3, 1e3, 600_000)
+    text = b"\t".join(b"%.9f" % number for number in expected)
     assert len(text) > 8 << 20
-    np.testing.assert_array_equal(parse_numbers(text), [float(word) for word in text.split()])
-    assert len(parse_numbers(b"  \n")) == 0
+    numbers, left = parse_numbers(text)
+    np.testing.assert_array_equal(numbers, [float(word) for word in text.split()])
+    assert left == 0
+    numbers, left = parse_numbers(b"1 x " + text)
+    np.testing.assert_array_equal(numbers, [1.0])
+    assert left == 1 + len(expected)
+    assert len(parse_numbers(b"  \n")[0]) == 0

@@ -112,6 +112,17 @@ def test_bad_rows_are_counted(tmp_path: Path, opened: Opened):
     }
 
 
+def test_what_comes_after_a_word_that_is_no_number_is_counted(tmp_path: Path, opened: Opened):
+    text = "\t".join(["5"] * 362 + ["x"] + ["6"] * 361)
+    path = tmp_path / "run.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("LASER.txt", text)
+        archive.writestr("DRS.txt", "0.1 1.0 0.0\n")
+    source = opened(path)
+    assert source.description.scans == 1
+    assert source.losses == {"words of LASER.txt from the first one that is not a number on": 362}
+
+
 def test_a_gps_row_that_is_no_position_is_counted(tmp_path: Path, opened: Opened):
     gps = "0.1 1e200 0\n0.2 5 7\n0.3 0 -1e9\n0.4 6\n"
     source = opened(write_zip(tmp_path, np.full(362, 5.0), **{"GPS.txt": gps}))
