@@ -132,18 +132,19 @@ class Db3File(IndexedContainer):
 
 def bag_files(folder: Path) -> list[Path]:
     """Return the .mcap and .db3 files (suffix in any case) of a folder in the order of the numbers at the
-    end of their names; may be empty. Compressed files (.zstd) are ignored where others are not compressed.
+    end of their names; may be empty. Compressed files (.zstd) are ignored beside their unpacked ones.
 
     Raises:
-        SourceError: All files are compressed, or there are several without metadata.yaml.
+        SourceError: A file is only there compressed, or there are several without metadata.yaml.
         OSError: The folder cannot be read.
     """
     bags = (path for path in folder.iterdir() if path.suffix.lower() in (".mcap", ".db3"))
     files = sorted(bags, key=_natural)
-    packed = sorted(path for path in folder.iterdir() if path.suffixes[-1:] == [".zstd"])
-    if packed and not files:
+    unpacked = {path.name for path in files}
+    packed = sorted(p for p in folder.iterdir() if p.suffix == ".zstd" and p.stem not in unpacked)
+    if packed:
         raise SourceError(
-            "the files of the recording are compressed",
+            "files of the recording are compressed",
             where=str(packed[0]),
             remedy="Unpack them with zstd -d.",
         )

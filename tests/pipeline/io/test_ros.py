@@ -104,6 +104,17 @@ def test_a_missing_topic_is_told_with_the_topics_that_are_there(opened: Opened, 
         opened(path)
 
 
+def test_a_part_that_is_only_there_compressed_is_told(opened: Opened, tmp_path: Path):
+    folder = write_recording("db3", tmp_path, drive)
+    (part,) = folder.glob("*.db3")
+    (folder / f"{part.name}.zstd").write_bytes(b"as unpacking leaves it")
+    assert opened(folder).description.scans == SCANS
+    (folder / "run_1.db3.zstd").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"compressed.*zstd -d") as refusal:
+        opened(folder)
+    assert refusal.value.where == str(folder / "run_1.db3.zstd")
+
+
 def test_topics_can_be_chosen_and_wrong_choices_are_told(opened: Opened, tmp_path: Path):
     def two(author, write):
         drive(author, write)
