@@ -37,14 +37,14 @@ def read_poses(path: Path) -> list[Pose3]:
     of a LiDAR.
 
     Raises:
-        TextError: The file has another format, matrices that are not orthogonal, or positions of
+        TextError: The file has another format, matrices that are not rotations, or positions of
             COORDINATE_LIMIT or more.
         OSError: The file cannot be read.
     """
     rows = read_table(path, 12).reshape(-1, 3, 4)
     _check_positions(rows[:, :, 3])
     R, t = rows[:, :, :3], rows[:, :, 3]
-    if not np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-2):
+    if not _are_rotations(R):
         raise TextError("its matrices are no rotations")
     T_camera_lidar = _calibration(path.with_name("calib.txt"))
     if T_camera_lidar is None and _moves_along_z(R, t):
@@ -207,7 +207,7 @@ def _calibration(path: Path) -> Pose3 | None:
         matrix = np.array([float(word) for word in rows[0][1:]]).reshape(3, 4)
     except (OSError, TextError, ValueError, IndexError):
         return None
-    sound = np.isfinite(matrix).all() and np.allclose(matrix[:, :3] @ matrix[:, :3].T, np.eye(3), atol=1e-2)
+    sound = np.isfinite(matrix).all() and _are_rotations(matrix[:, :3])
     return Pose3(_nearest_rotation(matrix[:, :3]), matrix[:, 3]) if sound else None
 
 
@@ -221,6 +221,12 @@ def _moves_along_z(R: Float, t: Float) -> bool:
     steps = np.einsum("nji,nj->ni", R[:-1], np.diff(t, axis=0))
     x, _, z = np.abs(steps).sum(axis=0)
     return bool(z > x and z > _STILL)
+
+
+def _are_rotations(R: Float) -> bool:
+    """Return whether finite matrices, shape (..., 3, 3), are rotations up to rounding: orthogonal to 0.01, and
+    not reflections."""
+    return np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-2) and bool((np.linalg.det(R) > 0).all())
 
 
 def _nearest_rotation(matrix: Float) -> Float:

@@ -105,6 +105,13 @@ def test_the_calibration_beside_the_poses_is_used(tmp_path: Path):
         np.testing.assert_allclose(read.t, expected.t, atol=1e-9)
 
 
+def test_a_calibration_with_a_reflection_is_not_used(tmp_path: Path):
+    (tmp_path / "calib.txt").write_text("Tr: 1 0 0 1 0 -1 0 2 0 0 1 3\n")
+    (tmp_path / "poses.txt").write_text(matrices(curve(10)))
+    for read, expected in zip(read_poses(tmp_path / "poses.txt"), curve(10), strict=True):
+        np.testing.assert_allclose(read.t, expected.t, atol=1e-9)
+
+
 def test_the_number_of_a_file_is_its_row(tmp_path: Path, opened: Opened):
     write_scans(tmp_path / "velodyne", [0, 5, 10])
     (tmp_path / "poses.txt").write_text(matrices(curve(12)))
@@ -124,6 +131,7 @@ def test_the_number_of_a_file_is_its_row(tmp_path: Path, opened: Opened):
         ("1 2 3\n", "12 numbers"),
         ("nan " * 12, "finite"),
         ("1 " * 12, "rotations"),
+        ("1 0 0 0 0 -1 0 0 0 0 1 0\n" * 11, "rotations"),
         ("x " * 12, "words"),
         ("", "12 numbers"),
     ],
