@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import datetime
 from itertools import islice, takewhile
 from pathlib import Path
@@ -68,18 +68,39 @@ def read_any_poses(path: Path) -> tuple[Int | None, list[Pose3]]:
     lines = _lines(path)
     if not lines or len(lines[0]) != TUM_COLUMNS:
         return None, read_poses(path)
+    return read_tum_poses(path)
+
+
+def read_tum_poses(path: Path) -> tuple[Int, list[Pose3]]:
+    """Return times [ns], int64, shape (N,), N >= 1, and poses of a file of TUM rows t x y z qx qy qz qw.
+
+    Raises:
+        TextError: The file has another format, times that do not strictly ascend or cannot be read, a
+            quaternion of length 0, or positions of COORDINATE_LIMIT or more.
+        OSError: The file cannot be read.
+    """
+    lines = _lines(path)
     rows = _table(lines, TUM_COLUMNS)
     _check_positions(rows[:, 1:4])
-    try:  # a float has too few digits for the times
-        times = np.array([seconds_ns(line[0]) for line in lines], dtype=np.int64)
-    except (ValueError, OverflowError) as error:
-        raise TextError("its times are no seconds") from error
+    times = _times(line[0] for line in lines)
     if np.any(np.diff(times) <= 0):
         raise TextError("its times do not ascend")
     try:
         return times, [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in rows]
     except ValueError as error:
         raise TextError("it has a quaternion of no length") from error
+
+
+def _times(seconds: Iterable[str]) -> Int:
+    """Return decimal seconds as nanoseconds, int64, shape (N,): a float has too few digits for them.
+
+    Raises:
+        TextError: A word is not a number, or too large.
+    """
+    try:
+        return np.array([seconds_ns(word) for word in seconds], dtype=np.int64)
+    except (ValueError, OverflowError) as error:
+        raise TextError("its times are no seconds") from error
 
 
 def seconds_ns(text: str) -> int:
@@ -104,16 +125,17 @@ def seconds_ns(text: str) -> int:
 
 def read_times(path: Path) -> Int:
     """Return the times of a file [ns], int64, shape (N,), one per row, in seconds or as dates with times of
-    day (UTC). Empty lines are skipped; lines that begin with # only in a file of seconds.
+    day (UTC). Empty lines and lines that begin with # are skipped.
 
     Raises:
         TextError: The file has another format, no rows, or times that decrease; equal times are accepted.
         OSError: The file cannot be read.
     """
+    lines = [" ".join(words) for words in _lines(path)]
     try:
-        times = np.rint(read_table(path, 1) * 1e9).astype(np.int64).ravel()
+        times = _times(lines)
     except TextError:
-        times = np.array([_date(line) for line in _text(path).split("\n") if line.strip()], dtype=np.int64)
+        times = np.array([_date(line) for line in lines], dtype=np.int64)
     if not len(times):
         raise TextError("it has no times")
     if np.any(np.diff(times) < 0):
@@ -192,7 +214,7 @@ def _date(line: str) -> int:
     Raises:
         TextError: The line is not such a time.
     """
-    whole, _, fraction = line.strip().partition(".")
+    whole, _, fraction = line.partition(".")
     try:
         moment = datetime.fromisoformat(whole + "+00:00")
         return int(moment.timestamp()) * 1_000_000_000 + int((fraction or "0").ljust(9, "0")[:9])

@@ -14,6 +14,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from pipeline.errors import SourceError, StemmapError
 from pipeline.geometry.poses import Pose2, Pose3
 from pipeline.io.atomic_files import UNFINISHED
 from pipeline.io.readers.base import FileSource, SourceDescription, SourceOptions, count_loss, digest_of
-from pipeline.io.readers.pose_files import TextError, parse_table, read_table
+from pipeline.io.readers.pose_files import TextError, parse_table, read_tum_poses
 from pipeline.types.records import Float, Int, Odometry, Record, Scan, Sensor, Stems, Trees
 from pipeline.types.records import Path as MapPath
 
@@ -57,7 +58,8 @@ def trajectory_text(stamp_ns: Int, poses: Iterable[Pose3]) -> str:
     lines = []
     for stamp, pose in zip(stamp_ns.tolist(), poses, strict=True):
         w, x, y, z = pose.quaternion().tolist()
-        lines.append(" ".join([f"{stamp * 1e-9:.9f}", *(f"{v:.9f}" for v in (*pose.t.tolist(), x, y, z, w))]))
+        seconds = f"{Decimal(stamp).scaleb(-9):f}"  # a float has too few digits
+        lines.append(" ".join([seconds, *(f"{v:.9f}" for v in (*pose.t.tolist(), x, y, z, w))]))
     return "\n".join(lines) + "\n"
 
 
@@ -144,7 +146,6 @@ STEM_AXIS = AXIS[2::3]
 #: A frame of 100 stems has 40 kB.
 CSV_LIMIT = 16 << 20
 PLACE_LIMIT, DBH_LIMIT = 1e4, 10.0
-_TIME_LIMIT = 9e9  # s; what nanoseconds since 1970 hold in 64 bits
 STEM_FINDER = Sensor("stems of another program", 0, 0.0, 0.0035, 0.1, 100.0)
 
 
@@ -311,22 +312,16 @@ def _read_trajectory(file: Path, uri: str) -> tuple[Int, list[Pose3]]:
     """Return the times [ns], int64, shape (N,), strictly ascending, and the poses of the sensor in a file.
 
     Raises:
-        SourceError: The file is missing, damaged, or its times do not strictly ascend or are _TIME_LIMIT or
-            more.
+        SourceError: The file is missing or damaged, or its times do not strictly ascend.
         OSError: The file cannot be read.
     """
     remedy = "It needs a row `time x y z qx qy qz qw` for each TreeManagerState file."
     try:
-        table = read_table(file, 8)
-        stamp = table[:, 0]
-        if not (np.all(np.abs(stamp) < _TIME_LIMIT) and np.all(np.diff(stamp) > 0.0)):
-            raise TextError("its times do not ascend")
-        poses = [Pose3.from_quaternion(row[1:4], row[[7, 4, 5, 6]]) for row in table]
+        return read_tum_poses(file)
     except FileNotFoundError:
         raise SourceError(f"there is no {TRAJECTORY} in the folder", where=uri, remedy=remedy) from None
-    except (TextError, ValueError) as error:
+    except TextError as error:
         raise SourceError(f"{TRAJECTORY} cannot be used: {error}", where=uri, remedy=remedy) from error
-    return np.rint(stamp * 1e9).astype(np.int64), poses
 
 
 def _rows(number: Int, count: int, uri: str) -> tuple[Int, tuple[str, ...]]:

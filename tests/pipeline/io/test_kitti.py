@@ -146,9 +146,17 @@ def test_poses_that_do_not_fit_are_left_aside_with_a_warning(
     assert reason in source.description.warnings[0]
 
 
-def test_dates_are_times(tmp_path: Path, opened: Opened):
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2011-09-26 13:02:25.964389445\n2011-09-26 13:02:26.064389446\n",
+        "1317042145.964389445\n1317042146.064389446\n",
+    ],
+)
+@pytest.mark.parametrize("head", ["", "# times of the scans\n\n"])
+def test_dates_and_seconds_are_times_to_the_nanosecond(head: str, text: str, tmp_path: Path, opened: Opened):
     write_scans(tmp_path, [0, 1])
-    (tmp_path / "timestamps.txt").write_text("2011-09-26 13:02:25.964389445\n2011-09-26 13:02:26.064389446\n")
+    (tmp_path / "timestamps.txt").write_text(head + text)
     stamps = [record.stamp_ns for record in opened(tmp_path).records()]
     assert stamps == [1_317_042_145_964_389_445, 1_317_042_146_064_389_446]
 
