@@ -187,13 +187,14 @@ def within_reach(seen: SeenArea, parameters: Stand) -> SeenArea:
 
 
 def detection_function(trees: PlotTrees, seen: SeenArea, parameters: Stand) -> DetectionFunction:
-    """Return the probability of detection over distance, fitted to all trees in the observed area of at least
-    the minimum diameter or without one. It is 1 (CERTAIN) if the parameter `correction` is "none", if there
-    are fewer than LEAST_TREES trees, or if all distances of the area are unknown."""
-    if parameters.correction == "none" or not np.isfinite(seen.nearest).any():
+    """Return the probability of detection over distance, fitted to all trees in cells of known distance, of
+    at least the minimum diameter or without one. It is 1 (CERTAIN) if the parameter `correction` is "none",
+    or if there are fewer than LEAST_TREES such trees."""
+    if parameters.correction == "none":
         return CERTAIN
-    rows = seen.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
-    return fit_half_normal(seen.nearest[rows[rows >= 0]], seen.nearest) or CERTAIN
+    known = seen.where(np.isfinite(seen.nearest))
+    rows = known.rows(trees.position[~(trees.dbh < parameters.dbh_min)])
+    return fit_half_normal(known.nearest[rows[rows >= 0]], known.nearest) or CERTAIN
 
 
 def figures_of(

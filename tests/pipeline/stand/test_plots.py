@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from pipeline.stand.plots import (
     along,
     checked,
     circle,
+    detection_function,
     figures_of,
     rectangle,
     seen_plot,
@@ -179,6 +181,24 @@ def test_figures_refer_to_the_observed_part_of_a_plot():
     assert figures["in"].values["n_ha"].se == 0.0
     assert (figures["out"].seen, figures["out"].trees) == (0.0, 0)
     assert "no part of the plot was observed" in figures["out"].warnings[0]
+
+
+def test_cells_of_unknown_distance_do_not_change_the_detection():
+    driven = area_of([[x, y] for x in range(40) for y in range(40)])
+    driven = replace(driven, nearest=0.2 + np.abs(driven.centres[:, 1] - 10.0))
+    random = np.random.default_rng(1)
+    places = random.uniform(0.0, 20.0, (400, 2))
+    found = random.random(400) < np.exp(-0.5 * np.square((places[:, 1] - 10.0) / 4.0))
+    alone = PlotTrees(places[found], np.full(found.sum(), 0.2), np.zeros(found.sum()))
+    scanned = area_of([[x, y] for x in range(40, 60) for y in range(40)])
+    scanned = replace(scanned, nearest=np.full(len(scanned.place), np.nan))
+    position = np.concatenate([alone.position, random.uniform([20.0, 0.0], [30.0, 20.0], (100, 2))])
+    trees = PlotTrees(position, np.full(len(position), 0.2), np.zeros(len(position)))
+    both = driven.joined(scanned)
+    assert detection_function(trees, both, Stand()) == detection_function(alone, driven, Stand())
+    assert math.isfinite(detection_function(trees, both, Stand()).sigma)
+    figures = figures_of([rectangle("all", 15, 10, 30, 20)], trees, both, Stand())
+    assert figures["all"].values["n_ha"].value == pytest.approx(len(position) / 0.06)
 
 
 def test_a_cloud_covers_its_cells_and_gaps_up_to_a_metre():
