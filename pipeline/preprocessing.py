@@ -126,7 +126,7 @@ def _transformed_points(
         range_min, range_max: Limits, both inclusive [m]; points with NaN are removed.
     """
     kept = np.empty((points.shape[0], 3), np.float32)
-    n = 0
+    n = np.int64(0)
     # Blocks of contiguous rows and simple loops, which the compiler vectorises.
     u, v, w = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
     dt, inside = np.empty(CHUNK), np.empty(CHUNK, np.uint8)
