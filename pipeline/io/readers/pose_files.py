@@ -246,9 +246,10 @@ def _moves_along_z(R: Float, t: Float) -> bool:
 
 
 def _are_rotations(R: Float) -> bool:
-    """Return whether finite matrices, shape (..., 3, 3), are rotations up to rounding: orthogonal to 0.01, and
-    not reflections."""
-    return np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-2) and bool((np.linalg.det(R) > 0).all())
+    """Return whether finite matrices, shape (..., 3, 3), are rotations up to rounding: orthogonal to 0.01,
+    and no reflections."""
+    orthogonal = np.allclose(R @ np.swapaxes(R, -1, -2), np.eye(3), atol=1e-2)
+    return orthogonal and bool(np.all(np.linalg.det(R) > 0.0))
 
 
 def _nearest_rotation(matrix: Float) -> Float:

@@ -234,15 +234,17 @@ def write_live(path: Path, run: Path, topics: list[str], spoil: Callable[[LiveWr
 
 
 def test_settings_without_a_topic_of_scans_are_refused(stand: Path, tmp_path: Path):
-    write_live(tmp_path / "live.mcap", stand, [], lambda writer: None)
+    write_live(tmp_path / "live.mcap", stand, [], lambda _: None)
     with pytest.raises(SourceError, match="newer version"):
         open_source(str(tmp_path / "live.mcap"))
 
 
 def test_damaged_notes_are_counted_in_every_reading(stand: Path, tmp_path: Path):
+    damaged: Any = {"/velodyne_points": ["late"]}
+
     def spoil(writer: LiveWriter) -> None:
         writer.add_parameters(0, -1, {"clustering": []})
-        writer.add_skipped({"/velodyne_points": ["late"]})
+        writer.add_skipped(damaged)
 
     write_live(tmp_path / "live.mcap", stand, ["/velodyne_points"], spoil)
     with closing(open_source(str(tmp_path / "live.mcap"))) as source:
