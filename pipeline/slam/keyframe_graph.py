@@ -8,29 +8,25 @@ x*, l* = argmin   sum_k  |x_k-1^-1 x_k - u_k|^2_Q
 x_k are the poses of keyframes, p_k and C_k their positions and rotations, l_j the positions of stems, u_k the
 motions by odometry between keyframes, z_kj the detections of stems with the data association of FastSLAM, and
 t_ij the loops that stem matching finds. rho is the Cauchy kernel, which switches off a wrong association or a
-wrong loop. Levenberg-Marquardt solves the sparse normal equations, starting at the present estimate.
+wrong loop. `graph_solver` finds the minimum, starting at the present estimate.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 import numpy as np
 
 from pipeline.geometry.pose_arrays import composed, interpolated, inverse, rotated_rows
 from pipeline.geometry.poses import Float, Pose2, wrap_angle
 from pipeline.slam.association import associate
+from pipeline.slam.graph_solver import Problem, cauchy_weight
 from pipeline.slam.motion import Noise, compounded
 from pipeline.slam.particle_maps import MapColumns
 from pipeline.slam.places import REVISIT_DISTANCE
 from pipeline.types.records import Bool, Int
 
-Sparse = Any  # scipy.sparse.csc_matrix, or its factors; scipy has no types
-#: Scale of the Cauchy kernel [sigma]: 95 % of the efficiency of least squares for Gaussian errors (Holland,
-#: Welsch 1977).
-CAUCHY = 2.385
 #: Stems of one keyframe in the graph; bounds the cost of a keyframe.
 STEMS_MAX = 64
 GOLDEN = 0.6180339887498949  # golden ratio; its multiples modulo 1 order the stems evenly and reproducibly
@@ -41,13 +37,6 @@ LOOPS_MAX = 250
 #: Growth of the graph between two solutions: a share of it, and at least so many keyframes. All solutions
 #: of a run together cost a bounded multiple of the last one.
 GROWTH, GROWTH_MIN = 0.1, 5
-MOTION_SIGMA_MIN = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad; lower bound, for a robot that does not move
-CONVERGED = 1e-5  # relative decrease of the cost; a smaller one ends the iteration
-ITERATIONS_MAX = 50
-DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the solver fails
-FIXED = 1e8  # 1/m^2, 1/rad^2; information that holds the first pose, which is the frame of the map
-REGULAR = 1e-9  # 1/m^2, 1/rad^2; information of a pose or stem that nothing observes
-MARGINALS = 16  # keyframes whose covariance is computed; it is interpolated in between
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -313,7 +302,7 @@ class KeyframeGraph:
             y = (l - pose[:2]) @ C - keyframe.centre[known]
             xx, xy, yy = keyframe.R[known].T
             d2 = (yy * y[:, 0] ** 2 - 2.0 * xy * y[:, 0] * y[:, 1] + xx * y[:, 1] ** 2) / (xx * yy - xy**2)
-            total += float(_weight(d2).sum())
+            total += float(cauchy_weight(d2).sum())
         return total
 
     def thinned(self) -> KeyframeGraph:
@@ -362,9 +351,14 @@ class KeyframeGraph:
         if len(self.keyframes) < 2:
             return None
         try:
-            problem = _Problem(self)
+            problem = Problem(self)
             minimum = problem.minimum(quadratic_loops=int(new_loop))
-            return None if minimum is None else problem.solution(*minimum)
+            if minimum is None:
+                return None
+            pose, stem, normal = minimum
+            # A block of the diagonal is the information of a pose given all other unknowns.
+            conditional = np.linalg.inv(normal.U[-1])
+            return Solution(pose, problem.birth, stem, *problem.marginals(normal), conditional)
         except np.linalg.LinAlgError:
             return None
 
@@ -383,292 +377,6 @@ class KeyframeGraph:
         old = keyframe.birth[keyframe.birth < first_birth]
         seen = np.concatenate(recent) if recent else old[:0]
         return int(np.count_nonzero(~np.isin(old, seen))) >= 2
-
-
-class _Problem:
-    """A graph as arrays of K poses, L landmarks, E motions and loops, and M detections."""
-
-    def __init__(self, graph: KeyframeGraph) -> None:
-        """Convert a graph with at least two keyframes. Stems with a single detection are omitted, and so are
-        motions with infinite covariance.
-
-        Raises:
-            LinAlgError: A covariance is not positive definite.
-        """
-        keyframes = graph.keyframes
-        birth = np.concatenate([k.birth for k in keyframes])
-        row = np.repeat(np.arange(len(keyframes)), [len(k.birth) for k in keyframes])
-        names, of, count = np.unique(birth, return_inverse=True, return_counts=True)
-        used = count[of] > 1  # a single view of a stem does not constrain a pose
-        self.birth = names[count > 1]
-        self.row = row[used]
-        self.of = np.searchsorted(self.birth, birth[used])
-        self.z = np.concatenate([k.centre for k in keyframes])[used]
-        R = np.concatenate([k.R for k in keyframes])[used]
-        self.root_R = _root_information(R[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
-        self.pose = graph.pose
-        # Motions by odometry, then loops.
-        connected = [k for k in range(1, len(keyframes)) if np.isfinite(keyframes[k].covariance).all()]
-        scans = graph.scans
-        ends = [np.searchsorted(scans, e.scans) for e in graph.loops]
-        self.motions = len(connected)
-        self.first = np.array([k - 1 for k in connected] + [i for i, _ in ends], np.int64)
-        self.second = np.array(connected + [j for _, j in ends], np.int64)
-        motion = [keyframes[k].motion for k in connected] + [e.motion for e in graph.loops]
-        covariance = [keyframes[k].covariance for k in connected] + [e.covariance for e in graph.loops]
-        self.u = np.array(motion).reshape(-1, 3)
-        floor = np.diag(np.square(MOTION_SIGMA_MIN))
-        self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
-        self.order: Int | None = None  # of elimination, the same for all steps
-
-    def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Sparse] | None:
-        """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
-        iteration ends without a test of convergence.
-
-        Args:
-            quadratic_loops: Number of loops at the end that have no Cauchy kernel.
-
-        Returns:
-            Poses, shape (K, 3), yaw wrapped; positions of the stems, shape (L, 2) [m]; and normal matrix,
-            sparse, shape (3K + 2L, 3K + 2L). None if the normal matrix is singular or the damping exceeds its
-            limit.
-        """
-        x, l = self.pose.copy(), self._triangulated()  # noqa: E741
-        cost, H, g = self._linearised(x, l, quadratic_loops)
-        damping, factor, most = DAMPING
-        for _ in range(ITERATIONS_MAX):
-            step = self._step(H, g, damping)
-            if step is None:
-                return None
-            dx, dl = step[: 3 * len(x)].reshape(-1, 3), step[3 * len(x) :].reshape(-1, 2)
-            moved, placed = x + dx, l + dl
-            new_cost, new_H, new_g = self._linearised(moved, placed, quadratic_loops)
-            if new_cost > cost * (1.0 + 1e-9):
-                damping *= factor
-                if damping > most:
-                    return None
-                continue
-            converged = cost - new_cost < CONVERGED * cost
-            x, l, cost, H, g = moved, placed, new_cost, new_H, new_g  # noqa: E741
-            damping = max(damping / factor, DAMPING[0])
-            if converged:
-                break
-        x[:, 2] = wrap_angle(x[:, 2])
-        return x, l, H
-
-    def solution(self, x: Float, l: Float, H: Sparse) -> Solution:  # noqa: E741
-        """Return the record of a minimum. A diagonal block of the normal matrix H is the information of a
-        pose given all other unknowns.
-
-        Args:
-            x: Poses, shape (K, 3).
-            l: Stems, shape (L, 2) [m].
-            H: Normal matrix, sparse, shape (3K + 2L, 3K + 2L).
-
-        Raises:
-            LinAlgError: Nothing observes the newest pose, or the problem is singular.
-        """
-        end = 3 * len(x)
-        conditional = np.linalg.inv(H[end - 3 : end, end - 3 : end].toarray())
-        return Solution(x, self.birth, l, *self._marginals(H), conditional)
-
-    def _triangulated(self) -> Float:
-        """Return the mean position of each landmark by its detections at the poses in `pose`, shape (L, 2)
-        [m]."""
-        c, s = np.cos(self.pose[self.row, 2]), np.sin(self.pose[self.row, 2])
-        x = self.pose[self.row, 0] + c * self.z[:, 0] - s * self.z[:, 1]
-        y = self.pose[self.row, 1] + s * self.z[:, 0] + c * self.z[:, 1]
-        n = np.bincount(self.of, minlength=len(self.birth))
-        return np.column_stack([np.bincount(self.of, v, len(self.birth)) for v in (x, y)]) / n[:, None]
-
-    def _linearised(
-        self,
-        x: Float,
-        l: Float,  # noqa: E741
-        quadratic_loops: int,
-    ) -> tuple[float, Sparse, Float]:
-        """Return cost and linear system at an estimate.
-
-        Args:
-            x: Poses, shape (K, 3).
-            l: Stems, shape (L, 2) [m].
-            quadratic_loops: Number of loops at the end that have no Cauchy kernel.
-
-        Returns:
-            Robust cost; normal matrix, sparse, shape (3K + 2L, 3K + 2L); and gradient, shape (3K + 2L,),
-            poses first.
-        """
-        from scipy import sparse
-
-        K, L, M, E = len(x), len(l), len(self.row), len(self.first)
-        i, j = self.first, self.second
-        c, s = np.cos(x[i, 2]), np.sin(x[i, 2])
-        dx, dy = (x[j, :2] - x[i, :2]).T
-        e = np.column_stack([c * dx + s * dy, c * dy - s * dx, x[j, 2] - x[i, 2]]) - self.u
-        e[:, 2] = wrap_angle(e[:, 2])
-        J = np.zeros((2, E, 3, 3))
-        J[1, :, 0, 0], J[1, :, 0, 1], J[1, :, 1, 0], J[1, :, 1, 1], J[1, :, 2, 2] = c, s, -s, c, 1.0
-        J[0] = -J[1]
-        J[0, :, 0, 2], J[0, :, 1, 2] = c * dy - s * dx, -c * dx - s * dy
-        e, J = (self.root_Q @ e[:, :, None])[:, :, 0], self.root_Q @ J
-        d2 = np.einsum("ea,ea->e", e, e)
-        weight = np.ones(E)
-        robust = slice(self.motions, E - quadratic_loops)
-        weight[robust] = _weight(d2[robust])
-        cost = float(d2[: self.motions].sum() + _cost(d2[robust]).sum() + d2[E - quadratic_loops :].sum())
-        J, e = np.sqrt(weight)[:, None, None] * J, np.sqrt(weight)[:, None] * e
-
-        c, s = np.cos(x[self.row, 2]), np.sin(x[self.row, 2])
-        dx, dy = (l[self.of] - x[self.row, :2]).T
-        h = np.column_stack([c * dx + s * dy, c * dy - s * dx])
-        Jl = np.empty((M, 2, 2))
-        Jl[:, 0, 0], Jl[:, 0, 1], Jl[:, 1, 0], Jl[:, 1, 1] = c, s, -s, c
-        Jx = np.empty((M, 2, 3))
-        Jx[:, :, :2], Jx[:, 0, 2], Jx[:, 1, 2] = -Jl, h[:, 1], -h[:, 0]
-        r = (self.root_R @ (h - self.z)[:, :, None])[:, :, 0]
-        d2 = np.einsum("ma,ma->m", r, r)
-        cost += float(_cost(d2).sum())
-        q = np.sqrt(_weight(d2))
-        r, Jx, Jl = (
-            q[:, None] * r,
-            q[:, None, None] * (self.root_R @ Jx),
-            q[:, None, None] * (self.root_R @ Jl),
-        )
-
-        size = 3 * K + 2 * L
-        rows = [np.broadcast_to(3 * np.arange(E)[:, None, None] + np.arange(3)[:, None], (E, 3, 3))] * 2
-        columns = [np.broadcast_to(3 * k[:, None, None] + np.arange(3), (E, 3, 3)) for k in (i, j)]
-        at = 3 * E + 2 * np.arange(M)[:, None, None] + np.arange(2)[:, None]
-        rows += [np.broadcast_to(at, (M, 2, 3)), np.broadcast_to(at, (M, 2, 2))]
-        columns += [
-            np.broadcast_to(3 * self.row[:, None, None] + np.arange(3), (M, 2, 3)),
-            np.broadcast_to(3 * K + 2 * self.of[:, None, None] + np.arange(2), (M, 2, 2)),
-        ]
-        values = np.concatenate([J[0].ravel(), J[1].ravel(), Jx.ravel(), Jl.ravel()])
-        A = sparse.csc_matrix(
-            (
-                values,
-                (np.concatenate([v.ravel() for v in rows]), np.concatenate([v.ravel() for v in columns])),
-            ),
-            shape=(3 * E + 2 * M, size),
-        )
-        b = np.concatenate([e.ravel(), r.ravel()])
-        return cost, (A.T @ A).tocsc(), A.T @ b
-
-    def _step(self, H: Sparse, g: Float, damping: float) -> Float | None:
-        """Return the Levenberg-Marquardt step that is added to the poses and stems, for the normal matrix H
-        and the gradient g, shape (3K + 2L,); None if the system is singular or the step is not finite.
-        `damping` is relative to the diagonal of H. The first pose is held, so that the free frame of the map
-        does not make the system singular.
-        """
-        solve = self._factorised(H, damping)
-        if solve is None:
-            return None
-        out = -solve(g)
-        return out if np.isfinite(out).all() else None
-
-    def _factorised(self, H: Sparse, damping: float) -> Callable[[Float], Float] | None:
-        """Return the function that solves for right-hand sides, shape (3K + 2L,) or (3K + 2L, N), by the LU
-        factors of the normal matrix H plus `damping` times its diagonal, with the first pose fixed; None if
-        this matrix is singular. The first call stores the order of elimination in `order`."""
-        from scipy import sparse
-        from scipy.sparse.linalg import splu
-
-        diagonal = damping * H.diagonal() + REGULAR
-        diagonal[:3] += FIXED
-        if self.order is None:
-            self.order = self._elimination_order(H)
-        order = self.order
-        matrix = (H + sparse.diags(diagonal))[order][:, order].tocsc()
-        try:
-            factors = splu(
-                matrix, permc_spec="NATURAL", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
-        except RuntimeError:
-            return None
-
-        def solve(right: Float) -> Float:
-            solution = np.empty_like(right)
-            solution[order] = factors.solve(right[order])
-            return solution
-
-        return solve
-
-    def _elimination_order(self, H: Sparse) -> Int:
-        """Return the order of the unknowns in which the factors of the normal matrix H have few entries,
-        int64, shape (3K + 2L,).
-
-        It is the minimum degree order of the graph of poses and stems: that of the single unknowns is as
-        good, and to find it takes longer than to factorise.
-        """
-        from scipy import sparse
-        from scipy.sparse.linalg import splu
-
-        K, L = len(self.pose), len(self.birth)
-        node = np.concatenate([np.repeat(np.arange(K), 3), K + np.repeat(np.arange(L), 2)])
-        entries = H.tocoo()
-        pattern = (np.ones(entries.nnz), (node[entries.row], node[entries.col]))
-        graph = sparse.coo_matrix(pattern, shape=(K + L, K + L)).tocsc()
-        dominant = graph + sparse.diags(np.asarray(graph.sum(axis=0)).ravel() + 1.0)  # never singular
-        rank = splu(dominant, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}).perm_c
-        return np.argsort(rank[node], kind="stable")
-
-    def _marginals(self, H: Sparse) -> tuple[Float, Float]:
-        """Return `covariance` and `of_map` of the solution, shape (K, 3, 3) each. They are computed from the
-        normal matrix H for the second and at most MARGINALS other keyframes, and interpolated linearly by row
-        in between.
-
-        Raises:
-            LinAlgError: H is singular.
-        """
-        K = len(self.pose)
-        solve = self._factorised(H, 0.0)
-        if solve is None:
-            raise np.linalg.LinAlgError("the normal matrix is singular")
-        chosen = np.unique(np.r_[1, np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64)])
-        unit = np.zeros((H.shape[0], 3 * len(chosen)))
-        columns = (3 * chosen[:, None] + np.arange(3)).ravel()
-        unit[columns, np.arange(len(columns))] = 1.0
-        inverse_H = solve(unit)
-        blocks = np.array([inverse_H[3 * k : 3 * k + 3, 3 * n : 3 * n + 3] for n, k in enumerate(chosen)])
-        blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
-        given_others = [
-            np.linalg.inv(H[3 * k : 3 * k + 3, 3 * k : 3 * k + 3].toarray() + REGULAR * np.eye(3))
-            for k in chosen
-        ]
-        values, axes = np.linalg.eigh(blocks - np.array(given_others))
-        of_map = (axes * np.maximum(values, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
-        return _interpolated(chosen, blocks, K), _interpolated(chosen[1:], of_map[1:], K)
-
-
-def _interpolated(rows: Int, matrices: Float, count: int) -> Float:
-    """Return matrices for the rows 0 to `count` - 1, shape (count, 3, 3), interpolated linearly between those
-    of some rows, shape (N, 3, 3), and constant before and after them."""
-    flat, at = matrices.reshape(-1, 9), np.arange(count)
-    return np.column_stack([np.interp(at, rows, column) for column in flat.T]).reshape(-1, 3, 3)
-
-
-def _root_information(covariance: Float) -> Float:
-    """Return upper triangular matrices W with W^T W = covariance^-1, shape (N, n, n), for covariances of this
-    shape.
-
-    Raises:
-        LinAlgError: A covariance is not positive definite.
-    """
-    if not len(covariance):
-        return covariance
-    return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
-
-
-def _weight(d2: Float) -> Float:
-    """Return the weights of squared errors [sigma^2] by the Cauchy kernel: 1 for 0, towards 0 for large
-    errors; same shape."""
-    return 1.0 / (1.0 + d2 / CAUCHY**2)
-
-
-def _cost(d2: Float) -> Float:
-    """Return the cost of squared errors [sigma^2] by the Cauchy kernel; same shape."""
-    return CAUCHY**2 * np.log1p(d2 / CAUCHY**2)
 
 
 JUMP, JUMP_TURN = 1.0, 1.0  # m, rad; a larger difference between path and odometry is no motion

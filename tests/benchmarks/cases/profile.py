@@ -158,8 +158,8 @@ def _by_stage(profiles: dict[str, Profile]) -> Table:
         ("stage", *profiles),
         tuple(rows),
         (
-            "Preset of each source, 100 particles, seed 1. SLAM uses the detections of some scans, whose "
-            "number is in the next table. Rest: loop closure, corrections of the map, the record of the scan.",
+            "Preset of each source, 100 particles, seed 1. SLAM uses the detections of some scans, see the "
+            "next table. Rest: loop closure, corrections of the map, the record of the scan.",
         ),
     )
 

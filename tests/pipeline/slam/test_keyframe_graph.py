@@ -11,9 +11,9 @@ from scipy.optimize import least_squares
 
 from pipeline.geometry.pose_arrays import composed, inverse
 from pipeline.geometry.poses import Pose2, wrap_angle
-from pipeline.slam import keyframe_graph
+from pipeline.slam import graph_solver
+from pipeline.slam.graph_solver import CAUCHY
 from pipeline.slam.keyframe_graph import (
-    CAUCHY,
     KEYFRAMES_MAX,
     STEMS_MAX,
     Keyframe,
@@ -192,7 +192,7 @@ def test_the_part_of_the_map_is_interpolated_from_the_second_keyframe_on(monkeyp
     """The covariance of the first keyframe is zero, because it is fixed; that of its stems is not."""
     graph = graph_of(arc(80, radius=40.0, turn=0.02), np.random.default_rng(2))
     interpolated = graph.solve().of_map
-    monkeypatch.setattr(keyframe_graph, "MARGINALS", len(graph.keyframes))
+    monkeypatch.setattr(graph_solver, "MARGINALS", len(graph.keyframes))
     exact = graph.solve().of_map
     np.testing.assert_allclose(interpolated[1], exact[1], rtol=1e-6)
     sigma, expected = (np.sqrt(np.trace(part[:, :2, :2], axis1=1, axis2=2)) for part in (interpolated, exact))

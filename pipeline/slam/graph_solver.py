@@ -1,0 +1,422 @@
+"""Solution of the graph of keyframes and stems: Levenberg-Marquardt with the stems eliminated.
+
+Each stem is seen by some keyframes and by no other stem, so that its unknowns l are eliminated one stem at a
+time (Schur complement; Triggs et al. 2000, Bundle Adjustment, section 6.1). With the normal equations
+
+    [U    W ] [dx]     [g_x]
+    [W^T  V ] [dl] = - [g_l],        V block diagonal,
+
+    (U - W V^-1 W^T) dx = -g_x + W V^-1 g_l,        dl = -V^-1 (g_l + W^T dx).
+
+Two keyframes are coupled if they see a common stem. In the order of Cuthill and McKee these are near each
+other, so that the reduced matrix has a band, which LAPACK factorises.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from pipeline.geometry.poses import Float, wrap_angle
+from pipeline.jit import compiled
+from pipeline.types.records import Int
+
+if TYPE_CHECKING:
+    from pipeline.slam.keyframe_graph import KeyframeGraph
+
+#: Scale of the Cauchy kernel [sigma]: 95 % of the efficiency of least squares for Gaussian errors (Holland,
+#: Welsch 1977).
+CAUCHY = 2.385
+MOTION_SIGMA_MIN = np.array([1e-3, 1e-3, 1e-4])  # m, m, rad; lower bound, for a robot that does not move
+CONVERGED = 1e-5  # relative decrease of the cost; a smaller one ends the iteration
+ITERATIONS_MAX = 50
+DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the solver fails
+FIXED = 1e8  # 1/m^2, 1/rad^2; information that holds the first pose, which is the frame of the map
+REGULAR = 1e-9  # 1/m^2, 1/rad^2; information of a pose or stem that nothing observes
+MARGINALS = 16  # keyframes whose covariance is computed; it is interpolated in between
+
+
+class Normal(NamedTuple):
+    """Normal equations of K poses, L stems, E motions and loops, and M detections.
+
+    Attributes:
+        U: Blocks of the poses on the diagonal, shape (K, 3, 3).
+        edge: Block of each motion and loop, of its second pose by its first one, shape (E, 3, 3).
+        W: Block of each detection, of its pose by its stem, shape (M, 3, 2).
+        V: Blocks of the stems xx, xy, yy, shape (L, 3).
+        g_x, g_l: Gradient, shapes (K, 3) and (L, 2).
+    """
+
+    U: Float
+    edge: Float
+    W: Float
+    V: Float
+    g_x: Float
+    g_l: Float
+
+
+class Problem:
+    """A graph as arrays of K poses, L stems, E motions and loops, and M detections, by stem."""
+
+    def __init__(self, graph: KeyframeGraph) -> None:
+        """Convert a graph with at least two keyframes. Stems with a single detection are omitted, and so are
+        motions with infinite covariance.
+
+        Raises:
+            LinAlgError: A covariance is not positive definite.
+        """
+        keyframes = graph.keyframes
+        birth = np.concatenate([k.birth for k in keyframes])
+        row = np.repeat(np.arange(len(keyframes)), [len(k.birth) for k in keyframes])
+        names, of, count = np.unique(birth, return_inverse=True, return_counts=True)
+        self.birth = names[count > 1]
+        by_stem = np.argsort(of, kind="stable")
+        by_stem = by_stem[count[of[by_stem]] > 1]  # a single view of a stem does not constrain a pose
+        self.row = row[by_stem]
+        self.of = np.searchsorted(self.birth, birth[by_stem])
+        self.begin = np.searchsorted(self.of, np.arange(len(self.birth) + 1))
+        self.z = np.concatenate([k.centre for k in keyframes])[by_stem]
+        R = np.concatenate([k.R for k in keyframes])[by_stem]
+        self.root_R = _root_information(R[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
+        self.pose = graph.pose
+        # Motions by odometry, then loops.
+        connected = [k for k in range(1, len(keyframes)) if np.isfinite(keyframes[k].covariance).all()]
+        scans = graph.scans
+        ends = [np.searchsorted(scans, e.scans) for e in graph.loops]
+        self.motions = len(connected)
+        self.first = np.array([k - 1 for k in connected] + [i for i, _ in ends], np.int64)
+        self.second = np.array(connected + [j for _, j in ends], np.int64)
+        motion = [keyframes[k].motion for k in connected] + [e.motion for e in graph.loops]
+        covariance = [keyframes[k].covariance for k in connected] + [e.covariance for e in graph.loops]
+        self.u = np.array(motion).reshape(-1, 3)
+        floor = np.diag(np.square(MOTION_SIGMA_MIN))
+        self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
+        self.place, self.width = self._band()
+
+    def _band(self) -> tuple[Int, int]:
+        """Return the place of each pose in the reduced matrix, int64, shape (K,), and the number of diagonals
+        of its lower half."""
+        from scipy import sparse
+        from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+        K, M, E = len(self.pose), len(self.row), len(self.first)
+        seen = sparse.csr_matrix((np.ones(M), (self.row, self.of)), shape=(K, len(self.birth)))
+        edges = sparse.csr_matrix((np.ones(E), (self.first, self.second)), shape=(K, K))
+        coupled = (seen @ seen.T + edges + edges.T).tocsr()
+        place = np.empty(K, np.int64)
+        place[reverse_cuthill_mckee(coupled, symmetric_mode=True)] = np.arange(K)
+        pairs = coupled.tocoo()
+        farthest = int(np.abs(place[pairs.row] - place[pairs.col]).max(initial=0))
+        return place, 3 * farthest + 3
+
+    def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Normal] | None:
+        """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
+        iteration ends without a test of convergence.
+
+        Args:
+            quadratic_loops: Number of loops at the end that have no Cauchy kernel.
+
+        Returns:
+            Poses, shape (K, 3), yaw wrapped; positions of the stems, shape (L, 2) [m]; and normal equations
+            at the minimum. None if they are singular or the damping exceeds its limit.
+        """
+        x, l = self.pose.copy(), self._triangulated()  # noqa: E741
+        cost, normal = self._linearised(x, l, quadratic_loops)
+        damping, factor, most = DAMPING
+        for _ in range(ITERATIONS_MAX):
+            step = self._step(normal, damping)
+            if step is None:
+                return None
+            moved, placed = x + step[0], l + step[1]
+            new_cost, new_normal = self._linearised(moved, placed, quadratic_loops)
+            if new_cost > cost * (1.0 + 1e-9):
+                damping *= factor
+                if damping > most:
+                    return None
+                continue
+            converged = cost - new_cost < CONVERGED * cost
+            x, l, cost, normal = moved, placed, new_cost, new_normal  # noqa: E741
+            damping = max(damping / factor, DAMPING[0])
+            if converged:
+                break
+        x[:, 2] = wrap_angle(x[:, 2])
+        return x, l, normal
+
+    def _triangulated(self) -> Float:
+        """Return the mean position of each stem by its detections at the poses in `pose`, shape (L, 2)
+        [m]."""
+        c, s = np.cos(self.pose[self.row, 2]), np.sin(self.pose[self.row, 2])
+        x = self.pose[self.row, 0] + c * self.z[:, 0] - s * self.z[:, 1]
+        y = self.pose[self.row, 1] + s * self.z[:, 0] + c * self.z[:, 1]
+        n = np.bincount(self.of, minlength=len(self.birth))
+        return np.column_stack([np.bincount(self.of, v, len(self.birth)) for v in (x, y)]) / n[:, None]
+
+    def _linearised(
+        self,
+        x: Float,
+        l: Float,  # noqa: E741
+        quadratic_loops: int,
+    ) -> tuple[float, Normal]:
+        """Return robust cost and normal equations at an estimate.
+
+        Args:
+            x: Poses, shape (K, 3).
+            l: Stems, shape (L, 2) [m].
+            quadratic_loops: Number of loops at the end that have no Cauchy kernel.
+        """
+        K, L, E = len(x), len(l), len(self.first)
+        i, j = self.first, self.second
+        c, s = np.cos(x[i, 2]), np.sin(x[i, 2])
+        dx, dy = (x[j, :2] - x[i, :2]).T
+        e = np.column_stack([c * dx + s * dy, c * dy - s * dx, x[j, 2] - x[i, 2]]) - self.u
+        e[:, 2] = wrap_angle(e[:, 2])
+        J = np.zeros((2, E, 3, 3))
+        J[1, :, 0, 0], J[1, :, 0, 1], J[1, :, 1, 0], J[1, :, 1, 1], J[1, :, 2, 2] = c, s, -s, c, 1.0
+        J[0] = -J[1]
+        J[0, :, 0, 2], J[0, :, 1, 2] = c * dy - s * dx, -c * dx - s * dy
+        e, J = (self.root_Q @ e[:, :, None])[:, :, 0], self.root_Q @ J
+        d2 = np.einsum("ea,ea->e", e, e)
+        weight, cost = np.ones(E), d2.copy()
+        robust = slice(self.motions, E - quadratic_loops)
+        weight[robust] = cauchy_weight(d2[robust])
+        cost[robust] = CAUCHY**2 * np.log1p(d2[robust] / CAUCHY**2)
+        J, e = np.sqrt(weight)[:, None, None] * J, np.sqrt(weight)[:, None] * e
+
+        U, g_x = np.zeros((K, 3, 3)), np.zeros((K, 3))
+        for n, ends in enumerate((i, j)):
+            np.add.at(U, ends, J[n].transpose(0, 2, 1) @ J[n])
+            np.add.at(g_x, ends, np.einsum("eai,ea->ei", J[n], e))
+        edge = J[1].transpose(0, 2, 1) @ J[0]
+        normal = Normal(U, edge, np.empty((len(self.row), 3, 2)), np.zeros((L, 3)), g_x, np.zeros((L, 2)))
+        of_stems = _add_detections(x, l, self.row, self.of, self.z, self.root_R, normal)
+        return float(cost.sum()) + of_stems, normal
+
+    def _step(self, normal: Normal, damping: float) -> tuple[Float, Float] | None:
+        """Return the Levenberg-Marquardt step of the poses, shape (K, 3), and of the stems, shape (L, 2).
+
+        It is None if the system is singular or the step is not finite. `damping` is relative to the diagonal.
+        The first pose is held, so that the free frame of the map does not make the system singular.
+        """
+        from scipy.linalg import cho_solve_banded
+
+        factor, right, inverse_V = self._reduced(normal, damping)
+        if factor is None:
+            return None
+        dx = -cho_solve_banded((factor, True), right, check_finite=False).reshape(-1, 3)[self.place]
+        dl = _stem_steps(normal, inverse_V, self.row, self.begin, dx)
+        return (dx, dl) if np.isfinite(dx).all() and np.isfinite(dl).all() else None
+
+    def _reduced(self, normal: Normal, damping: float) -> tuple[Float | None, Float, Float]:
+        """Eliminate the stems and factorise the rest.
+
+        Args:
+            normal: Normal equations, unchanged.
+            damping: Share of the diagonal that is added to it.
+
+        Returns:
+            Cholesky factor of the reduced matrix as its lower diagonals, shape (width, 3K), None if the
+            matrix is not positive definite; reduced gradient in the same order, shape (3K,); and inverse
+            blocks of the stems xx, xy, yy, shape (L, 3).
+        """
+        from scipy.linalg import cholesky_banded
+
+        columns = np.zeros((3 * len(self.pose), self.width))  # each row is a column of the matrix
+        right = np.empty((len(self.pose), 3))
+        right[self.place] = normal.g_x
+        _write_poses(normal, self.first, self.second, self.place, damping, columns)
+        inverse_V = _eliminate_stems(normal, self.row, self.begin, self.place, damping, columns, right)
+        try:
+            factor = cholesky_banded(columns.T, overwrite_ab=True, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            factor = None
+        return factor, right.ravel(), inverse_V
+
+    def marginals(self, normal: Normal) -> tuple[Float, Float]:
+        """Return `covariance` and `of_map` of the solution, shape (K, 3, 3) each. They are computed from the
+        normal equations for the second and at most MARGINALS other keyframes, and interpolated linearly by
+        row in between.
+
+        Raises:
+            LinAlgError: The normal equations are singular.
+        """
+        from scipy.linalg import cho_solve_banded
+
+        K = len(self.pose)
+        factor, _, _ = self._reduced(normal, 0.0)
+        if factor is None:
+            raise np.linalg.LinAlgError("the normal equations are singular")
+        chosen = np.unique(np.r_[1, np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64)])
+        rows = 3 * self.place[chosen, None] + np.arange(3)
+        unit = np.zeros((3 * K, rows.size))
+        unit[rows.ravel(), np.arange(rows.size)] = 1.0
+        inverse = cho_solve_banded((factor, True), unit, overwrite_b=True, check_finite=False)
+        blocks = np.array([inverse[at, 3 * n : 3 * n + 3] for n, at in enumerate(rows)])
+        blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
+        given_others = np.linalg.inv(normal.U[chosen] + REGULAR * np.eye(3))
+        values, axes = np.linalg.eigh(blocks - given_others)
+        of_map = (axes * np.maximum(values, 0.0)[:, None, :]) @ axes.transpose(0, 2, 1)
+        return _interpolated(chosen, blocks, K), _interpolated(chosen[1:], of_map[1:], K)
+
+
+@compiled
+def _add_detections(
+    x: Float,
+    l: Float,  # noqa: E741
+    row: Int,
+    of: Int,
+    z: Float,
+    root_R: Float,
+    normal: Normal,
+) -> float:
+    """Add the detections to the normal equations, in place, and return their robust cost.
+
+    Args:
+        x: Poses, shape (K, 3).
+        l: Stems, shape (L, 2) [m].
+        row, of: Pose and stem of each detection, int64, shape (M,).
+        z: Detections in the frame of their pose, shape (M, 2) [m].
+        root_R: Roots of their information, upper triangular, shape (M, 2, 2).
+        normal: Normal equations; all blocks of W are written.
+    """
+    cost = 0.0
+    Jx, Jl = np.empty((2, 3)), np.empty((2, 2))
+    for m in range(row.shape[0]):
+        k, j = row[m], of[m]
+        c, s = np.cos(x[k, 2]), np.sin(x[k, 2])
+        dx, dy = l[j, 0] - x[k, 0], l[j, 1] - x[k, 1]
+        h0, h1 = c * dx + s * dy, c * dy - s * dx
+        a, b, d = root_R[m, 0, 0], root_R[m, 0, 1], root_R[m, 1, 1]
+        e1 = d * (h1 - z[m, 1])
+        e0 = a * (h0 - z[m, 0]) + b * (h1 - z[m, 1])
+        d2 = (e0 * e0 + e1 * e1) / (CAUCHY * CAUCHY)
+        cost += CAUCHY * CAUCHY * np.log1p(d2)
+        weight = 1.0 / (1.0 + d2)
+        Jl[0, 0], Jl[0, 1], Jl[1, 0], Jl[1, 1] = a * c - b * s, a * s + b * c, -d * s, d * c
+        Jx[0, 2], Jx[1, 2] = a * h1 - b * h0, -d * h0
+        Jx[:, :2] = -Jl
+        for p in range(3):
+            normal.g_x[k, p] += weight * (Jx[0, p] * e0 + Jx[1, p] * e1)
+            for q in range(3):
+                normal.U[k, p, q] += weight * (Jx[0, p] * Jx[0, q] + Jx[1, p] * Jx[1, q])
+            for q in range(2):
+                normal.W[m, p, q] = weight * (Jx[0, p] * Jl[0, q] + Jx[1, p] * Jl[1, q])
+        normal.V[j, 0] += weight * (Jl[0, 0] * Jl[0, 0] + Jl[1, 0] * Jl[1, 0])
+        normal.V[j, 1] += weight * (Jl[0, 0] * Jl[0, 1] + Jl[1, 0] * Jl[1, 1])
+        normal.V[j, 2] += weight * (Jl[0, 1] * Jl[0, 1] + Jl[1, 1] * Jl[1, 1])
+        for q in range(2):
+            normal.g_l[j, q] += weight * (Jl[0, q] * e0 + Jl[1, q] * e1)
+    return cost
+
+
+@compiled
+def _write_poses(normal: Normal, first: Int, second: Int, place: Int, damping: float, columns: Float) -> None:
+    """Write the blocks of poses, motions and loops into the lower half of the reduced matrix.
+
+    Args:
+        normal: Normal equations.
+        first, second: Poses of each motion and loop, int64, shape (E,).
+        place: Place of each pose in the reduced matrix, int64, shape (K,).
+        damping: Share of the diagonal that is added to it.
+        columns: Columns of the reduced matrix from the diagonal downwards, shape (3K, width); filled.
+    """
+    for k in range(place.shape[0]):
+        for p in range(3):
+            for q in range(p + 1):
+                columns[3 * place[k] + q, p - q] += normal.U[k, p, q]
+            columns[3 * place[k] + p, 0] += damping * normal.U[k, p, p] + REGULAR + (FIXED if k == 0 else 0.0)
+    for e in range(first.shape[0]):
+        low, high = 3 * place[first[e]], 3 * place[second[e]]
+        for p in range(3):
+            for q in range(3):
+                if low < high:
+                    columns[low + q, high + p - low - q] += normal.edge[e, p, q]
+                else:
+                    columns[high + p, low + q - high - p] += normal.edge[e, p, q]
+
+
+@compiled
+def _eliminate_stems(
+    normal: Normal, row: Int, begin: Int, place: Int, damping: float, columns: Float, right: Float
+) -> Float:
+    """Subtract W V^-1 W^T from the reduced matrix and W V^-1 g_l from its gradient, in place; return V^-1 as
+    xx, xy, yy, shape (L, 3).
+
+    Args:
+        normal: Normal equations.
+        row: Pose of each detection, int64, shape (M,).
+        begin: First detection of each stem, and M, int64, shape (L + 1,).
+        place, damping, columns: See `_write_poses`.
+        right: Gradient in the order of the places, shape (K, 3).
+    """
+    inverse = np.empty((normal.V.shape[0], 3))
+    T = np.empty((3, 2))
+    for j in range(inverse.shape[0]):
+        xx = (1.0 + damping) * normal.V[j, 0] + REGULAR
+        yy = (1.0 + damping) * normal.V[j, 2] + REGULAR
+        xy = normal.V[j, 1]
+        determinant = xx * yy - xy * xy
+        inverse[j, 0], inverse[j, 1], inverse[j, 2] = yy / determinant, -xy / determinant, xx / determinant
+        for m in range(begin[j], begin[j + 1]):
+            at = place[row[m]]
+            for p in range(3):
+                T[p, 0] = normal.W[m, p, 0] * inverse[j, 0] + normal.W[m, p, 1] * inverse[j, 1]
+                T[p, 1] = normal.W[m, p, 0] * inverse[j, 1] + normal.W[m, p, 1] * inverse[j, 2]
+                right[at, p] -= T[p, 0] * normal.g_l[j, 0] + T[p, 1] * normal.g_l[j, 1]
+            for n in range(begin[j], begin[j + 1]):
+                below = place[row[n]] - at
+                if below < 0:
+                    continue
+                for p in range(3):
+                    for q in range(3):
+                        if 3 * below + q >= p:
+                            columns[3 * at + p, 3 * below + q - p] -= (
+                                normal.W[n, q, 0] * T[p, 0] + normal.W[n, q, 1] * T[p, 1]
+                            )
+    return inverse
+
+
+@compiled
+def _stem_steps(normal: Normal, inverse_V: Float, row: Int, begin: Int, dx: Float) -> Float:
+    """Return the steps of the stems, -V^-1 (g_l + W^T dx), shape (L, 2) [m].
+
+    Args:
+        normal: Normal equations.
+        inverse_V, row, begin: See `_eliminate_stems`.
+        dx: Steps of the poses, shape (K, 3).
+    """
+    dl = np.empty((inverse_V.shape[0], 2))
+    for j in range(dl.shape[0]):
+        gx, gy = normal.g_l[j, 0], normal.g_l[j, 1]
+        for m in range(begin[j], begin[j + 1]):
+            for p in range(3):
+                gx += normal.W[m, p, 0] * dx[row[m], p]
+                gy += normal.W[m, p, 1] * dx[row[m], p]
+        dl[j, 0] = -inverse_V[j, 0] * gx - inverse_V[j, 1] * gy
+        dl[j, 1] = -inverse_V[j, 1] * gx - inverse_V[j, 2] * gy
+    return dl
+
+
+def cauchy_weight(d2: Float) -> Float:
+    """Return the weights of squared errors [sigma^2] by the Cauchy kernel: 1 for 0, towards 0 for large
+    errors; same shape."""
+    return 1.0 / (1.0 + d2 / CAUCHY**2)
+
+
+def _interpolated(rows: Int, matrices: Float, count: int) -> Float:
+    """Return matrices for the rows 0 to `count` - 1, shape (count, 3, 3), interpolated linearly between those
+    of some rows, shape (N, 3, 3), and constant before and after them."""
+    flat, at = matrices.reshape(-1, 9), np.arange(count)
+    return np.column_stack([np.interp(at, rows, column) for column in flat.T]).reshape(-1, 3, 3)
+
+
+def _root_information(covariance: Float) -> Float:
+    """Return upper triangular matrices W with W^T W = covariance^-1, shape (N, n, n), for covariances of this
+    shape.
+
+    Raises:
+        LinAlgError: A covariance is not positive definite.
+    """
+    if not len(covariance):
+        return covariance
+    return np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)
