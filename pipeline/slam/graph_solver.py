@@ -9,7 +9,7 @@ time (Schur complement; Triggs et al. 2000, Bundle Adjustment, section 6.1). Wit
     (U - W V^-1 W^T) dx = -g_x + W V^-1 g_l,        dl = -V^-1 (g_l + W^T dx).
 
 Two keyframes are coupled if they see a common stem. In the order of Cuthill and McKee these are near each
-other, so that the reduced matrix has a band, which LAPACK factorises.
+other, so that the envelope of the reduced matrix is small.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from pipeline.geometry.envelope import Envelope, Factor
 from pipeline.geometry.poses import Float, wrap_angle
 from pipeline.jit import compiled
 from pipeline.types.records import Int
@@ -34,6 +35,7 @@ ITERATIONS_MAX = 50
 DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the solver fails
 FIXED = 1e8  # 1/m^2, 1/rad^2; information that holds the first pose, which is the frame of the map
 REGULAR = 1e-9  # 1/m^2, 1/rad^2; information of a pose or stem that nothing observes
+BLOCK = 16  # poses of a block of the reduced matrix
 MARGINALS = 16  # keyframes whose covariance is computed; it is interpolated in between
 
 
@@ -92,11 +94,11 @@ class Problem:
         self.u = np.array(motion).reshape(-1, 3)
         floor = np.diag(np.square(MOTION_SIGMA_MIN))
         self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
-        self.place, self.width = self._band()
+        self.place, self.envelope = self._ordered()
 
-    def _band(self) -> tuple[Int, int]:
-        """Return the place of each pose in the reduced matrix, int64, shape (K,), and the number of diagonals
-        of its lower half."""
+    def _ordered(self) -> tuple[Int, Envelope]:
+        """Return the place of each pose in the reduced matrix, int64, shape (K,), and the envelope of this
+        matrix."""
         from scipy import sparse
         from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -107,8 +109,7 @@ class Problem:
         place = np.empty(K, np.int64)
         place[reverse_cuthill_mckee(coupled, symmetric_mode=True)] = np.arange(K)
         pairs = coupled.tocoo()
-        farthest = int(np.abs(place[pairs.row] - place[pairs.col]).max(initial=0))
-        return place, 3 * farthest + 3
+        return place, Envelope.of(3 * place[pairs.row], 3 * place[pairs.col], 3 * K, 3 * BLOCK)
 
     def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Normal] | None:
         """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
@@ -198,16 +199,15 @@ class Problem:
         It is None if the system is singular or the step is not finite. `damping` is relative to the diagonal.
         The first pose is held, so that the free frame of the map does not make the system singular.
         """
-        from scipy.linalg import cho_solve_banded
-
-        factor, right, inverse_V = self._reduced(normal, damping)
-        if factor is None:
+        try:
+            factor, right, inverse_V = self._reduced(normal, damping)
+        except np.linalg.LinAlgError:
             return None
-        dx = -cho_solve_banded((factor, True), right, check_finite=False).reshape(-1, 3)[self.place]
+        dx = -factor.solve(right).reshape(-1, 3)[self.place]
         dl = _stem_steps(normal, inverse_V, self.row, self.begin, dx)
         return (dx, dl) if np.isfinite(dx).all() and np.isfinite(dl).all() else None
 
-    def _reduced(self, normal: Normal, damping: float) -> tuple[Float | None, Float, Float]:
+    def _reduced(self, normal: Normal, damping: float) -> tuple[Factor, Float, Float]:
         """Eliminate the stems and factorise the rest.
 
         Args:
@@ -215,22 +215,19 @@ class Problem:
             damping: Share of the diagonal that is added to it.
 
         Returns:
-            Cholesky factor of the reduced matrix as its lower diagonals, shape (width, 3K), None if the
-            matrix is not positive definite; reduced gradient in the same order, shape (3K,); and inverse
-            blocks of the stems xx, xy, yy, shape (L, 3).
-        """
-        from scipy.linalg import cholesky_banded
+            Factor of the reduced matrix; reduced gradient in the same order, shape (3K,); and inverse blocks
+            of the stems xx, xy, yy, shape (L, 3).
 
-        columns = np.zeros((3 * len(self.pose), self.width))  # each row is a column of the matrix
-        right = np.empty((len(self.pose), 3))
+        Raises:
+            LinAlgError: The reduced matrix is not positive definite.
+        """
+        e = self.envelope
+        values, right = np.zeros(e.offset[-1]), np.empty((len(self.pose), 3))
         right[self.place] = normal.g_x
-        _write_poses(normal, self.first, self.second, self.place, damping, columns)
-        inverse_V = _eliminate_stems(normal, self.row, self.begin, self.place, damping, columns, right)
-        try:
-            factor = cholesky_banded(columns.T, overwrite_ab=True, lower=True, check_finite=False)
-        except np.linalg.LinAlgError:
-            factor = None
-        return factor, right.ravel(), inverse_V
+        places = self.place, e.first, e.width, e.offset
+        _write_poses(normal, self.first, self.second, places, damping, values)
+        inverse_V = _eliminate_stems(normal, self.row, self.begin, places, damping, values, right)
+        return Factor(values, e), right.ravel(), inverse_V
 
     def marginals(self, normal: Normal) -> tuple[Float, Float]:
         """Return `covariance` and `of_map` of the solution, shape (K, 3, 3) each. They are computed from the
@@ -240,17 +237,13 @@ class Problem:
         Raises:
             LinAlgError: The normal equations are singular.
         """
-        from scipy.linalg import cho_solve_banded
-
         K = len(self.pose)
         factor, _, _ = self._reduced(normal, 0.0)
-        if factor is None:
-            raise np.linalg.LinAlgError("the normal equations are singular")
         chosen = np.unique(np.r_[1, np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64)])
         rows = 3 * self.place[chosen, None] + np.arange(3)
         unit = np.zeros((3 * K, rows.size))
         unit[rows.ravel(), np.arange(rows.size)] = 1.0
-        inverse = cho_solve_banded((factor, True), unit, overwrite_b=True, check_finite=False)
+        inverse = factor.solve(unit)
         blocks = np.array([inverse[at, 3 * n : 3 * n + 3] for n, at in enumerate(rows)])
         blocks = 0.5 * (blocks + blocks.transpose(0, 2, 1))
         given_others = np.linalg.inv(normal.U[chosen] + REGULAR * np.eye(3))
@@ -309,35 +302,63 @@ def _add_detections(
     return cost
 
 
+Places = tuple[Int, Int, Int, Int]
+"""Place of each pose in the reduced matrix, int64, shape (K,), and `first`, `width` and `offset` of its
+envelope."""
+
+
 @compiled
-def _write_poses(normal: Normal, first: Int, second: Int, place: Int, damping: float, columns: Float) -> None:
-    """Write the blocks of poses, motions and loops into the lower half of the reduced matrix.
+def _entry(low: int, high: int, places: Places) -> tuple[int, int]:
+    """Return where the block of two poses is stored: index of its first entry, and distance of its rows.
+
+    Args:
+        low, high: Places of the poses of its columns and of its rows, low <= high.
+        places: See Places.
+    """
+    _, first, width, offset = places
+    block = high // BLOCK
+    row, column = 3 * (high - BLOCK * block), 3 * (low - BLOCK * first[block])
+    return offset[block] + row * width[block] + column, width[block]
+
+
+@compiled
+def _write_poses(
+    normal: Normal, first: Int, second: Int, places: Places, damping: float, values: Float
+) -> None:
+    """Write the blocks of poses, motions and loops into the reduced matrix.
 
     Args:
         normal: Normal equations.
         first, second: Poses of each motion and loop, int64, shape (E,).
-        place: Place of each pose in the reduced matrix, int64, shape (K,).
+        places: See Places.
         damping: Share of the diagonal that is added to it.
-        columns: Columns of the reduced matrix from the diagonal downwards, shape (3K, width); filled.
+        values: Entries of the reduced matrix in the places of the envelope, zeros at first; filled on and
+            below the diagonal. Rows beyond the last pose become those of the identity.
     """
-    for k in range(place.shape[0]):
-        for p in range(3):
-            for q in range(p + 1):
-                columns[3 * place[k] + q, p - q] += normal.U[k, p, q]
-            columns[3 * place[k] + p, 0] += damping * normal.U[k, p, p] + REGULAR + (FIXED if k == 0 else 0.0)
-    for e in range(first.shape[0]):
-        low, high = 3 * place[first[e]], 3 * place[second[e]]
+    place, poses, blocks = places[0], places[0].shape[0], places[1].shape[0]
+    for k in range(poses):
+        at, stride = _entry(place[k], place[k], places)
         for p in range(3):
             for q in range(3):
-                if low < high:
-                    columns[low + q, high + p - low - q] += normal.edge[e, p, q]
-                else:
-                    columns[high + p, low + q - high - p] += normal.edge[e, p, q]
+                values[at + p * stride + q] += normal.U[k, p, q]
+            values[at + p * (stride + 1)] += (
+                damping * normal.U[k, p, p] + REGULAR + (FIXED if k == 0 else 0.0)
+            )
+    for e in range(first.shape[0]):
+        i, j = place[first[e]], place[second[e]]
+        at, stride = _entry(min(i, j), max(i, j), places)
+        for p in range(3):
+            for q in range(3):
+                values[at + p * stride + q] += normal.edge[e, p, q] if i < j else normal.edge[e, q, p]
+    for k in range(poses, BLOCK * blocks):
+        at, stride = _entry(k, k, places)
+        for p in range(3):
+            values[at + p * (stride + 1)] = 1.0
 
 
 @compiled
 def _eliminate_stems(
-    normal: Normal, row: Int, begin: Int, place: Int, damping: float, columns: Float, right: Float
+    normal: Normal, row: Int, begin: Int, places: Places, damping: float, values: Float, right: Float
 ) -> Float:
     """Subtract W V^-1 W^T from the reduced matrix and W V^-1 g_l from its gradient, in place; return V^-1 as
     xx, xy, yy, shape (L, 3).
@@ -346,9 +367,10 @@ def _eliminate_stems(
         normal: Normal equations.
         row: Pose of each detection, int64, shape (M,).
         begin: First detection of each stem, and M, int64, shape (L + 1,).
-        place, damping, columns: See `_write_poses`.
+        places, damping, values: See `_write_poses`.
         right: Gradient in the order of the places, shape (K, 3).
     """
+    place = places[0]
     inverse = np.empty((normal.V.shape[0], 3))
     T = np.empty((3, 2))
     for j in range(inverse.shape[0]):
@@ -358,21 +380,21 @@ def _eliminate_stems(
         determinant = xx * yy - xy * xy
         inverse[j, 0], inverse[j, 1], inverse[j, 2] = yy / determinant, -xy / determinant, xx / determinant
         for m in range(begin[j], begin[j + 1]):
-            at = place[row[m]]
+            low = place[row[m]]
             for p in range(3):
                 T[p, 0] = normal.W[m, p, 0] * inverse[j, 0] + normal.W[m, p, 1] * inverse[j, 1]
                 T[p, 1] = normal.W[m, p, 0] * inverse[j, 1] + normal.W[m, p, 1] * inverse[j, 2]
-                right[at, p] -= T[p, 0] * normal.g_l[j, 0] + T[p, 1] * normal.g_l[j, 1]
+                right[low, p] -= T[p, 0] * normal.g_l[j, 0] + T[p, 1] * normal.g_l[j, 1]
             for n in range(begin[j], begin[j + 1]):
-                below = place[row[n]] - at
-                if below < 0:
+                high = place[row[n]]
+                if high < low:
                     continue
+                at, stride = _entry(low, high, places)
                 for p in range(3):
                     for q in range(3):
-                        if 3 * below + q >= p:
-                            columns[3 * at + p, 3 * below + q - p] -= (
-                                normal.W[n, q, 0] * T[p, 0] + normal.W[n, q, 1] * T[p, 1]
-                            )
+                        values[at + p * stride + q] -= (
+                            normal.W[n, p, 0] * T[q, 0] + normal.W[n, p, 1] * T[q, 1]
+                        )
     return inverse
 
 
