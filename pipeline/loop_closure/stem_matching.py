@@ -197,7 +197,9 @@ def search(
         if looked >= most:
             break
         mx, my = 0.5 * (local[i, 0] + local[j, 0]), 0.5 * (local[i, 1] + local[j, 1])
-        outwards = np.argsort((local[:, 0] - mx) ** 2 + (local[:, 1] - my) ** 2, kind="mergesort")
+        away = (local[:, 0] - mx) ** 2 + (local[:, 1] - my) ** 2
+        away[i] = away[j] = -1.0  # the pair comes first
+        outwards = np.argsort(away, kind="mergesort")
         variance = local_sigma[i] ** 2 + local_sigma[j] ** 2 + 2.0 * slack * slack
         widest = 3.0 * np.sqrt(variance + 2.0 * sigma.max() ** 2)
         at = np.searchsorted(length, span - widest)
@@ -225,7 +227,7 @@ def search(
                 for compared in range(count):
                     if found + count - compared < floor:
                         break
-                    if compared == NEIGHBOURS and found < 0.5 * AGREEING * NEIGHBOURS:
+                    if compared == 2 + NEIGHBOURS and found < 2.0 + 0.5 * AGREEING * NEIGHBOURS:
                         break
                     m = outwards[compared]
                     ax, ay = local[m, 0] - mx, local[m, 1] - my
