@@ -261,7 +261,7 @@ def scanned(points: np.ndarray, *, name: str = "forest", sensor: Sensor = SENSOR
     """Return clusters, detections, clearance and counts of one scan."""
     p = preset(name).replace({key.replace("__", "."): value for key, value in parameters.items()})
     one = step(0, points, Pose2(), roll=0.02, pitch=-0.03, tilt_known=True)
-    found = segment(one, sensor, Pose3.from_euler(np.array([0.1, 0.0, 0.2]), 0.0, 0.0, 0.1), p)
+    found = segment(one, sensor, Pose3.from_euler(np.array([0.1, -0.15, 0.2]), 0.0, 0.0, 0.1), p)
     return {
         "clusters": detect(found, p.detection).clusters,
         "detections": detect(found, p.detection).detections,

@@ -12,8 +12,9 @@ from scipy.spatial import cKDTree
 
 from pipeline.errors import SourceError
 from pipeline.io.readers.point_files import read_columns
-from pipeline.io.readers.velodyne import SENSORS, is_data_packet
+from pipeline.io.readers.velodyne import SENSORS, find_packets, is_data_packet
 from pipeline.types.records import Scan
+from tests.app.robot.test_velodyne import packet
 from tests.pipeline.io.conftest import Opened
 
 
@@ -126,6 +127,26 @@ def test_a_capture_of_other_traffic_is_refused(real: Path, tmp_path: Path, opene
     path.write_bytes(capture_of(web))
     with pytest.raises(SourceError, match="no data packets of a known Velodyne sensor"):
         opened(path)
+
+
+def udp(payload: bytes, port: int = 2368) -> bytes:
+    """An Ethernet frame with a UDP packet."""
+    length = 8 + len(payload)
+    ip = struct.pack(">BBHHHBBH4s4s", 0x45, 0, 20 + length, 0, 0, 64, 17, 0, bytes(4), bytes(4))
+    return bytes(12) + b"\x08\x00" + ip + struct.pack(">HHHH", port, port, length, 0) + payload
+
+
+@pytest.mark.parametrize("nano", [False, True])
+def test_packets_have_the_times_of_the_capture(nano: bool, tmp_path: Path):
+    """1,764,000,000 s and parts of a second, exact to the unit of the capture."""
+    times = [(1_764_000_000, 7), (1_764_000_000, 999_999), (1_764_000_003, 500_000)]
+    packets = [(s, us, udp(packet(100 * k))) for k, (s, us) in enumerate(times)]
+    path = tmp_path / "made.pcap"
+    path.write_bytes(capture_of(packets, nano=nano))
+    found, losses = find_packets(path)
+    assert losses == {}
+    assert found["stamp_ns"].tolist() == [s * 10**9 + us * 1000 for s, us in times]
+    assert found["azimuth"].tolist() == [0, 100, 200]
 
 
 def test_garbage_of_the_right_length_is_no_data_packet(real: Path):
