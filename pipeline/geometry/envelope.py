@@ -20,12 +20,14 @@ class Envelope:
     """Places of the entries of a matrix of N block rows in one array.
 
     Attributes:
+        count: Number of rows of the matrix; the last block row may have more.
         side: Height and width of a block.
         first: First block in the envelope of each block row, int64, shape (N,).
         width: Number of columns of each block row up to the diagonal block, with it, int64, shape (N,).
         offset: Place of the first entry of each block row, and the number of entries, int64, shape (N + 1,).
     """
 
+    count: int
     side: int
     first: Int
     width: Int
@@ -44,7 +46,7 @@ class Envelope:
         first = np.arange(blocks)
         np.minimum.at(first, rows // side, columns // side)
         width = side * (np.arange(blocks) - first + 1)
-        return cls(side, first, width, np.r_[0, np.cumsum(side * width)])
+        return cls(count, side, first, width, np.r_[0, np.cumsum(side * width)])
 
     def rows(self, values: Float) -> list[Float]:
         """Return the block rows of an array of values as views, each of the shape (side, width)."""

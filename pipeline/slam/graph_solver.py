@@ -1,4 +1,4 @@
-"""Solution of the graph of keyframes and stems: Levenberg-Marquardt with the stems eliminated.
+"""Solution of the graph of keyframes and stems: Levenberg-Marquardt with most stems eliminated.
 
 Each stem is seen by some keyframes and by no other stem, so that its unknowns l are eliminated one stem at a
 time (Schur complement; Triggs et al. 2000, Bundle Adjustment, section 6.1). With the normal equations
@@ -8,8 +8,9 @@ time (Schur complement; Triggs et al. 2000, Bundle Adjustment, section 6.1). Wit
 
     (U - W V^-1 W^T) dx = -g_x + W V^-1 g_l,        dl = -V^-1 (g_l + W^T dx).
 
-Two keyframes are coupled if they see a common stem. In the order of Cuthill and McKee these are near each
-other, so that the envelope of the reduced matrix is small.
+Two keyframes are coupled if they see a common eliminated stem. In the order of Cuthill and McKee these are
+near each other, so that the envelope of the reduced matrix is small. A stem that more than VIEWS_MAX
+keyframes see would couple too many of them; it remains an unknown, behind all poses.
 """
 
 from __future__ import annotations
@@ -35,8 +36,17 @@ ITERATIONS_MAX = 50
 DAMPING = (1e-6, 10.0, 1e6)  # first value, factor, and the value at which the solver fails
 FIXED = 1e8  # 1/m^2, 1/rad^2; information that holds the first pose, which is the frame of the map
 REGULAR = 1e-9  # 1/m^2, 1/rad^2; information of a pose or stem that nothing observes
-BLOCK = 16  # poses of a block of the reduced matrix
+SIDE = 48  # rows of a block of the reduced matrix
+#: Most keyframes that see a stem which is eliminated. Coupling n keyframes costs up to 9 n^3 products, a stem
+#: that remains costs two rows over all poses. In a forest, 5 to 60 keyframes see most stems; at a place to
+#: which the robot returns all the time, hundreds do.
+VIEWS_MAX = 256
 MARGINALS = 16  # keyframes whose covariance is computed; it is interpolated in between
+
+
+Places = tuple[Int, Int, Int, Int, Int]
+"""First unknown in the reduced matrix of each pose, int64, shape (K,), and of each stem that remains, -1 for
+others, shape (L,); `first`, `width` and `offset` of its envelope."""
 
 
 class Normal(NamedTuple):
@@ -94,22 +104,31 @@ class Problem:
         self.u = np.array(motion).reshape(-1, 3)
         floor = np.diag(np.square(MOTION_SIGMA_MIN))
         self.root_Q = _root_information(np.array(covariance).reshape(-1, 3, 3) + floor)
-        self.place, self.envelope = self._ordered()
+        self.place, self.last, self.envelope = self._elimination_order()
 
-    def _ordered(self) -> tuple[Int, Envelope]:
-        """Return the place of each pose in the reduced matrix, int64, shape (K,), and the envelope of this
-        matrix."""
+    def _elimination_order(self) -> tuple[Int, Int, Envelope]:
+        """Return the first unknown of each pose and of each stem in the reduced matrix, see Places, and its
+        envelope."""
         from scipy import sparse
         from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-        K, M, E = len(self.pose), len(self.row), len(self.first)
-        seen = sparse.csr_matrix((np.ones(M), (self.row, self.of)), shape=(K, len(self.birth)))
+        K, L, E = len(self.pose), len(self.birth), len(self.first)
+        views = np.diff(self.begin)
+        remains = views > VIEWS_MAX
+        last = np.where(remains, 3 * K + 2 * (np.cumsum(remains) - 1), -1)
+        far = remains[self.of]  # detections of stems that remain
+        pair = self.row[~far], self.of[~far]
+        seen = sparse.csr_matrix((np.ones(len(pair[0])), pair), shape=(K, L))
         edges = sparse.csr_matrix((np.ones(E), (self.first, self.second)), shape=(K, K))
         coupled = (seen @ seen.T + edges + edges.T).tocsr()
         place = np.empty(K, np.int64)
-        place[reverse_cuthill_mckee(coupled, symmetric_mode=True)] = np.arange(K)
+        place[reverse_cuthill_mckee(coupled, symmetric_mode=True)] = 3 * np.arange(K)
         pairs = coupled.tocoo()
-        return place, Envelope.of(3 * place[pairs.row], 3 * place[pairs.col], 3 * K, 3 * BLOCK)
+        rows = np.concatenate(
+            [place[pairs.row] + p for p in range(3)] + [last[self.of[far]] + q for q in (0, 1)]
+        )
+        columns = np.concatenate([place[pairs.col]] * 3 + [place[self.row[far]]] * 2)
+        return place, last, Envelope.of(rows, columns, 3 * K + 2 * int(remains.sum()), SIDE)
 
     def minimum(self, quadratic_loops: int = 0) -> tuple[Float, Float, Normal] | None:
         """Minimise the cost by Levenberg-Marquardt from the poses in `pose`. After ITERATIONS_MAX steps the
@@ -124,7 +143,7 @@ class Problem:
         """
         x, l = self.pose.copy(), self._triangulated()  # noqa: E741
         cost, normal = self._linearised(x, l, quadratic_loops)
-        damping, factor, most = DAMPING
+        damping, factor, damping_max = DAMPING
         for _ in range(ITERATIONS_MAX):
             step = self._step(normal, damping)
             if step is None:
@@ -133,7 +152,7 @@ class Problem:
             new_cost, new_normal = self._linearised(moved, placed, quadratic_loops)
             if new_cost > cost * (1.0 + 1e-9):
                 damping *= factor
-                if damping > most:
+                if damping > damping_max:
                     return None
                 continue
             converged = cost - new_cost < CONVERGED * cost
@@ -203,8 +222,9 @@ class Problem:
             factor, right, inverse_V = self._reduced(normal, damping)
         except np.linalg.LinAlgError:
             return None
-        dx = -factor.solve(right).reshape(-1, 3)[self.place]
-        dl = _stem_steps(normal, inverse_V, self.row, self.begin, dx)
+        step = -factor.solve(right)
+        dx = step[self.place[:, None] + np.arange(3)]
+        dl = _stem_steps(normal, inverse_V, self.row, self.begin, self.last, step, dx)
         return (dx, dl) if np.isfinite(dx).all() and np.isfinite(dl).all() else None
 
     def _reduced(self, normal: Normal, damping: float) -> tuple[Factor, Float, Float]:
@@ -215,19 +235,18 @@ class Problem:
             damping: Share of the diagonal that is added to it.
 
         Returns:
-            Factor of the reduced matrix; reduced gradient in the same order, shape (3K,); and inverse blocks
-            of the stems xx, xy, yy, shape (L, 3).
+            Factor of the reduced matrix; reduced gradient in the same order, shape (N,); and inverse blocks
+            of the eliminated stems xx, xy, yy, shape (L, 3).
 
         Raises:
             LinAlgError: The reduced matrix is not positive definite.
         """
-        e = self.envelope
-        values, right = np.zeros(e.offset[-1]), np.empty((len(self.pose), 3))
-        right[self.place] = normal.g_x
-        places = self.place, e.first, e.width, e.offset
-        _write_poses(normal, self.first, self.second, places, damping, values)
-        inverse_V = _eliminate_stems(normal, self.row, self.begin, places, damping, values, right)
-        return Factor(values, e), right.ravel(), inverse_V
+        envelope = self.envelope
+        values, right = np.zeros(envelope.offset[-1]), np.zeros(envelope.count)
+        places = self.place, self.last, envelope.first, envelope.width, envelope.offset
+        _write_poses(normal, self.first, self.second, places, damping, values, right)
+        inverse_V = _write_stems(normal, self.row, self.begin, places, damping, values, right)
+        return Factor(values, envelope), right, inverse_V
 
     def marginals(self, normal: Normal) -> tuple[Float, Float]:
         """Return `covariance` and `of_map` of the solution, shape (K, 3, 3) each. They are computed from the
@@ -240,8 +259,8 @@ class Problem:
         K = len(self.pose)
         factor, _, _ = self._reduced(normal, 0.0)
         chosen = np.unique(np.r_[1, np.linspace(0, K - 1, min(K, MARGINALS)).round().astype(np.int64)])
-        rows = 3 * self.place[chosen, None] + np.arange(3)
-        unit = np.zeros((3 * K, rows.size))
+        rows = self.place[chosen, None] + np.arange(3)
+        unit = np.zeros((self.envelope.count, rows.size))
         unit[rows.ravel(), np.arange(rows.size)] = 1.0
         inverse = factor.solve(unit)
         blocks = np.array([inverse[at, 3 * n : 3 * n + 3] for n, at in enumerate(rows)])
@@ -302,28 +321,18 @@ def _add_detections(
     return cost
 
 
-Places = tuple[Int, Int, Int, Int]
-"""Place of each pose in the reduced matrix, int64, shape (K,), and `first`, `width` and `offset` of its
-envelope."""
-
-
 @compiled
-def _entry(low: int, high: int, places: Places) -> tuple[int, int]:
-    """Return where the block of two poses is stored: index of its first entry, and distance of its rows.
-
-    Args:
-        low, high: Places of the poses of its columns and of its rows, low <= high.
-        places: See Places.
-    """
-    _, first, width, offset = places
-    block = high // BLOCK
-    row, column = 3 * (high - BLOCK * block), 3 * (low - BLOCK * first[block])
-    return offset[block] + row * width[block] + column, width[block]
+def _entry(row: int, column: int, places: Places) -> int:
+    """Return where the entry of a row and a column up to it is stored."""
+    _, _, first, width, offset = places
+    block = row // SIDE
+    at: int = offset[block] + (row - SIDE * block) * width[block] + column - SIDE * first[block]
+    return at
 
 
 @compiled
 def _write_poses(
-    normal: Normal, first: Int, second: Int, places: Places, damping: float, values: Float
+    normal: Normal, first: Int, second: Int, places: Places, damping: float, values: Float, right: Float
 ) -> None:
     """Write the blocks of poses, motions and loops into the reduced matrix.
 
@@ -333,82 +342,95 @@ def _write_poses(
         places: See Places.
         damping: Share of the diagonal that is added to it.
         values: Entries of the reduced matrix in the places of the envelope, zeros at first; filled on and
-            below the diagonal. Rows beyond the last pose become those of the identity.
+            below the diagonal. Rows beyond the last unknown become those of the identity.
+        right: Gradient in the order of the unknowns, shape (N,); filled for the poses.
     """
-    place, poses, blocks = places[0], places[0].shape[0], places[1].shape[0]
-    for k in range(poses):
-        at, stride = _entry(place[k], place[k], places)
+    place = places[0]
+    for k in range(place.shape[0]):
         for p in range(3):
-            for q in range(3):
-                values[at + p * stride + q] += normal.U[k, p, q]
-            values[at + p * (stride + 1)] += (
-                damping * normal.U[k, p, p] + REGULAR + (FIXED if k == 0 else 0.0)
-            )
+            right[place[k] + p] = normal.g_x[k, p]
+            at = _entry(place[k] + p, place[k], places)
+            for q in range(p + 1):
+                values[at + q] += normal.U[k, p, q]
+            values[at + p] += damping * normal.U[k, p, p] + REGULAR + (FIXED if k == 0 else 0.0)
     for e in range(first.shape[0]):
         i, j = place[first[e]], place[second[e]]
-        at, stride = _entry(min(i, j), max(i, j), places)
         for p in range(3):
+            at = _entry(max(i, j) + p, min(i, j), places)
             for q in range(3):
-                values[at + p * stride + q] += normal.edge[e, p, q] if i < j else normal.edge[e, q, p]
-    for k in range(poses, BLOCK * blocks):
-        at, stride = _entry(k, k, places)
-        for p in range(3):
-            values[at + p * (stride + 1)] = 1.0
+                values[at + q] += normal.edge[e, p, q] if i < j else normal.edge[e, q, p]
+    for n in range(right.shape[0], SIDE * places[2].shape[0]):
+        values[_entry(n, n, places)] = 1.0
 
 
 @compiled
-def _eliminate_stems(
+def _write_stems(
     normal: Normal, row: Int, begin: Int, places: Places, damping: float, values: Float, right: Float
 ) -> Float:
-    """Subtract W V^-1 W^T from the reduced matrix and W V^-1 g_l from its gradient, in place; return V^-1 as
-    xx, xy, yy, shape (L, 3).
+    """Subtract W V^-1 W^T of the eliminated stems from the reduced matrix and W V^-1 g_l from its gradient,
+    and write the blocks of the others; return V^-1 of the eliminated ones as xx, xy, yy, shape (L, 3).
 
     Args:
         normal: Normal equations.
         row: Pose of each detection, int64, shape (M,).
         begin: First detection of each stem, and M, int64, shape (L + 1,).
         places, damping, values: See `_write_poses`.
-        right: Gradient in the order of the places, shape (K, 3).
+        right: Gradient in the order of the unknowns, shape (N,); changed in place.
     """
-    place = places[0]
-    inverse = np.empty((normal.V.shape[0], 3))
+    place, last = places[0], places[1]
+    inverse = np.zeros((normal.V.shape[0], 3))
     T = np.empty((3, 2))
     for j in range(inverse.shape[0]):
         xx = (1.0 + damping) * normal.V[j, 0] + REGULAR
         yy = (1.0 + damping) * normal.V[j, 2] + REGULAR
         xy = normal.V[j, 1]
+        if last[j] >= 0:
+            values[_entry(last[j], last[j], places)] += xx
+            values[_entry(last[j] + 1, last[j], places)] += xy
+            values[_entry(last[j] + 1, last[j] + 1, places)] += yy
+            for q in range(2):
+                right[last[j] + q] = normal.g_l[j, q]
+                for m in range(begin[j], begin[j + 1]):
+                    at = _entry(last[j] + q, place[row[m]], places)
+                    for p in range(3):
+                        values[at + p] += normal.W[m, p, q]
+            continue
         determinant = xx * yy - xy * xy
         inverse[j, 0], inverse[j, 1], inverse[j, 2] = yy / determinant, -xy / determinant, xx / determinant
         for m in range(begin[j], begin[j + 1]):
-            low = place[row[m]]
+            column = place[row[m]]
             for p in range(3):
                 T[p, 0] = normal.W[m, p, 0] * inverse[j, 0] + normal.W[m, p, 1] * inverse[j, 1]
                 T[p, 1] = normal.W[m, p, 0] * inverse[j, 1] + normal.W[m, p, 1] * inverse[j, 2]
-                right[low, p] -= T[p, 0] * normal.g_l[j, 0] + T[p, 1] * normal.g_l[j, 1]
+                right[column + p] -= T[p, 0] * normal.g_l[j, 0] + T[p, 1] * normal.g_l[j, 1]
             for n in range(begin[j], begin[j + 1]):
-                high = place[row[n]]
-                if high < low:
+                if place[row[n]] < column:
                     continue
-                at, stride = _entry(low, high, places)
                 for p in range(3):
-                    for q in range(3):
-                        values[at + p * stride + q] -= (
-                            normal.W[n, p, 0] * T[q, 0] + normal.W[n, p, 1] * T[q, 1]
-                        )
+                    at = _entry(place[row[n]] + p, column, places)
+                    for q in range(3 if place[row[n]] > column else p + 1):
+                        values[at + q] -= normal.W[n, p, 0] * T[q, 0] + normal.W[n, p, 1] * T[q, 1]
     return inverse
 
 
 @compiled
-def _stem_steps(normal: Normal, inverse_V: Float, row: Int, begin: Int, dx: Float) -> Float:
-    """Return the steps of the stems, -V^-1 (g_l + W^T dx), shape (L, 2) [m].
+def _stem_steps(
+    normal: Normal, inverse_V: Float, row: Int, begin: Int, last: Int, step: Float, dx: Float
+) -> Float:
+    """Return the steps of the stems, shape (L, 2) [m]: -V^-1 (g_l + W^T dx) of the eliminated ones.
 
     Args:
         normal: Normal equations.
-        inverse_V, row, begin: See `_eliminate_stems`.
+        inverse_V, row, begin: See `_write_stems`.
+        last: First unknown of each stem that remains, -1 for others, int64, shape (L,).
+        step: Step of all unknowns of the reduced matrix, shape (N,).
         dx: Steps of the poses, shape (K, 3).
     """
     dl = np.empty((inverse_V.shape[0], 2))
     for j in range(dl.shape[0]):
+        if last[j] >= 0:
+            dl[j, 0], dl[j, 1] = step[last[j]], step[last[j] + 1]
+            continue
         gx, gy = normal.g_l[j, 0], normal.g_l[j, 1]
         for m in range(begin[j], begin[j + 1]):
             for p in range(3):

@@ -292,8 +292,8 @@ class KeyframeGraph:
         return replace(self, keyframes=tuple(keyframes))
 
     def support(self, revisit: Revisit, solution: Solution) -> float:
-        """Return the sum of the kernel weights (`_weight`) of the detections of a revisit in a solution of
-        the graph. Detections of landmarks that the solution does not have do not count."""
+        """Return the sum of the kernel weights (`cauchy_weight`) of the detections of a revisit in a solution
+        of the graph. Detections of landmarks that the solution does not have do not count."""
         total = 0.0
         for keyframe, pose in zip(self.keyframes, solution.pose, strict=True):
             known = revisit.of(keyframe) & np.isin(keyframe.birth, solution.birth)

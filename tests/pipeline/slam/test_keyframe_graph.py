@@ -188,6 +188,18 @@ def test_the_covariance_of_a_pose_is_that_given_all_others_and_that_of_the_map()
     assert np.linalg.eigvalsh(solution.of_map).min() > -1e-15
 
 
+@pytest.mark.parametrize("most", [0, 4])
+def test_stems_that_remain_unknowns_have_the_solution_of_eliminated_ones(monkeypatch, most):
+    graph = graph_of(arc(80, radius=40.0, turn=0.02), np.random.default_rng(3))
+    eliminated = graph.solve()
+    monkeypatch.setattr(graph_solver, "VIEWS_MAX", most)
+    remaining = graph.solve()
+    for name in ("pose", "position", "covariance", "of_map", "conditional"):
+        np.testing.assert_allclose(
+            getattr(remaining, name), getattr(eliminated, name), rtol=1e-7, atol=1e-9, err_msg=name
+        )
+
+
 def test_the_part_of_the_map_is_interpolated_from_the_second_keyframe_on(monkeypatch):
     """The covariance of the first keyframe is zero, because it is fixed; that of its stems is not."""
     graph = graph_of(arc(80, radius=40.0, turn=0.02), np.random.default_rng(2))
