@@ -565,19 +565,27 @@ class RobotWatch:
         await asyncio.to_thread(self._link.close)
 
     async def _watch(self) -> None:
-        """Add the robots of the router every 0.5 s until the task is cancelled; errors are only logged. While
-        the fleet is empty, `notice` has the problem or that no robot is announced; with the first robot it is
-        cleared."""
+        """Add the robots of the router every 0.5 s until the task is cancelled. `notice` has the reason why a
+        robot cannot be added, which is logged once. Without such a reason, while the fleet is empty, it has
+        the problem of the link, or that no robot is announced."""
+        failed: dict[str, str] = {}
+        own = ""  # the last notice of this task
         while True:
             for robot in self._link.robots():
                 try:
                     self.take(robot)
-                except Exception:  # the other robots are still to be added
-                    _log.exception("the robot %r could not be added", robot)
-            if not self._fleet.members:
-                problem = self._link.problem
-                self._fleet.notice = problem or f"Waiting: no robot is announced at {self._address.endpoint}"
-            elif self._fleet.notice.startswith(("Waiting", "no connection", "not connected")):
+                except Exception as error:  # the other robots are still to be added
+                    if robot not in failed:
+                        _log.exception("the robot %r could not be added", robot)
+                    failed[robot] = f"{robot or NAMELESS} cannot be shown: {error}"
+                else:
+                    failed.pop(robot, None)
+            now = next(iter(failed.values()), "")
+            if not now and not self._fleet.members:
+                now = self._link.problem or f"Waiting: no robot is announced at {self._address.endpoint}"
+            if now:
+                own = self._fleet.notice = now
+            elif self._fleet.notice == own:
                 self._fleet.notice = ""
             await asyncio.sleep(_LOOK_S)
 

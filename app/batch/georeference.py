@@ -324,7 +324,13 @@ def read_map_frame(folder: FilePath) -> MapFrame:
         method, numbers, note = _method_of(given)
         crs, place = _known(str(given["crs"])), str(given.get("place", ""))
         return MapFrame(crs, Pose2(x, y, yaw), z, method, numbers, note, sigma, residuals, place)
-    except (ValueError, KeyError, TypeError, RecursionError, OSError, pyproj.exceptions.ProjError):
+    except pyproj.exceptions.ProjError:
+        raise SourceError(
+            f"this version of PROJ does not know the reference system of {FILE}",
+            where=str(folder),
+            remedy="Update the package pyproj, or run stemmap georeference again",
+        ) from None
+    except (ValueError, KeyError, TypeError, RecursionError, OSError):
         raise SourceError(
             f"{FILE} is damaged", where=str(folder), remedy="Run stemmap georeference again"
         ) from None

@@ -24,7 +24,7 @@ import msgspec
 
 from app.robot.address import is_live, parse_address
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers import Source, SourceOptions, check_existence, is_cloud
+from pipeline.io.readers import Source, SourceOptions, check_existence, is_cloud, path_of
 from pipeline.io.readers import open_source as _open_source
 from pipeline.simulation.scenarios import SCHEME, parse_uri
 
@@ -221,7 +221,7 @@ def _size(uri: str) -> int | None:
     """Return the size of a file, or of all files in a folder, also in subfolders [bytes]; None if there is no
     such path or it cannot be read."""
     with contextlib.suppress(OSError, ValueError, RuntimeError):
-        path = Path(uri.removeprefix("file:").removeprefix("//")).expanduser()
+        path = Path(path_of(uri)).expanduser()
         if path.is_dir():
             return sum(inside.stat().st_size for inside in path.rglob("*") if inside.is_file())
         return path.stat().st_size

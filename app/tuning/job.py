@@ -28,7 +28,7 @@ from app.tuning.plan import GoalName, Plan, PlannedRun, Trial, axes_of, check
 from app.tuning.result import Result, SearchMessage, best_parameters, for_page, toml_of
 from pipeline.config import Parameters
 from pipeline.errors import SourceError, StemmapError
-from pipeline.io.readers import check_existence
+from pipeline.io.readers import check_existence, path_of
 from pipeline.types.records import TruthTrees
 
 COMMAND = python_module("app.tuning.search")
@@ -364,7 +364,7 @@ def _why_gone(uri: str) -> str:
     if is_live(uri):
         return "it is a live run, which cannot be mapped again"
     try:
-        check_existence(uri.removeprefix("file:").removeprefix("//"))
+        check_existence(path_of(uri))
     except SourceError:
         return "its recording does not exist any more"
     return ""

@@ -24,7 +24,7 @@ from app.worker.outbox import Outbox
 from app.worker.protocol import ToWorker, WireError, to_worker
 from app.worker.session import Session
 from pipeline.config import Parameters
-from pipeline.io.readers import is_cloud
+from pipeline.io.readers import is_cloud, path_of
 from pipeline.io.readers.base import Source, SourceOptions
 from pipeline.jit import on_compiling
 
@@ -58,7 +58,7 @@ def open_any_or_cloud(uri: str, options: SourceOptions) -> Source | LiveSource:
     from app.robot.source import open_any
     from app.sources.opening import open_cloud
 
-    path = uri.removeprefix("file:").removeprefix("//")
+    path = path_of(uri)
     return CloudSource(open_cloud(path)) if is_cloud(path) else open_any(uri, options)
 
 

@@ -3,7 +3,7 @@ covariance, or the reason of a refusal.
 
 Hypotheses of a pose align each pair of local stems with each pair of the map of equal length; the pairs of
 the map are sorted by length. Each hypothesis is verified by the number of other stems that find a partner.
-The search is exhaustive, so that the second best pose is known as well.
+The search tries all pairs, so that the second best pose is known as well.
 
 A wrong loop ruins a map, a missed one costs little. A pose is accepted only if (1) enough stems agree, (2) so
 many would not agree by chance, by the number of false alarms of the a contrario method (Desolneux, Moisan,
@@ -29,6 +29,7 @@ MOST_CELLS = 1_000_000
 BINS = 256  # bins of the lengths of pairs, by which the longest are omitted if there are too many
 DBH_SLACK = 0.05  # m; difference of diameters by another height, season or instrument
 NEIGHBOURS = 12  # local stems next to a base pair that are compared first
+NEIGHBOURS_LEAST = 3  # of them agree; half of the share AGREEING, with which a true pose has fewer in 8 %
 
 
 @compiled
@@ -164,9 +165,9 @@ def search(
 ) -> tuple[Float, Int, int]:  # fmt: skip
     """Align each base pair with all pairs of the map of equal length, and count the stems that agree.
 
-    The stems next to the base pair are compared first. In a true pose the share AGREEING of them agrees,
-    since the map covers the place of the pair; by chance few agree, since the error of the heading has little
-    effect there. A hypothesis in which less than half of this share agrees is dropped.
+    The NEIGHBOURS stems nearest to the base pair are compared first. There, the error of the heading moves a
+    stem little, so that few stems agree by chance. A hypothesis is dropped if fewer than NEIGHBOURS_LEAST of
+    them agree. At the edge of the map this drops true poses of some pairs as well, but not of all.
 
     Args:
         local: Positions of the local stems relative to their mean, shape (L, 2) [m].
@@ -197,9 +198,9 @@ def search(
         if looked >= most:
             break
         mx, my = 0.5 * (local[i, 0] + local[j, 0]), 0.5 * (local[i, 1] + local[j, 1])
-        away = (local[:, 0] - mx) ** 2 + (local[:, 1] - my) ** 2
-        away[i] = away[j] = -1.0  # the pair comes first
-        outwards = np.argsort(away, kind="mergesort")
+        distance2 = (local[:, 0] - mx) ** 2 + (local[:, 1] - my) ** 2
+        distance2[i] = distance2[j] = -1.0  # the pair comes first
+        by_distance = np.argsort(distance2, kind="mergesort")
         variance = local_sigma[i] ** 2 + local_sigma[j] ** 2 + 2.0 * slack * slack
         widest = 3.0 * np.sqrt(variance + 2.0 * sigma.max() ** 2)
         at = np.searchsorted(length, span - widest)
@@ -224,12 +225,12 @@ def search(
                 x = 0.5 * (reference[a, 0] + reference[b, 0]) - c * mx + s * my
                 y = 0.5 * (reference[a, 1] + reference[b, 1]) - s * mx - c * my
                 found = 0
-                for compared in range(count):
-                    if found + count - compared < floor:
+                for rank in range(count):
+                    if found + count - rank < floor:
                         break
-                    if compared == 2 + NEIGHBOURS and found < 2.0 + 0.5 * AGREEING * NEIGHBOURS:
+                    if rank == 2 + NEIGHBOURS and found < 2 + NEIGHBOURS_LEAST:
                         break
-                    m = outwards[compared]
+                    m = by_distance[rank]
                     ax, ay = local[m, 0] - mx, local[m, 1] - my
                     lever2 = (ax * ax + ay * ay) / (span * span)
                     tolerance = 2.0 * np.sqrt(local_sigma[m] ** 2 + slack * slack + v * (0.25 + lever2))

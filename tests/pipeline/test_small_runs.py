@@ -1,4 +1,5 @@
-"""Small runs whose results are stored: an unintended change of any stage is found here.
+"""Small runs whose results are stored, so that a change of detection, SLAM or tracking that is not intended
+is found. Voxel columns and the search of loops are not covered: they need more points and stems.
 
 Each run takes less than a second even without numba. `tests/data/small_runs.json` holds the results. After an
 intended change, `python -m tests.pipeline.test_small_runs` writes them again, and the difference of the file
@@ -156,7 +157,7 @@ def frozen_odometry(begin: int, end: int) -> Callable[[int, Pose2, Pose2], dict[
             held.append(odometry)
         if k < begin:
             return {}
-        # After the end, the wheels count on from where they stood still.
+        # After the end, the odometry continues from the pose at which it was frozen.
         if k == end:
             held.append(odometry)
         return {"odometry": held[0] if k < end else held[0] @ held[1].inverse() @ odometry}
@@ -201,13 +202,13 @@ def turns(k: int, _truth: Pose2, odometry: Pose2) -> dict[str, Any]:
     return {"odometry": odometry @ slip, "turn": Turn(0.15, 0.01) if k else None, "turn_rate": 1.5}
 
 
-def carried(k: int, _truth: Pose2, odometry: Pose2) -> dict[str, Any]:
-    """Put the odometry elsewhere from scan 25 on."""
+def offset_odometry(k: int, _truth: Pose2, odometry: Pose2) -> dict[str, Any]:
+    """Add an offset to the odometry from scan 25 on."""
     return {"odometry": Pose2(3.0, -2.0, 0.8) @ odometry if k >= 25 else odometry}
 
 
 ROWS = np.stack(np.meshgrid(np.arange(-8.5, 9.6, 2.0), np.arange(-8.7, 9.4, 2.0)), axis=-1).reshape(-1, 2)
-TWICE = (stand(1, 16, 9.0, 1.2)[:, None] + np.array([[0.0, 0.0], [0.35, 0.0]])).reshape(-1, 2)
+DOUBLED_STEMS = (stand(1, 16, 9.0, 1.2)[:, None] + np.array([[0.0, 0.0], [0.35, 0.0]])).reshape(-1, 2)
 
 #: Drives by name.
 DRIVES: dict[str, Callable[[], dict[str, Any]]] = {
@@ -215,9 +216,9 @@ DRIVES: dict[str, Callable[[], dict[str, Any]]] = {
     "circle, FastSLAM 1.0": lambda: drive(40, slam__method="fastslam1"),
     "close stems": lambda: drive(30, trees=stand(3, 40, 9.0, 0.5), slam__particles=6),
     "rows of a plantation": lambda: drive(25, trees=ROWS, motion=Pose2(0.6, 0.0, 0.0)),
-    "wheels that stand still": lambda: drive(26, changed=frozen_odometry(10, 20)),
-    "odometry that is absent": lambda: drive(50, changed=missing_odometry(20, 32)),
-    "odometry that jumps": lambda: drive(50, changed=carried),
+    "frozen odometry": lambda: drive(26, changed=frozen_odometry(10, 20)),
+    "missing odometry": lambda: drive(50, changed=missing_odometry(20, 32)),
+    "odometry with an offset": lambda: drive(50, changed=offset_odometry),
     "turns by a gyroscope": lambda: drive(40, changed=turns),
     "measured poses": lambda: drive(50, changed=measured_poses),
     "trees that vanish": lambda: drive(
@@ -228,7 +229,7 @@ DRIVES: dict[str, Callable[[], dict[str, Any]]] = {
     "trees that may move": lambda: drive(
         30, tracking__velocity_sigma=0.2, tracking__acceleration_sigma=0.1, tracking__engine="filterpy"
     ),
-    "a tree seen as two": lambda: drive(40, trees=TWICE),
+    "a tree seen as two": lambda: drive(40, trees=DOUBLED_STEMS),
 }
 
 # --- scans of a few objects -----------------------------------------------------------------------------
@@ -332,6 +333,10 @@ def stored() -> dict[str, Any]:
 def test_a_small_run_has_the_stored_results(name):
     found = list(differences(plain(RUNS[name]()), stored()[name]))
     assert not found, f"{len(found)} differences, the first: {found[:5]}"
+
+
+def test_each_stored_result_has_its_run():
+    assert stored().keys() == RUNS.keys()
 
 
 if __name__ == "__main__":

@@ -36,6 +36,7 @@ from app.web.auth import Role, is_local, role_of
 from app.web.responses import BadRequestError, Body, Number, UserName, json_reply
 from pipeline.config.stages import Stand
 from pipeline.errors import StemmapError
+from pipeline.io.readers import path_of
 from pipeline.stand.volume import LONGEST
 
 #: Largest number of connections of one kind.
@@ -213,7 +214,7 @@ def permitted_uri(uri: str, settings: Settings, any_file: bool) -> str | None:
     try:
         if uri.startswith("sim:") and not Path(uri).exists():
             return _permitted_simulation(uri, settings)
-        return _permitted_path(uri.removeprefix("file://"), settings)
+        return _permitted_path(path_of(uri), settings)
     except (OSError, ValueError, RuntimeError):  # RuntimeError: "~name" of an unknown user
         return None
 

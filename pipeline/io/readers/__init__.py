@@ -12,10 +12,11 @@ from pathlib import Path
 from pipeline.errors import SourceError, UsageError
 from pipeline.io.readers.base import Source, SourceDescription, SourceOptions
 
-__all__ = ["Source", "SourceDescription", "SourceOptions", "open_source"]
+__all__ = ["Source", "SourceDescription", "SourceOptions", "open_source", "path_of"]
 
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+]+):")
 _LIVE = ("udp", "tcp", "ros2")
+_FILE_SCHEME = re.compile(r"file:(//)?")
 
 
 def open_source(uri: str, options: SourceOptions | None = None) -> Source:
@@ -47,6 +48,12 @@ def open_source(uri: str, options: SourceOptions | None = None) -> Source:
         raise SourceError(
             f"cannot open: {reason}", where=uri, remedy="Look at the path and its rights."
         ) from error
+
+
+def path_of(uri: str) -> str:
+    """Return a URI without the scheme `file:` or `file://`; another text as it is."""
+    scheme = _FILE_SCHEME.match(uri)
+    return uri if scheme is None else uri[scheme.end() :]
 
 
 def check_existence(uri: str) -> None:

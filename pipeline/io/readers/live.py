@@ -343,8 +343,12 @@ def read_live_header(container: Container, where: str) -> LiveRunHeader | None:
     except (SourceError, msgspec.DecodeError, RecursionError):
         count_loss(container.damage, "settings of the live run that cannot be read")
         return None
-    if run.version != VERSION or not run.topics or len(run.topics) + len(run.camera) > _MOST_TOPICS:
+    if run.version != VERSION or len(run.topics) + len(run.camera) > _MOST_TOPICS:
         raise SourceError("the recording is of a newer version of stemmap", where=where)
+    if not run.topics:
+        raise SourceError(
+            "the recording has no topic of scans", where=where, remedy="Record the LiDAR as well."
+        )
     return run
 
 

@@ -130,18 +130,24 @@ class Db3File(IndexedContainer):
         ]
 
 
+_BAGS = (".mcap", ".db3")
+_PACKED = tuple(f"{suffix}.zstd" for suffix in _BAGS)
+
+
 def bag_files(folder: Path) -> list[Path]:
     """Return the .mcap and .db3 files (suffix in any case) of a folder in the order of the numbers at the
-    end of their names; may be empty. Compressed files (.zstd) are ignored beside their unpacked ones.
+    end of their names; may be empty. A compressed one (.mcap.zstd, .db3.zstd) is ignored beside an unpacked
+    one of its name.
 
     Raises:
         SourceError: A file is only there compressed, or there are several without metadata.yaml.
         OSError: The folder cannot be read.
     """
-    bags = (path for path in folder.iterdir() if path.suffix.lower() in (".mcap", ".db3"))
-    files = sorted(bags, key=_natural)
-    unpacked = {path.name for path in files}
-    packed = sorted(p for p in folder.iterdir() if p.suffix == ".zstd" and p.stem not in unpacked)
+    inside = sorted(folder.iterdir(), key=_natural)
+    files = [path for path in inside if path.suffix.lower() in _BAGS]
+    unpacked = {path.stem.lower() for path in files}
+    packed = [path for path in inside if path.name.lower().endswith(_PACKED)]
+    packed = [path for path in packed if Path(path.stem).stem.lower() not in unpacked]
     if packed:
         raise SourceError(
             "files of the recording are compressed",

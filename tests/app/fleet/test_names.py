@@ -76,6 +76,7 @@ async def test_a_robot_that_cannot_be_added_does_not_keep_others_out(monkeypatch
         while not fleet.members:
             await asyncio.sleep(0.01)
     assert list(fleet.members) == ["blue"]
+    assert fleet.notice == "red cannot be shown: no memory"
     assert watching._task is not None
     assert not watching._task.done()
     await watching.close()

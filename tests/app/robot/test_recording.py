@@ -235,7 +235,7 @@ def write_live(path: Path, run: Path, topics: list[str], spoil: Callable[[LiveWr
 
 def test_settings_without_a_topic_of_scans_are_refused(stand: Path, tmp_path: Path):
     write_live(tmp_path / "live.mcap", stand, [], lambda _: None)
-    with pytest.raises(SourceError, match="newer version"):
+    with pytest.raises(SourceError, match="no topic of scans"):
         open_source(str(tmp_path / "live.mcap"))
 
 

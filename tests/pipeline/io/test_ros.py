@@ -109,6 +109,8 @@ def test_a_part_that_is_only_there_compressed_is_told(opened: Opened, tmp_path: 
     (part,) = folder.glob("*.db3")
     (folder / f"{part.name}.zstd").write_bytes(b"as unpacking leaves it")
     assert opened(folder).description.scans == SCANS
+    (folder / "notes.txt.zstd").write_bytes(b"not a part")
+    assert opened(folder).description.scans == SCANS
     (folder / "run_1.db3.zstd").write_bytes(b"")
     with pytest.raises(SourceError, match=r"compressed.*zstd -d") as refusal:
         opened(folder)
