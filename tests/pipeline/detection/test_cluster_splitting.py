@@ -11,6 +11,14 @@ from hypothesis import strategies as st
 
 from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe, describe_stems
+from pipeline.detection.cluster_splitting import (
+    ALIKE,
+    ALIKE_LEAST,
+    APART,
+    LEAN,
+    Runs,
+    _count_agreeing_slices,
+)
 from pipeline.detection.verdicts import classify_clusters
 from pipeline.types.records import Clusters, Labels, Verdict
 from tests.pipeline.strategies import SENSOR, one_cluster
@@ -130,6 +138,26 @@ def test_no_return_is_lost_whatever_the_points(seed, slices, spread):
     assert ((labels.label >= 0) == (label >= 0)).all()
     assert (np.bincount(labels.label[label >= 0], minlength=labels.clusters) == clusters.size).all()
     assert len(clusters.size) == labels.clusters == len(labels.hidden)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 3))
+def test_circles_of_one_trunk_may_be_farther_apart_the_higher_they_are_above_each_other(seed, per_slice):
+    """In each slice, the most similar circle agrees if it is within the limits."""
+    rng = np.random.default_rng(seed)
+    count = 12
+    level, height = np.arange(count) // per_slice, rng.uniform(-2.0, 2.0, count)
+    x, y, radius = rng.uniform(-0.2, 0.2, count), rng.uniform(-0.2, 0.2, count), rng.uniform(0.1, 0.2, count)
+    returns = rng.integers(3, 9, count)
+    runs = Runs(level, x, y, radius, height, returns, np.ones(count, np.bool_), np.zeros(count, np.bool_))
+    first = int(rng.integers(count))
+    off, wider = np.hypot(x - x[first], y - y[first]), np.abs(radius - radius[first])
+    within = (off < APART + LEAN * np.abs(height - height[first])) & (
+        wider < ALIKE * radius[first] + ALIKE_LEAST
+    )
+    unlike = np.where(within, off + wider, np.inf)
+    agrees = np.array([within[k] and unlike[k] == unlike[level == level[k]].min() for k in range(count)])
+    assert _count_agreeing_slices(runs, count, first) == (agrees.sum(), returns[agrees].sum())
+    np.testing.assert_array_equal(runs.agrees, agrees)
 
 
 def assert_same(one, other):

@@ -7,13 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from pipeline.config import preset
 from pipeline.detection.cluster_shape import describe
-from pipeline.detection.cylinder_fit import BEAM, fit_stems
+from pipeline.detection.cylinder_fit import BEAM, angular_width, fit_stems
 from pipeline.types.records import Labels, Sensor
 from tests.pipeline.strategies import SENSOR, arc, one_cluster
 
@@ -265,3 +265,18 @@ def test_the_centre_is_that_of_the_leaning_axis_at_the_height_asked_for():
     assert at_breast[2] > at_mean[2]
     assert at_breast[4] > at_mean[4]
     np.testing.assert_array_equal(at_breast[5:], at_mean[5:])
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 6), st.floats(0.1, np.pi))
+def test_the_angular_width_is_the_spread_about_the_mean_direction(seed, count, spread):
+    """Also if returns are behind the sensor, seen along the mean direction."""
+    rng = np.random.default_rng(seed)
+    bearing = rng.uniform(-np.pi, np.pi) + rng.uniform(-spread, spread, count)
+    reach = rng.uniform(1.0, 2.0, count)
+    ray = np.exp(1j * bearing)
+    middle = np.angle(reach @ ray)
+    turn = np.angle(ray * np.exp(-1j * middle))
+    assume(abs(reach @ ray) > 1e-3)
+    assume(np.abs(turn).max() < np.pi - 1e-6)
+    found = angular_width(np.vstack([ray.real, ray.imag, reach, np.zeros(count)]), count)
+    np.testing.assert_allclose(found, [middle + (turn.max() + turn.min()) / 2, np.ptp(turn)], atol=1e-6)

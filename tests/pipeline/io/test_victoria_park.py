@@ -51,6 +51,24 @@ def test_beams_go_from_right_to_left(tmp_path: Path, opened: Opened):
     assert scan.dropped == 358
 
 
+def test_times_of_all_files_are_seconds(tmp_path: Path, opened: Opened):
+    laser = np.full((2, 362), 5.0)
+    laser[:, 0] = [0.15, 12345.67]
+    source = opened(write_zip(tmp_path, laser, "0.1 1 0\n12345.678 1 0\n", **{"GPS.txt": "0.25 5 7\n"}))
+    stamps = {
+        kind: [r.stamp_ns for r in source.records() if isinstance(r, kind)] for kind in (Scan, Odometry)
+    }
+    assert stamps == {
+        Scan: [150_000_000, 12_345_670_000_000],
+        Odometry: [100_000_000, 12_345_678_000_000],
+    }
+    assert (source.description.start_ns, source.description.end_ns) == tuple(stamps[Scan])
+    truth = source.truth()
+    assert truth is not None
+    assert truth.path is not None
+    assert truth.path.stamp_ns.tolist() == [250_000_000]
+
+
 @given(st.floats(-5, 5), st.floats(-0.6, 0.6), st.integers(1, 400))
 def test_steady_steering_drives_an_arc_of_one_centre(speed: float, steering: float, steps: int):
     car = Car()
