@@ -20,10 +20,10 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from pipeline.geometry.poses import Pose3
-from pipeline.io.readers.container import BrokenChunkError, plain, unpack
+from pipeline.io.readers.container import BrokenChunkError, Channel, plain, unpack
 from pipeline.io.readers.mcap_file import MAGIC, MESSAGE_HEAD, RECORD, McapFile
 from pipeline.io.readers.message_time import WINDOW_NS, Stamped, in_order_of_stamps
-from pipeline.io.readers.topics import POINT_CLOUD
+from pipeline.io.readers.topics import POINT_CLOUD, choose_topics
 from pipeline.io.readers.transforms import TransformTree
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
@@ -282,3 +282,23 @@ def test_transforms_are_chained_over_the_fewest_links():
     assert back is not None
     np.testing.assert_allclose((back @ chain).t, 0.0, atol=1e-12)
     assert tree.find("f0", "elsewhere") is None
+
+
+@pytest.mark.parametrize(
+    ("counts", "wanted", "why_not"),
+    [
+        ((5, 3), {}, ["", "/a has more messages"]),
+        ((5, 5), {}, ["", "/a has as many messages, and is taken"]),
+        ((3, 5), {}, ["/b has more messages", ""]),
+        ((3, 5), {"scan": "/a"}, ["", "/a was named"]),
+        ((5, 0), {}, ["", "no message in it"]),
+    ],
+)
+def test_the_reason_why_a_topic_is_not_read_compares_numbers_of_messages(
+    counts: tuple[int, int], wanted: dict[str, str], why_not: list[str]
+):
+    channels = [
+        Channel(k, name, POINT_CLOUD, "cdr", count)
+        for k, (name, count) in enumerate(zip(("/a", "/b"), counts, strict=True))
+    ]
+    assert [topic.why_not for topic in choose_topics(channels, wanted, "run").recorded()] == why_not

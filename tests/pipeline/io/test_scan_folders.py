@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import laspy
@@ -11,6 +12,8 @@ import pytest
 
 from pipeline.errors import SourceError
 from pipeline.geometry.poses import Pose3
+from pipeline.io.readers.base import COORDINATE_LIMIT
+from pipeline.io.readers.pose_files import TextError, read_any_poses
 from pipeline.types.records import Odometry, Scan
 from tests.pipeline.io.conftest import Opened
 from tests.pipeline.io.test_kitti import curve, matrices
@@ -113,6 +116,22 @@ def test_poses_that_are_none_are_said(text: str, tmp_path: Path, opened: Opened)
     source = opened(tmp_path)
     assert not source.description.has_odometry
     assert source.description.warnings[0].startswith("poses.txt is not used")
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("write_poses", [tum, matrices])
+def test_each_coordinate_of_a_position_is_bounded(
+    axis: int, write_poses: Callable[[list[Pose3]], str], tmp_path: Path
+):
+    path = tmp_path / "poses.txt"
+    for coordinate in (0.99 * COORDINATE_LIMIT, COORDINATE_LIMIT, -COORDINATE_LIMIT):
+        poses = [Pose3.identity(), Pose3(np.eye(3), coordinate * np.eye(3)[axis])]
+        path.write_text(write_poses(poses))
+        if abs(coordinate) < COORDINATE_LIMIT:
+            assert len(read_any_poses(path)[1]) == 2
+        else:
+            with pytest.raises(TextError, match="positions beyond"):
+                read_any_poses(path)
 
 
 def test_a_damaged_scan_is_counted_and_the_others_are_read(tmp_path: Path, opened: Opened):

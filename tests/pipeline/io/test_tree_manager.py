@@ -197,6 +197,31 @@ def test_frames_have_the_trees_that_were_seen_until_then_and_are_within_reach(tm
     assert [len(lines) - 1 for lines in frames] == [1, 2]
 
 
+def test_a_written_map_is_read_as_trees_in_the_frame_of_each_pose(tmp_path: Path, opened: Opened):
+    rng = np.random.default_rng(1)
+    trees = replace(
+        fakes.trees(5),
+        position=rng.uniform(-9.0, 9.0, (5, 2)),
+        first_seen_ns=np.zeros(5, np.int64),
+        confirmed=np.ones(5, np.bool_),
+    )
+    x, y, yaw = rng.uniform(-3.0, 3.0, (3, 4))
+    path = MapPath(10**9 * np.arange(4), x, y, yaw, np.zeros(4))
+    assert write_tree_manager(tmp_path / "out", path, trees, 100.0) == 0
+    records = list(opened(tmp_path / "out").records())
+    poses = [record.T_odom_base for record in records if isinstance(record, Odometry)]
+    np.testing.assert_allclose([pose.t for pose in poses], np.column_stack([x, y, np.zeros(4)]), atol=1e-8)
+    read = [record for record in records if isinstance(record, Scan)]
+    assert len(read) == 4
+    for k, scan in enumerate(read):
+        place = ((trees.position - [x[k], y[k]]) @ [1.0, 1.0j]) * np.exp(-1j * yaw[k])
+        np.testing.assert_allclose(
+            scan.points, np.column_stack([place.real, place.imag, np.zeros(5)]), atol=1e-5
+        )
+        np.testing.assert_allclose(stems(scan).axis, np.tile([0.0, 0.0, 1.0], (5, 1)))
+        np.testing.assert_allclose(stems(scan).dbh, trees.dbh)
+
+
 @given(st.binary(max_size=300))
 def test_whatever_the_bytes_are_rows_are_whole_or_counted(body: bytes):
     table, damaged = _numbers(body, 3)
